@@ -1,0 +1,703 @@
+"""The one in-memory form of a recording, its checks and its HDF5 file (`yid-recording/1`)."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import numbers
+import os
+import re
+import secrets
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import h5py
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from yid_ocp.errors import DataError, OutputError, nearest
+
+Array = NDArray[np.float64]
+Clock = Literal["recorded", "nominal"]
+
+FORMAT = "yid-recording/1"
+JOINT_CHANNELS: Mapping[str, str] = {
+    "position": "rad",
+    "velocity": "rad/s",
+    "effort": "N m",
+    "position_command": "rad",
+    "velocity_command": "rad/s",
+    "external_effort": "N m",
+}
+"""Channels of a joint group and their units."""
+
+_JOINT_STD = ("position_std", "velocity_std", "effort_std")
+_JOINT_UNITS = {"t": "s", **JOINT_CHANNELS}
+_POINT_UNITS = {"t": "s", "position": "m", "std": "m"}
+_JOINT_ATTRIBUTES = ("names", "clock", *_JOINT_STD)
+_POINT_ATTRIBUTES = ("names", "sensor", "frame", "pose", "clock", "std")
+_POINT_GROUP_NAME = re.compile(r"points(_[^/]+)?")
+_LARGEST_ANGLE = 50.0  # eight turns: no robot joint does that, whereas a posture in degrees nearly always does
+_LARGEST_DISTANCE = 50.0  # beyond any motion capture volume, whereas an object in millimetres is always larger
+_TIME_TOLERANCE = 1e-9  # a nominal clock is a sum of rounded periods, so its end is seldom exactly the number asked for
+
+
+@dataclass(frozen=True, eq=False)
+class JointGroup:
+    """What a robot measured of its joints; N samples of nj joints on one clock.
+
+    Arrays are copied, made float64 and read-only.
+
+    Attributes
+    ----------
+    names : tuple of str, length nj
+        Joint names, as in the URDF.
+    t : ndarray, shape (N,)
+        Strictly increasing time [s].
+    position : ndarray, shape (N, nj)
+        Measured joint angle [rad].
+    velocity, effort : ndarray, shape (N, nj), or None
+        Measured joint velocity [rad/s] and effort [N m].
+    position_command, velocity_command : ndarray, shape (N, nj), or None
+        What the controller asked for [rad], [rad/s].
+    external_effort : ndarray, shape (N, nj), or None
+        Effort left when the robot's own model is taken away [N m].
+    position_std, velocity_std, effort_std : float or ndarray, shape (nj,), or None
+        Standard deviation of the noise, where known [rad], [rad/s], [N m].
+    clock : {'recorded', 'nominal'}
+        Whether `t` was measured or is a sample index times a nominal period.
+    """
+
+    names: tuple[str, ...]
+    t: Array
+    position: Array
+    velocity: Array | None = None
+    effort: Array | None = None
+    position_command: Array | None = None
+    velocity_command: Array | None = None
+    external_effort: Array | None = None
+    position_std: float | Array | None = None
+    velocity_std: float | Array | None = None
+    effort_std: float | Array | None = None
+    clock: Clock = "recorded"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "names", tuple(self.names))
+        for name in ("t", *JOINT_CHANNELS):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, _frozen(getattr(self, name), f"joints/{name}"))
+        for name in _JOINT_STD:
+            if getattr(self, name) is not None:
+                std = _frozen(getattr(self, name), f"joints, attribute {name}")
+                object.__setattr__(self, name, float(std) if std.ndim == 0 else std)
+
+    @property
+    def channels(self) -> dict[str, Array]:
+        """The channels that were recorded: name to array, shape (N, nj), units in `JOINT_CHANNELS`."""
+        return {name: getattr(self, name) for name in JOINT_CHANNELS if getattr(self, name) is not None}
+
+    def _rows(self, rows: NDArray[np.bool_]) -> JointGroup:
+        changes: dict[str, Any] = {name: value[rows] for name, value in self.channels.items()}
+        return replace(self, t=self.t[rows], **changes)
+
+
+@dataclass(frozen=True, eq=False)
+class PointGroup:
+    """Positions of np named points over M frames of one sensor, on its own clock.
+
+    Arrays are copied, made float64 and read-only.
+
+    Attributes
+    ----------
+    name : str
+        `points`, or `points_` and a word of one's own (`points_camera`, `points_arm`).
+    names : tuple of str, length np
+        Point names.
+    t : ndarray, shape (M,)
+        Strictly increasing time [s].
+    position : ndarray, shape (M, np, 3)
+        Position in `frame` [m], NaN (all three coordinates) where a point was not seen.
+    std : ndarray, shape (M, np, 3), or None
+        Standard deviation of the noise [m]; a number given for it is spread over the shape.
+    sensor : str
+        What saw the points, in words.
+    frame : str
+        The frame of reference of `position`.
+    pose : ndarray, shape (4, 4), or None
+        Of a camera: the transform from camera to world coordinates [m].
+    clock : {'recorded', 'nominal'}
+        Whether `t` was measured or is a frame index times a nominal period.
+    """
+
+    name: str
+    names: tuple[str, ...]
+    t: Array
+    position: Array
+    std: Array | None = None
+    sensor: str = "unknown"
+    frame: str = "world"
+    pose: Array | None = None
+    clock: Clock = "recorded"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "names", tuple(self.names))
+        for name in ("t", "position", "std", "pose"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, _frozen(getattr(self, name), f"{self.name}/{name}"))
+        if self.std is not None and self.std.ndim == 0:
+            object.__setattr__(self, "std", _frozen(np.full(self.position.shape, float(self.std)), f"{self.name}/std"))
+
+    def _rows(self, rows: NDArray[np.bool_]) -> PointGroup:
+        std = None if self.std is None else self.std[rows]
+        return replace(self, t=self.t[rows], position=self.position[rows], std=std)
+
+    def _select(self, names: Sequence[str]) -> PointGroup:
+        columns = [self.names.index(name) for name in names]
+        std = None if self.std is None else self.std[:, columns]
+        return replace(self, names=tuple(names), position=self.position[:, columns], std=std)
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """One run on a robot, or of a virtual experiment, in SI units.
+
+    The constructor only stores; `validate(Recording(...))` checks as well.
+
+    Attributes
+    ----------
+    joints : JointGroup or None
+        What the robot measured of its joints.
+    points : tuple of PointGroup
+        What cameras, motion capture or an arm measured of points; every group has its own clock.
+    description, source : str
+        What was recorded, and where it comes from.
+    name : str
+        Short name, the stem of the file.
+    sha256 : str or None
+        Hash of the file read; kept by `slice` and `select_points`.
+    truth : mapping of str to float
+        The parameter values of a virtual experiment, in the parameters' own units; empty for a real one.
+    """
+
+    joints: JointGroup | None = None
+    points: tuple[PointGroup, ...] = ()
+    description: str = ""
+    source: str = ""
+    name: str = "recording"
+    sha256: str | None = None
+    truth: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "points", tuple(self.points))
+        object.__setattr__(self, "truth", dict(self.truth))
+
+    @property
+    def groups(self) -> tuple[JointGroup | PointGroup, ...]:
+        """All groups there are, joints first."""
+        return ((self.joints,) if self.joints is not None else ()) + self.points
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the recorded joints, length nj."""
+        return () if self.joints is None else self.joints.names
+
+    @property
+    def point_names(self) -> tuple[str, ...]:
+        """Names of the points of all groups, each once, in order of appearance."""
+        return tuple(dict.fromkeys(name for group in self.points for name in group.names))
+
+    @property
+    def duration(self) -> float:
+        """Time from the first sample of any group to the last of any [s]."""
+        return float(max(group.t[-1] for group in self.groups) - min(group.t[0] for group in self.groups))
+
+    def slice(self, start: float, stop: float) -> Recording:
+        """Cut out the samples with  start <= t <= stop.
+
+        Times are kept as they are, each group's on its own clock; a group without a sample in between is left out.
+
+        Parameters
+        ----------
+        start, stop : float
+            Bounds [s], both included (within 1 ns).
+
+        Returns
+        -------
+        Recording
+            The part in between.
+
+        Raises
+        ------
+        DataError
+            If nothing was recorded in between, or `start` is not before `stop`.
+        """
+        masks = [(g.t >= start - _TIME_TOLERANCE) & (g.t <= stop + _TIME_TOLERANCE) for g in self.groups]
+        kept = [group._rows(mask) for group, mask in zip(self.groups, masks, strict=True) if mask.any()]
+        first, last = min(g.t[0] for g in self.groups), max(g.t[-1] for g in self.groups)
+        _check(
+            start < stop and bool(kept),
+            f"nothing was recorded from {start:g} s to {stop:g} s",
+            f"recording '{self.name}'",
+            f"start < stop, overlapping {first:g} s to {last:g} s",
+        )
+        joints = next((group for group in kept if isinstance(group, JointGroup)), None)
+        return replace(self, joints=joints, points=tuple(g for g in kept if isinstance(g, PointGroup)))
+
+    def select_points(self, names: Iterable[str]) -> Recording:
+        """Keep only the named points, in the order given, in every group that has them.
+
+        Parameters
+        ----------
+        names : iterable of str
+            Point names; none at all keeps the joints only.
+
+        Returns
+        -------
+        Recording
+            The same recording without the other points; groups left without a point are dropped.
+
+        Raises
+        ------
+        DataError
+            If a point was not recorded, or nothing is left.
+        """
+        wanted = tuple(dict.fromkeys(names))
+        check_names(self, (), wanted)
+        present = [(group, [name for name in wanted if name in group.names]) for group in self.points]
+        points = tuple(group._select(kept) for group, kept in present if kept)
+        what = "no point was selected and the recording has no joints"
+        _check(bool(points) or self.joints is not None, what, f"recording '{self.name}'", ", ".join(self.point_names))
+        return replace(self, points=points)
+
+
+def validate(recording: Recording, *, allow_nan_effort: bool = False) -> Recording:
+    """Check shapes, clocks, names, values and units of a recording.
+
+    Parameters
+    ----------
+    recording : Recording
+        What to check.
+    allow_nan_effort : bool
+        Whether `effort` and `external_effort` may hold NaN.
+
+    Returns
+    -------
+    Recording
+        The argument itself.
+
+    Raises
+    ------
+    DataError
+        If there is no group, or one is empty; names are repeated or do not match the arrays; a clock is not finite and
+        strictly increasing; a joint channel has a value that is not finite; a point is infinite or seen in part; a
+        standard deviation is negative; a pose is not a rigid transform; joint positions exceed 50 rad or points 50 m,
+        which are degrees or millimetres.
+    """
+    _validate(recording, f"recording '{recording.name}'", allow_nan_effort)
+    return recording
+
+
+def check_names(recording: Recording, joints: Iterable[str], points: Iterable[str]) -> None:
+    """Check that a recording has what a model needs.
+
+    Parameters
+    ----------
+    recording : Recording
+        What was recorded.
+    joints, points : iterable of str
+        Names of the joints and points that must be in it.
+
+    Raises
+    ------
+    DataError
+        If one is missing; the error names it and the nearest that there is.
+    """
+    for noun, wanted, known in (("joint", joints, recording.joint_names), ("point", points, recording.point_names)):
+        missing = [name for name in dict.fromkeys(wanted) if name not in known]
+        if missing:
+            listed = ", ".join(f"'{name}'" for name in missing)
+            raise DataError(
+                f"the recording has no {noun}{'s' if len(missing) > 1 else ''} {listed}",
+                where=f"recording '{recording.name}'",
+                allowed=", ".join(known) or f"no {noun}s were recorded",
+                hint="; ".join(f"'{name}': {nearest(name, known)}" for name in missing) if known else "",
+            )
+
+
+def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = False) -> Recording:
+    """Read and check a `yid-recording/1` file.
+
+    Parameters
+    ----------
+    path : path-like
+        The HDF5 file.
+    allow_nan_effort : bool
+        Whether `effort` and `external_effort` may hold NaN.
+
+    Returns
+    -------
+    Recording
+        Its contents, with the file's stem as name and its hash.
+
+    Raises
+    ------
+    DataError
+        If the file is missing, not HDF5 or damaged, of another format, has a group, dataset, attribute or unit that
+        the format does not know, lacks one that it needs, or fails `validate`.
+    """
+    path = Path(path)
+    digest = file_sha256(path)
+    hint = "read other formats (CSV, rosbag, MCAP) with `yid-ocp import` or yid_ocp.data.read_any"
+    _check(h5py.is_hdf5(path), "the file is not an HDF5 file", str(path), f"HDF5 in the format {FORMAT}", hint)
+    try:
+        with h5py.File(path, "r") as file:
+            recording = _from_file(file, path, digest)
+    except (OSError, RuntimeError, KeyError) as error:
+        what = f"the HDF5 file is truncated or damaged ({_reason(error)})"
+        raise DataError(what, where=str(path), hint="copy or record it again") from error
+    _validate(recording, str(path), allow_nan_effort)
+    return recording
+
+
+def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
+    """Check a recording and write it as `yid-recording/1`, whole or not at all.
+
+    Parameters
+    ----------
+    recording : Recording
+        What to write; effort may hold NaN. Its `name` and `sha256` are properties of the file and not written.
+    path : path-like
+        The HDF5 file to make or replace.
+
+    Raises
+    ------
+    DataError
+        As `validate`.
+    OutputError
+        If the file cannot be written; one that was there before is left as it was.
+    """
+    validate(recording, allow_nan_effort=True)
+    with new_file(Path(path)) as temporary, h5py.File(temporary, "x") as file:
+        file.attrs.update(format=FORMAT, description=recording.description, source=recording.source)
+        if recording.truth:
+            file.attrs["truth"] = json.dumps({key: float(value) for key, value in recording.truth.items()})
+        if recording.joints is not None:
+            _write_group(file.create_group("joints"), recording.joints, _JOINT_UNITS, _JOINT_ATTRIBUTES)
+        for group in recording.points:
+            attributes = [name for name in _POINT_ATTRIBUTES if name != "std"]
+            _write_group(file.create_group(group.name), group, _POINT_UNITS, attributes)
+
+
+@contextlib.contextmanager
+def new_file(path: Path) -> Iterator[Path]:
+    """Give a temporary name beside `path`; what is written there takes its place when the block ends without error.
+
+    Parameters
+    ----------
+    path : Path
+        The file to make or replace.
+
+    Yields
+    ------
+    Path
+        Where to write meanwhile.
+
+    Raises
+    ------
+    OutputError
+        If the folder is missing or the file cannot be written.
+    """
+    if path.is_dir() or not path.parent.is_dir():
+        what = "the name of the file is that of a folder" if path.is_dir() else "the folder to write to does not exist"
+        raise OutputError(what, where=str(path), hint="make the folder first, or choose another name")
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        yield temporary
+        with temporary.open("rb+") as file:
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except (OSError, RuntimeError) as error:
+        what, hint = f"the file cannot be written ({_reason(error)})", "choose a writable folder on a disk with room"
+        raise OutputError(what, where=str(path), hint=hint) from error
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def file_sha256(path: Path) -> str:
+    """Hash a file, or the files of a folder in the order of their names.
+
+    Parameters
+    ----------
+    path : Path
+        The file or folder.
+
+    Returns
+    -------
+    str
+        SHA-256, 64 hexadecimal digits.
+
+    Raises
+    ------
+    DataError
+        If it is missing or cannot be read.
+    """
+    digest = hashlib.sha256()
+    try:
+        for entry in sorted(item for item in path.rglob("*") if item.is_file()) if path.is_dir() else [path]:
+            with entry.open("rb") as file:
+                while block := file.read(1 << 20):
+                    digest.update(block)
+    except FileNotFoundError as error:
+        raise DataError("there is no such file", where=str(path), hint="check the path") from error
+    except OSError as error:
+        raise DataError(f"the file cannot be read ({_reason(error)})", where=str(path)) from error
+    return digest.hexdigest()
+
+
+def _reason(error: Exception) -> str:
+    number = getattr(error, "errno", None)
+    return os.strerror(number) if number else str(error).strip("'\"")
+
+
+def _check(ok: bool, what: str, where: str, allowed: str = "", hint: str = "") -> None:
+    if not ok:
+        raise DataError(what, where=where, allowed=allowed, hint=hint)
+
+
+def _frozen(value: ArrayLike, where: str) -> Array:
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise DataError("not an array of real numbers", where=where, allowed="numbers in a regular array") from error
+    array.setflags(write=False)
+    return array
+
+
+def _validate(recording: Recording, origin: str, allow_nan_effort: bool) -> None:
+    _check(bool(recording.groups), "the recording has no group", origin, "joints, points, points_<name>")
+    _check_text(origin, recording.description, recording.source)
+    for key, value in recording.truth.items():
+        good = isinstance(value, numbers.Real) and not isinstance(value, bool) and bool(np.isfinite(value))
+        _check(good, f"the true value of '{key}' is {value!r}", f"{origin}: truth", "finite numbers")
+    if recording.joints is not None:
+        _validate_joints(recording.joints, f"{origin}: joints", allow_nan_effort)
+    names = [group.name for group in recording.points]
+    for group in recording.points:
+        legal = _POINT_GROUP_NAME.fullmatch(group.name) is not None
+        _check(legal, f"a group of points is called '{group.name}'", origin, "points, points_<name>")
+        _check(names.count(group.name) == 1, f"two groups of points are called '{group.name}'", origin)
+        _validate_points(group, f"{origin}: {group.name}")
+
+
+def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> None:
+    _check_names_and_clock(joints, where)
+    for channel, value in joints.channels.items():
+        place = f"{where}/{channel}"
+        _check_shape(value, (len(joints.t), len(joints.names)), place, "(N, nj)")
+        is_effort = channel in ("effort", "external_effort")
+        bad = np.isinf(value) if is_effort and allow_nan_effort else ~np.isfinite(value)
+        if bad.any():
+            row, column = (int(index[0]) for index in np.nonzero(bad))
+            raise DataError(
+                f"channel '{channel}' of joint '{joints.names[column]}' is not finite at t = {joints.t[row]:g} s "
+                f"({int(bad.sum())} such values in the channel)",
+                where=place,
+                allowed="finite numbers; NaN is for points only",
+                hint="cut the recording or leave the channel out"
+                + (", or read with allow_nan_effort=True" if is_effort else ""),
+            )
+        largest = float(np.nanmax(np.abs(value))) if JOINT_CHANNELS[channel] == "rad" else 0.0
+        _check(
+            largest <= _LARGEST_ANGLE,
+            f"channel '{channel}' reaches {largest:g} rad",
+            place,
+            f"at most {_LARGEST_ANGLE:g} rad",
+            f"these look like degrees: convert them to radians, or read a CSV with units={{'{channel}': 'deg'}}",
+        )
+    for name in _JOINT_STD:
+        std, place = getattr(joints, name), f"{where}, attribute {name}"
+        if std is not None:
+            if np.ndim(std) > 0:
+                _check_shape(std, (len(joints.names),), place, "one number or (nj,)")
+            good = bool(np.all(np.isfinite(std) & (np.asarray(std) >= 0)))
+            _check(good, f"{name} is {std}", place, "finite and not negative")
+
+
+def _validate_points(group: PointGroup, where: str) -> None:
+    _check_names_and_clock(group, where)
+    _check_text(where, group.sensor, group.frame)
+    _check_shape(group.position, (len(group.t), len(group.names), 3), f"{where}/position", "(M, np, 3)")
+    unseen = np.isnan(group.position).all(axis=2)
+    bad = ~np.isfinite(group.position).all(axis=2) & ~unseen
+    if bad.any():
+        row, column = (int(index[0]) for index in np.nonzero(bad))
+        raise DataError(
+            f"point '{group.names[column]}' is {group.position[row, column]} at t = {group.t[row]:g} s",
+            where=f"{where}/position",
+            allowed="three finite coordinates, or three NaN where the point was not seen",
+        )
+    largest = float(np.linalg.norm(group.position[~unseen], axis=-1).max(initial=0.0))
+    _check(
+        largest <= _LARGEST_DISTANCE,
+        f"a point is {largest:g} m away from the origin",
+        f"{where}/position",
+        f"at most {_LARGEST_DISTANCE:g} m",
+        "these look like millimetres: convert them to metres, or read a CSV with units={'points': 'mm'}",
+    )
+    if group.std is not None:
+        _check_shape(group.std, group.position.shape, f"{where}/std", "one number or (M, np, 3)")
+        seen = group.std[~unseen]
+        wrong = seen[~(np.isfinite(seen) & (seen >= 0))]
+        what = f"the standard deviation of a point that was seen is {wrong[:1]}"
+        _check(wrong.size == 0, what, f"{where}/std", "finite and not negative")
+    if group.pose is not None:
+        _check_pose(group.pose, f"{where}, attribute pose")
+
+
+def _check_pose(pose: Array, where: str) -> None:
+    _check_shape(pose, (4, 4), where, "(4, 4)")
+    rotation, allowed = pose[:3, :3], "a rotation, a translation [m] and the last row 0 0 0 1"
+    _check(bool(np.isfinite(pose).all()), "the pose has a value that is not finite", where, allowed)
+    _check(_close(pose[3], np.eye(4)[3]), f"the last row of the pose is {pose[3]}", where, allowed)
+    _check(_close(rotation.T @ rotation, np.eye(3)), "the axes of the pose are not orthonormal", where, allowed)
+    _check(bool(np.linalg.det(rotation) > 0), "the pose is a reflection", where, allowed)
+
+
+def _close(array: Array, expected: Array) -> bool:
+    return bool(np.allclose(array, expected, rtol=0, atol=1e-6))
+
+
+def _check_names_and_clock(group: JointGroup | PointGroup, where: str) -> None:
+    _check(bool(group.names), "the group has no names", where)
+    _check(group.t.size > 0, "the group has no samples", where)
+    for name in group.names:
+        place = f"{where}, names"
+        _check(isinstance(name, str) and bool(name), f"the name {name!r} cannot be used", place, "text, not empty")
+        _check_text(place, name)
+        _check(group.names.count(name) == 1, f"the name '{name}' occurs {group.names.count(name)} times", place)
+    clocks = get_args(Clock)
+    _check(group.clock in clocks, f"the clock is '{group.clock}'", f"{where}, attribute clock", ", ".join(clocks))
+    _check_shape(group.t, (group.t.size,), f"{where}/t", "one-dimensional")
+    bad = np.flatnonzero(~np.isfinite(group.t))
+    _check(bad.size == 0, f"the time at index {bad[:1]} is not finite", f"{where}/t", "finite seconds")
+    backward = np.flatnonzero(np.diff(group.t) <= 0)
+    if backward.size:
+        index = int(backward[0])
+        before, after = float(group.t[index]), float(group.t[index + 1])
+        raise DataError(
+            f"the clock does not advance from index {index} to {index + 1}: {before!r} s, then {after!r} s",
+            where=f"{where}/t",
+            allowed="strictly increasing times",
+            hint="remove repeated samples and sort by time",
+        )
+
+
+def _check_shape(array: Array, shape: tuple[int, ...], where: str, letters: str) -> None:
+    _check(array.shape == shape, f"the array has shape {array.shape}", where, f"{shape}, that is {letters}")
+
+
+def _check_text(where: str, *texts: str) -> None:
+    for text in texts:
+        # HDF5 ends text at the first null character and stores it as UTF-8
+        storable = "\0" not in text and not any("\ud800" <= letter <= "\udfff" for letter in text)
+        _check(storable, f"the text {text!r} cannot be stored", where, "Unicode text without null characters")
+
+
+def _write_group(
+    target: h5py.Group, group: JointGroup | PointGroup, units: Mapping[str, str], attributes: Iterable[str]
+) -> None:
+    for name, unit in units.items():
+        if getattr(group, name) is not None:
+            target.create_dataset(name, data=getattr(group, name)).attrs["unit"] = unit
+    for name in attributes:
+        if getattr(group, name) is not None:
+            value = getattr(group, name)
+            target.attrs[name] = np.array(value, dtype=h5py.string_dtype()) if name == "names" else value
+
+
+def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
+    origin = str(path)
+    texts = {
+        key: _text(file.attrs[key], f"{origin}, attribute {key}") if key in file.attrs else ""
+        for key in ("format", "description", "source", "truth")
+    }
+    what = f"the format of the file is '{texts['format']}'" if texts["format"] else "the file does not say its format"
+    _check(texts["format"] == FORMAT, what, f"{origin}, attribute format", FORMAT)
+    joints, points = None, []
+    for name in file:
+        where, legal = f"{origin}: {name}", name == "joints" or _POINT_GROUP_NAME.fullmatch(name) is not None
+        hint = "" if legal else nearest(name, ("joints", "points"))
+        _check(legal, f"the format has no group '{name}'", origin, "joints, points, points_<name>", hint)
+        _check(isinstance(file[name], h5py.Group), f"'{name}' is not a group", where, "a group of datasets")
+        if name == "joints":
+            joints = JointGroup(**_read_group(file[name], where, _JOINT_UNITS, _JOINT_ATTRIBUTES, ("names",)))
+        else:
+            required = ("names", "sensor", "frame")
+            values = _read_group(file[name], where, _POINT_UNITS, _POINT_ATTRIBUTES, required)
+            points.append(PointGroup(name=name, **values))
+    truth = _truth(texts["truth"], f"{origin}, attribute truth") if texts["truth"] else {}
+    return Recording(joints, tuple(points), texts["description"], texts["source"], path.stem, digest, truth)
+
+
+def _read_group(
+    group: h5py.Group, where: str, units: Mapping[str, str], attributes: Sequence[str], required: Iterable[str]
+) -> dict[str, Any]:
+    for noun, found, known, needed in (
+        ("dataset", set(group), tuple(units), {"t", "position"}),
+        ("attribute", set(group.attrs), attributes, set(required)),
+    ):
+        for name in sorted(found - set(known)):
+            what = f"the format has no {noun} '{name}' here"
+            raise DataError(what, where=where, allowed=", ".join(known), hint=nearest(name, known))
+        for name in sorted(needed - found):
+            raise DataError(f"the {noun} '{name}' is missing", where=where, allowed=", ".join(known))
+    both = "std" in group and "std" in group.attrs
+    _check(not both, "`std` is both a dataset and an attribute", where, "one of the two")
+    values: dict[str, Any] = {name: _read_dataset(group[name], f"{where}/{name}", units[name]) for name in group}
+    for name, value in group.attrs.items():
+        place = f"{where}, attribute {name}"
+        if name == "names":
+            values[name] = tuple(_text(entry, place) for entry in np.atleast_1d(np.asarray(value, dtype=object)))
+        elif name in ("clock", "sensor", "frame"):
+            values[name] = _text(value, place)
+        else:
+            values[name] = _frozen(value, place)
+    return values
+
+
+def _read_dataset(dataset: Any, where: str, unit: str) -> Array:
+    numeric = isinstance(dataset, h5py.Dataset) and dataset.dtype.kind in "fiu" and dataset.shape is not None
+    _check(numeric, "not a dataset of real numbers", where, "floating point or integer numbers")
+    found = _text(dataset.attrs["unit"], f"{where}, attribute unit") if "unit" in dataset.attrs else unit
+    hint = f"convert the values to {unit}: recordings are never converted silently"
+    _check(found == unit, f"the unit is '{found}'", where, unit, hint)
+    return np.asarray(dataset[()], dtype=np.float64)
+
+
+def _text(value: object, where: str) -> str:
+    if isinstance(value, h5py.Empty):
+        return ""
+    if isinstance(value, np.ndarray) and value.size == 1:
+        value = value.reshape(()).item()
+    if isinstance(value, bytes):
+        try:
+            return value.decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise DataError("the text is not UTF-8", where=where) from error
+    if not isinstance(value, str):
+        raise DataError(f"found {value!r}", where=where, allowed="text")
+    return str(value)
+
+
+def _truth(text: str, where: str) -> dict[str, float]:
+    try:
+        truth = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise DataError(f"the text is not JSON ({error})", where=where) from error
+    if not isinstance(truth, dict):
+        raise DataError("the JSON text is not an object", where=where, allowed='{"name": number, ...}')
+    return truth

@@ -1,0 +1,358 @@
+"""From symbolic step equations to functions: structure tables, generated C, the compiler and its private cache."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import hashlib
+import logging
+import os
+import platform
+import shutil
+import stat
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import platformdirs
+from numpy.typing import NDArray
+
+from yid_ocp.errors import OutputError
+from yid_ocp.integrator.discrete import DiscreteEquations
+
+log = logging.getLogger(__name__)
+
+FLAGS = ("-O2", "-ftree-vectorize", "-ffp-contract=fast", "-fopenmp-simd", "-fPIC", "-shared")
+NATIVE = ("-march=native",)
+Indices = NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class StepFunctions:
+    """CasADi functions of one step, all with the arguments of `DiscreteEquations.arguments`.
+
+    Attributes
+    ----------
+    residual : (balance without the constraints' pull, internal, constraint, p1)
+    linear : (pair vectors, rest Jacobian, rest Jacobian of p1, constraint Jacobian), the last three as nonzeros
+    matrix : nonzeros of Dphi(q_k)
+    pull : nonzeros of d(Dphi' lam)/d(q_k, z_k)
+    scales : (row scale, h)
+    patterns : sparsity of rest, rest of p1, constraint Jacobian, matrix and pull
+    """
+
+    equations: DiscreteEquations
+    residual: ca.Function
+    linear: ca.Function
+    matrix: ca.Function
+    pull: ca.Function
+    scales: ca.Function
+    patterns: dict[str, ca.Sparsity]
+
+    @property
+    def all(self) -> tuple[ca.Function, ...]:
+        """Every function, in the order of generation."""
+        return self.residual, self.linear, self.matrix, self.pull, self.scales
+
+
+def step_functions(equations: DiscreteEquations) -> StepFunctions:
+    """Build the functions that the stepping kernel calls.
+
+    The bodies' part of the Jacobians leaves as vectors per joint, from which the kernel forms the entries pair by pair
+    (`RigidBody`), everything else as sparse nonzeros from automatic differentiation.
+    """
+    e = equations
+    h, rigid = e.h, e.rigid
+    balance = e.balance_rest + e.row_scale * (e.p0 + h / 2 * rigid.by_q - rigid.by_v)
+    plus, minus = rigid.S + h / 2 * rigid.D, rigid.S - h / 2 * rigid.D
+    lower, upper = rigid.B / 2 - rigid.F / h, rigid.B / 2 + rigid.F / h
+    parts = (plus, minus, lower, upper, rigid.S[:3, :], h / 4 * rigid.G)
+    pairs = ca.vertcat(*(ca.vec(ca.densify(part).T) for part in parts))
+
+    unknown = ca.vertcat(e.q1, e.z1, e.lam)
+    old = ca.vertcat(e.q0, e.z0)
+    rest = ca.jacobian(ca.vertcat(e.balance_rest, e.internal), ca.vertcat(unknown, old, e.u))
+    rest_p = ca.jacobian(e.p1_rest, ca.vertcat(unknown, old, e.u))
+    by_q1 = ca.substitute(e.constraint_matrix, old, ca.vertcat(e.q1, e.z1))
+    by_rest = ca.jacobian(e.constraint, ca.vertcat(e.z1, e.lam))
+    by_unknown = ca.sparsify(ca.horzcat(by_q1, by_rest))
+    by_z = ca.jacobian(e.constraint_matrix.T @ e.lam, e.z0)
+    pull = ca.sparsify(ca.horzcat(e.pull_by_q, by_z))
+
+    def function(name: str, *outputs: ca.SX) -> ca.Function:
+        return ca.Function(name, e.arguments, ca.cse(list(outputs)))
+
+    def nonzeros(matrix: ca.SX) -> ca.SX:
+        return ca.vertcat(*matrix.nonzeros()) if matrix.nnz() else ca.SX(0, 1)
+
+    return StepFunctions(
+        e,
+        function("residual", balance, e.internal, e.constraint, e.p1),
+        function("linear", pairs, nonzeros(rest), nonzeros(rest_p), nonzeros(by_unknown)),
+        function("matrix", nonzeros(e.constraint_matrix)),
+        function("pull", nonzeros(pull)),
+        function("scales", e.row_scale, h),
+        {
+            "rest": rest.sparsity(),
+            "rest_p": rest_p.sparsity(),
+            "constraint": by_unknown.sparsity(),
+            "matrix": e.constraint_matrix.sparsity(),
+            "pull": pull.sparsity(),
+        },
+    )
+
+
+def theta_function(equations: DiscreteEquations, names: Sequence[str]) -> ca.Function:
+    """Partial derivatives of (all rows, p1, effort of prescribed coordinates) by the named parameters, sparse."""
+    e = equations
+    chosen = ca.vertcat(*(e.system.parameters[name].symbol for name in names)) if names else ca.SX(0, 1)
+    prescribed = list(e.system.prescribed_indices)
+    rows = ca.vertcat(e.momentum_balance, e.internal, e.constraint)
+    effort = -e.momentum_balance[prescribed] / e.h
+    outputs = [ca.jacobian(expression, chosen) for expression in (rows, e.p1, effort)]
+    return ca.Function("by_theta", e.arguments, ca.cse(outputs))
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Index tables of a step that hold for every state.
+
+    Attributes
+    ----------
+    unknown_row : (ny,)
+        Full row (balance, internal, constraint) of each unknown (free q1, z1, lam).
+    order : (ny,)
+        Elimination order: internal coordinates, tips before roots, multipliers last.
+    fill : list of (k,) arrays
+        For each pivot, the later positions that its row and column fill.
+    """
+
+    unknown_row: Indices
+    order: Indices
+    fill: tuple[Indices, ...]
+    ancestors: tuple[Indices, ...]
+    rows_old: tuple[Indices, ...]
+    p1_old: tuple[Indices, ...]
+    p1_new: tuple[Indices, ...]
+
+
+def structure(functions: StepFunctions) -> Structure:
+    """Work out sparsity, elimination order and fill of a step."""
+    e = functions.equations
+    system = e.system
+    n, nz, m = system.size, e.z0.numel(), e.lam.numel()
+    nt, nqz = n + nz + m, n + nz
+    related = np.zeros((n, n), bool)
+    ancestors = tuple(np.array(system.mechanism.ancestors(j), np.int32) for j in range(n))
+    for j, chain in enumerate(ancestors):
+        related[j, chain] = related[chain, j] = True
+    rows_new, rows_old = np.zeros((nt, nt), bool), np.zeros((nt, nqz), bool)
+    p1_new, p1_old = np.zeros((n, nt), bool), np.zeros((n, nqz), bool)
+    rows_new[:n, :n] = rows_old[:n, :n] = p1_new[:, :n] = p1_old[:, :n] = related
+    for key, new, old in (("rest", rows_new, rows_old), ("rest_p", p1_new, p1_old)):
+        row, column = _triplet(functions.patterns[key])
+        inside = column < nt
+        new[row[inside], column[inside]] = True
+        inside = (column >= nt) & (column < nt + nqz)
+        old[row[inside], column[inside] - nt] = True
+    row, column = _triplet(functions.patterns["constraint"])
+    rows_new[n + nz + row, column] = True
+    row, column = _triplet(functions.patterns["matrix"])
+    rows_new[column, n + nz + row] = True
+    row, column = _triplet(functions.patterns["pull"])
+    rows_old[row, column] = True
+
+    free = np.array(system.free_indices, np.int32)
+    unknown_row = np.concatenate([free, np.arange(n, nt, dtype=np.int32)]).astype(np.int32)
+    nf = len(free)
+    order = np.concatenate(
+        [np.arange(nf, nf + nz), np.arange(nf)[::-1], np.arange(nf + nz, nf + nz + m)]
+    ).astype(np.int32)
+    pattern = rows_new[np.ix_(unknown_row[order], unknown_row[order])]
+    pattern = pattern | pattern.T
+    fill = []
+    for k in range(len(order)):
+        later = np.flatnonzero(pattern[k, k + 1 :]) + k + 1
+        pattern[np.ix_(later, later)] = True
+        fill.append(later.astype(np.int32))
+
+    def columns(matrix: NDArray[np.bool_]) -> tuple[Indices, ...]:
+        return tuple(np.flatnonzero(line).astype(np.int32) for line in matrix)
+
+    return Structure(unknown_row, order, tuple(fill), ancestors, columns(rows_old), columns(p1_old), columns(p1_new))
+
+
+def kernel_source(functions: StepFunctions, tables: Structure) -> str:
+    """C source of the stepping kernel: sizes, tables, CasADi's functions, then `kernel.c`."""
+    e = functions.equations
+    system = e.system
+    n, nz, m = system.size, e.z0.numel(), e.lam.numel()
+    patterns = functions.patterns
+    sizes = {
+        "N": n,
+        "NZ": nz,
+        "M": m,
+        "NU": e.u.numel(),
+        "NC": len(system.prescribed),
+        "NF": n - len(system.prescribed),
+        "NY": len(tables.order),
+        "NT": n + nz + m,
+        "NNZ_REST": patterns["rest"].nnz(),
+        "NNZ_REST_P": patterns["rest_p"].nnz(),
+        "NNZ_CONSTRAINT": patterns["constraint"].nnz(),
+        "NNZ_MATRIX": patterns["matrix"].nnz(),
+        "NNZ_PULL": patterns["pull"].nnz(),
+        "SZ_W": max(f.sz_w() for f in functions.all),
+        "SZ_IW": max(f.sz_iw() for f in functions.all),
+        "ROW_SCALED": int(bool(system.compliant)),
+    }
+    lines = [f"#define {name} {value}" for name, value in sizes.items()]
+
+    def table(name: str, values: Sequence[int] | Indices) -> None:
+        entries = ", ".join(str(int(v)) for v in values) or "0"
+        lines.append(f"static const int {name}[] = {{{entries}}};")
+
+    def runs(name: str, lists: Sequence[Indices], gap: int) -> None:
+        starts, flat = [0], []
+        for entries in lists:
+            for first, last in _runs(entries, gap):
+                flat += [first, last]
+            starts.append(len(flat) // 2)
+        table(f"{name}_start", starts)
+        table(f"{name}_run", flat)
+
+    def ragged(name: str, lists: Sequence[Indices]) -> None:
+        table(f"{name}_start", np.concatenate([[0], np.cumsum([len(entries) for entries in lists])]))
+        table(f"{name}_col", np.concatenate(lists) if lists else [])
+
+    table("free_index", system.free_indices)
+    table("prescribed_index", system.prescribed_indices)
+    table("unknown_row", tables.unknown_row)
+    table("order", tables.order)
+    runs("ancestor", tables.ancestors, 0)
+    runs("fill", tables.fill, 0)
+    ragged("rows_old", tables.rows_old)
+    ragged("p1_old", tables.p1_old)
+    ragged("p1_new", tables.p1_new)
+    for key in ("rest", "rest_p", "constraint", "matrix", "pull"):
+        row, column = _triplet(patterns[key])
+        table(f"{key}_row", row)
+        table(f"{key}_col", column)
+    body = resources.files("yid_ocp.integrator").joinpath("kernel.c").read_text(encoding="utf-8")
+    return "\n".join([_generated("step", functions.all), *lines, body])
+
+
+def function_source(function: ca.Function) -> str:
+    """C source of one CasADi function."""
+    return _generated(function.name(), (function,))
+
+
+def _generated(name: str, functions: Sequence[ca.Function]) -> str:
+    generator = ca.CodeGenerator(name, {"with_header": False, "indent": 0})
+    for function in functions:
+        generator.add(function)
+    return generator.dump()
+
+
+def _triplet(sparsity: ca.Sparsity) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    row, column = sparsity.get_triplet()
+    return np.array(row, np.int64), np.array(column, np.int64)
+
+
+def _runs(entries: Indices, gap: int) -> list[tuple[int, int]]:
+    result: list[tuple[int, int]] = []
+    for value in map(int, entries):
+        if result and value <= result[-1][1] + gap:
+            result[-1] = (result[-1][0], value + 1)
+        else:
+            result.append((value, value + 1))
+    return result
+
+
+@functools.cache
+def compiler() -> str | None:
+    """Path of the C compiler, or None; the environment variable CC chooses one, `CC=none` means none."""
+    wanted = os.environ.get("CC")
+    if wanted == "none":
+        return None
+    return next((found for name in (wanted, "cc", "gcc", "clang") if name and (found := shutil.which(name))), None)
+
+
+def cache_folder() -> Path:
+    """The private folder of compiled code, made when absent; YID_OCP_CACHE overrides its place.
+
+    Raises
+    ------
+    OutputError
+        It cannot be made, or others could write to it.
+    """
+    folder = Path(os.environ.get("YID_OCP_CACHE") or platformdirs.user_cache_dir("yid_ocp"))
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"the cache of compiled code cannot be made: {error.strerror}",
+            where=str(folder),
+            hint="set YID_OCP_CACHE to a folder of your own, or CC=none to do without compiled code",
+        ) from error
+    info = folder.stat()
+    if hasattr(os, "getuid") and (info.st_uid != os.getuid() or info.st_mode & (stat.S_IWGRP | stat.S_IWOTH)):
+        raise OutputError(
+            "the cache of compiled code belongs to, or is writable by, somebody else",
+            where=str(folder),
+            allowed="a folder that you own, writable by you alone",
+            hint=f"chmod 700 it, or set YID_OCP_CACHE to another folder ({folder.name})",
+        )
+    return folder
+
+
+@functools.cache
+def _machine() -> str:
+    path = compiler() or "none"
+    version = subprocess.run([path, "--version"], capture_output=True, text=True, check=False).stdout
+    processor = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        wanted = ("model name", "flags", "Features")
+        processor += "".join(
+            sorted({line for line in info.read_text(errors="replace").splitlines() if line.startswith(wanted)})
+        )
+    return f"{version}|{platform.system()}|{processor}"
+
+
+def compile_library(source: str) -> ctypes.CDLL | None:
+    """Shared library of a C source, from the cache where it is there; None where nothing can compile it.
+
+    Parameters
+    ----------
+    source : str
+        C text. The cache key is the hash of this text, the flags, the compiler, the processor and CasADi's version.
+    """
+    path = compiler()
+    if path is None:
+        return None
+    key = hashlib.sha256("\0".join([source, *FLAGS, *NATIVE, _machine(), ca.__version__]).encode()).hexdigest()[:32]
+    target = cache_folder() / f"{key}.so"
+    if not target.exists():
+        with tempfile.TemporaryDirectory(dir=target.parent) as work:
+            text, built = Path(work) / "source.c", Path(work) / "library.so"
+            text.write_text(source, encoding="utf-8")
+            for flags in ((*FLAGS, *NATIVE), FLAGS):
+                command = [path, *flags, str(text), "-o", str(built), "-lm"]
+                run = subprocess.run(command, capture_output=True, text=True, check=False)
+                if run.returncode == 0:
+                    break
+            else:
+                log.warning("the C compiler %s failed; going on without compiled code:\n%s", path, run.stderr[:2000])
+                return None
+            os.replace(built, target)
+    try:
+        return ctypes.CDLL(str(target))
+    except OSError as error:
+        log.warning("compiled code cannot be loaded (%s); going on without it", error)
+        return None

@@ -1,0 +1,269 @@
+"""The midpoint discrete Euler-Lagrange (DEL) equations of a system as symbolic expressions.
+
+Position-momentum form, with L_d(q0, q1) = h L((q0 + q1)/2, (q1 - q0)/h):
+
+    p_k + D1 L_d(q_k, q_{k+1}) + f- - Dphi(q_k)' lam_k = 0        phi(q_{k+1}) - C lam_k / h = 0
+    p_{k+1} = D2 L_d(q_k, q_{k+1}) + f+
+
+with f- = f+ = (h/2) F for the symmetric split, f- = h F and f+ = 0 for the left one. The first equation holds for
+free coordinates; at a prescribed one its left side is -h times the effort that the prescription needs at node k.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import casadi as ca
+
+from yid_ocp.errors import ModelError
+from yid_ocp.model.kinematics import Kinematics, RigidBody, cross, forward_kinematics, rigid_body
+from yid_ocp.model.mechanism import Frame, Placement
+from yid_ocp.model.system import Grasp, MidpointState, System
+
+ForceSplit = Literal["symmetric", "left"]
+
+
+@dataclass(frozen=True)
+class DiscreteEquations:
+    """One step of a system, symbolically.
+
+    Letters: n coordinates, nz internal coordinates, m constraints, nu inputs, ntheta parameters.
+
+    Attributes
+    ----------
+    system : System
+    force_split : "symmetric" or "left"
+    q0, q1 : casadi.SX, shape (n, 1)
+        q_k and q_{k+1}.
+    z0, z1 : casadi.SX, shape (nz, 1)
+    p0 : casadi.SX, shape (n, 1)
+        p_k [N m s].
+    lam : casadi.SX, shape (m, 1)
+        Multipliers of the step [N s].
+    u : casadi.SX, shape (nu, 1)
+        Motor torques held over the step [N m].
+    theta : casadi.SX, shape (ntheta, 1)
+    time_step : casadi.SX
+        Recorded step [s]; the step in the equations is this times `System.time_scale`.
+    momentum_balance : casadi.SX, shape (n, 1)
+        Left side of the DEL equation.
+    internal : casadi.SX, shape (nz, 1)
+        Midpoint equations of the internal coordinates.
+    constraint : casadi.SX, shape (m, 1)
+        phi(q_{k+1}) - C lam / h.
+    p1 : casadi.SX, shape (n, 1)
+        p_{k+1}.
+    rigid : RigidBody
+        Closed-form derivatives of the bodies' Lagrangian at the midpoint.
+    balance_rest, p1_rest : casadi.SX, shape (n, 1)
+        What is left of `momentum_balance` and `p1` when the bodies' Lagrangian, p_k and the constraints' pull are
+        taken out; with the closed form this gives the Jacobians without differentiating the tree.
+    constraint_matrix : casadi.SX, shape (m, n)
+        Dphi(q_k), so that the pull is its transpose times lam.
+    pull_by_q : casadi.SX, shape (n, n)
+        d(Dphi(q_k)' lam)/dq_k.
+    row_scale : casadi.SX, shape (n, 1)
+        Factor on each row of the bodies' part (1, or the compliance of a compliant coordinate).
+    """
+
+    system: System
+    force_split: ForceSplit
+    q0: ca.SX
+    q1: ca.SX
+    z0: ca.SX
+    z1: ca.SX
+    p0: ca.SX
+    lam: ca.SX
+    u: ca.SX
+    theta: ca.SX
+    time_step: ca.SX
+    h: ca.SX
+    momentum_balance: ca.SX
+    internal: ca.SX
+    constraint: ca.SX
+    p1: ca.SX
+    rigid: RigidBody
+    balance_rest: ca.SX
+    p1_rest: ca.SX
+    constraint_matrix: ca.SX
+    pull_by_q: ca.SX
+    row_scale: ca.SX
+
+    @property
+    def arguments(self) -> list[ca.SX]:
+        """Arguments of every compiled function of the step, in order."""
+        return [self.q0, self.q1, self.p0, self.z0, self.z1, self.lam, self.u, self.theta, self.time_step]
+
+    @property
+    def residual(self) -> ca.SX:
+        """Residual of the step's unknowns: free rows of the balance, internal and constraint equations."""
+        return ca.vertcat(self.momentum_balance[list(self.system.free_indices)], self.internal, self.constraint)
+
+    @property
+    def unknowns(self) -> ca.SX:
+        """Unknowns of the step: free coordinates of q1, then z1, then lam."""
+        return ca.vertcat(self.q1[list(self.system.free_indices)], self.z1, self.lam)
+
+
+def discrete_lagrangian(system: System, q0: ca.SX, q1: ca.SX, time_step: ca.SX) -> ca.SX:
+    """Midpoint discrete Lagrangian L_d = h L((q0 + q1)/2, (q1 - q0)/h) without effects [J s].
+
+    Parameters
+    ----------
+    system : System
+    q0, q1 : casadi.SX, shape (n, 1)
+    time_step : casadi.SX or float
+        h [s]
+
+    References
+    ----------
+    Marsden and West (2001), Acta Numerica 10:357, doi:10.1017/S096249290100006X.
+    """
+    q, v = (q0 + q1) / 2, (q1 - q0) / time_step
+    rigid = rigid_body(forward_kinematics(system.mechanism, q), v, system.gravity)
+    return time_step * (rigid.kinetic - rigid.potential - system.elastic_energy(q))
+
+
+def discrete_equations(system: System, force_split: ForceSplit = "symmetric") -> DiscreteEquations:
+    """Build the DEL equations of one step.
+
+    Parameters
+    ----------
+    system : System
+    force_split : "symmetric" or "left"
+        How the force of a step is shared between its two ends.
+
+    Returns
+    -------
+    DiscreteEquations
+
+    Raises
+    ------
+    ModelError
+        Unknown force split, or an internal coordinate without an equation.
+
+    References
+    ----------
+    Marsden and West (2001), Acta Numerica 10:357, section 3, doi:10.1017/S096249290100006X.
+    Johnson and Murphey (2009), IEEE Trans. Robotics 25(6):1249, doi:10.1109/TRO.2009.2032955.
+    """
+    if force_split not in ("symmetric", "left"):
+        raise ModelError(f"force_split = '{force_split}'", allowed="symmetric, left")
+    n, m = system.size, system.constraint_count
+    names = tuple(system.internal)
+    symbols = ca.vertcat(*system.internal.values()) if names else ca.SX(0, 1)
+    q0, q1, p0 = ca.SX.sym("q0", n), ca.SX.sym("q1", n), ca.SX.sym("p0", n)
+    z0, z1 = ca.SX.sym("z0", len(names)), ca.SX.sym("z1", len(names))
+    lam, u = ca.SX.sym("lam", m), ca.SX.sym("u", len(system.driven))
+    time_step = ca.SX.sym("time_step")
+    h = time_step * system.time_scale
+
+    qm, vm = ca.SX.sym("qm", n), ca.SX.sym("vm", n)
+    zm, z_rate, pull_rate = ca.SX.sym("zm", len(names)), ca.SX.sym("z_rate", len(names)), ca.SX.sym("pull_rate", m)
+    kinematics = forward_kinematics(system.mechanism, qm)
+    rigid = rigid_body(kinematics, vm, system.gravity)
+    rows = {name: i for i, name in enumerate(names)}
+    state = MidpointState(system, kinematics, qm, vm, zm, z_rate, u, pull_rate, rows)
+    energy = -system.elastic_energy(qm)
+    force = system.viscous_force(vm) + system.input_force(u)
+    equations: dict[str, ca.SX] = {}
+    for effect in system.effects:
+        terms = effect.terms(state)
+        energy += terms.lagrangian
+        force = force if terms.force is None else force + terms.force
+        equations.update(terms.internal)
+    missing = [name for name in names if name not in equations]
+    if missing:
+        raise ModelError(f"internal coordinate '{missing[0]}' has no equation")
+    extra_q, extra_v = ca.gradient(energy, qm), ca.gradient(energy, vm)
+    midpoint = ca.vertcat(qm, vm, zm, z_rate, pull_rate, symbols)
+    midpoint_values = ca.vertcat((q0 + q1) / 2, (q1 - q0) / h, (z0 + z1) / 2, (z1 - z0) / h, lam / h, (z0 + z1) / 2)
+
+    phi_there = ca.substitute(system.constraints(forward_kinematics(system.mechanism, q1)), symbols, z1)
+    matrix, pull_by_q = (
+        ca.substitute(expression, symbols, z0)
+        for expression in _constraint_derivatives(system, forward_kinematics(system.mechanism, q0), q0, lam)
+    )
+    pull = matrix.T @ lam
+
+    weight_left, weight_right = (h, ca.SX(0)) if force_split == "left" else (h / 2, h / 2)
+    row_scale, held = [ca.SX(1)] * n, [ca.SX(0)] * n
+    for joint, compliance in system.compliant.items():
+        index = system.mechanism.joint_index(joint)
+        row_scale[index], held[index] = compliance, h * qm[index]
+    scale = ca.vertcat(*row_scale)
+    balance_rest = scale * (h / 2 * extra_q - extra_v + weight_left * force) - ca.vertcat(*held)
+    p1_rest = h / 2 * extra_q + extra_v + weight_right * force
+    balance = scale * (p0 + h / 2 * rigid.by_q - rigid.by_v - pull) + balance_rest
+    p1 = h / 2 * rigid.by_q + rigid.by_v + p1_rest
+
+    def placed(expression: ca.SX) -> ca.SX:
+        return ca.densify(ca.substitute(expression, midpoint, midpoint_values))
+
+    fields = ("by_q", "by_v", "kinetic", "potential", "S", "D", "F", "B", "G")
+    return DiscreteEquations(
+        system=system,
+        force_split=force_split,
+        q0=q0,
+        q1=q1,
+        z0=z0,
+        z1=z1,
+        p0=p0,
+        lam=lam,
+        u=u,
+        theta=system.parameters.symbols,
+        time_step=time_step,
+        h=h,
+        momentum_balance=placed(balance),
+        internal=placed(ca.vertcat(*(equations[name] for name in names)) if names else ca.SX(0, 1)),
+        constraint=ca.densify(phi_there - system.constraint_compliance() * lam / h),
+        p1=placed(p1),
+        rigid=RigidBody(**{name: placed(getattr(rigid, name)) for name in fields}),
+        balance_rest=placed(balance_rest),
+        p1_rest=placed(p1_rest),
+        constraint_matrix=matrix,
+        pull_by_q=pull_by_q,
+        row_scale=ca.densify(scale),
+    )
+
+
+def _constraint_derivatives(system: System, kinematics: Kinematics, q: ca.SX, lam: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Dphi(q) and d(Dphi(q)' lam)/dq; point grasps in closed form, where d2x/dq_i dq_j = w_i x dx/dq_j for i above j."""
+    n = system.size
+    blocks, hessian, row = [ca.SX(0, n)], ca.SX(n, n), 0
+    for grasp in system.grasps:
+        part = lam[row : row + grasp.equations]
+        row += grasp.equations
+        if grasp.kind != "point":
+            phi = grasp.residual(kinematics)
+            matrix = ca.jacobian(phi, q)
+            blocks.append(matrix)
+            hessian += ca.jacobian(matrix.T @ part, q)
+            continue
+        block = ca.SX(3, n)
+        for frame, sign in ((_grasped(system, grasp, "holder"), 1.0), (_grasped(system, grasp, "held"), -1.0)):
+            jacobian = kinematics.point_jacobian(frame)
+            block += sign * jacobian
+            chain = system.mechanism.ancestors(frame.joint)
+            for above, i in enumerate(chain):
+                if system.mechanism.joints[i].kind == "prismatic":
+                    continue
+                turned = cross(part, kinematics.screws[i][:3])
+                for j in chain[above:]:
+                    entry = sign * ca.dot(jacobian[:, j], turned)
+                    hessian[i, j] += entry
+                    if i != j:
+                        hessian[j, i] += entry
+        blocks.append(block)
+    return ca.sparsify(ca.vertcat(*blocks)), ca.sparsify(hessian)
+
+
+def _grasped(system: System, grasp: Grasp, side: str) -> Frame:
+    """The frame whose origin is the grasped point, on one side of a grasp."""
+    if side == "holder":
+        frame = system.mechanism.frame(grasp.holder)
+        return Frame(frame.joint, frame.placement @ Placement(grasp.rotation, grasp.offset))
+    frame = system.mechanism.frame(grasp.held)
+    back = Placement(ca.SX(ca.DM.eye(3)), ca.vertcat(0, 0, -grasp.slip))
+    return Frame(frame.joint, frame.placement @ back)

@@ -1,0 +1,17 @@
+"""What the world is made of: parameters, mechanisms, the flexible object, their symbolic mechanics and the `System`.
+
+Everything here is description and symbols, nothing is solved; extend it with new terms through `effects`, not here.
+"""
+
+from yid_ocp.model.kinematics import Kinematics as Kinematics
+from yid_ocp.model.kinematics import forward_kinematics as forward_kinematics
+from yid_ocp.model.mechanism import Mechanism as Mechanism
+from yid_ocp.model.parameters import Parameter as Parameter
+from yid_ocp.model.parameters import Parameters as Parameters
+from yid_ocp.model.y_object import FlexibleObject as FlexibleObject
+from yid_ocp.model.y_object import Segment as Segment
+from yid_ocp.model.y_object import flexible_object as flexible_object
+from yid_ocp.model.system import Effect as Effect
+from yid_ocp.model.system import Grasp as Grasp
+from yid_ocp.model.system import System as System
+from yid_ocp.model.system import Terms as Terms

@@ -1,0 +1,279 @@
+"""Symbolic kinematics and rigid-body mechanics of a tree, in world-frame screw coordinates.
+
+A spatial velocity is (angular, linear of the body point now at the world origin), a wrench (moment about the world
+origin, force); with both in one fixed frame the derivatives of the Lagrangian take the closed forms given at
+`RigidBody`, which is what makes the compiled step cheap.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from yid_ocp.model.mechanism import Frame, Inertia, Mechanism, Placement
+
+
+@dataclass(frozen=True)
+class Kinematics:
+    """Poses of a tree at a configuration.
+
+    Attributes
+    ----------
+    mechanism : Mechanism
+    rotations : tuple of casadi.SX, each (3, 3)
+        Of each joint's moving frame, to the world.
+    origins : tuple of casadi.SX, each (3, 1)
+        [m]
+    screws : tuple of casadi.SX, each (6, 1)
+        S_j, the spatial velocity per unit rate of joint j.
+    """
+
+    mechanism: Mechanism
+    rotations: tuple[ca.SX, ...]
+    origins: tuple[ca.SX, ...]
+    screws: tuple[ca.SX, ...]
+
+    def pose(self, frame: str | Frame) -> Placement:
+        """Placement of a frame in the world."""
+        entry = self.mechanism.frame(frame) if isinstance(frame, str) else frame
+        if entry.joint < 0:
+            return entry.placement
+        return Placement(self.rotations[entry.joint], self.origins[entry.joint]) @ entry.placement
+
+    def position(self, frame: str | Frame) -> ca.SX:
+        """Origin of a frame in the world, shape (3, 1) [m]."""
+        return self.pose(frame).translation
+
+    def point_jacobian(self, frame: str | Frame) -> ca.SX:
+        """Derivative of a frame's origin by the configuration, shape (3, n)."""
+        entry = self.mechanism.frame(frame) if isinstance(frame, str) else frame
+        point = self.position(entry)
+        columns = [ca.SX(3, 1)] * len(self.screws)
+        for j in self.mechanism.ancestors(entry.joint):
+            columns[j] = self.screws[j][3:] + cross(self.screws[j][:3], point)
+        return ca.horzcat(*columns) if columns else ca.SX(3, 0)
+
+    def angular_jacobian(self, frame: str | Frame) -> ca.SX:
+        """Angular velocity of a frame per configuration rate, in the world, shape (3, n)."""
+        entry = self.mechanism.frame(frame) if isinstance(frame, str) else frame
+        columns = [ca.SX(3, 1)] * len(self.screws)
+        for j in self.mechanism.ancestors(entry.joint):
+            columns[j] = self.screws[j][:3]
+        return ca.horzcat(*columns) if columns else ca.SX(3, 0)
+
+
+@dataclass(frozen=True)
+class RigidBody:
+    """The rigid-body Lagrangian's derivatives at (q, v), and the vectors from which its second derivatives follow.
+
+    With S_j the screw of joint j, D_j = V_parent(j) x S_j, Ic_j and H_j the inertia and momentum of all that j moves:
+
+        dL/dv_j = S_j . H_j            dL/dq_j = D_j . H_j + S_j . W_j   (W_j: weight of all that j moves)
+
+    and for i an ancestor of j or j itself, F_j = Ic_j S_j, B_j = Ic_j D_j + S_j x* H_j,
+    G_j the moment by which the weight changes with the posture, w_i the angular part of S_i:
+
+        L_vv[i, j] = S_i . F_j              L_qv[j, i] = S_i . B_j   (row: q_j, column: v_i)
+        L_qq[i, j] = D_i . B_j + w_i . G_j  L_qv[i, j] = D_i . F_j
+
+    Attributes
+    ----------
+    by_q, by_v : casadi.SX, shape (n, 1)
+        dL/dq and dL/dv.
+    kinetic, potential : casadi.SX
+        [J]
+    S, D, F, B : casadi.SX, shape (6, n)
+    G : casadi.SX, shape (3, n)
+    """
+
+    by_q: ca.SX
+    by_v: ca.SX
+    kinetic: ca.SX
+    potential: ca.SX
+    S: ca.SX
+    D: ca.SX
+    F: ca.SX
+    B: ca.SX
+    G: ca.SX
+
+
+def cross(a: ca.SX, b: ca.SX) -> ca.SX:
+    """Vector product of two (3, 1) expressions."""
+    return ca.vertcat(a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+def motion_cross(a: ca.SX, b: ca.SX) -> ca.SX:
+    """Spatial product a x b of two motions, shape (6, 1)."""
+    return ca.vertcat(cross(a[:3], b[:3]), cross(a[:3], b[3:]) + cross(a[3:], b[:3]))
+
+
+def force_cross(a: ca.SX, f: ca.SX) -> ca.SX:
+    """Spatial product a x* f of a motion and a wrench, shape (6, 1)."""
+    return ca.vertcat(cross(a[:3], f[:3]) + cross(a[3:], f[3:]), cross(a[:3], f[3:]))
+
+
+def forward_kinematics(mechanism: Mechanism, q: ca.SX) -> Kinematics:
+    """Poses and screws of every joint.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    q : casadi.SX, shape (n, 1)
+        Configuration [rad or m].
+    """
+    rotations: list[ca.SX] = []
+    origins: list[ca.SX] = []
+    screws: list[ca.SX] = []
+    for j, joint in enumerate(mechanism.joints):
+        rotation, origin = joint.placement.rotation, joint.placement.translation
+        if joint.parent >= 0:
+            origin = rotations[joint.parent] @ origin + origins[joint.parent]
+            rotation = rotations[joint.parent] @ rotation
+        axis = rotation @ ca.SX(ca.DM(joint.axis))
+        if joint.kind == "revolute":
+            rotations.append(rotation @ _axis_rotation(joint.axis, q[j]))
+            screws.append(ca.vertcat(axis, cross(origin, axis)))
+        else:
+            origin = origin + axis * q[j]
+            rotations.append(rotation)
+            screws.append(ca.vertcat(ca.SX(ca.DM.zeros(3)), axis))
+        origins.append(origin)
+    return Kinematics(mechanism, tuple(rotations), tuple(origins), tuple(screws))
+
+
+def rigid_body(kinematics: Kinematics, v: ca.SX, gravity: ca.SX) -> RigidBody:
+    """Lagrangian derivatives of the tree's bodies.
+
+    Parameters
+    ----------
+    kinematics : Kinematics
+    v : casadi.SX, shape (n, 1)
+        Velocity [rad/s or m/s].
+    gravity : casadi.SX, shape (3, 1)
+        Acceleration of free fall in the world frame [m/s^2].
+    """
+    mechanism = kinematics.mechanism
+    n = len(mechanism.joints)
+    S = kinematics.screws
+    zero6 = ca.SX(ca.DM.zeros(6))
+    velocity: list[ca.SX] = []
+    D: list[ca.SX] = []
+    for j, joint in enumerate(mechanism.joints):
+        above = velocity[joint.parent] if joint.parent >= 0 else zero6
+        D.append(motion_cross(above, S[j]) if joint.parent >= 0 else zero6)
+        velocity.append(above + S[j] * v[j])
+
+    mass = [ca.SX(0)] * n
+    first = [ca.SX(ca.DM.zeros(3))] * n
+    second = [ca.SX(ca.DM.zeros(3, 3))] * n
+    momentum = [zero6] * n
+    kinetic, potential = ca.SX(0), ca.SX(0)
+    for j, joint in enumerate(mechanism.joints):
+        for body in joint.bodies:
+            com = kinematics.rotations[j] @ body.com + kinematics.origins[j]
+            about_com = _rotated_tensor(body, kinematics.rotations[j])
+            angular, linear = velocity[j][:3], velocity[j][3:] + cross(velocity[j][:3], com)
+            impulse = body.mass * linear
+            spin = about_com @ angular
+            wrench = ca.vertcat(spin + cross(com, impulse), impulse)
+            kinetic += 0.5 * (ca.dot(impulse, linear) + ca.dot(spin, angular))
+            potential -= body.mass * ca.dot(gravity, com)
+            mass[j] = mass[j] + body.mass
+            first[j] = first[j] + body.mass * com
+            second[j] = second[j] + about_com + body.mass * (ca.dot(com, com) * ca.SX.eye(3) - com @ com.T)
+            momentum[j] = momentum[j] + wrench
+    for j in reversed(range(n)):
+        parent = mechanism.joints[j].parent
+        if parent >= 0:
+            mass[parent] = mass[parent] + mass[j]
+            first[parent] = first[parent] + first[j]
+            second[parent] = second[parent] + second[j]
+            momentum[parent] = momentum[parent] + momentum[j]
+
+    def inertia_times(j: int, motion: ca.SX) -> ca.SX:
+        force = mass[j] * motion[3:] + cross(motion[:3], first[j])
+        return ca.vertcat(second[j] @ motion[:3] + cross(first[j], motion[3:]), force)
+
+    by_q, by_v, F, B, G = [], [], [], [], []
+    for j in range(n):
+        moment, weight = cross(first[j], gravity), mass[j] * gravity
+        axis, linear = S[j][:3], S[j][3:]
+        by_v.append(ca.dot(S[j], momentum[j]))
+        by_q.append(ca.dot(D[j], momentum[j]) + ca.dot(axis, moment) + ca.dot(linear, weight))
+        F.append(inertia_times(j, S[j]))
+        B.append(inertia_times(j, D[j]) + force_cross(S[j], momentum[j]))
+        G.append(cross(axis, moment) + cross(linear, weight) + cross(first[j], cross(gravity, axis)))
+
+    def columns(entries: list[ca.SX] | tuple[ca.SX, ...], rows: int) -> ca.SX:
+        return ca.densify(ca.horzcat(*entries)) if entries else ca.SX(rows, 0)
+
+    return RigidBody(
+        ca.densify(ca.vertcat(*by_q)) if n else ca.SX(0, 1),
+        ca.densify(ca.vertcat(*by_v)) if n else ca.SX(0, 1),
+        kinetic,
+        potential,
+        columns(S, 6),
+        columns(D, 6),
+        columns(F, 6),
+        columns(B, 6),
+        columns(G, 3),
+    )
+
+
+def mass_matrix(rigid: RigidBody, mechanism: Mechanism) -> ca.SX:
+    """M = L_vv of the bodies, shape (n, n), from the closed form of `RigidBody`."""
+    return _from_pairs(mechanism, lambda i, j: (_dot(rigid.S, i, rigid.F, j), _dot(rigid.S, i, rigid.F, j)))
+
+
+def second_derivatives(rigid: RigidBody, mechanism: Mechanism) -> tuple[ca.SX, ca.SX, ca.SX]:
+    """(L_qq, L_qv, L_vv) of the bodies, each (n, n), from the closed form of `RigidBody`; L_qv[row q, column v]."""
+
+    def by_qq(i: int, j: int) -> tuple[ca.SX, ca.SX]:
+        entry = _dot(rigid.D, i, rigid.B, j) + ca.dot(rigid.S[:3, i], rigid.G[:, j])
+        return entry, entry
+
+    def by_qv(i: int, j: int) -> tuple[ca.SX, ca.SX]:
+        return _dot(rigid.D, i, rigid.F, j), _dot(rigid.S, i, rigid.B, j)
+
+    return _from_pairs(mechanism, by_qq), _from_pairs(mechanism, by_qv), mass_matrix(rigid, mechanism)
+
+
+def _dot(a: ca.SX, i: int, b: ca.SX, j: int) -> ca.SX:
+    return ca.dot(a[:, i], b[:, j])
+
+
+def _from_pairs(mechanism: Mechanism, entry) -> ca.SX:  # type: ignore[no-untyped-def]
+    n = len(mechanism.joints)
+    matrix = ca.SX(n, n)
+    for j in range(n):
+        for i in mechanism.ancestors(j):
+            upper, lower = entry(i, j)
+            matrix[j, i] = lower
+            matrix[i, j] = upper
+    return matrix
+
+
+def _axis_rotation(axis: tuple[float, float, float], angle: ca.SX) -> ca.SX:
+    c, s = ca.cos(angle), ca.sin(angle)
+    for k in range(3):
+        if abs(abs(axis[k]) - 1.0) < 1e-15:
+            s = s * axis[k]
+            a, b = (k + 1) % 3, (k + 2) % 3
+            matrix = ca.SX(ca.DM.eye(3))
+            matrix[a, a], matrix[a, b], matrix[b, a], matrix[b, b] = c, -s, s, c
+            return ca.densify(matrix)
+    u = np.asarray(axis)
+    skew = np.array([[0, -u[2], u[1]], [u[2], 0, -u[0]], [-u[1], u[0], 0]])
+    return ca.SX(ca.DM(np.outer(u, u))) + c * ca.SX(ca.DM(np.eye(3) - np.outer(u, u))) + s * ca.SX(ca.DM(skew))
+
+
+def _rotated_tensor(body: Inertia, rotation: ca.SX) -> ca.SX:
+    tensor = ca.densify(body.about_com)
+    off = [(0, 1), (0, 2), (1, 2)]
+    diagonal = all(tensor[i, j].is_zero() and tensor[j, i].is_zero() for i, j in off)
+    if diagonal and ca.is_equal(tensor[0, 0], tensor[1, 1], 8):
+        axis = rotation[:, 2]
+        return tensor[0, 0] * ca.SX.eye(3) + (tensor[2, 2] - tensor[0, 0]) * (axis @ axis.T)
+    return rotation @ tensor @ rotation.T

@@ -1,0 +1,548 @@
+"""Trees of rigid bodies: read from URDF, locked, merged, joined and written back."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+import site
+import sys
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from yid_ocp.errors import ModelError, nearest
+from yid_ocp.model.parameters import Parameter, Parameters
+
+Matrix = NDArray[np.float64]
+
+# URDF writers round pi to a dozen digits; entries this close to 0 and 1 are meant to be exactly that.
+SNAP = 1e-11
+
+
+@dataclass(frozen=True)
+class Placement:
+    """A rigid transform whose entries may depend on parameters.
+
+    Attributes
+    ----------
+    rotation : casadi.SX, shape (3, 3)
+    translation : casadi.SX, shape (3, 1)
+        [m]
+    """
+
+    rotation: ca.SX
+    translation: ca.SX
+
+    @staticmethod
+    def of(matrix: ArrayLike) -> Placement:
+        """Placement from a numeric 4x4 homogeneous matrix."""
+        array = snapped(np.asarray(matrix, dtype=float))
+        return Placement(ca.SX(ca.DM(array[:3, :3])), ca.SX(ca.DM(array[:3, 3])))
+
+    @staticmethod
+    def identity() -> Placement:
+        """No displacement."""
+        return Placement.of(np.eye(4))
+
+    def __matmul__(self, other: Placement) -> Placement:
+        return Placement(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
+
+    def matrix(self) -> ca.SX:
+        """The 4x4 homogeneous matrix."""
+        return ca.vertcat(ca.horzcat(self.rotation, self.translation), ca.SX(ca.DM([[0.0, 0.0, 0.0, 1.0]])))
+
+
+@dataclass(frozen=True)
+class Inertia:
+    """Mass, centre of mass [m] and inertia about it [kg m^2], in the frame of the joint that carries the body."""
+
+    mass: ca.SX
+    com: ca.SX
+    about_com: ca.SX
+
+    @staticmethod
+    def of(mass: float, com: ArrayLike, about_com: ArrayLike) -> Inertia:
+        """Inertia from numbers."""
+        return Inertia(ca.SX(mass), ca.SX(ca.DM(np.asarray(com, float))), ca.SX(ca.DM(np.asarray(about_com, float))))
+
+    def scaled(self, factor: ca.SX) -> Inertia:
+        """Mass and inertia multiplied by `factor`, the centre kept."""
+        return Inertia(self.mass * factor, self.com, self.about_com * factor)
+
+    def moved(self, placement: Placement) -> Inertia:
+        """The same body seen from the frame in which its own frame has `placement`."""
+        rotation = placement.rotation
+        return Inertia(
+            self.mass, rotation @ self.com + placement.translation, rotation @ self.about_com @ rotation.T
+        )
+
+
+@dataclass(frozen=True)
+class Joint:
+    """One degree of freedom and the bodies that move with it.
+
+    Attributes
+    ----------
+    name : str
+    kind : "revolute" or "prismatic"
+    parent : int
+        Index of the parent joint, -1 for the world.
+    placement : Placement
+        From the parent's joint frame to this joint's frame at zero.
+    axis : tuple of float
+        Unit vector in the joint frame.
+    bodies : tuple of Inertia
+        Everything rigidly attached to the moving side.
+    lower, upper : float
+        Range [rad or m].
+    effort_limit, velocity_limit : float
+        [N m or N], [rad/s or m/s]
+    """
+
+    name: str
+    kind: Literal["revolute", "prismatic"]
+    parent: int
+    placement: Placement
+    axis: tuple[float, float, float]
+    bodies: tuple[Inertia, ...] = ()
+    lower: float = -math.inf
+    upper: float = math.inf
+    effort_limit: float = math.inf
+    velocity_limit: float = math.inf
+
+    @property
+    def unit(self) -> str:
+        """Unit of the coordinate."""
+        return "rad" if self.kind == "revolute" else "m"
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A named frame fixed to a joint's moving side (`joint` = -1: to the world)."""
+
+    joint: int
+    placement: Placement
+
+
+@dataclass(frozen=True)
+class Mechanism:
+    """A tree of joints in an order in which parents come first.
+
+    Attributes
+    ----------
+    name : str
+    joints : tuple of Joint
+    frames : mapping of str to Frame
+    parameters : Parameters
+        Those on which placements and inertias depend.
+    """
+
+    name: str
+    joints: tuple[Joint, ...]
+    frames: Mapping[str, Frame]
+    parameters: Parameters = field(default_factory=Parameters)
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints, in configuration order."""
+        return tuple(joint.name for joint in self.joints)
+
+    @property
+    def parents(self) -> tuple[int, ...]:
+        """Parent index of every joint, -1 for the world."""
+        return tuple(joint.parent for joint in self.joints)
+
+    def joint_index(self, name: str) -> int:
+        """Index of a joint by name; `ModelError` with the nearest name where there is none."""
+        names = self.joint_names
+        if name not in names:
+            raise ModelError(f"there is no joint '{name}'", where=self.name, hint=nearest(name, names))
+        return names.index(name)
+
+    def frame(self, name: str) -> Frame:
+        """A frame by name; `ModelError` with the nearest name where there is none."""
+        if name not in self.frames:
+            raise ModelError(f"there is no frame '{name}'", where=self.name, hint=nearest(name, self.frames))
+        return self.frames[name]
+
+    def ancestors(self, index: int) -> tuple[int, ...]:
+        """Indices from the root to joint `index`, itself included; empty for the world."""
+        chain = []
+        while index >= 0:
+            chain.append(index)
+            index = self.joints[index].parent
+        return tuple(reversed(chain))
+
+    def joined(self, other: Mechanism, frame: str | None = None, placement: ArrayLike | None = None) -> Mechanism:
+        """Hang another mechanism on a frame of this one.
+
+        Parameters
+        ----------
+        other : Mechanism
+            Its joint and frame names must differ from this one's.
+        frame : str, optional
+            Where its root goes; the world when absent.
+        placement : array_like, shape (4, 4), optional
+            Of its root in that frame.
+        """
+        root = Placement.identity() if placement is None else Placement.of(placement)
+        at = -1
+        if frame is not None:
+            carrier = self.frame(frame)
+            at, root = carrier.joint, carrier.placement @ root
+        shift = len(self.joints)
+        clash = sorted((set(self.joint_names) & set(other.joint_names)) | (set(self.frames) & set(other.frames)))
+        if clash:
+            raise ModelError(f"two parts of the model use the name '{clash[0]}'", where=f"{self.name} + {other.name}")
+
+        def moved(index: int, local: Placement) -> tuple[int, Placement]:
+            return (index + shift, local) if index >= 0 else (at, root @ local)
+
+        joints = list(self.joints)
+        for joint in other.joints:
+            parent, local = moved(joint.parent, joint.placement)
+            joints.append(replace(joint, parent=parent, placement=local))
+        frames = dict(self.frames)
+        for name, entry in other.frames.items():
+            index, local = moved(entry.joint, entry.placement)
+            frames[name] = Frame(index, local)
+        return Mechanism(
+            f"{self.name}+{other.name}" if self.joints else other.name,
+            tuple(joints),
+            frames,
+            self.parameters.joined(other.parameters),
+        )
+
+    def numeric(self, values: Mapping[str, float] | None = None) -> Mechanism:
+        """The mechanism with numbers in place of its parameters."""
+        return self._evaluated(self.parameters.symbols, self.parameters.vector(values))
+
+    def _evaluated(self, symbols: ca.SX, theta: NDArray[np.float64]) -> Mechanism:
+        def number(expression: ca.SX) -> ca.SX:
+            function = ca.Function("number", [symbols], [expression])
+            return ca.SX(ca.densify(function(theta)))
+
+        def placed(placement: Placement) -> Placement:
+            return Placement(number(placement.rotation), number(placement.translation))
+
+        joints = tuple(
+            replace(
+                joint,
+                placement=placed(joint.placement),
+                bodies=tuple(Inertia(number(b.mass), number(b.com), number(b.about_com)) for b in joint.bodies),
+            )
+            for joint in self.joints
+        )
+        frames = {name: Frame(frame.joint, placed(frame.placement)) for name, frame in self.frames.items()}
+        return Mechanism(self.name, joints, frames)
+
+    @staticmethod
+    def from_urdf(
+        path: str | Path,
+        joints: Sequence[str] | None = None,
+        locked: Mapping[str, float] | None = None,
+        name: str | None = None,
+        parametric: bool = True,
+    ) -> Mechanism:
+        """Read a URDF; keep the chosen joints, lock the others, merge what is then fixed together.
+
+        Parameters
+        ----------
+        path : str or Path
+            A URDF file; `package:baxter` (or any robot folder of example-robot-data) finds that package's file.
+        joints : sequence of str, optional
+            Names of the joints to keep as degrees of freedom, which are then ordered as given as far as parents come
+            first; all movable ones when absent.
+        locked : mapping of str to float, optional
+            Value at which a joint that is not kept is locked [rad or m]; zero, or the nearest bound, when absent.
+        name : str, optional
+            Name of the mechanism; that of the robot in the file when absent.
+        parametric : bool
+            Whether each kept joint's bodies get the parameter `joint.mass` [kg] (inertia in proportion).
+
+        Returns
+        -------
+        Mechanism
+            Links without a kept joint above them are fixed to the world. Every link is a frame of its name.
+
+        Raises
+        ------
+        ModelError
+            Missing or malformed file, unknown joint, joint type that is not revolute, continuous, prismatic or fixed.
+        """
+        return _from_urdf(Path(str(path)), joints, dict(locked or {}), name, parametric)
+
+    def to_urdf(self, values: Mapping[str, float] | None = None) -> str:
+        """The mechanism as URDF text: one link per joint, named frames as links on fixed joints.
+
+        Bodies are merged into one inertial per link. Placements keep full precision. Reading the text back with
+        `from_urdf(..., parametric=False)` gives the same numbers to 1e-12.
+        """
+        return _to_urdf(self.numeric(values))
+
+
+def merged(bodies: Iterable[Inertia]) -> Inertia | None:
+    """One rigid body equal to several, None for no body or no mass."""
+    entries = list(bodies)
+    if not entries:
+        return None
+    mass = sum((b.mass for b in entries), ca.SX(0))
+    if mass.is_zero():
+        return None
+    com = sum((b.mass * b.com for b in entries), ca.SX(ca.DM.zeros(3))) / mass
+    inertia = ca.SX(ca.DM.zeros(3, 3))
+    for body in entries:
+        offset = body.com - com
+        inertia += body.about_com + body.mass * (ca.dot(offset, offset) * ca.SX.eye(3) - offset @ offset.T)
+    return Inertia(mass, com, ca.densify(inertia))
+
+
+def snapped(matrix: Matrix) -> Matrix:
+    """Replace entries within `SNAP` of -1, 0 and 1 by these."""
+    result = np.array(matrix, dtype=float)
+    for exact in (-1.0, 0.0, 1.0):
+        result[np.abs(result - exact) < SNAP] = exact
+    return result
+
+
+def robot_description_file(robot: str) -> Path:
+    """Path of a URDF that the example-robot-data package installed.
+
+    Parameters
+    ----------
+    robot : str
+        `baxter`, `panda`, `ur5`, or `folder/file.urdf` below the package's robots folder.
+
+    Raises
+    ------
+    ModelError
+        The package is not installed, or has no such robot.
+    """
+    roots = [Path(p) / "cmeel.prefix/share/example-robot-data/robots" for p in [*sys.path, *site.getsitepackages()]]
+    roots += [Path(sys.prefix) / "share/example-robot-data/robots"]
+    folder = next((root for root in roots if root.is_dir()), None)
+    if folder is None:
+        raise ModelError("example-robot-data is not installed", hint="pip install example-robot-data")
+    files = {str(path.relative_to(folder)): path for path in folder.rglob("*.urdf")}
+    short = {"ur5": "ur_description/urdf/ur5_robot.urdf", "ur10": "ur_description/urdf/ur10_robot.urdf"}
+    wanted = short.get(robot, robot)
+    for candidate in (wanted, f"{wanted}_description/urdf/{wanted}.urdf"):
+        if candidate in files:
+            return files[candidate]
+    stems = {path.stem for path in files.values()}
+    raise ModelError(f"example-robot-data has no robot '{robot}'", hint=nearest(robot, stems))
+
+
+def transform(rotation: ArrayLike, translation: ArrayLike) -> Matrix:
+    """Homogeneous 4x4 matrix from a rotation (3, 3) and a translation (3,) [m]."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = np.asarray(rotation, float), np.asarray(translation, float)
+    return matrix
+
+
+def roll_pitch_yaw(roll: float, pitch: float, yaw: float) -> Matrix:
+    """Rotation matrix Rz(yaw) Ry(pitch) Rx(roll), the URDF convention [rad]."""
+    cr, sr, cp, sp, cy, sy = *_cs(roll), *_cs(pitch), *_cs(yaw)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def _cs(angle: float) -> tuple[float, float]:
+    return math.cos(angle), math.sin(angle)
+
+
+def _from_urdf(
+    path: Path, chosen: Sequence[str] | None, locked: dict[str, float], name: str | None, parametric: bool
+) -> Mechanism:
+    import yourdfpy
+
+    text = str(path)
+    if text.startswith("package:"):
+        path = robot_description_file(text.removeprefix("package:"))
+    if not path.is_file():
+        raise ModelError(f"there is no URDF file '{path}'", hint="give a path, or package:NAME for example-robot-data")
+    try:
+        with contextlib.redirect_stderr(io.StringIO()):
+            robot = yourdfpy.URDF.load(
+                str(path), build_scene_graph=False, load_meshes=False, load_collision_meshes=False
+            ).robot
+    except Exception as error:  # yourdfpy and lxml raise many kinds for a malformed file
+        raise ModelError(f"the URDF cannot be read: {error}", where=str(path)) from error
+
+    movable = {"revolute", "continuous", "prismatic"}
+    for joint in robot.joints:
+        if joint.type not in movable | {"fixed"}:
+            raise ModelError(
+                f"joint '{joint.name}' has type '{joint.type}'",
+                where=str(path),
+                allowed="revolute, continuous, prismatic, fixed",
+            )
+    known = [joint.name for joint in robot.joints if joint.type in movable]
+    for wanted in [*(chosen or ()), *locked]:
+        if wanted not in known:
+            raise ModelError(f"there is no movable joint '{wanted}'", where=str(path), hint=nearest(wanted, known))
+    kept = set(known if chosen is None else chosen)
+
+    children: dict[str, list] = {}
+    for joint in robot.joints:
+        children.setdefault(joint.parent, []).append(joint)
+    below = {joint.child for joint in robot.joints}
+    roots = [link.name for link in robot.links if link.name not in below]
+    if len(roots) != 1:
+        raise ModelError(f"the URDF has {len(roots)} root links", where=str(path), allowed="exactly one")
+    links = {link.name: link for link in robot.links}
+    rank = {joint: i for i, joint in enumerate(chosen if chosen is not None else known)}
+
+    collected: dict[str, tuple[str | None, Matrix, object]] = {}
+    bodies: dict[str | None, list[Inertia]] = {}
+    frames: dict[str, tuple[str | None, Matrix]] = {}
+    stack: list[tuple[str, str | None, Matrix]] = [(roots[0], None, np.eye(4))]
+    while stack:
+        link, carrier, at = stack.pop()
+        frames[link] = (carrier, at)
+        inertial = links[link].inertial
+        if inertial is not None and inertial.mass:
+            origin = np.eye(4) if inertial.origin is None else np.asarray(inertial.origin, float)
+            body = Inertia.of(float(inertial.mass), np.zeros(3), np.asarray(inertial.inertia, float))
+            bodies.setdefault(carrier, []).append(body.moved(Placement.of(at @ origin)))
+        for joint in children.get(link, ()):
+            origin = np.eye(4) if joint.origin is None else np.asarray(joint.origin, float)
+            if joint.name in kept:
+                collected[joint.name] = (carrier, at @ origin, joint)
+                stack.append((joint.child, joint.name, np.eye(4)))
+            else:
+                stack.append((joint.child, carrier, at @ origin @ _locked_motion(joint, locked)))
+
+    order: list[str] = []
+    waiting = sorted(collected, key=lambda entry: rank[entry])
+    while waiting:
+        ready = next(entry for entry in waiting if collected[entry][0] is None or collected[entry][0] in order)
+        order.append(ready)
+        waiting.remove(ready)
+
+    parameters: list[Parameter] = []
+    joints: list[Joint] = []
+    for entry in order:
+        carrier, at, source = collected[entry]
+        body = merged(bodies.get(entry, ()))
+        if body is not None and parametric:
+            mass = float(body.mass)
+            parameter = Parameter(f"{entry}.mass", mass, "kg", 0.0, math.inf, f"mass of what {entry} carries")
+            parameters.append(parameter)
+            body = replace(body.scaled(parameter.symbol / mass), mass=parameter.symbol)
+        limit = source.limit
+        axis = np.asarray([1.0, 0.0, 0.0] if source.axis is None else source.axis, dtype=float)
+        if np.linalg.norm(axis) < 1e-9:
+            raise ModelError(f"joint '{entry}' has a zero axis", where=str(path))
+        axis = snapped(axis / np.linalg.norm(axis))
+        continuous = source.type == "continuous" or limit is None
+
+        def bound(value: float | None, otherwise: float) -> float:
+            return otherwise if value is None else float(value)
+
+        joints.append(
+            Joint(
+                entry,
+                "prismatic" if source.type == "prismatic" else "revolute",
+                order.index(carrier) if carrier is not None else -1,
+                Placement.of(at),
+                (float(axis[0]), float(axis[1]), float(axis[2])),
+                () if body is None else (body,),
+                -math.inf if continuous else bound(limit.lower, -math.inf),
+                math.inf if continuous else bound(limit.upper, math.inf),
+                math.inf if limit is None else bound(limit.effort, math.inf),
+                math.inf if limit is None else bound(limit.velocity, math.inf),
+            )
+        )
+    named = {
+        link: Frame(-1 if carrier is None else order.index(carrier), Placement.of(at))
+        for link, (carrier, at) in frames.items()
+    }
+    return Mechanism(name or robot.name, tuple(joints), named, Parameters(parameters))
+
+
+def _locked_motion(joint: object, locked: Mapping[str, float]) -> Matrix:
+    if joint.type == "fixed":  # type: ignore[attr-defined]
+        return np.eye(4)
+    limit = joint.limit  # type: ignore[attr-defined]
+    low = -math.inf if limit is None or limit.lower is None else float(limit.lower)
+    high = math.inf if limit is None or limit.upper is None else float(limit.upper)
+    if joint.type == "continuous" or low > high:  # type: ignore[attr-defined]
+        low, high = -math.inf, math.inf
+    value = locked.get(joint.name, min(max(0.0, low), high))  # type: ignore[attr-defined]
+    axis = np.asarray([1.0, 0.0, 0.0] if joint.axis is None else joint.axis, float)  # type: ignore[attr-defined]
+    axis = axis / np.linalg.norm(axis)
+    if joint.type == "prismatic":  # type: ignore[attr-defined]
+        return transform(np.eye(3), value * axis)
+    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return transform(np.eye(3) + math.sin(value) * cross + (1 - math.cos(value)) * cross @ cross, np.zeros(3))
+
+
+def _angles(rotation: Matrix) -> tuple[float, float, float]:
+    pitch = math.atan2(-rotation[2, 0], math.hypot(rotation[0, 0], rotation[1, 0]))
+    if math.cos(pitch) < 1e-9:
+        return math.atan2(-rotation[1, 2], rotation[1, 1]), pitch, 0.0
+    return math.atan2(rotation[2, 1], rotation[2, 2]), pitch, math.atan2(rotation[1, 0], rotation[0, 0])
+
+
+def _to_urdf(mechanism: Mechanism) -> str:
+    def text(values: Iterable[float]) -> str:
+        return " ".join(f"{0.0 if abs(v) < 1e-16 else v:.17g}" for v in values)
+
+    def origin(element: ElementTree.Element, placement: Placement) -> None:
+        rotation = np.array(ca.DM(placement.rotation))
+        translation = np.array(ca.DM(placement.translation)).ravel()
+        ElementTree.SubElement(element, "origin", xyz=text(translation), rpy=text(_angles(rotation)))
+
+    robot = ElementTree.Element("robot", name=mechanism.name)
+    ElementTree.SubElement(robot, "link", name="world")
+    links = ["world"] + [f"{joint.name}_link" for joint in mechanism.joints]
+    for i, joint in enumerate(mechanism.joints):
+        link = ElementTree.SubElement(robot, "link", name=links[i + 1])
+        body = merged(joint.bodies)
+        if body is not None:
+            inertial = ElementTree.SubElement(link, "inertial")
+            ElementTree.SubElement(inertial, "origin", xyz=text(np.array(ca.DM(body.com)).ravel()), rpy="0 0 0")
+            ElementTree.SubElement(inertial, "mass", value=text([float(body.mass)]))
+            tensor = np.array(ca.DM(body.about_com))
+            keys = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
+            ElementTree.SubElement(inertial, "inertia", {k: text([tensor[ij]]) for k, ij in keys.items()})
+        unlimited = not (math.isfinite(joint.lower) and math.isfinite(joint.upper))
+        kind = "continuous" if unlimited and joint.kind == "revolute" else joint.kind
+        element = ElementTree.SubElement(robot, "joint", name=joint.name, type=kind)
+        origin(element, joint.placement)
+        ElementTree.SubElement(element, "parent", link=links[joint.parent + 1])
+        ElementTree.SubElement(element, "child", link=links[i + 1])
+        ElementTree.SubElement(element, "axis", xyz=text(joint.axis))
+        if kind != "continuous":
+            large = 1e3
+            ElementTree.SubElement(
+                element,
+                "limit",
+                lower=text([max(joint.lower, -large)]),
+                upper=text([min(joint.upper, large)]),
+                effort=text([min(joint.effort_limit, large)]),
+                velocity=text([min(joint.velocity_limit, large)]),
+            )
+    for name, frame in mechanism.frames.items():
+        if name in links:
+            continue
+        ElementTree.SubElement(robot, "link", name=name)
+        element = ElementTree.SubElement(robot, "joint", name=f"{name}_fixed", type="fixed")
+        origin(element, frame.placement)
+        ElementTree.SubElement(element, "parent", link=links[frame.joint + 1])
+        ElementTree.SubElement(element, "child", link=name)
+    ElementTree.indent(robot)
+    return ElementTree.tostring(robot, encoding="unicode") + "\n"

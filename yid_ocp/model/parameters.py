@@ -1,0 +1,153 @@
+"""Named physical parameters: value, unit, bounds and the symbol that stands for each in the equations."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.errors import ConfigError, nearest
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One physical number of the model.
+
+    Attributes
+    ----------
+    name : str
+        `owner.quantity`, for example `T1.bend`; for an effect `kind@location.quantity`.
+    value : float
+        Nominal value, in `unit`.
+    unit : str
+        SI unit, `1` for a pure number.
+    lower, upper : float
+        Physical bounds, infinite where there are none.
+    description : str
+        What it is, in a few words.
+    symbol : casadi.SX
+        The scalar that stands for it in symbolic expressions.
+    """
+
+    name: str
+    value: float
+    unit: str
+    lower: float = -math.inf
+    upper: float = math.inf
+    description: str = ""
+    symbol: ca.SX = field(default=None, compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if self.symbol is None:
+            object.__setattr__(self, "symbol", ca.SX.sym(self.name))
+        if not math.isfinite(self.value):
+            raise ConfigError(f"{self.name} = {self.value} is not a finite number", where=f"parameter {self.name}")
+        if not self.lower <= self.value <= self.upper:
+            raise ConfigError(
+                f"{self.name} = {self.value:g} {self.unit} lies outside its bounds",
+                where=f"parameter {self.name}",
+                allowed=f"{self.lower:g} to {self.upper:g} {self.unit}",
+                hint="change the value, or widen the bounds under `parameters`",
+            )
+
+
+class Parameters:
+    """The ordered, immutable set of a model's parameters; fixes the order of `theta`.
+
+    Parameters
+    ----------
+    entries : iterable of Parameter
+        Names must be unique.
+    """
+
+    def __init__(self, entries: Iterable[Parameter] = ()) -> None:
+        self._entries = tuple(entries)
+        self._index = {entry.name: i for i, entry in enumerate(self._entries)}
+        if len(self._index) != len(self._entries):
+            names = [entry.name for entry in self._entries]
+            twice = sorted({name for name in names if names.count(name) > 1})
+            raise ConfigError(f"parameter named twice: {', '.join(twice)}", hint="give each part of the model its own name")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names in the order of `theta`."""
+        return tuple(entry.name for entry in self._entries)
+
+    @property
+    def symbols(self) -> ca.SX:
+        """Symbols in the order of `theta`, shape (ntheta, 1)."""
+        return ca.vertcat(*(entry.symbol for entry in self._entries)) if self._entries else ca.SX(0, 1)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def __iter__(self) -> Iterator[Parameter]:
+        return iter(self._entries)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._index
+
+    def __getitem__(self, name: str) -> Parameter:
+        return self._entries[self.index(name)]
+
+    def index(self, name: str) -> int:
+        """Position of a name in `theta`; an unknown name raises `ConfigError` with the nearest one."""
+        if name not in self._index:
+            raise ConfigError(f"there is no parameter '{name}'", hint=nearest(name, self._index))
+        return self._index[name]
+
+    def vector(self, values: Mapping[str, float] | None = None) -> Vector:
+        """Nominal values with some replaced.
+
+        Parameters
+        ----------
+        values : mapping of str to float, optional
+            Replacements by name.
+
+        Returns
+        -------
+        ndarray, shape (ntheta,)
+
+        Raises
+        ------
+        ConfigError
+            Unknown name, or a value that is not finite.
+        """
+        theta = np.array([entry.value for entry in self._entries], dtype=float)
+        for name, value in (values or {}).items():
+            if not math.isfinite(value):
+                raise ConfigError(f"{name} = {value} is not a finite number", where=f"parameter {name}")
+            theta[self.index(name)] = value
+        return theta
+
+    def with_values(self, values: Mapping[str, float]) -> Parameters:
+        """The same parameters (and symbols) with other nominal values."""
+        for name in values:
+            self.index(name)
+        return Parameters(
+            replace(entry, value=float(values[entry.name])) if entry.name in values else entry for entry in self._entries
+        )
+
+    def with_bounds(self, bounds: Mapping[str, tuple[float, float]]) -> Parameters:
+        """The same parameters (and symbols) with other bounds."""
+        for name in bounds:
+            self.index(name)
+        return Parameters(
+            replace(entry, lower=bounds[entry.name][0], upper=bounds[entry.name][1]) if entry.name in bounds else entry
+            for entry in self._entries
+        )
+
+    def joined(self, *others: Iterable[Parameter]) -> Parameters:
+        """This set followed by the entries of others."""
+        return Parameters([*self._entries, *(entry for other in others for entry in other)])
+
+    def bounds(self, names: Sequence[str]) -> tuple[Vector, Vector]:
+        """Lower and upper bounds of the named parameters, two arrays of shape (len(names),)."""
+        chosen = [self[name] for name in names]
+        return np.array([e.lower for e in chosen], dtype=float), np.array([e.upper for e in chosen], dtype=float)

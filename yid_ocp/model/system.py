@@ -1,0 +1,390 @@
+"""The mechanical system: tree, springs, dampers, grasps, inputs, and the terms that effects add to it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal, Protocol, runtime_checkable
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from yid_ocp.errors import ModelError, nearest
+from yid_ocp.model.kinematics import Kinematics
+from yid_ocp.model.mechanism import Mechanism, Placement, roll_pitch_yaw, transform
+from yid_ocp.model.parameters import Parameter, Parameters
+from yid_ocp.model.y_object import ElasticJoint, FlexibleObject, SegmentLayout
+
+GraspKind = Literal["point", "axis", "weld"]
+EQUATIONS: dict[str, int] = {"point": 3, "axis": 5, "weld": 6}
+
+
+@dataclass(frozen=True)
+class Grasp:
+    """A holonomic constraint between a frame of the robot (or of a clamp) and one of the object.
+
+    Attributes
+    ----------
+    name : str
+        `left`, `right`, `gripper`, or a clamp's name.
+    holder, held : str
+        Frames; their origins coincide.
+    kind : "point", "axis" or "weld"
+        3 equations (positions), 5 (and the direction of the z axes), 6 (and the orientation).
+    rotation : casadi.SX, shape (3, 3)
+        Orientation of `held` in `holder` for `axis` and `weld`.
+    offset : casadi.SX, shape (3, 1)
+        Where the grasped point sits in the holder's frame [m].
+    slip : casadi.SX
+        How far the grasped point has crept along the object's z axis [m].
+    compliance : casadi.SX
+        C in phi(q_{k+1}) = C lam_k / h [m/N]; zero for a rigid grasp.
+    """
+
+    name: str
+    holder: str
+    held: str
+    kind: GraspKind = "point"
+    rotation: ca.SX = field(default_factory=lambda: ca.SX(ca.DM.eye(3)))
+    offset: ca.SX = field(default_factory=lambda: ca.SX(ca.DM.zeros(3)))
+    slip: ca.SX = field(default_factory=lambda: ca.SX(0))
+    compliance: ca.SX = field(default_factory=lambda: ca.SX(0))
+
+    @property
+    def equations(self) -> int:
+        """Number of scalar constraints."""
+        return EQUATIONS[self.kind]
+
+    def residual(self, kinematics: Kinematics) -> ca.SX:
+        """phi(q), shape (equations, 1): positions [m], then direction or orientation [rad]."""
+        holder = kinematics.pose(self.holder) @ Placement(self.rotation, self.offset)
+        held = kinematics.pose(self.held)
+        point = held.translation - held.rotation[:, 2] * self.slip
+        rows = [holder.translation - point]
+        if self.kind == "axis":
+            rows.append(holder.rotation[:, :2].T @ held.rotation[:, 2])
+        elif self.kind == "weld":
+            error = holder.rotation.T @ held.rotation
+            rows.append(0.5 * ca.vertcat(error[2, 1] - error[1, 2], error[0, 2] - error[2, 0], error[1, 0] - error[0, 1]))
+        return ca.vertcat(*rows)
+
+
+@dataclass(frozen=True)
+class MidpointState:
+    """What a term may depend on: the midpoint of one step.
+
+    Attributes
+    ----------
+    system : System
+    kinematics : Kinematics
+        At `q`.
+    q, v : casadi.SX, shape (n, 1)
+        (q_k + q_{k+1})/2 and (q_{k+1} - q_k)/h.
+    z, z_rate : casadi.SX, shape (nz, 1)
+        The same of all internal coordinates.
+    u : casadi.SX, shape (nu, 1)
+        Motor torques held over the step [N m].
+    constraint_force : casadi.SX, shape (m, 1)
+        lam_k / h [N or N m].
+    internal : mapping of str to int
+        Row of each internal coordinate in `z`, by name.
+    """
+
+    system: System
+    kinematics: Kinematics
+    q: ca.SX
+    v: ca.SX
+    z: ca.SX
+    z_rate: ca.SX
+    u: ca.SX
+    constraint_force: ca.SX
+    internal: Mapping[str, int]
+
+
+@dataclass(frozen=True)
+class Terms:
+    """What one part of the model adds to the equations of a step.
+
+    Attributes
+    ----------
+    lagrangian : casadi.SX
+        Scalar added to L(q, v) [J].
+    force : casadi.SX, optional, shape (n, 1)
+        Generalized force F(q, v, u, z) [N m or N].
+    internal : mapping of str to casadi.SX
+        Equation (= 0) of each internal coordinate that the term owns, at the midpoint.
+    """
+
+    lagrangian: ca.SX = field(default_factory=lambda: ca.SX(0))
+    force: ca.SX | None = None
+    internal: Mapping[str, ca.SX] = field(default_factory=dict)
+
+
+@runtime_checkable
+class Effect(Protocol):
+    """An unmodelled effect, or any other addition to the nominal model.
+
+    `modify` changes the description (masses, lengths, grasps, gravity, added joints); `terms` adds energy, force and
+    equations of internal coordinates. At neutral parameters both must leave the nominal model unchanged.
+    """
+
+    kind: str
+    location: str
+
+    @property
+    def parameters(self) -> Parameters:
+        """Its parameters, named `kind@location.quantity`."""
+        ...
+
+    @property
+    def internal(self) -> Mapping[str, ca.SX]:
+        """Internal coordinates (without momentum) that it owns: name to the symbol that stands for it in `modify`."""
+        ...
+
+    def modify(self, system: System) -> System:
+        """The system with the effect's changes of description."""
+        ...
+
+    def terms(self, state: MidpointState) -> Terms:
+        """What the effect adds to the step's equations."""
+        ...
+
+
+@dataclass(frozen=True)
+class System:
+    """A mechanism with everything that acts on it.
+
+    Attributes
+    ----------
+    mechanism : Mechanism
+        Arms first (left, then right), then the object.
+    parameters : Parameters
+        Fixes the order of theta.
+    elastic : tuple of ElasticJoint
+    damping : mapping of joint name to casadi.SX
+        Viscous coefficients of joints that are not elastic [N m s/rad].
+    grasps : tuple of Grasp
+    driven : tuple of str
+        Joints with a motor torque, in the order of u.
+    prescribed : tuple of str
+        Joints whose coordinate is known, in the order of s.
+    gravity : casadi.SX, shape (3, 1)
+        [m/s^2], in the world frame.
+    time_scale : casadi.SX
+        Factor on the recorded time step.
+    compliant : mapping of joint name to casadi.SX
+        Coordinates held by a spring of this compliance [rad/(N m)], zero meaning rigid; their equation is multiplied
+        by it so that it stays regular at zero.
+    segments : tuple of SegmentLayout
+    points : tuple of str
+        Frames that a sensor may see.
+    effects : tuple of Effect
+    """
+
+    mechanism: Mechanism
+    parameters: Parameters
+    elastic: tuple[ElasticJoint, ...] = ()
+    damping: Mapping[str, ca.SX] = field(default_factory=dict)
+    grasps: tuple[Grasp, ...] = ()
+    driven: tuple[str, ...] = ()
+    prescribed: tuple[str, ...] = ()
+    gravity: ca.SX = field(default_factory=lambda: ca.SX(ca.DM([0.0, 0.0, -9.81])))
+    time_scale: ca.SX = field(default_factory=lambda: ca.SX(1))
+    compliant: Mapping[str, ca.SX] = field(default_factory=dict)
+    segments: tuple[SegmentLayout, ...] = ()
+    points: tuple[str, ...] = ()
+    effects: tuple[Effect, ...] = ()
+
+    @staticmethod
+    def build(
+        mechanism: Mechanism | None = None,
+        *,
+        objects: Sequence[tuple[FlexibleObject, str | None, ArrayLike | None]] = (),
+        grasps: Sequence[Grasp] = (),
+        driven: Sequence[str] = (),
+        prescribed: Sequence[str] = (),
+        damping: float | Mapping[str, float] = 0.0,
+        gravity: ArrayLike = (0.0, 0.0, -9.81),
+        points: Sequence[str] | None = None,
+        effects: Sequence[Effect] = (),
+    ) -> System:
+        """Put robot, objects, grasps and effects together.
+
+        Parameters
+        ----------
+        mechanism : Mechanism, optional
+            The robot; none for an object alone.
+        objects : sequence of (FlexibleObject, frame, placement)
+            Each hung on a frame of what came before (None: the world) at a 4x4 placement (None: identity).
+        grasps : sequence of Grasp
+        driven, prescribed : sequence of str
+            Joint names; no joint may be both.
+        damping : float or mapping
+            Viscous damping of the robot's joints [N m s/rad]; becomes the parameters `JOINT.damping`.
+        gravity : array_like, shape (3,)
+            [m/s^2]
+        points : sequence of str, optional
+            Frames that sensors may see; the segments' tips `w_*` when absent.
+        effects : sequence of Effect
+
+        Returns
+        -------
+        System
+
+        Raises
+        ------
+        ModelError
+            A name that does not exist or is used twice, no joint at all, a joint both driven and prescribed.
+        """
+        tree = mechanism if mechanism is not None else Mechanism("system", (), {})
+        entries: list[Parameter] = []
+        coefficients: dict[str, ca.SX] = {}
+        wanted = dict(damping) if isinstance(damping, Mapping) else dict.fromkeys(tree.joint_names, float(damping))
+        for joint, value in wanted.items():
+            tree.joint_index(joint)
+            parameter = Parameter(f"{joint}.damping", value, "N m s/rad", 0.0, math.inf, f"viscous damping of {joint}")
+            entries.append(parameter)
+            coefficients[joint] = parameter.symbol
+        elastic: list[ElasticJoint] = []
+        segments: list[SegmentLayout] = []
+        for item, frame, placement in objects:
+            tree = tree.joined(item.mechanism, frame, placement)
+            elastic += item.elastic
+            segments += item.segments
+        if not tree.joints:
+            raise ModelError("the system has no joint", hint="give a robot, an object, or both")
+        for joint in [*driven, *prescribed]:
+            tree.joint_index(joint)
+        both = sorted(set(driven) & set(prescribed))
+        if both:
+            raise ModelError(f"joint '{both[0]}' is both driven and prescribed", allowed="one of the two")
+        for grasp in grasps:
+            tree.frame(grasp.holder)
+            tree.frame(grasp.held)
+        seen = tuple(points) if points is not None else tuple(name for name in tree.frames if name.startswith("w_"))
+        for point in seen:
+            tree.frame(point)
+        system = System(
+            tree,
+            tree.parameters.joined(entries),
+            tuple(elastic),
+            coefficients,
+            tuple(grasps),
+            tuple(driven),
+            tuple(prescribed),
+            ca.SX(ca.DM(np.asarray(gravity, float))),
+            segments=tuple(segments),
+            points=seen,
+        )
+        return system.with_effects(effects)
+
+    def with_effects(self, effects: Sequence[Effect]) -> System:
+        """This system with more effects, whose parameters are appended to theta in the order given."""
+        system = self
+        for effect in effects:
+            system = replace(system, parameters=system.parameters.joined(effect.parameters))
+            system = effect.modify(system)
+            system = replace(system, effects=(*system.effects, effect))
+        return system
+
+    @property
+    def size(self) -> int:
+        """n, the number of configuration variables."""
+        return len(self.mechanism.joints)
+
+    @property
+    def constraint_count(self) -> int:
+        """m, the number of scalar constraints."""
+        return sum(grasp.equations for grasp in self.grasps)
+
+    @property
+    def driven_indices(self) -> tuple[int, ...]:
+        """Configuration index of each input."""
+        return tuple(self.mechanism.joint_index(name) for name in self.driven)
+
+    @property
+    def prescribed_indices(self) -> tuple[int, ...]:
+        """Configuration index of each prescribed coordinate."""
+        return tuple(self.mechanism.joint_index(name) for name in self.prescribed)
+
+    @property
+    def free_indices(self) -> tuple[int, ...]:
+        """Configuration indices that are not prescribed."""
+        known = set(self.prescribed_indices)
+        return tuple(i for i in range(self.size) if i not in known)
+
+    @property
+    def internal(self) -> dict[str, ca.SX]:
+        """Internal coordinates in the order of z: name to the symbol that stands for it in grasps and placements."""
+        return {name: symbol for effect in self.effects for name, symbol in effect.internal.items()}
+
+    def segment(self, name: str) -> SegmentLayout:
+        """Layout of one of the object's segments; `ModelError` with the nearest name where there is none."""
+        for entry in self.segments:
+            if entry.name == name:
+                return entry
+        raise ModelError(f"there is no segment '{name}'", hint=nearest(name, [s.name for s in self.segments]))
+
+    def elastic_energy(self, q: ca.SX) -> ca.SX:
+        """Sum of 1/2 stiffness (q - rest)^2 over the elastic joints [J]."""
+        energy = ca.SX(0)
+        for spring in self.elastic:
+            deflection = q[self.mechanism.joint_index(spring.joint)] - spring.rest
+            energy += 0.5 * spring.stiffness * deflection**2
+        return energy
+
+    def viscous_force(self, v: ca.SX) -> ca.SX:
+        """Force of all viscous dampers, shape (n, 1) [N m]."""
+        force = [ca.SX(0)] * self.size
+        for spring in self.elastic:
+            index = self.mechanism.joint_index(spring.joint)
+            force[index] = force[index] - spring.damping * v[index]
+        for joint, coefficient in self.damping.items():
+            index = self.mechanism.joint_index(joint)
+            force[index] = force[index] - coefficient * v[index]
+        return ca.vertcat(*force)
+
+    def input_force(self, u: ca.SX) -> ca.SX:
+        """B u, the motor torques placed on their coordinates, shape (n, 1) [N m]."""
+        force = [ca.SX(0)] * self.size
+        for row, index in enumerate(self.driven_indices):
+            force[index] = u[row]
+        return ca.vertcat(*force)
+
+    def constraints(self, kinematics: Kinematics) -> ca.SX:
+        """phi(q) of all grasps, shape (m, 1)."""
+        return ca.vertcat(*(grasp.residual(kinematics) for grasp in self.grasps)) if self.grasps else ca.SX(0, 1)
+
+    def constraint_compliance(self) -> ca.SX:
+        """Diagonal of C in phi(q_{k+1}) = C lam_k / h, shape (m, 1)."""
+        rows = [grasp.compliance for grasp in self.grasps for _ in range(grasp.equations)]
+        return ca.vertcat(*rows) if rows else ca.SX(0, 1)
+
+
+def floating_clamp(name: str, frame: str | None = None) -> Mechanism:
+    """A massless frame with six coordinates (x, y, z, then turns about x, y, z), to be prescribed along a path.
+
+    Parameters
+    ----------
+    name : str
+        Joints become `NAME_x`, `NAME_y`, `NAME_z`, `NAME_rx`, `NAME_ry`, `NAME_rz`; the moving frame is `NAME`.
+    frame : str, optional
+        Another name for the moving frame.
+    """
+    from yid_ocp.model.mechanism import Frame, Joint
+
+    axes = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    joints = tuple(
+        Joint(f"{name}_{prefix}{'xyz'[a]}", kind, 3 * block + a - 1, Placement.identity(), axes[a])
+        for block, (prefix, kind) in enumerate((("", "prismatic"), ("r", "revolute")))
+        for a in range(3)
+    )
+    return Mechanism(name, joints, {frame or name: Frame(5, Placement.identity())})  # type: ignore[arg-type]
+
+
+def placement_matrix(xyz: ArrayLike = (0.0, 0.0, 0.0), rpy: ArrayLike = (0.0, 0.0, 0.0)) -> np.ndarray:
+    """4x4 placement from a translation [m] and roll, pitch, yaw [rad]."""
+    angles = np.asarray(rpy, float)
+    return transform(roll_pitch_yaw(*angles), xyz)
