@@ -44,7 +44,7 @@ def compress(path: Path) -> None:
 
 
 def make(folder: Path) -> None:
-    for arms, word in ((1, "single"), (2, "dual")):
+    for arms, word, hands in ((1, "single", "one arm"), (2, "dual", "two arms")):
         system = paper_system(arms)
         posture = initial_posture(system, TRUTH)
         for purpose in ("estimate", "held_out"):
@@ -61,7 +61,7 @@ def make(folder: Path) -> None:
                     time_step=INNER_STEP,
                     posture=posture,
                     name=name,
-                    description=f"Baxter moves the foam Y with {word} arm (motion seed {seed}).",
+                    description=f"Baxter moves the foam Y with {hands} (motion seed {seed}).",
                 )
                 path = folder / f"{name}.h5"
                 write_recording(recording, path)

@@ -21,7 +21,7 @@ from yid_ocp.data.synthetic import (
 )
 from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body
-from yid_ocp.model.mechanism import Mechanism
+from yid_ocp.model.mechanism import Frame, Inertia, Mechanism, Placement
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.system import Grasp, MidpointState, System, Terms, floating_clamp
 from yid_ocp.model.y_object import Segment, flexible_object
@@ -46,7 +46,10 @@ def runs() -> dict[tuple[int, float], SimulatedRun]:
 
 def clamped_beam() -> System:
     beam = flexible_object([Segment("B", 0.5, 0.2, 0.01, links=3)], name="beam")
-    return System.build(floating_clamp("clamp"), objects=[(beam, "clamp", None)], driven=["clamp_x"], damping=0.1)
+    clamp = floating_clamp("clamp")
+    body = Inertia.of(0.3, [0.01, 0.02, 0.03], np.diag([1e-3, 2e-3, 2.5e-3]))
+    clamp = replace(clamp, joints=(*clamp.joints[:-1], replace(clamp.joints[-1], bodies=(body,))))
+    return System.build(clamp, objects=[(beam, "clamp", None)], driven=["clamp_x"], damping=0.1)
 
 
 @pytest.mark.parametrize(
@@ -128,7 +131,9 @@ def test_starts_in_static_equilibrium_of_the_symbolic_equations(
     force = rigid.by_q - ca.gradient(system.elastic_energy(q), q) + system.input_force(u)
     jacobian = ca.jacobian(system.constraints(kinematics), q)
     function = ca.Function("statics", [q, u, system.parameters.symbols], [force, jacobian])
-    load, gradient = (np.array(ca.densify(e)) for e in function(run.q[0], run.effort[0], system.parameters.vector(TRUTH)))
+    load, gradient = (
+        np.array(ca.densify(e)) for e in function(run.q[0], run.effort[0], system.parameters.vector(TRUTH))
+    )
     multiplier = np.linalg.lstsq(gradient.T, load, rcond=None)[0]
     assert np.abs(load - gradient.T @ multiplier).max() < 1e-5
     assert np.abs(run.v[0]).max() == 0.0
@@ -284,8 +289,13 @@ def test_what_mujoco_cannot_express_is_refused() -> None:
         mujoco_xml(replace(system, compliant={"B_0_x": ca.SX(1e-3)}))
     with pytest.raises(ModelError, match="has a mass"):
         mujoco_xml(System.build(floating_clamp("clamp")))
+    beam = flexible_object([Segment("B", 0.5, 0.2, 0.01)])
+    tree = SYSTEMS[1].mechanism
+    bare = Frame(tree.joint_index("T2_1_y"), Placement.identity())
+    with pytest.raises(ModelError, match="more than six"):
+        mujoco_xml(System.build(floating_clamp("clamp"), objects=[(beam, "clamp", None)]))
     with pytest.raises(ModelError, match="sits on a joint that carries no mass"):
-        mujoco_xml(replace(system, points=("clamp",)))
+        mujoco_xml(replace(SYSTEMS[1], points=("bare",), mechanism=replace(tree, frames={**tree.frames, "bare": bare})))
     with pytest.raises(ConfigError, match="time_step"):
         mujoco_xml(system, time_step=0.0)
 
@@ -311,7 +321,7 @@ def test_without_mujoco_the_error_says_what_to_install(monkeypatch: pytest.Monke
 
 def test_other_robots_start_from_the_middle_of_their_range() -> None:
     robot = Mechanism.from_urdf("package:panda", locked={"panda_finger_joint1": 0.0, "panda_finger_joint2": 0.0})
-    beam = flexible_object([Segment("B", 0.5, 0.2, 0.01, links=2)], foot=np.diag([1.0, 1.0, 1.0, 1.0]))
+    beam = flexible_object([Segment("B", 0.5, 0.2, 0.01, links=2)])
     names = robot.joint_names[:7]
     placement = np.eye(4)
     placement[:3, 3] = [0.5, 0.0, 0.0]

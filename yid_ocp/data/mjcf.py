@@ -20,6 +20,7 @@ from yid_ocp.model.system import Effect, MidpointState, System
 
 Array = NDArray[np.float64]
 
+_JOINTS_PER_BODY = 6  # as many as MuJoCo allows
 _AXIS_LEVER = 0.1  # [m] between the two points that keep two axes parallel
 
 
@@ -56,7 +57,8 @@ def mujoco_xml(
     Raises
     ------
     ModelError
-        What MuJoCo cannot express: a moving body without mass, a frame on a massless joint, a compliant grasp or
+        What MuJoCo cannot express: a moving body without mass, more than six massless joints at one place, a frame on
+        one of them, a compliant grasp or
         coordinate, an effect that adds forces.
     ConfigError
         Unknown parameter, or `time_step` not positive.
@@ -107,6 +109,12 @@ def mujoco_xml(
             attributes["stiffness"] = _text([stiffness])
             attributes["springref"] = _text([sum(k * rest for k, rest in springs[joint.name]) / stiffness])
         ElementTree.SubElement(elements[j], "joint", attributes)
+        if len(elements[j].findall("joint")) > _JOINTS_PER_BODY:
+            raise ModelError(
+                "more than six joints without mass sit at one place",
+                where=f"joint {joint.name}",
+                allowed="up to six; a body with mass on the last of them",
+            )
         body = merged(joint.bodies)
         if body is not None:
             ElementTree.SubElement(elements[j], "inertial", _inertial(body))

@@ -237,12 +237,8 @@ class Recording:
         masks = [(g.t >= start - _TIME_TOLERANCE) & (g.t <= stop + _TIME_TOLERANCE) for g in self.groups]
         kept = [group._rows(mask) for group, mask in zip(self.groups, masks, strict=True) if mask.any()]
         first, last = min(g.t[0] for g in self.groups), max(g.t[-1] for g in self.groups)
-        _check(
-            start < stop and bool(kept),
-            f"nothing was recorded from {start:g} s to {stop:g} s",
-            f"recording '{self.name}'",
-            f"start < stop, overlapping {first:g} s to {last:g} s",
-        )
+        what, allowed = f"nothing was recorded from {start:g} s to {stop:g} s", f"within {first:g} s to {last:g} s"
+        _check(start < stop and bool(kept), what, f"recording '{self.name}'", f"start < stop, {allowed}")
         joints = next((group for group in kept if isinstance(group, JointGroup)), None)
         return replace(self, joints=joints, points=tuple(g for g in kept if isinstance(g, PointGroup)))
 
@@ -355,7 +351,7 @@ def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = Fal
     try:
         with h5py.File(path, "r") as file:
             recording = _from_file(file, path, digest)
-    except (OSError, RuntimeError, KeyError) as error:
+    except (OSError, RuntimeError, KeyError, TypeError) as error:  # all of them come from h5py on damaged files
         what = f"the HDF5 file is truncated or damaged ({_reason(error)})"
         raise DataError(what, where=str(path), hint="copy or record it again") from error
     _validate(recording, str(path), allow_nan_effort)
@@ -540,10 +536,10 @@ def _validate_points(group: PointGroup, where: str) -> None:
             where=f"{where}/position",
             allowed="three finite coordinates, or three NaN where the point was not seen",
         )
-    largest = float(np.linalg.norm(group.position[~unseen], axis=-1).max(initial=0.0))
+    largest = float(np.abs(group.position[~unseen]).max(initial=0.0))
     _check(
         largest <= _LARGEST_DISTANCE,
-        f"a point is {largest:g} m away from the origin",
+        f"a coordinate reaches {largest:g} m",
         f"{where}/position",
         f"at most {_LARGEST_DISTANCE:g} m",
         "these look like millimetres: convert them to metres, or read a CSV with units={'points': 'mm'}",
@@ -628,7 +624,7 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
     what = f"the format of the file is '{texts['format']}'" if texts["format"] else "the file does not say its format"
     _check(texts["format"] == FORMAT, what, f"{origin}, attribute format", FORMAT)
     joints, points = None, []
-    for name in file:
+    for name in map(str, file):
         where, legal = f"{origin}: {name}", name == "joints" or _POINT_GROUP_NAME.fullmatch(name) is not None
         hint = "" if legal else nearest(name, ("joints", "points"))
         _check(legal, f"the format has no group '{name}'", origin, "joints, points, points_<name>", hint)
@@ -647,8 +643,8 @@ def _read_group(
     group: h5py.Group, where: str, units: Mapping[str, str], attributes: Sequence[str], required: Iterable[str]
 ) -> dict[str, Any]:
     for noun, found, known, needed in (
-        ("dataset", set(group), tuple(units), {"t", "position"}),
-        ("attribute", set(group.attrs), attributes, set(required)),
+        ("dataset", set(map(str, group)), tuple(units), {"t", "position"}),
+        ("attribute", set(map(str, group.attrs)), attributes, set(required)),
     ):
         for name in sorted(found - set(known)):
             what = f"the format has no {noun} '{name}' here"
@@ -688,8 +684,7 @@ def _text(value: object, where: str) -> str:
             return value.decode("utf-8")
         except UnicodeDecodeError as error:
             raise DataError("the text is not UTF-8", where=where) from error
-    if not isinstance(value, str):
-        raise DataError(f"found {value!r}", where=where, allowed="text")
+    _check(isinstance(value, str), f"found {value!r}", where, "text")
     return str(value)
 
 

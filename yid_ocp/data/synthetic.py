@@ -552,7 +552,8 @@ def virtual_experiment(
 
     made = (
         f"Virtual experiment in MuJoCo {mujoco_module().__version__} "
-        f"(implicitfast, {1e3 * time_step:g} ms inner step): multi-sine motion of {len(driven)} joints from static equilibrium, torque held over each {1e3 / rate:g} ms, "
+        f"(implicitfast, {1e3 * time_step:g} ms inner step): multi-sine motion of {len(driven)} joints "
+        f"from static equilibrium, torque held over each {1e3 / rate:g} ms, "
         f"seed {seed}. White noise: joint position {joint_noise:g} rad, velocity {velocity_noise:g} rad/s, "
         f"effort {effort_noise:g} N m, arm points {1e3 * arm_point_noise:g} mm"
     )

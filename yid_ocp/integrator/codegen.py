@@ -68,7 +68,8 @@ def step_functions(equations: DiscreteEquations) -> StepFunctions:
     """
     e = equations
     h, rigid = e.h, e.rigid
-    balance = e.balance_rest + e.row_scale * (e.p0 + h / 2 * rigid.by_q - rigid.by_v)
+    bodies, bodies_p = (e.row_scale * (h / 2 * rigid.by_q + sign * rigid.by_v) for sign in (-1, 1))
+    balance = e.balance_rest + e.p0 + bodies
     plus, minus = rigid.S + h / 2 * rigid.D, rigid.S - h / 2 * rigid.D
     lower, upper = rigid.B / 2 - rigid.F / h, rigid.B / 2 + rigid.F / h
     parts = (plus, minus, lower, upper, rigid.S[:3, :], h / 4 * rigid.G)
@@ -76,8 +77,18 @@ def step_functions(equations: DiscreteEquations) -> StepFunctions:
 
     unknown = ca.vertcat(e.q1, e.z1, e.lam)
     old = ca.vertcat(e.q0, e.z0)
-    rest = ca.jacobian(ca.vertcat(e.balance_rest, e.internal), ca.vertcat(unknown, old, e.u))
-    rest_p = ca.jacobian(e.p1_rest, ca.vertcat(unknown, old, e.u))
+    inputs = ca.vertcat(unknown, old, e.u)
+
+    def by_internal(expression: ca.SX) -> ca.SX:
+        """What the closed form leaves out: placements and masses may depend on internal coordinates."""
+        rows, n = expression.numel(), e.q0.numel()
+        blocks = [ca.jacobian(expression, z) for z in (e.z1, e.z0)]
+        gaps = [ca.SX(rows, count) for count in (n, e.lam.numel() + n, e.u.numel())]
+        return ca.horzcat(gaps[0], blocks[0], gaps[1], blocks[1], gaps[2])
+
+    rest = ca.jacobian(ca.vertcat(e.balance_rest, e.internal), inputs)
+    rest = ca.sparsify(rest + by_internal(ca.vertcat(bodies, ca.SX(e.z0.numel(), 1))))
+    rest_p = ca.sparsify(ca.jacobian(e.p1_rest, inputs) + by_internal(bodies_p))
     by_q1 = ca.substitute(e.constraint_matrix, old, ca.vertcat(e.q1, e.z1))
     by_rest = ca.jacobian(e.constraint, ca.vertcat(e.z1, e.lam))
     by_unknown = ca.sparsify(ca.horzcat(by_q1, by_rest))
@@ -88,7 +99,8 @@ def step_functions(equations: DiscreteEquations) -> StepFunctions:
         return ca.Function(name, e.arguments, ca.cse(list(outputs)))
 
     def nonzeros(matrix: ca.SX) -> ca.SX:
-        return ca.vertcat(*matrix.nonzeros()) if matrix.nnz() else ca.SX(0, 1)
+        values: ca.SX = matrix.nz[:]
+        return values
 
     return StepFunctions(
         e,
@@ -170,9 +182,8 @@ def structure(functions: StepFunctions) -> Structure:
     free = np.array(system.free_indices, np.int32)
     unknown_row = np.concatenate([free, np.arange(n, nt, dtype=np.int32)]).astype(np.int32)
     nf = len(free)
-    order = np.concatenate(
-        [np.arange(nf, nf + nz), np.arange(nf)[::-1], np.arange(nf + nz, nf + nz + m)]
-    ).astype(np.int32)
+    order = np.concatenate([np.arange(nf, nf + nz), np.arange(nf)[::-1], np.arange(nf + nz, nf + nz + m)])
+    order = order.astype(np.int32)
     pattern = rows_new[np.ix_(unknown_row[order], unknown_row[order])]
     pattern = pattern | pattern.T
     fill = []
@@ -213,7 +224,7 @@ def kernel_source(functions: StepFunctions, tables: Structure) -> str:
     }
     lines = [f"#define {name} {value}" for name, value in sizes.items()]
 
-    def table(name: str, values: Sequence[int] | Indices) -> None:
+    def table(name: str, values: Sequence[int] | NDArray[np.integer]) -> None:
         entries = ", ".join(str(int(v)) for v in values) or "0"
         lines.append(f"static const int {name}[] = {{{entries}}};")
 
@@ -276,11 +287,13 @@ def _runs(entries: Indices, gap: int) -> list[tuple[int, int]]:
 
 @functools.cache
 def compiler() -> str | None:
-    """Path of the C compiler, or None; the environment variable CC chooses one, `CC=none` means none."""
+    """Path of the C compiler, or None with one notice; the environment variable CC chooses one, `CC=none` means none."""
     wanted = os.environ.get("CC")
-    if wanted == "none":
-        return None
-    return next((found for name in (wanted, "cc", "gcc", "clang") if name and (found := shutil.which(name))), None)
+    names = () if wanted == "none" else (wanted, "cc", "gcc", "clang")
+    path = next((found for name in names if name and (found := shutil.which(name))), None)
+    if path is None:
+        log.warning("no C compiler: everything works without compiled code, about ten times slower")
+    return path
 
 
 def cache_folder() -> Path:
@@ -336,7 +349,7 @@ def compile_library(source: str) -> ctypes.CDLL | None:
     path = compiler()
     if path is None:
         return None
-    key = hashlib.sha256("\0".join([source, *FLAGS, *NATIVE, _machine(), ca.__version__]).encode()).hexdigest()[:32]
+    key = hashlib.sha256("\0".join([source, *FLAGS, *NATIVE, _machine(), ca.CasadiMeta.version()]).encode()).hexdigest()[:32]
     target = cache_folder() / f"{key}.so"
     if not target.exists():
         with tempfile.TemporaryDirectory(dir=target.parent) as work:
@@ -356,3 +369,86 @@ def compile_library(source: str) -> ctypes.CDLL | None:
     except OSError as error:
         log.warning("compiled code cannot be loaded (%s); going on without it", error)
         return None
+
+
+class Mapped:
+    """A CasADi function evaluated at many points at once, compiled where possible.
+
+    Parameters
+    ----------
+    function : casadi.Function
+        Dense or sparse outputs of any number; inputs are dense columns.
+    shared : collection of int
+        Positions of the inputs that are the same at every point.
+    use_compiler : bool
+        Whether to try compiled code.
+    """
+
+    def __init__(self, function: ca.Function, shared: Sequence[int] = (), use_compiler: bool = True) -> None:
+        self.function = function
+        self.shared = frozenset(shared)
+        self._inputs = [function.numel_in(i) for i in range(function.n_in())]
+        self._outputs = [function.nnz_out(i) for i in range(function.n_out())]
+        self._library = compile_library(self._source()) if use_compiler else None
+
+    def _source(self) -> str:
+        name, f = self.function.name(), self.function
+        strides = ", ".join("0" if i in self.shared else str(size) for i, size in enumerate(self._inputs)) or "0"
+        widths = ", ".join(str(size) for size in self._outputs) or "0"
+        return f"""{_generated(name, (f,))}
+#include <stdlib.h>
+int yid_map(int count, const double **in, double **out) {{
+    static const int stride[] = {{{strides}}}, width[] = {{{widths}}};
+    const double *arg[{max(f.sz_arg(), 1)}];
+    double *res[{max(f.sz_res(), 1)}];
+    double *w = malloc(sizeof(double) * {f.sz_w() + 1});
+    long long *iw = malloc(sizeof(long long) * {f.sz_iw() + 1});
+    for (int k = 0; k < count; k++) {{
+        for (int i = 0; i < {len(self._inputs)}; i++) arg[i] = in[i] + (size_t)k * stride[i];
+        for (int o = 0; o < {len(self._outputs)}; o++) res[o] = out[o] + (size_t)k * width[o];
+        {name}(arg, res, iw, w, 0);
+    }}
+    free(w);
+    free(iw);
+    return 0;
+}}
+"""
+
+    def __call__(self, *inputs: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        """Evaluate.
+
+        Parameters
+        ----------
+        *inputs : ndarray, shape (count, size) or, where shared, (size,)
+
+        Returns
+        -------
+        list of ndarray, shape (count, rows, columns)
+            Dense, one for each output.
+        """
+        count = next((len(x) for i, x in enumerate(inputs) if i not in self.shared), 1)
+        arrays = [np.ascontiguousarray(x, dtype=float) for x in inputs]
+        for i, array in enumerate(arrays):
+            expected = (self._inputs[i],) if i in self.shared else (count, self._inputs[i])
+            assert array.shape == expected, f"input {i} of {self.function.name()}: {array.shape}, not {expected}"
+        values = [np.zeros((count, size)) for size in self._outputs]
+        if self._library is not None:
+            pointers = (ctypes.c_void_p * max(len(arrays), 1))(*(a.ctypes.data for a in arrays))
+            targets = (ctypes.c_void_p * len(values))(*(v.ctypes.data for v in values))
+            self._library.yid_map(ctypes.c_int(count), pointers, targets)
+        else:
+            for k in range(count):
+                point = [a if i in self.shared else a[k] for i, a in enumerate(arrays)]
+                for target, result in zip(values, self.function.call(point), strict=True):
+                    target[k] = np.array(result.nonzeros())
+        dense = []
+        for o, value in enumerate(values):
+            sparsity = self.function.sparsity_out(o)
+            if sparsity.is_dense():
+                dense.append(value.reshape(count, sparsity.size2(), sparsity.size1()).transpose(0, 2, 1))
+                continue
+            full = np.zeros((count, *sparsity.shape))
+            row, column = _triplet(sparsity)
+            full[:, row, column] = value
+            dense.append(full)
+        return dense

@@ -7,6 +7,8 @@ Position-momentum form, with L_d(q0, q1) = h L((q0 + q1)/2, (q1 - q0)/h):
 
 with f- = f+ = (h/2) F for the symmetric split, f- = h F and f+ = 0 for the left one. The first equation holds for
 free coordinates; at a prescribed one its left side is -h times the effort that the prescription needs at node k.
+Both equations of a compliant coordinate are multiplied by its compliance, its momentum with them: there p is the
+compliance times the momentum [rad s], which keeps the spring's force (1/compliance) finite and the rule's order two.
 """
 
 from __future__ import annotations
@@ -64,7 +66,7 @@ class DiscreteEquations:
     pull_by_q : casadi.SX, shape (n, n)
         d(Dphi(q_k)' lam)/dq_k.
     row_scale : casadi.SX, shape (n, 1)
-        Factor on each row of the bodies' part (1, or the compliance of a compliant coordinate).
+        Factor on each row of the bodies' part, in the balance and in p1 (1, or the compliance of a compliant one).
     """
 
     system: System
@@ -191,12 +193,12 @@ def discrete_equations(system: System, force_split: ForceSplit = "symmetric") ->
     row_scale, held = [ca.SX(1)] * n, [ca.SX(0)] * n
     for joint, compliance in system.compliant.items():
         index = system.mechanism.joint_index(joint)
-        row_scale[index], held[index] = compliance, h * qm[index]
-    scale = ca.vertcat(*row_scale)
-    balance_rest = scale * (h / 2 * extra_q - extra_v + weight_left * force) - ca.vertcat(*held)
-    p1_rest = h / 2 * extra_q + extra_v + weight_right * force
-    balance = scale * (p0 + h / 2 * rigid.by_q - rigid.by_v - pull) + balance_rest
-    p1 = h / 2 * rigid.by_q + rigid.by_v + p1_rest
+        row_scale[index], held[index] = compliance, h / 2 * qm[index]
+    scale, spring = ca.vertcat(*row_scale), ca.vertcat(*held)
+    balance_rest = scale * (h / 2 * extra_q - extra_v + weight_left * force) - spring
+    p1_rest = scale * (h / 2 * extra_q + extra_v + weight_right * force) - spring
+    balance = p0 + scale * (h / 2 * rigid.by_q - rigid.by_v - pull) + balance_rest
+    p1 = scale * (h / 2 * rigid.by_q + rigid.by_v) + p1_rest
 
     def placed(expression: ca.SX) -> ca.SX:
         return ca.densify(ca.substitute(expression, midpoint, midpoint_values))

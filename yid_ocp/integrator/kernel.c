@@ -34,18 +34,20 @@ typedef struct {
     long iterations, factorisations;
 } Work;
 
+static void work_free(Work *k) {
+    free(k->w);
+    free(k->iw);
+    free(k);
+}
+
 static Work *work_new(void) {
     Work *k = calloc(1, sizeof(Work));
     if (!k) return NULL;
     k->w = malloc(sizeof(double) * ONE(SZ_W));
     k->iw = malloc(sizeof(long long) * ONE(SZ_IW));
-    return k;
-}
-
-static void work_free(Work *k) {
-    free(k->w);
-    free(k->iw);
-    free(k);
+    if (k->w && k->iw) return k;
+    work_free(k);
+    return NULL;
 }
 
 typedef struct {
@@ -144,7 +146,10 @@ static void linearise(Work *k, const Point *a, int everything) {
         for (int j = 0; j < N; j++)
             for (int i = 0; i < N; i++) {
                 k->R1[j][i] *= k->row_scale[j];
-                if (everything) k->R0[j][i] *= k->row_scale[j];
+                if (!everything) continue;
+                k->R0[j][i] *= k->row_scale[j];
+                k->P1[j][i] *= k->row_scale[j];
+                k->P0[j][i] *= k->row_scale[j];
             }
     for (int e = 0; e < NNZ_REST; e++) {
         const int column = rest_col[e];
@@ -268,8 +273,8 @@ static void solve_many(Work *k, double *Y, int d) {
 static double coordinate_norm(const double *delta) {
     double norm = 0;
     for (int i = 0; i < NF + NZ; i++) {
-        const double size = fabs(delta[i]);
-        if (!(size <= norm)) norm = size;
+        if (isnan(delta[i])) return NAN;
+        norm = fmax(norm, fabs(delta[i]));
     }
     return norm;
 }
@@ -280,8 +285,16 @@ static void advance(const Point *a, const double *delta, double factor) {
     for (int i = 0; i < M; i++) a->lam[i] += factor * delta[NF + NZ + i];
 }
 
-static void settle_multipliers(const Point *a, const double *delta) {
-    for (int i = 0; i < M; i++) a->lam[i] += delta[NF + NZ + i];
+/* Last correction of the multipliers, and of the balance at prescribed coordinates, which gives the effort. */
+static void settle_multipliers(Work *k, const Point *a, const double *delta) {
+    for (int c = 0; c < M; c++) {
+        const double change = delta[NF + NZ + c];
+        a->lam[c] += change;
+        for (int j = 0; j < NC; j++) {
+            const int at = prescribed_index[j];
+            k->balance[at] -= k->row_scale[at] * k->Phi[c][at] * change;
+        }
+    }
 }
 
 /* Simplified Newton with the factorisation at hand; refactorises where it contracts slowly. */
@@ -303,7 +316,7 @@ static int newton_chord(Work *k, const Point *a, double tolerance, int limit, do
         if (!isfinite(norm)) return NOT_FINITE;
         const double rate = norm / previous;
         if (norm <= tolerance || (norm < 1e3 * tolerance && rate > 0.5)) {
-            settle_multipliers(a, k->delta);
+            settle_multipliers(k, a, k->delta);
             return OK;
         }
         if (it > 0 && rate > 0.9 && fresh) return NOT_CONVERGED;
@@ -328,7 +341,7 @@ static int newton_damped(Work *k, const Point *a, double tolerance, int limit, d
         const double norm = *error = coordinate_norm(step);
         if (!isfinite(norm)) return NOT_FINITE;
         if (norm <= tolerance || (norm < 1e3 * tolerance && norm > 0.5 * previous)) {
-            settle_multipliers(a, step);
+            settle_multipliers(k, a, step);
             return OK;
         }
         previous = norm;
@@ -434,10 +447,7 @@ static void sensitivity_step(Work *k, const Point *a, const Directions *dir, con
     memcpy(start + (size_t)N * d, X0 + (size_t)2 * N * d, sizeof(double) * NZ * d);
     memset(rows, 0, sizeof(double) * NT * d);
     multiply_rows(&k->R0[0][0], ONE(NQZ), rows_old_start, rows_old_col, NT, start, d, rows);
-    for (int i = 0; i < N; i++) {
-        const double scale = k->row_scale[i];
-        for (int c = 0; c < d; c++) rows[(size_t)i * d + c] += scale * X0[(size_t)(N + i) * d + c];
-    }
+    for (int i = 0; i < N * d; i++) rows[i] += X0[(size_t)N * d + i];
     double *p1 = X1 + (size_t)N * d;
     memset(p1, 0, sizeof(double) * N * d);
     if (dir->theta_count) {
@@ -482,7 +492,7 @@ static void sensitivity_step(Work *k, const Point *a, const Directions *dir, con
             const int at = prescribed_index[j];
             double *target = effort + (size_t)j * d;
             for (int c = 0; c < d; c++) {
-                double sum = k->row_scale[at] * X0[(size_t)(N + at) * d + c];
+                double sum = X0[(size_t)(N + at) * d + c];
                 for (int i = 0; i < NQZ; i++) sum += k->R0[at][i] * start[(size_t)i * d + c];
                 for (int i = 0; i < NT; i++) sum += k->R1[at][i] * joined[(size_t)i * d + c];
                 if (input)
@@ -527,6 +537,10 @@ int yid_rollout(int steps, const double *theta, double time_step, const double *
     const int d = dir ? dir->count : 0;
     const int feeds = feedback && feedback->count > 0;
     double *buffer = d ? malloc(sizeof(double) * (size_t)d * (3 * ONE(NT) + ONE(NY) + ONE(NU) + ONE(NQZ))) : NULL;
+    if (d && !buffer) {
+        work_free(k);
+        return SINGULAR;
+    }
     double *rows = buffer, *joined = rows + (size_t)d * ONE(NT), *Y = joined + (size_t)d * ONE(NT);
     double *input = Y + (size_t)d * ONE(NY), *start = input + (size_t)d * ONE(NU);
     double q1[ONE(N)], z1[ONE(NZ)], lam[ONE(M)], u[ONE(NU)];
@@ -630,7 +644,7 @@ int yid_adjoint(int steps, const double *theta, double time_step, const double *
             for (int r = 0; r < N; r++) sum += k->P0[r][i] * weight[r];
             mu[i < N ? i : N + i] = sum;
         }
-        for (int i = 0; i < N; i++) mu[N + i] = k->row_scale[i] * full[i];
+        for (int i = 0; i < N; i++) mu[N + i] = full[i];
         for (int j = 0; j < NU; j++) {
             mu_u[j] = 0;
             for (int r = 0; r < NT; r++) mu_u[j] += k->Ru[r][j] * full[r];

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -19,8 +18,6 @@ from yid_ocp.errors import ModelError
 from yid_ocp.integrator import codegen
 from yid_ocp.integrator.discrete import DiscreteEquations, ForceSplit, discrete_equations
 from yid_ocp.model.system import System
-
-log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
@@ -143,11 +140,12 @@ class Sweep:
     multipliers : ndarray, shape (N, m)
         [N s]
     effort : ndarray, shape (N, nc)
-        Effort of prescribed coordinates at nodes 0..N-1 [N m].
+        Effort of prescribed coordinates at nodes 0..N-1 [N m]; at node 0 it presumes that p_0 came from a step before
+        (`Rest` gives such a p_0); after p_0 = dL/dv it holds only half a step's impulse, half the effort.
     torque : ndarray, shape (N, nu)
         Applied torque [N m].
     by_state, by_multipliers, by_effort : ndarray, shape (..., d), or None
-        Derivatives by the directions.
+        Derivatives by the directions; like everything else NaN after a step that failed.
     status : StepStatus
     """
 
@@ -172,6 +170,8 @@ class Gradient:
         By the initial state.
     by_torque : ndarray, shape (N, nu)
         By the nominal torque.
+
+    All NaN where a step's equations turned out singular.
     """
 
     by_theta: Array
@@ -226,8 +226,6 @@ class Step:
         self.structure = codegen.structure(self.functions)
         library = codegen.compile_library(codegen.kernel_source(self.functions, self.structure)) if use_compiler else None
         self.compiled = library is not None
-        if not self.compiled:
-            log.warning("no compiled code: everything works, about ten times slower")
         self.kernel: Kernel = InterpretedKernel(self) if library is None else CompiledKernel(self, library)
 
     @property
@@ -337,6 +335,8 @@ class Step:
                 )
             path = np.zeros((2, 0))
         else:
+            if len(prescribed) != 2:
+                raise ModelError(f"prescribed has {len(prescribed)} entries", allowed="the pair (s0, s1)")
             path = np.stack([check_shape("prescribed", s, (sizes["nc"],)) for s in prescribed])
         start[list(self.system.prescribed_indices)] = path[0]
         torque = check_shape("u", u, (sizes["nu"],))[None, :]
@@ -484,9 +484,9 @@ class CompiledKernel:
         keep: list[object] = []
         if wanted is not None:
             d = wanted.count
-            by_state = np.zeros((steps + 1, sizes["nx"], d))
+            by_state = np.full((steps + 1, sizes["nx"], d), np.nan)
             by_state[0] = wanted.start
-            by_multipliers, by_effort = np.zeros((steps, sizes["m"], d)), np.zeros((steps, sizes["nc"], d))
+            by_multipliers, by_effort = (np.full((steps, sizes[key], d), np.nan) for key in ("m", "nc"))
             struct, keep = self._directions(wanted.names, d)
             given_torque, given_path = _contiguous(wanted.torque), _contiguous(wanted.path)
         loop, held = _feedback_struct(feedback)
@@ -535,7 +535,7 @@ class CompiledKernel:
         loop, held = _feedback_struct(feedback)
         inputs = [np.ascontiguousarray(a, dtype=float) for a in (theta, swept.torque, swept.state, swept.multipliers)]
         partial = [_contiguous(a) for a in (by_state, by_multipliers, by_effort)]
-        self._library.yid_adjoint(
+        code = self._library.yid_adjoint(
             ctypes.c_int(steps),
             _pointer(inputs[0]),
             ctypes.c_double(self._step.time_step),
@@ -551,6 +551,9 @@ class CompiledKernel:
             _pointer(info),
         )
         del keep, held
+        if code != StepCode.OK:
+            for array in (gradient, by_start, by_torque):
+                array[:] = np.nan
         return Gradient(gradient[: len(names)], by_start, by_torque)
 
 
@@ -595,8 +598,8 @@ class InterpretedKernel:
         patterns = step.functions.patterns
         self._triplets = {key: tuple(np.array(part) for part in s.get_triplet()) for key, s in patterns.items()}
         self._unknown = step.structure.unknown_row
-        self._free = list(step.system.free_indices)
-        self._fixed = list(step.system.prescribed_indices)
+        self._free = np.array(step.system.free_indices, np.intp)
+        self._fixed = np.array(step.system.prescribed_indices, np.intp)
 
     def _scales(self, theta: Array) -> tuple[Array, float]:
         s = self._step.sizes
@@ -637,7 +640,7 @@ class InterpretedKernel:
         p1_new, p1_old, p1_input = np.zeros((n, nt)), np.zeros((n, nqz)), np.zeros((n, nu))
         rows_new[:n, :n] = scale[:, None] * slope
         rows_old[:n, :n] = scale[:, None] * both(here, here)
-        p1_new[:, :n], p1_old[:, :n] = both(there, there), slope.T
+        p1_new[:, :n], p1_old[:, :n] = scale[:, None] * both(there, there), scale[:, None] * slope.T
         for key, values, blocks in (
             ("rest", rest, (rows_new, rows_old, rows_input)),
             ("rest_p", rest_p, (p1_new, p1_old, p1_input)),
@@ -714,8 +717,8 @@ class InterpretedKernel:
         state[0] = start
         multipliers, effort = np.full((steps, m), np.nan), np.full((steps, s["nc"]), np.nan)
         applied = np.full((steps, s["nu"]), np.nan)
-        by_state, by_multipliers = np.zeros((steps + 1, nx, d)), np.zeros((steps, m, d))
-        by_effort = np.zeros((steps, s["nc"], d))
+        by_state, by_multipliers = np.full((steps + 1, nx, d), np.nan), np.full((steps, m, d), np.nan)
+        by_effort = np.full((steps, s["nc"], d), np.nan)
         if wanted is not None:
             by_state[0] = wanted.start
         total, code, error, k = 0, StepCode.OK, 0.0, 0
@@ -777,7 +780,7 @@ class InterpretedKernel:
         matrices = self._linearise(arguments, phi, scale)
         old = np.concatenate([before[:n], before[2 * n :]])
         rows = matrices.rows_old @ old
-        rows[:n] += scale[:, None] * before[n : 2 * n]
+        rows[:n] += before[n : 2 * n]
         change = np.zeros((s["nu"], d)) if wanted.torque is None else wanted.torque[k].copy()
         if feedback is not None:
             change -= feedback.gain[k] @ before[feedback.index]
@@ -848,7 +851,7 @@ class InterpretedKernel:
             full[self._fixed] = -effort / h
             old = matrices.rows_old.T @ full + matrices.p1_old.T @ weight
             by_torque[k] = matrices.rows_input.T @ full + matrices.p1_input.T @ weight
-            costate = np.concatenate([old[:n], scale * full[:n], old[n:]]) + by_state[k]
+            costate = np.concatenate([old[:n], full[:n], old[n:]]) + by_state[k]
             if feedback is not None:
                 np.subtract.at(costate, feedback.index, feedback.gain[k].T @ by_torque[k])
         return Gradient(gradient, costate, by_torque)

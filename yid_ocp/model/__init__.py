@@ -15,3 +15,5 @@ from yid_ocp.model.system import Effect as Effect
 from yid_ocp.model.system import Grasp as Grasp
 from yid_ocp.model.system import System as System
 from yid_ocp.model.system import Terms as Terms
+from yid_ocp.model.system import MidpointState as MidpointState
+from yid_ocp.model.system import NodeState as NodeState

@@ -7,6 +7,7 @@ origin, force); with both in one fixed frame the derivatives of the Lagrangian t
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import casadi as ca
@@ -206,8 +207,8 @@ def rigid_body(kinematics: Kinematics, v: ca.SX, gravity: ca.SX) -> RigidBody:
         B.append(inertia_times(j, D[j]) + force_cross(S[j], momentum[j]))
         G.append(cross(axis, moment) + cross(linear, weight) + cross(first[j], cross(gravity, axis)))
 
-    def columns(entries: list[ca.SX] | tuple[ca.SX, ...], rows: int) -> ca.SX:
-        return ca.densify(ca.horzcat(*entries)) if entries else ca.SX(rows, 0)
+    def columns(entries: Sequence[ca.SX], rows: int) -> ca.SX:
+        return ca.densify(ca.horzcat(ca.SX(rows, 0), *entries))
 
     return RigidBody(
         ca.densify(ca.vertcat(*by_q)) if n else ca.SX(0, 1),
@@ -244,7 +245,7 @@ def _dot(a: ca.SX, i: int, b: ca.SX, j: int) -> ca.SX:
     return ca.dot(a[:, i], b[:, j])
 
 
-def _from_pairs(mechanism: Mechanism, entry) -> ca.SX:  # type: ignore[no-untyped-def]
+def _from_pairs(mechanism: Mechanism, entry: Callable[[int, int], tuple[ca.SX, ca.SX]]) -> ca.SX:
     n = len(mechanism.joints)
     matrix = ca.SX(n, n)
     for j in range(n):

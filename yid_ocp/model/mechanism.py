@@ -11,7 +11,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
@@ -24,6 +24,8 @@ Matrix = NDArray[np.float64]
 
 # URDF writers round pi to a dozen digits; entries this close to 0 and 1 are meant to be exactly that.
 SNAP = 1e-11
+# Stands for no limit where URDF asks for a number.
+UNLIMITED = 1e9
 
 
 @dataclass(frozen=True)
@@ -79,9 +81,7 @@ class Inertia:
     def moved(self, placement: Placement) -> Inertia:
         """The same body seen from the frame in which its own frame has `placement`."""
         rotation = placement.rotation
-        return Inertia(
-            self.mass, rotation @ self.com + placement.translation, rotation @ self.about_com @ rotation.T
-        )
+        return Inertia(self.mass, rotation @ self.com + placement.translation, rotation @ self.about_com @ rotation.T)
 
 
 @dataclass(frozen=True)
@@ -374,6 +374,7 @@ def _from_urdf(
     if not path.is_file():
         raise ModelError(f"there is no URDF file '{path}'", hint="give a path, or package:NAME for example-robot-data")
     try:
+        ElementTree.parse(path)  # yourdfpy would read what it can of a broken file and say nothing
         with contextlib.redirect_stderr(io.StringIO()):
             robot = yourdfpy.URDF.load(
                 str(path), build_scene_graph=False, load_meshes=False, load_collision_meshes=False
@@ -389,23 +390,40 @@ def _from_urdf(
                 where=str(path),
                 allowed="revolute, continuous, prismatic, fixed",
             )
+        if joint.type in movable and joint.axis is not None and np.linalg.norm(joint.axis) < 1e-9:
+            raise ModelError(f"joint '{joint.name}' has a zero axis", where=str(path))
     known = [joint.name for joint in robot.joints if joint.type in movable]
     for wanted in [*(chosen or ()), *locked]:
         if wanted not in known:
             raise ModelError(f"there is no movable joint '{wanted}'", where=str(path), hint=nearest(wanted, known))
     kept = set(known if chosen is None else chosen)
 
+    links = {link.name: link for link in robot.links}
     children: dict[str, list] = {}
     for joint in robot.joints:
+        for link in (joint.parent, joint.child):
+            if link not in links:
+                raise ModelError(
+                    f"joint '{joint.name}' names a link '{link}' that is not there",
+                    where=str(path),
+                    hint=nearest(str(link), links),
+                )
         children.setdefault(joint.parent, []).append(joint)
-    below = {joint.child for joint in robot.joints}
-    roots = [link.name for link in robot.links if link.name not in below]
+    below = [joint.child for joint in robot.joints]
+    roots = [link for link in links if link not in below]
     if len(roots) != 1:
         raise ModelError(f"the URDF has {len(roots)} root links", where=str(path), allowed="exactly one")
-    links = {link.name: link for link in robot.links}
+    for kind, names in (
+        ("links are called", [link.name for link in robot.links]),
+        ("joints are called", [joint.name for joint in robot.joints]),
+        ("joints carry the link", below),
+    ):
+        twice = sorted({entry for entry in names if names.count(entry) > 1})
+        if twice:
+            raise ModelError(f"two {kind} '{twice[0]}'", where=str(path), allowed="a tree with unique names")
     rank = {joint: i for i, joint in enumerate(chosen if chosen is not None else known)}
 
-    collected: dict[str, tuple[str | None, Matrix, object]] = {}
+    collected: dict[str, tuple[str | None, Matrix, Any]] = {}
     bodies: dict[str | None, list[Inertia]] = {}
     frames: dict[str, tuple[str | None, Matrix]] = {}
     stack: list[tuple[str, str | None, Matrix]] = [(roots[0], None, np.eye(4))]
@@ -415,7 +433,8 @@ def _from_urdf(
         inertial = links[link].inertial
         if inertial is not None and inertial.mass:
             origin = np.eye(4) if inertial.origin is None else np.asarray(inertial.origin, float)
-            body = Inertia.of(float(inertial.mass), np.zeros(3), np.asarray(inertial.inertia, float))
+            tensor = np.zeros((3, 3)) if inertial.inertia is None else np.asarray(inertial.inertia, float)
+            body = Inertia.of(float(inertial.mass), np.zeros(3), tensor)
             bodies.setdefault(carrier, []).append(body.moved(Placement.of(at @ origin)))
         for joint in children.get(link, ()):
             origin = np.eye(4) if joint.origin is None else np.asarray(joint.origin, float)
@@ -424,6 +443,9 @@ def _from_urdf(
                 stack.append((joint.child, joint.name, np.eye(4)))
             else:
                 stack.append((joint.child, carrier, at @ origin @ _locked_motion(joint, locked)))
+    if len(frames) < len(links):
+        loose = sorted(set(links) - set(frames))
+        raise ModelError(f"link '{loose[0]}' does not hang on '{roots[0]}'", where=str(path), allowed="one tree")
 
     order: list[str] = []
     waiting = sorted(collected, key=lambda entry: rank[entry])
@@ -436,21 +458,18 @@ def _from_urdf(
     joints: list[Joint] = []
     for entry in order:
         carrier, at, source = collected[entry]
-        body = merged(bodies.get(entry, ()))
-        if body is not None and parametric:
-            mass = float(body.mass)
+        carried = merged(bodies.get(entry, ()))
+        if carried is not None and parametric:
+            mass = float(carried.mass)
             parameter = Parameter(f"{entry}.mass", mass, "kg", 0.0, math.inf, f"mass of what {entry} carries")
             parameters.append(parameter)
-            body = replace(body.scaled(parameter.symbol / mass), mass=parameter.symbol)
+            carried = replace(carried.scaled(parameter.symbol / mass), mass=parameter.symbol)
         limit = source.limit
-        axis = np.asarray([1.0, 0.0, 0.0] if source.axis is None else source.axis, dtype=float)
-        if np.linalg.norm(axis) < 1e-9:
-            raise ModelError(f"joint '{entry}' has a zero axis", where=str(path))
-        axis = snapped(axis / np.linalg.norm(axis))
+        axis = snapped(_unit_axis(source))
         continuous = source.type == "continuous" or limit is None
 
         def bound(value: float | None, otherwise: float) -> float:
-            return otherwise if value is None else float(value)
+            return otherwise if value is None or abs(value) >= UNLIMITED else float(value)
 
         joints.append(
             Joint(
@@ -459,7 +478,7 @@ def _from_urdf(
                 order.index(carrier) if carrier is not None else -1,
                 Placement.of(at),
                 (float(axis[0]), float(axis[1]), float(axis[2])),
-                () if body is None else (body,),
+                () if carried is None else (carried,),
                 -math.inf if continuous else bound(limit.lower, -math.inf),
                 math.inf if continuous else bound(limit.upper, math.inf),
                 math.inf if limit is None else bound(limit.effort, math.inf),
@@ -473,28 +492,33 @@ def _from_urdf(
     return Mechanism(name or robot.name, tuple(joints), named, Parameters(parameters))
 
 
-def _locked_motion(joint: object, locked: Mapping[str, float]) -> Matrix:
-    if joint.type == "fixed":  # type: ignore[attr-defined]
+def _locked_motion(joint: Any, locked: Mapping[str, float]) -> Matrix:
+    if joint.type == "fixed":
         return np.eye(4)
-    limit = joint.limit  # type: ignore[attr-defined]
+    limit = joint.limit
     low = -math.inf if limit is None or limit.lower is None else float(limit.lower)
     high = math.inf if limit is None or limit.upper is None else float(limit.upper)
-    if joint.type == "continuous" or low > high:  # type: ignore[attr-defined]
+    if joint.type == "continuous" or low > high:
         low, high = -math.inf, math.inf
-    value = locked.get(joint.name, min(max(0.0, low), high))  # type: ignore[attr-defined]
-    axis = np.asarray([1.0, 0.0, 0.0] if joint.axis is None else joint.axis, float)  # type: ignore[attr-defined]
-    axis = axis / np.linalg.norm(axis)
-    if joint.type == "prismatic":  # type: ignore[attr-defined]
+    value = locked.get(joint.name, min(max(0.0, low), high))
+    axis = _unit_axis(joint)
+    if joint.type == "prismatic":
         return transform(np.eye(3), value * axis)
     cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
     return transform(np.eye(3) + math.sin(value) * cross + (1 - math.cos(value)) * cross @ cross, np.zeros(3))
 
 
+def _unit_axis(joint: Any) -> NDArray[np.float64]:
+    axis = np.asarray([1.0, 0.0, 0.0] if joint.axis is None else joint.axis, float)
+    return axis / np.linalg.norm(axis)
+
+
 def _angles(rotation: Matrix) -> tuple[float, float, float]:
+    # the roll is taken in the frame that yaw and pitch leave, which holds at and near pitch = 90 degrees too
+    yaw = math.atan2(rotation[1, 0], rotation[0, 0])
     pitch = math.atan2(-rotation[2, 0], math.hypot(rotation[0, 0], rotation[1, 0]))
-    if math.cos(pitch) < 1e-9:
-        return math.atan2(-rotation[1, 2], rotation[1, 1]), pitch, 0.0
-    return math.atan2(rotation[2, 1], rotation[2, 2]), pitch, math.atan2(rotation[1, 0], rotation[0, 0])
+    c, s = _cs(yaw)
+    return math.atan2(s * rotation[0, 2] - c * rotation[1, 2], c * rotation[1, 1] - s * rotation[0, 1]), pitch, yaw
 
 
 def _to_urdf(mechanism: Mechanism) -> str:
@@ -506,9 +530,19 @@ def _to_urdf(mechanism: Mechanism) -> str:
         translation = np.array(ca.DM(placement.translation)).ravel()
         ElementTree.SubElement(element, "origin", xyz=text(translation), rpy=text(_angles(rotation)))
 
+    identity = np.eye(4)
+
+    def link_name(wanted: str, joint: int) -> str:
+        frame = mechanism.frames.get(wanted)
+        same = frame is None or (frame.joint == joint and np.array_equal(ca.DM(frame.placement.matrix()), identity))
+        return wanted if same else link_name(f"{wanted}_", joint)
+
+    def bounded(value: float) -> float:
+        return max(-UNLIMITED, min(value, UNLIMITED))
+
     robot = ElementTree.Element("robot", name=mechanism.name)
-    ElementTree.SubElement(robot, "link", name="world")
-    links = ["world"] + [f"{joint.name}_link" for joint in mechanism.joints]
+    links = [link_name("world", -1)] + [link_name(f"{joint.name}_link", i) for i, joint in enumerate(mechanism.joints)]
+    ElementTree.SubElement(robot, "link", name=links[0])
     for i, joint in enumerate(mechanism.joints):
         link = ElementTree.SubElement(robot, "link", name=links[i + 1])
         body = merged(joint.bodies)
@@ -519,28 +553,33 @@ def _to_urdf(mechanism: Mechanism) -> str:
             tensor = np.array(ca.DM(body.about_com))
             keys = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
             ElementTree.SubElement(inertial, "inertia", {k: text([tensor[ij]]) for k, ij in keys.items()})
-        unlimited = not (math.isfinite(joint.lower) and math.isfinite(joint.upper))
-        kind = "continuous" if unlimited and joint.kind == "revolute" else joint.kind
+        limits = {
+            key: text([bounded(value)])
+            for key, value in (
+                ("lower", joint.lower),
+                ("upper", joint.upper),
+                ("effort", joint.effort_limit),
+                ("velocity", joint.velocity_limit),
+            )
+        }
+        kind: str = joint.kind
+        if kind == "revolute" and math.isinf(joint.lower) and math.isinf(joint.upper):
+            kind, limits = "continuous", {key: limits[key] for key in ("effort", "velocity")}
         element = ElementTree.SubElement(robot, "joint", name=joint.name, type=kind)
         origin(element, joint.placement)
         ElementTree.SubElement(element, "parent", link=links[joint.parent + 1])
         ElementTree.SubElement(element, "child", link=links[i + 1])
         ElementTree.SubElement(element, "axis", xyz=text(joint.axis))
-        if kind != "continuous":
-            large = 1e3
-            ElementTree.SubElement(
-                element,
-                "limit",
-                lower=text([max(joint.lower, -large)]),
-                upper=text([min(joint.upper, large)]),
-                effort=text([min(joint.effort_limit, large)]),
-                velocity=text([min(joint.velocity_limit, large)]),
-            )
+        if kind != "continuous" or math.isfinite(joint.effort_limit) or math.isfinite(joint.velocity_limit):
+            ElementTree.SubElement(element, "limit", limits)
     for name, frame in mechanism.frames.items():
         if name in links:
             continue
         ElementTree.SubElement(robot, "link", name=name)
-        element = ElementTree.SubElement(robot, "joint", name=f"{name}_fixed", type="fixed")
+        fixed = f"{name}_fixed"
+        while fixed in mechanism.joint_names:
+            fixed += "_"
+        element = ElementTree.SubElement(robot, "joint", name=fixed, type="fixed")
         origin(element, frame.placement)
         ElementTree.SubElement(element, "parent", link=links[frame.joint + 1])
         ElementTree.SubElement(element, "child", link=name)

@@ -41,10 +41,10 @@ class Parameter:
     lower: float = -math.inf
     upper: float = math.inf
     description: str = ""
-    symbol: ca.SX = field(default=None, compare=False, repr=False)
+    symbol: ca.SX = field(default_factory=ca.SX, compare=False, repr=False)
 
     def __post_init__(self) -> None:
-        if self.symbol is None:
+        if self.symbol.is_empty():
             object.__setattr__(self, "symbol", ca.SX.sym(self.name))
         if not math.isfinite(self.value):
             raise ConfigError(f"{self.name} = {self.value} is not a finite number", where=f"parameter {self.name}")
@@ -72,7 +72,9 @@ class Parameters:
         if len(self._index) != len(self._entries):
             names = [entry.name for entry in self._entries]
             twice = sorted({name for name in names if names.count(name) > 1})
-            raise ConfigError(f"parameter named twice: {', '.join(twice)}", hint="give each part of the model its own name")
+            raise ConfigError(
+                f"parameter named twice: {', '.join(twice)}", hint="give each part of the model its own name"
+            )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -131,7 +133,8 @@ class Parameters:
         for name in values:
             self.index(name)
         return Parameters(
-            replace(entry, value=float(values[entry.name])) if entry.name in values else entry for entry in self._entries
+            replace(entry, value=float(values[entry.name])) if entry.name in values else entry
+            for entry in self._entries
         )
 
     def with_bounds(self, bounds: Mapping[str, tuple[float, float]]) -> Parameters:

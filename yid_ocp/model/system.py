@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.errors import ModelError, nearest
 from yid_ocp.model.kinematics import Kinematics
-from yid_ocp.model.mechanism import Mechanism, Placement, roll_pitch_yaw, transform
+from yid_ocp.model.mechanism import Frame, Joint, Mechanism, Placement, roll_pitch_yaw, transform
 from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.model.y_object import ElasticJoint, FlexibleObject, SegmentLayout
+from yid_ocp.model.y_object import AXES, ElasticJoint, FlexibleObject, SegmentLayout
 
 GraspKind = Literal["point", "axis", "weld"]
 EQUATIONS: dict[str, int] = {"point": 3, "axis": 5, "weld": 6}
@@ -67,7 +67,8 @@ class Grasp:
             rows.append(holder.rotation[:, :2].T @ held.rotation[:, 2])
         elif self.kind == "weld":
             error = holder.rotation.T @ held.rotation
-            rows.append(0.5 * ca.vertcat(error[2, 1] - error[1, 2], error[0, 2] - error[2, 0], error[1, 0] - error[0, 1]))
+            pairs = ((2, 1), (0, 2), (1, 0))
+            rows.append(0.5 * ca.vertcat(*(error[i, j] - error[j, i] for i, j in pairs)))
         return ca.vertcat(*rows)
 
 
@@ -100,6 +101,31 @@ class MidpointState:
     z_rate: ca.SX
     u: ca.SX
     constraint_force: ca.SX
+    internal: Mapping[str, int]
+
+
+@dataclass(frozen=True)
+class NodeState:
+    """What a measurement may depend on: one node of the trajectory.
+
+    Attributes
+    ----------
+    system : System
+    kinematics : Kinematics
+        At `q`.
+    q : casadi.SX, shape (n, 1)
+    z : casadi.SX, shape (nz, 1)
+    effort : casadi.SX, shape (n, 1)
+        Torque at every joint that has one: the motor torque where driven, the predicted effort where prescribed.
+    internal : mapping of str to int
+        Row of each internal coordinate in `z`, by name.
+    """
+
+    system: System
+    kinematics: Kinematics
+    q: ca.SX
+    z: ca.SX
+    effort: ca.SX
     internal: Mapping[str, int]
 
 
@@ -151,6 +177,10 @@ class Effect(Protocol):
         """What the effect adds to the step's equations."""
         ...
 
+    def measure(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
+        """What a sensor reads where it would have read `output`; `channel` is `group.point` or `joints.quantity`."""
+        ...
+
 
 @dataclass(frozen=True)
 class System:
@@ -175,8 +205,8 @@ class System:
     time_scale : casadi.SX
         Factor on the recorded time step.
     compliant : mapping of joint name to casadi.SX
-        Coordinates held by a spring of this compliance [rad/(N m)], zero meaning rigid; their equation is multiplied
-        by it so that it stays regular at zero.
+        Coordinates held by a spring of this compliance [rad/(N m)], zero meaning rigid; their equations and momentum
+        are multiplied by it so that they stay regular at zero.
     segments : tuple of SegmentLayout
     points : tuple of str
         Frames that a sensor may see.
@@ -238,6 +268,9 @@ class System:
         ModelError
             A name that does not exist or is used twice, no joint at all, a joint both driven and prescribed.
         """
+        acceleration = np.asarray(gravity, float)
+        if acceleration.shape != (3,) or not np.all(np.isfinite(acceleration)):
+            raise ModelError(f"gravity = {acceleration}", allowed="three numbers [m/s^2]")
         tree = mechanism if mechanism is not None else Mechanism("system", (), {})
         entries: list[Parameter] = []
         coefficients: dict[str, ca.SX] = {}
@@ -257,6 +290,14 @@ class System:
             raise ModelError("the system has no joint", hint="give a robot, an object, or both")
         for joint in [*driven, *prescribed]:
             tree.joint_index(joint)
+        for kind, names in (
+            ("driven joints", driven),
+            ("prescribed joints", prescribed),
+            ("grasps", [grasp.name for grasp in grasps]),
+        ):
+            twice = sorted({name for name in names if list(names).count(name) > 1})
+            if twice:
+                raise ModelError(f"'{twice[0]}' stands twice among the {kind}", allowed="each name once")
         both = sorted(set(driven) & set(prescribed))
         if both:
             raise ModelError(f"joint '{both[0]}' is both driven and prescribed", allowed="one of the two")
@@ -274,7 +315,7 @@ class System:
             tuple(grasps),
             tuple(driven),
             tuple(prescribed),
-            ca.SX(ca.DM(np.asarray(gravity, float))),
+            ca.SX(ca.DM(acceleration)),
             segments=tuple(segments),
             points=seen,
         )
@@ -373,15 +414,13 @@ def floating_clamp(name: str, frame: str | None = None) -> Mechanism:
     frame : str, optional
         Another name for the moving frame.
     """
-    from yid_ocp.model.mechanism import Frame, Joint
-
-    axes = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    kinds: tuple[tuple[str, Literal["revolute", "prismatic"]], ...] = (("", "prismatic"), ("r", "revolute"))
     joints = tuple(
-        Joint(f"{name}_{prefix}{'xyz'[a]}", kind, 3 * block + a - 1, Placement.identity(), axes[a])
-        for block, (prefix, kind) in enumerate((("", "prismatic"), ("r", "revolute")))
-        for a in range(3)
+        Joint(f"{name}_{prefix}{letter}", kind, 3 * block + a - 1, Placement.identity(), axis)
+        for block, (prefix, kind) in enumerate(kinds)
+        for a, (letter, axis) in enumerate(AXES.items())
     )
-    return Mechanism(name, joints, {frame or name: Frame(5, Placement.identity())})  # type: ignore[arg-type]
+    return Mechanism(name, joints, {frame or name: Frame(5, Placement.identity())})
 
 
 def placement_matrix(xyz: ArrayLike = (0.0, 0.0, 0.0), rpy: ArrayLike = (0.0, 0.0, 0.0)) -> np.ndarray:

@@ -176,16 +176,19 @@ def flexible_object(
         radius, mass = own["radius"].symbol, own["mass"].symbol
         shares = _shares(segment)
         lengths = tuple(own["length"].symbol * float(share) for share in shares)
-        rotations = [_rotation(segment.rotation)] + [
-            _rotation(entry) for entry in (segment.link_rotations or [None] * (len(shares) - 1))
-        ]
+        later: Sequence[ArrayLike | None] = (
+            [None] * (len(shares) - 1) if segment.link_rotations is None else segment.link_rotations
+        )
+        rotations = [_rotation(entry) for entry in (segment.rotation, *later)]
+        before: ca.SX | None = None
         if segment.parent is None:
-            carrier, tip, before = -1, root, None
+            carrier, tip = -1, root
         else:
             above = layouts[segment.parent]
             at = len(above.links) - 1 if segment.at_link is None else segment.at_link
             frame = frames[f"{segment.parent}_{at}_tip"]
-            carrier, tip, before = frame.joint, frame.placement, above.lengths[at]
+            carrier, tip = frame.joint, frame.placement
+            before = None if segment.clamped else above.lengths[at]
         links: list[tuple[str, ...]] = []
         for i, length in enumerate(lengths):
             along = ca.vertcat(0, 0, length)
@@ -248,8 +251,18 @@ def polyline_rotations(vertices: ArrayLike, start: ArrayLike | None = None) -> l
     -------
     list of ndarray, shape (3, 3)
         One for every edge, to be used as `Segment.rotation` and `Segment.link_rotations`.
+
+    Raises
+    ------
+    ModelError
+        Fewer than two vertices, not three coordinates each, or two that coincide.
     """
-    edges = np.diff(np.asarray(vertices, float), axis=0)
+    points = np.asarray(vertices, float)
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2:
+        raise ModelError(f"vertices have shape {points.shape}", where="polyline", allowed="(k, 3) with k from 2")
+    edges = np.diff(points, axis=0)
+    if not np.all(np.linalg.norm(edges, axis=1) > 0):
+        raise ModelError("two neighbouring vertices coincide or are not finite", where="polyline")
     frame = np.eye(3) if start is None else np.asarray(start, float)
     rotations = []
     for edge in edges:
@@ -292,7 +305,7 @@ def _shares(segment: Segment) -> NDArray[np.float64]:
 def _per_joint(segment: Segment, length: ca.SX, before: ca.SX | None) -> ca.SX:
     if not segment.rigidity:
         return ca.SX(1)
-    if before is None or (segment.clamped and length is before):
+    if before is None:
         return 2 / length if segment.clamped else 1 / length
     return 2 / (length + before)
 
@@ -333,7 +346,7 @@ def _check(segment: Segment, known: dict[str, SegmentLayout]) -> None:
             raise ModelError(f"{quantity} = {value}", where=where, allowed="a positive number in SI units")
     if segment.link_lengths is None and segment.links < 1:
         raise ModelError(f"links = {segment.links}", where=where, allowed="a whole number from 1")
-    if segment.link_lengths is not None and min(segment.link_lengths) <= 0:
+    if segment.link_lengths is not None and not min(segment.link_lengths, default=0.0) > 0:
         raise ModelError("a link has no length", where=where, allowed="positive lengths [m]")
     count = len(segment.link_lengths) if segment.link_lengths is not None else segment.links
     if segment.link_rotations is not None and len(segment.link_rotations) != count - 1:

@@ -1,0 +1,147 @@
+"""The tracking filter of driven arms: feedback about the measured motion, with gains from a finite-horizon LQR."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import ArrayLike, NDArray
+
+from yid_ocp.errors import ModelError
+from yid_ocp.integrator.step import Feedback, Step, compile_step
+from yid_ocp.model.system import System
+
+Array = NDArray[np.float64]
+
+
+def proportional_filter(step: Step, measured: ArrayLike, gains: ArrayLike) -> Feedback:
+    """u_k = ubar_k - K (q_k - qbar_k) with a constant diagonal K on the driven joints.
+
+    Parameters
+    ----------
+    step : Step
+    measured : array_like, shape (N + 1, nu)
+        Measured angles qbar of the driven joints at every node [rad].
+    gains : array_like, shape (nu,) or scalar
+        [N m/rad]
+
+    Raises
+    ------
+    ModelError
+        A negative gain, or a number of gains that is neither one nor nu.
+    """
+    reference = np.asarray(measured, float)
+    nu = step.sizes["nu"]
+    values = np.atleast_1d(np.asarray(gains, float))
+    if values.size not in (1, nu) and nu % max(values.size, 1):
+        raise ModelError(f"{values.size} gains for {nu} driven joints", allowed=f"one, {nu}, or one arm's worth")
+    values = np.resize(values, nu)
+    if np.any(values < 0):
+        raise ModelError(f"a tracking gain is negative: {values.min():g} N m/rad", allowed="0 or more")
+    steps = len(reference) - 1
+    gain = np.broadcast_to(np.diag(values), (steps, nu, nu)).copy()
+    return Feedback(np.array(step.system.driven_indices, np.int32), gain, reference[:-1])
+
+
+def lqr_filter(
+    step: Step,
+    measured: ArrayLike,
+    torque: ArrayLike,
+    theta: ArrayLike,
+    angle_std: ArrayLike = 0.02,
+    rate_std: float = 0.3,
+    torque_std: ArrayLike = 1.0,
+) -> Feedback:
+    """Finite-horizon LQR of the driven arms, linearised about their measured motion.
+
+    Minimises the sum of |dq|^2/angle_std^2 + |M^-1 dp|^2/rate_std^2 + |du|^2/torque_std^2 over the recording for the
+    arms without the object; the gains act on the arms' angles and momenta. The reference momentum follows from the
+    measured angles and torques by the arms' own DEL equations, so that it means the same as the model's.
+
+    Parameters
+    ----------
+    step : Step
+    measured : array_like, shape (N + 1, nu)
+        Angles of the driven joints at every node [rad], smooth enough to be differenced.
+    torque : array_like, shape (N, nu)
+        Measured torques [N m].
+    theta : array_like, shape (ntheta,)
+    angle_std, rate_std, torque_std : float or array_like
+        Deviations that weigh the same [rad], [rad/s], [N m].
+
+    References
+    ----------
+    Anderson and Moore (1990), Optimal Control: Linear Quadratic Methods, section 2.4.
+    """
+    reference, torques = np.asarray(measured, float), np.asarray(torque, float)
+    system = step.system
+    arms = _arms_only(system)
+    arm_step = compile_step(arms, step.time_step, step.force_split, use_compiler=step.compiled)  # type: ignore[arg-type]
+    values = dict(zip(system.parameters.names, np.asarray(theta, float), strict=True))
+    arm_theta = arms.parameters.vector({name: values[name] for name in arms.parameters.names})
+    nu = len(system.driven)
+    momenta = _reference_momentum(arm_step, reference, torques, arm_theta)
+    steps = len(reference) - 1
+
+    weight_u = np.diag(1.0 / np.broadcast_to(np.asarray(torque_std, float), (nu,)) ** 2)
+    weight_q = np.diag(1.0 / np.broadcast_to(np.asarray(angle_std, float), (nu,)) ** 2)
+    gain = np.zeros((steps, nu, 2 * nu))
+    cost: Array | None = None
+    for k in reversed(range(steps)):
+        a, b, _ = arm_step.jacobians(reference[k], momenta[k], torques[k], arm_theta, names=())
+        rate = a[:nu, nu:] / step.time_step
+        stage = scipy.linalg.block_diag(weight_q, rate.T @ rate / rate_std**2)
+        cost = stage if cost is None else cost
+        inner = weight_u + b.T @ cost @ b
+        gain[k] = np.linalg.solve(inner, b.T @ cost @ a)
+        closed = a - b @ gain[k]
+        cost = stage + closed.T @ cost @ closed + gain[k].T @ weight_u @ gain[k]
+        cost = 0.5 * (cost + cost.T)
+    n = system.size
+    index = np.concatenate([np.array(system.driven_indices), n + np.array(system.driven_indices)])
+    return Feedback(index.astype(np.int32), gain, np.hstack([reference[:-1], momenta[:-1]]))
+
+
+def _arms_only(system: System) -> System:
+    """The driven joints alone: everything hung on them or beside them taken away."""
+    mechanism = system.mechanism
+    keep = [mechanism.joint_index(name) for name in system.driven]
+    if sorted(keep) != list(range(len(keep))):
+        raise ModelError(
+            "the LQR filter needs the driven joints to come first in the configuration",
+            where=", ".join(system.driven),
+            hint="use proportional gains instead",
+        )
+    frames = {name: frame for name, frame in mechanism.frames.items() if frame.joint < len(keep)}
+    arms = replace(mechanism, joints=mechanism.joints[: len(keep)], frames=frames)
+    wanted: Sequence[str] = system.driven
+    return replace(
+        system,
+        mechanism=arms,
+        elastic=(),
+        grasps=(),
+        prescribed=(),
+        compliant={},
+        segments=(),
+        points=(),
+        effects=(),
+        damping={name: value for name, value in system.damping.items() if name in wanted},
+    )
+
+
+def _reference_momentum(arm_step: Step, measured: Array, torque: Array, theta: Array) -> Array:
+    """p_k = D2 L_d(q_{k-1}, q_k) + f+ of the measured motion, shape (N + 1, nu); the first from a standing start."""
+    functions = arm_step.functions
+    sizes = arm_step.sizes
+    momenta = np.zeros_like(measured)
+    none = np.zeros(0)
+    for k in range(len(measured)):
+        before = measured[max(k - 1, 0)]
+        u = torque[min(max(k - 1, 0), len(torque) - 1)]
+        out = functions.residual(
+            before, measured[k], np.zeros(sizes["n"]), none, none, none, u, theta, arm_step.time_step
+        )
+        momenta[k] = np.array(out[3]).ravel()
+    return momenta

@@ -1,0 +1,10 @@
+"""What is to be estimated from what: inputs and samples on the nodes, residuals, and the `EstimationProblem`.
+
+Solvers see only `evaluate` and `gradient`; change what is compared with what here, never in a solver.
+"""
+
+from yid_ocp.problem.inputs import ClampPath as ClampPath
+from yid_ocp.problem.problem import EstimationProblem as EstimationProblem
+from yid_ocp.problem.problem import Evaluation as Evaluation
+from yid_ocp.problem.problem import ProblemOptions as ProblemOptions
+from yid_ocp.problem.problem import SensorOptions as SensorOptions

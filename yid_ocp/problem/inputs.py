@@ -1,0 +1,231 @@
+"""From a recording to what drives the model: torques held over steps, prescribed paths, the known posture."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.interpolate
+import scipy.signal
+from numpy.typing import ArrayLike, NDArray
+
+from yid_ocp.data.recording import JointGroup, Recording
+from yid_ocp.errors import DataError, nearest
+from yid_ocp.model.system import System
+
+Array = NDArray[np.float64]
+
+FILTER_ORDER = 4
+
+
+@dataclass(frozen=True)
+class ClampPath:
+    """A prescribed clamp (`floating_clamp`) that follows two measured points.
+
+    Attributes
+    ----------
+    clamp : str
+        Name of the clamp.
+    origin : str
+        Point at which its origin sits.
+    towards : str
+        Point to which its z axis looks.
+    """
+
+    clamp: str
+    origin: str
+    towards: str
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Nodes of a rollout: t_k = start + k time_step, k = 0..steps."""
+
+    start: float
+    time_step: float
+    steps: int
+
+    @property
+    def times(self) -> Array:
+        """Times of all nodes, shape (steps + 1,) [s]."""
+        return self.start + self.time_step * np.arange(self.steps + 1)
+
+    def locate(self, t: ArrayLike) -> tuple[NDArray[np.int64], Array]:
+        """Node before each time and the fraction of a step beyond it; a time within 1e-6 of a node is that node."""
+        position = (np.asarray(t, float) - self.start) / self.time_step
+        near = np.rint(position)
+        position = np.where(np.abs(position - near) < 1e-6, near, position)
+        node = np.clip(np.floor(position).astype(np.int64), 0, self.steps - 1)
+        return node, position - node
+
+
+def make_grid(recording: Recording, time_step: float, duration: float | None = None) -> Grid:
+    """Nodes that cover the recording's driving group (its joints, else its first group of points).
+
+    Raises
+    ------
+    DataError
+        The recording is shorter than two steps.
+    """
+    t = recording.joints.t if recording.joints is not None else recording.points[0].t
+    span = float(t[-1] - t[0]) if duration is None else min(duration, float(t[-1] - t[0]))
+    steps = math.floor(span / time_step + 1e-6)
+    if steps < 2:
+        raise DataError(
+            f"{span:.3g} s of data are shorter than two time steps of {time_step:g} s",
+            where=recording.name,
+            hint="record longer, or choose a smaller time step",
+        )
+    return Grid(float(t[0]), time_step, steps)
+
+
+def held_torque(joints: JointGroup, driven: tuple[str, ...], grid: Grid, where: str) -> Array:
+    """Mean over every step of the effort, taken as held from sample to sample, shape (steps, nu) [N m].
+
+    Raises
+    ------
+    DataError
+        No effort recorded, or a joint that is missing.
+    """
+    if not driven:
+        return np.zeros((grid.steps, 0))
+    if joints.effort is None:
+        raise DataError(
+            "the recording has no joint effort, which drives the model",
+            where=f"{where}: joints/effort",
+            hint="prescribe the arms' motion instead (model.arms.mode: prescribed)",
+        )
+    effort = joints.effort[:, columns(joints, driven, where)]
+    widths = np.diff(joints.t)
+    total = np.vstack([np.zeros((1, effort.shape[1])), np.cumsum(effort[:-1] * widths[:, None], axis=0)])
+    # the last sample is held as long as the one before it
+    t = np.append(joints.t, joints.t[-1] + widths[-1])
+    total = np.vstack([total, total[-1] + effort[-1] * widths[-1]])
+    integral = scipy.interpolate.interp1d(t, total, axis=0, bounds_error=False, fill_value="extrapolate")
+    nodes = grid.times
+    return np.asarray(np.diff(integral(nodes), axis=0) / grid.time_step)
+
+
+def columns(joints: JointGroup, names: tuple[str, ...], where: str) -> list[int]:
+    """Columns of the named joints; `DataError` with the nearest recorded name where one is missing."""
+    for name in names:
+        if name not in joints.names:
+            raise DataError(
+                f"joint '{name}' of the model is not recorded", where=f"{where}: joints", hint=nearest(name, joints.names)
+            )
+    return [joints.names.index(name) for name in names]
+
+
+@dataclass(frozen=True)
+class Smoother:
+    """Zero-phase low-pass filter (Butterworth of order 4, forward and backward) on an even clock.
+
+    Attributes
+    ----------
+    cutoff : float
+        Frequency at which the amplitude is halved in power twice over [Hz]; infinite for no filter.
+    """
+
+    cutoff: float
+
+    def __call__(self, t: Array, values: Array) -> Array:
+        """Smoothed values at the same times; an uneven clock is resampled to its median step in between.
+
+        Parameters
+        ----------
+        t : ndarray, shape (M,)
+        values : ndarray, shape (M, k)
+        """
+        if not math.isfinite(self.cutoff):
+            return values
+        step = float(np.median(np.diff(t)))
+        even = t[0] + step * np.arange(round((t[-1] - t[0]) / step) + 1)
+        sections = self._sections(step)
+        resampled = scipy.interpolate.interp1d(t, values, axis=0, bounds_error=False, fill_value="extrapolate")(even)
+        pad = min(len(even) - 1, max(15, int(3 / (self.cutoff * step))))
+        smooth = scipy.signal.sosfiltfilt(sections, resampled, axis=0, padlen=pad)
+        return np.asarray(scipy.interpolate.CubicSpline(even, smooth, axis=0)(np.clip(t, even[0], even[-1])))
+
+    def gains(self, step: float) -> tuple[float, float, float]:
+        """Factors from white-noise deviation to that of the value, its rate [1/s] and its second rate [1/s^2]."""
+        if not math.isfinite(self.cutoff):
+            return 1.0, math.sqrt(0.5) / step, math.sqrt(6.0) / step**2
+        length = 2 * int(5 / (self.cutoff * step)) + 101
+        impulse = np.zeros(length)
+        impulse[length // 2] = 1.0
+        response = scipy.signal.sosfiltfilt(self._sections(step), impulse)
+        rate = np.gradient(response, step)
+        second = np.zeros_like(response)
+        second[1:-1] = (response[2:] - 2 * response[1:-1] + response[:-2]) / step**2
+        return float(np.linalg.norm(response)), float(np.linalg.norm(rate)), float(np.linalg.norm(second))
+
+    def _sections(self, step: float) -> Array:
+        nyquist = 0.5 / step
+        if not 0 < self.cutoff < nyquist:
+            raise DataError(
+                f"path_cutoff = {self.cutoff:g} Hz", allowed=f"above 0 and below {nyquist:g} Hz for this recording"
+            )
+        return np.asarray(scipy.signal.butter(FILTER_ORDER, self.cutoff / nyquist, output="sos"))
+
+
+def prescribed_path(
+    recording: Recording, system: System, grid: Grid, smoother: Smoother, clamps: tuple[ClampPath, ...] = ()
+) -> Array:
+    """Prescribed coordinates at every node, shape (steps + 1, nc).
+
+    Joints follow the smoothed recorded positions, clamps their smoothed points.
+
+    Raises
+    ------
+    DataError
+        A prescribed joint or a clamp's point is not recorded, or is seen too seldom.
+    """
+    if not system.prescribed:
+        return np.zeros((grid.steps + 1, 0))
+    course: dict[str, Array] = {}
+    for clamp in clamps:
+        course.update(_clamp_course(recording, clamp, grid, smoother))
+    remaining = tuple(name for name in system.prescribed if name not in course)
+    if remaining:
+        if recording.joints is None:
+            raise DataError(
+                f"joint '{remaining[0]}' is prescribed but the recording has no joints", where=recording.name
+            )
+        joints = recording.joints
+        values = smoother(joints.t, joints.position[:, columns(joints, remaining, recording.name)])
+        spline = scipy.interpolate.CubicSpline(joints.t, values, axis=0)
+        sampled = spline(np.clip(grid.times, joints.t[0], joints.t[-1]))
+        course.update({name: sampled[:, i] for i, name in enumerate(remaining)})
+    return np.stack([course[name] for name in system.prescribed], axis=1)
+
+
+def _clamp_course(recording: Recording, clamp: ClampPath, grid: Grid, smoother: Smoother) -> Mapping[str, Array]:
+    origin = point_course(recording, clamp.origin, grid, smoother)
+    direction = point_course(recording, clamp.towards, grid, smoother) - origin
+    length = np.linalg.norm(direction, axis=1, keepdims=True)
+    if np.any(length < 1e-6):
+        raise DataError(f"points '{clamp.origin}' and '{clamp.towards}' coincide", where=recording.name)
+    d = direction / length
+    about_y = np.arcsin(np.clip(d[:, 0], -1, 1))
+    about_x = np.unwrap(np.arctan2(-d[:, 1], d[:, 2]))
+    result = {f"{clamp.clamp}_{axis}": origin[:, i] for i, axis in enumerate("xyz")}
+    result |= {f"{clamp.clamp}_rx": about_x, f"{clamp.clamp}_ry": about_y, f"{clamp.clamp}_rz": np.zeros(len(d))}
+    return result
+
+
+def point_course(recording: Recording, point: str, grid: Grid, smoother: Smoother) -> Array:
+    """Smoothed position of a recorded point at every node, shape (steps + 1, 3) [m]."""
+    for group in recording.points:
+        if point in group.names:
+            seen = group.position[:, group.names.index(point)]
+            good = np.all(np.isfinite(seen), axis=1)
+            if good.sum() < 4:
+                raise DataError(f"point '{point}' is seen {good.sum()} times", where=recording.name, allowed="4 or more")
+            values = smoother(group.t[good], seen[good])
+            spline = scipy.interpolate.CubicSpline(group.t[good], values, axis=0)
+            return np.asarray(spline(np.clip(grid.times, group.t[good][0], group.t[good][-1])))
+    raise DataError(
+        f"point '{point}' is not recorded", where=recording.name, hint=nearest(point, recording.point_names)
+    )

@@ -1,0 +1,704 @@
+"""The estimation problem: recordings, a step, what is free, and the residual with its derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from yid_ocp.data.recording import Recording
+from yid_ocp.errors import ConfigError, DataError, nearest
+from yid_ocp.integrator.codegen import Mapped
+from yid_ocp.integrator.feedback import lqr_filter, proportional_filter
+from yid_ocp.integrator.rollout import Rest, Statics, adjoint_gradient, simulate
+from yid_ocp.integrator.step import Directions, Feedback, Step, Sweep
+from yid_ocp.problem.initial import fit_start
+from yid_ocp.problem.inputs import ClampPath, Grid, Smoother, columns, held_torque, make_grid, prescribed_path
+from yid_ocp.problem.residuals import Samples, Weighting, huber, make_samples, paper_weighting, point_samples
+from yid_ocp.sensors import EffortSensor, PointSensor, Sensor, sensor_function
+
+Array = NDArray[np.float64]
+InitialState = Literal["equilibrium", "estimated", "given"]
+
+
+@dataclass(frozen=True)
+class SensorOptions:
+    """How one group of a recording is used.
+
+    Attributes
+    ----------
+    use : bool
+        Whether the estimation sees it at all.
+    std : float or mapping of name to float, optional
+        Noise deviation in the group's unit, instead of the recorded one.
+    frames : mapping of point to frame
+        Frame that a point marks where the two have different names.
+    points : tuple of str, optional
+        Points to use; all that the model has when absent.
+    """
+
+    use: bool = True
+    std: float | Mapping[str, float] | None = None
+    frames: Mapping[str, str] = field(default_factory=dict)
+    points: tuple[str, ...] | None = None
+
+
+@dataclass(frozen=True)
+class ProblemOptions:
+    """Everything about an estimation problem that is neither the model nor the data.
+
+    Attributes
+    ----------
+    initial_state : "equilibrium", "estimated" or "given"
+        Rest at the first posture (depends on theta); that plus a free deviation with a prior; or fixed at the
+        configuration that fits the first measured points.
+    feedback : "none", "proportional" or "lqr"
+        Tracking filter of driven arms.
+    gains : sequence of float
+        Proportional gains of one arm or of all driven joints [N m/rad].
+    weighting : "whitened" or "paper"
+    robust_scale : float
+        Huber scale in standard deviations; infinite for squares.
+    path_cutoff : float
+        Low-pass cutoff of prescribed paths and of the efforts compared with them [Hz].
+    sensors : mapping of group to SensorOptions
+    clamps : tuple of ClampPath
+    local : tuple of str
+        Free parameters with a value of their own in every recording.
+    priors : mapping of parameter to deviation
+        Gaussian priors about the initial value, in the parameter's unit.
+    configuration_std, velocity_std : float
+        Prior of an estimated initial state [rad], [rad/s].
+    duration : float, optional
+        Use only the first seconds of every recording [s].
+    start_window : float
+        How long the measured points that fix a `given` start may reach [s].
+    """
+
+    initial_state: InitialState = "equilibrium"
+    feedback: Literal["none", "proportional", "lqr"] = "lqr"
+    gains: tuple[float, ...] = (80.0, 80.0, 60.0, 60.0, 15.0, 15.0, 8.0)
+    weighting: Weighting = "whitened"
+    robust_scale: float = float("inf")
+    path_cutoff: float = 10.0
+    sensors: Mapping[str, SensorOptions] = field(default_factory=dict)
+    clamps: tuple[ClampPath, ...] = ()
+    local: tuple[str, ...] = ()
+    priors: Mapping[str, float] = field(default_factory=dict)
+    configuration_std: float = 0.05
+    velocity_std: float = 0.2
+    duration: float | None = None
+    start_window: float = 0.02
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One recording placed on the nodes of a rollout.
+
+    Attributes
+    ----------
+    recording : Recording
+    grid : Grid
+    torque : ndarray, shape (N, nu)
+    path : ndarray, shape (N + 1, nc)
+    posture : ndarray, shape (nk,)
+        Known coordinates (driven, then prescribed) at node 0.
+    measured_arm : ndarray, shape (N + 1, nu)
+        Measured angles of the driven joints at every node.
+    samples : tuple of Samples
+    """
+
+    recording: Recording
+    grid: Grid
+    torque: Array
+    path: Array
+    posture: Array
+    measured_arm: Array
+    samples: tuple[Samples, ...]
+
+    @property
+    def name(self) -> str:
+        """Name of the recording."""
+        return self.recording.name
+
+
+@dataclass(frozen=True)
+class EpisodeResult:
+    """Rollout of one episode and its prediction of every sample.
+
+    Attributes
+    ----------
+    sweep : Sweep
+    rest : Rest or None
+        The equilibrium at which it started.
+    predicted : tuple of ndarray, shape (M, k) each
+        Prediction of every sample, in the sensor's unit.
+    sensitivities : tuple of ndarray, shape (M, k, d) each, or None
+    """
+
+    sweep: Sweep
+    rest: Rest | None
+    predicted: tuple[Array, ...]
+    sensitivities: tuple[Array, ...] | None
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Residual of a problem at one point.
+
+    Attributes
+    ----------
+    cost : float
+        1/2 |r|^2, or the robust loss; infinite where the rollout failed.
+    residual : ndarray, shape (nr,)
+    jacobian : ndarray, shape (nr, nx), or None
+    ok : bool
+    message : str
+    episodes : tuple of EpisodeResult
+    """
+
+    cost: float
+    residual: Array
+    jacobian: Array | None
+    ok: bool
+    message: str
+    episodes: tuple[EpisodeResult, ...]
+
+
+class EstimationProblem:
+    """Find the free parameters that make the model's sensors agree with recordings.
+
+    The unknown vector is (shared free parameters, local ones recording by recording, deviations of estimated initial
+    states recording by recording).
+
+    Parameters
+    ----------
+    step : Step
+        Compiled step; its time step is the problem's.
+    recordings : sequence of Recording
+        To estimate on.
+    free : sequence of str
+        Names of free parameters.
+    options : ProblemOptions, optional
+    values : mapping of str to float, optional
+        Initial values, and values of fixed parameters, where they differ from the model's.
+    held_out : sequence of Recording
+        Never touched by the fit; used by `validate`.
+
+    Raises
+    ------
+    ConfigError
+        Unknown or doubly named parameters, a value outside its bounds.
+    DataError
+        A recording that does not fit the model: missing joints or points, no noise level, too short.
+    """
+
+    def __init__(
+        self,
+        step: Step,
+        recordings: Sequence[Recording],
+        free: Sequence[str],
+        options: ProblemOptions | None = None,
+        values: Mapping[str, float] | None = None,
+        held_out: Sequence[Recording] = (),
+    ) -> None:
+        self.step = step
+        self.system = step.system
+        self.options = options or ProblemOptions()
+        self.free = tuple(free)
+        parameters = self.system.parameters
+        for name in [*self.free, *self.options.local, *self.options.priors]:
+            parameters.index(name)
+        if len(set(self.free)) != len(self.free):
+            raise ConfigError("a free parameter is named twice", where=", ".join(self.free))
+        for name in (*self.options.local, *self.options.priors):
+            if name not in self.free:
+                raise ConfigError(f"'{name}' is not free", hint=nearest(name, self.free), where="local or priors")
+        self.theta = parameters.vector(values)
+        self.shared = tuple(name for name in self.free if name not in self.options.local)
+        self.local = tuple(name for name in self.free if name in self.options.local)
+        self._columns = (*self.shared, *self.local)
+        self._check_bounds()
+        if not recordings:
+            raise DataError("there is no recording to estimate on", hint="give at least one under recordings.estimate")
+        self._statics: Statics | None = None
+        self._functions: dict[tuple[Sensor, tuple[str, ...]], Mapped] = {}
+        self.episodes = tuple(self.prepare(recording) for recording in recordings)
+        self.held_out = tuple(self.prepare(recording) for recording in held_out)
+        self._feedback: dict[int, Feedback | None] = {}
+        self._starts: dict[int, Array] = {}
+
+    # -- the unknown vector -------------------------------------------------------------------------------------------
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all unknowns; local ones and initial states carry their recording's name."""
+        names = list(self.shared)
+        for episode in self.episodes:
+            names += [f"{name}[{episode.name}]" for name in self.local]
+            names += [f"start.{name}[{episode.name}]" for name in self._start_names]
+        return tuple(names)
+
+    @property
+    def start(self) -> Array:
+        """Initial guess of the unknown vector."""
+        theta = self.theta
+        index = self.system.parameters.index
+        local = [theta[index(name)] for name in self.local] + [0.0] * self._start_size
+        return np.array([theta[index(name)] for name in self.shared] + local * len(self.episodes))
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Lower and upper bounds of the unknown vector."""
+        lower, upper = self.system.parameters.bounds(self.shared)
+        low, high = self.system.parameters.bounds(self.local)
+        wide = np.full(self._start_size, np.inf)
+        count = len(self.episodes)
+        return (
+            np.concatenate([lower, *([low, -wide] * count)]),
+            np.concatenate([upper, *([high, wide] * count)]),
+        )
+
+    @property
+    def _start_size(self) -> int:
+        return len(self._start_names)
+
+    @property
+    def _start_names(self) -> tuple[str, ...]:
+        if self.options.initial_state != "estimated":
+            return ()
+        joints = self.system.mechanism.joint_names
+        free = [joints[i] for i in self._start_rows]
+        return (*(f"q.{name}" for name in free), *(f"p.{name}" for name in free))
+
+    @property
+    def _start_rows(self) -> tuple[int, ...]:
+        known = set(self.system.driven_indices) | set(self.system.prescribed_indices)
+        return tuple(i for i in range(self.system.size) if i not in known)
+
+    def split(self, x: ArrayLike, episode: int) -> tuple[Array, Array]:
+        """theta and the start's deviation of one episode from the unknown vector."""
+        x = np.asarray(x, float)
+        index = self.system.parameters.index
+        theta = self.theta.copy()
+        for i, name in enumerate(self.shared):
+            theta[index(name)] = x[i]
+        at = len(self.shared) + episode * (len(self.local) + self._start_size)
+        for i, name in enumerate(self.local):
+            theta[index(name)] = x[at + i]
+        at += len(self.local)
+        return theta, x[at : at + self._start_size]
+
+    # -- from recordings to episodes ----------------------------------------------------------------------------------
+
+    def prepare(self, recording: Recording) -> Episode:
+        """Place a recording on the nodes: torques, paths, posture, samples."""
+        system, options = self.system, self.options
+        grid = make_grid(recording, self.step.time_step, options.duration)
+        if system.driven and recording.joints is None:
+            raise DataError("the model's arms are driven but the recording has no joints", where=recording.name)
+        smoother = Smoother(options.path_cutoff)
+        path = prescribed_path(recording, system, grid, smoother, options.clamps)
+        if recording.joints is not None and system.driven:
+            joints = recording.joints
+            torque = held_torque(joints, system.driven, grid, recording.name)
+            angles = joints.position[:, columns(joints, system.driven, recording.name)]
+            arm = np.stack([np.interp(grid.times, joints.t, column) for column in angles.T], axis=1)
+        else:
+            torque, arm = np.zeros((grid.steps, 0)), np.zeros((grid.steps + 1, 0))
+        posture = np.concatenate([arm[0], path[0]])
+        samples = tuple(self._samples(recording, grid, smoother))
+        if not any(np.any(s.weight > 0) for s in samples):
+            raise DataError(
+                "the recording holds no measurement that the model could be compared with",
+                where=recording.name,
+                hint="check `sensors` and the names of the recorded points",
+            )
+        if options.weighting == "paper":
+            samples = tuple(paper_weighting(s, grid) for s in samples)
+        return Episode(recording, grid, torque, path, posture, arm, samples)
+
+    def _samples(self, recording: Recording, grid: Grid, smoother: Smoother) -> list[Samples]:
+        system, options = self.system, self.options
+        found: list[Samples] = []
+        for group in recording.points:
+            choice = options.sensors.get(group.name, SensorOptions())
+            if not choice.use:
+                continue
+            wanted = choice.points if choice.points is not None else group.names
+            frames = {p: choice.frames.get(p, p) for p in wanted}
+            known = tuple(p for p in wanted if frames[p] in system.mechanism.frames)
+            if not known:
+                raise DataError(
+                    f"none of the points of group '{group.name}' is a frame of the model",
+                    where=recording.name,
+                    allowed=", ".join(system.points),
+                    hint=f"name them under sensors.{group.name}.frames, or switch the group off",
+                )
+            sensor = PointSensor(group.name, known, tuple(frames[p] for p in known))
+            std = choice.std
+            if isinstance(std, Mapping):
+                raise ConfigError("a group of points takes one std", where=f"sensors.{group.name}.std")
+            found.append(point_samples(recording, group, sensor, known, grid, std))
+        choice = options.sensors.get("joints.effort", SensorOptions())
+        joints = recording.joints
+        if joints is not None and joints.effort is not None and choice.use:
+            names = tuple(name for name in system.prescribed if name in joints.names)
+            if names:
+                found.append(self._effort_samples(recording, grid, smoother, names, choice))
+        return found
+
+    def _effort_samples(
+        self, recording: Recording, grid: Grid, smoother: Smoother, names: tuple[str, ...], choice: SensorOptions
+    ) -> Samples:
+        joints = recording.joints
+        assert joints is not None
+        assert joints.effort is not None
+        at = columns(joints, names, recording.name)
+        effort = smoother(joints.t, joints.effort[:, at])
+        measured = np.stack([np.interp(grid.times, joints.t, column) for column in effort.T], axis=1)
+        given = choice.std if choice.std is not None else joints.effort_std
+        if given is None:
+            raise DataError(
+                "the noise level of the joint efforts is neither recorded nor given",
+                where=recording.name,
+                hint="set sensors.joints.effort.std [N m], from a stretch at rest or the data sheet",
+            )
+        if isinstance(given, Mapping):
+            std = np.array([float(given[name]) for name in names])
+        else:
+            wide = np.broadcast_to(np.asarray(given, float), (len(joints.names),))
+            std = wide[at] if np.ndim(given) else np.full(len(names), float(np.asarray(given)))
+        step = float(np.median(np.diff(joints.t)))
+        value_gain, _, second_gain = smoother.gains(step)
+        angle = 0.0 if joints.position_std is None else np.broadcast_to(joints.position_std, (len(joints.names),))[at]
+        inertia = self._apparent_inertia(names)
+        total = np.sqrt((std * value_gain) ** 2 + (inertia * angle * second_gain) ** 2)
+        # the impulse at node 0 depends on the motion before the recording, that at the last node on the motion after it
+        inner = slice(1, grid.steps)
+        deviation = np.broadcast_to(total, measured.shape)[inner]
+        return make_samples(
+            EffortSensor(names), grid.times[inner], measured[inner], deviation, grid, f"{recording.name}: joints.effort"
+        )
+
+    def _apparent_inertia(self, names: tuple[str, ...]) -> Array:
+        e = self.step.equations
+        sizes = self.step.sizes
+        n, zero = sizes["n"], np.zeros
+        state = [zero(n), zero(n), zero(n), zero(sizes["nz"]), zero(sizes["nz"]), zero(sizes["m"]), zero(sizes["nu"])]
+        pairs = np.array(self.step.functions.linear(*state, self.theta, self.step.time_step)[0]).ravel()
+        plus, _, lower, upper = (pairs[6 * n * i : 6 * n * (i + 1)].reshape(6, n) for i in range(4))
+        h = self.step.time_step
+        mass = np.sum(plus * (upper - lower), axis=0) * h / 2
+        del e
+        return mass[[self.system.mechanism.joint_index(name) for name in names]]
+
+    # -- evaluation ---------------------------------------------------------------------------------------------------
+
+    def statics(self) -> Statics:
+        """The equilibrium equations of the system, built once."""
+        if self._statics is None:
+            self._statics = Statics(self.step)
+        return self._statics
+
+    def feedback(self, episode: Episode) -> Feedback | None:
+        """The tracking filter of an episode; its gains are worked out once, at the initial parameters."""
+        key = id(episode)
+        if key not in self._feedback:
+            options, system = self.options, self.system
+            result: Feedback | None = None
+            if system.driven and options.feedback == "proportional":
+                result = proportional_filter(self.step, episode.measured_arm, options.gains)
+            elif system.driven and options.feedback == "lqr":
+                smooth = Smoother(options.path_cutoff)(episode.grid.times, episode.measured_arm)
+                result = lqr_filter(self.step, smooth, episode.torque, self.theta)
+            self._feedback[key] = result
+        return self._feedback[key]
+
+    def _begin(
+        self, episode: Episode, theta: Array, deviation: Array, wanted: tuple[str, ...]
+    ) -> tuple[Array, Array, Rest | None, str]:
+        """Start state, its derivative by (wanted parameters, deviation), the equilibrium, and what went wrong."""
+        nx, n = self.step.sizes["nx"], self.system.size
+        rows = np.array(self._start_rows, int)
+        chosen = np.concatenate([rows, n + rows]) if self._start_size else np.zeros(0, int)
+        by_deviation = np.zeros((nx, len(chosen)))
+        by_deviation[chosen, np.arange(len(chosen))] = 1.0
+        key = id(episode)
+        rest: Rest | None = None
+        if self.options.initial_state == "given":
+            if key not in self._starts:
+                self._starts[key] = fit_start(
+                    self.step, episode.posture, episode.samples, theta, self.options.start_window, episode.path
+                )
+            state, by_theta = self._starts[key].copy(), np.zeros((nx, len(wanted)))
+        else:
+            guess = self._starts.get(key)
+            rest = self.statics().solve(episode.posture, theta, guess=guess, names=wanted)
+            if not rest.converged:
+                return rest.state, np.zeros((nx, len(wanted) + len(chosen))), rest, f"{episode.name}: {rest.message}"
+            self._starts[key] = rest.state[:n]
+            state, by_theta = rest.state.copy(), rest.by_theta
+        state[chosen] += deviation
+        return state, np.hstack([by_theta, by_deviation]), rest, ""
+
+    def sensor(self, sensor: Sensor, wanted: tuple[str, ...]) -> Mapped:
+        """Compiled readings of a sensor, with derivatives by the named parameters."""
+        key = (sensor, wanted)
+        if key not in self._functions:
+            function = sensor_function(self.system, sensor, wanted)
+            self._functions[key] = Mapped(function, shared=(3,), use_compiler=self.step.compiled)
+        return self._functions[key]
+
+    def run(self, episode: Episode, theta: Array, deviation: Array, derivatives: bool) -> EpisodeResult | str:
+        """Roll one episode out and predict its samples; a text says why where that is impossible."""
+        wanted = self._columns if derivatives else ()
+        state, by_start, rest, problem = self._begin(episode, theta, deviation, wanted)
+        if problem:
+            return problem
+        directions = Directions(wanted, by_start) if derivatives and by_start.shape[1] else None
+        sweep = simulate(
+            self.step,
+            theta,
+            state,
+            episode.grid.steps,
+            episode.torque,
+            episode.path,
+            self.feedback(episode),
+            directions,
+        )
+        if not sweep.status.ok:
+            return f"{episode.name}: {sweep.status.message}"
+        predicted, sensitivities = [], []
+        for samples in episode.samples:
+            values, by_all = self._predict(samples, sweep, theta, wanted, derivatives)
+            predicted.append(values)
+            sensitivities.append(by_all)
+        return EpisodeResult(sweep, rest, tuple(predicted), tuple(sensitivities) if derivatives else None)
+
+    def _efforts(self, sweep: Sweep) -> Array:
+        steps = len(sweep.multipliers)
+        effort = np.zeros((steps + 1, self.system.size))
+        effort[:-1, list(self.system.prescribed_indices)] = sweep.effort
+        effort[:-1, list(self.system.driven_indices)] = sweep.torque
+        effort[-1] = effort[-2]
+        return effort
+
+    def _predict(
+        self, samples: Samples, sweep: Sweep, theta: Array, wanted: tuple[str, ...], derivatives: bool
+    ) -> tuple[Array, Array]:
+        n, nodes = self.system.size, samples.nodes
+        q, z = sweep.state[nodes, :n], sweep.state[nodes, 2 * n :]
+        effort = self._efforts(sweep)[nodes]
+        y, by_q, by_z, by_effort, by_theta = self.sensor(samples.sensor, wanted)(q, z, effort, theta)
+        predicted = samples.interpolate(y[:, :, 0])
+        if not derivatives or sweep.by_state is None:
+            return predicted, np.zeros((*predicted.shape, 0))
+        total = by_q @ sweep.by_state[nodes, :n]
+        if z.shape[1]:
+            total += by_z @ sweep.by_state[nodes, 2 * n :]
+        fixed = list(self.system.prescribed_indices)
+        if fixed and sweep.by_effort is not None and np.any(by_effort):
+            total += by_effort[:, :, fixed] @ sweep.by_effort[np.minimum(nodes, len(sweep.effort) - 1)]
+        total[:, :, : len(wanted)] += by_theta
+        return predicted, samples.interpolate(total)
+
+    def evaluate(self, x: ArrayLike, derivatives: bool = True) -> Evaluation:
+        """Residual, cost and, where asked for, Jacobian at an unknown vector.
+
+        Parameters
+        ----------
+        x : array_like, shape (nx,)
+        derivatives : bool
+
+        Returns
+        -------
+        Evaluation
+            `ok` is False, with the reason, where an equilibrium or a rollout failed.
+        """
+        x = np.asarray(x, float)
+
+        def one(i: int) -> EpisodeResult | str:
+            return self.run(self.episodes[i], *self.split(x, i), derivatives)
+
+        count = len(self.episodes)
+        if count == 1:
+            results = [one(0)]
+        else:
+            # gains and sensor functions are built once; threads must not race to build them
+            for episode in self.episodes:
+                self.feedback(episode)
+            results = [one(0)]
+            with ThreadPoolExecutor(max_workers=2) as pool:
+                results += pool.map(one, range(1, count))
+        failures = [result for result in results if isinstance(result, str)]
+        if failures:
+            return Evaluation(np.inf, np.zeros(0), None, False, failures[0], ())
+        done = tuple(result for result in results if isinstance(result, EpisodeResult))
+        cost, residuals, jacobians = 0.0, [], []
+        for i, result in enumerate(done):
+            for k, samples in enumerate(self.episodes[i].samples):
+                difference = np.where(samples.weight > 0, result.predicted[k] - samples.value, 0.0)
+                raw = samples.weight * difference
+                part, factor = huber(raw, self.options.robust_scale)
+                cost += part
+                keep = (samples.weight > 0).ravel()
+                residuals.append((factor * raw).ravel()[keep])
+                if derivatives and result.sensitivities is not None:
+                    slope = (factor * samples.weight)[:, :, None] * result.sensitivities[k]
+                    jacobians.append(self._placed(slope.reshape(-1, slope.shape[2])[keep], i, len(x)))
+        prior_residual, prior_jacobian = self._prior(x)
+        residual = np.concatenate([*residuals, prior_residual])
+        cost += 0.5 * float(prior_residual @ prior_residual)
+        jacobian = np.vstack([*jacobians, prior_jacobian]) if derivatives else None
+        if not np.isfinite(cost):
+            return Evaluation(np.inf, residual, None, False, "the cost is not finite", done)
+        return Evaluation(cost, residual, jacobian, True, "", done)
+
+    def _placed(self, block: Array, episode: int, width: int) -> Array:
+        """Columns of one episode's directions moved to their places in the unknown vector."""
+        wide = np.zeros((len(block), width))
+        shared, own = len(self.shared), len(self.local) + self._start_size
+        wide[:, :shared] = block[:, :shared]
+        at = shared + episode * own
+        wide[:, at : at + own] = block[:, shared:]
+        return wide
+
+    def _prior(self, x: Array) -> tuple[Array, Array]:
+        names, start = self.names, self.start
+        rows, values = [], []
+        for i, name in enumerate(names):
+            base = name.split("[")[0]
+            std: float | None = self.options.priors.get(base)
+            if base.startswith("start.q."):
+                std = self.options.configuration_std
+            elif base.startswith("start.p."):
+                joint = base.removeprefix("start.p.")
+                inertia = float(self._apparent_inertia((joint,))[0])
+                std = self.options.velocity_std * max(inertia, 1e-9)
+            if std is not None:
+                row = np.zeros(len(x))
+                row[i] = 1.0 / std
+                rows.append(row)
+                values.append((x[i] - start[i]) / std)
+        return np.array(values), np.array(rows).reshape(len(rows), len(x))
+
+    def gradient(self, x: ArrayLike) -> tuple[float, Array, Evaluation]:
+        """Cost and its gradient by the adjoint sweep.
+
+        Returns
+        -------
+        cost : float
+        gradient : ndarray, shape (nx,)
+        evaluation : Evaluation
+            Without a Jacobian.
+        """
+        x = np.asarray(x, float)
+        evaluation = self.evaluate(x, derivatives=False)
+        gradient = np.zeros(len(x))
+        if not evaluation.ok:
+            return evaluation.cost, gradient, evaluation
+        n, nx = self.system.size, self.step.sizes["nx"]
+        wanted = self._columns
+        for i, result in enumerate(evaluation.episodes):
+            episode = self.episodes[i]
+            theta, deviation = self.split(x, i)
+            sweep = result.sweep
+            by_state, by_effort = np.zeros((episode.grid.steps + 1, nx)), np.zeros_like(sweep.effort)
+            total = np.zeros(len(wanted))
+            for k, samples in enumerate(episode.samples):
+                raw = samples.weight * np.where(samples.weight > 0, result.predicted[k] - samples.value, 0.0)
+                _, factor = huber(raw, self.options.robust_scale)
+                at_nodes = samples.distribute(factor**2 * raw * samples.weight)
+                nodes = samples.nodes
+                q, z = sweep.state[nodes, :n], sweep.state[nodes, 2 * n :]
+                efforts = self._efforts(sweep)[nodes]
+                _, by_q, by_z, by_e, by_theta = self.sensor(samples.sensor, wanted)(q, z, efforts, theta)
+                by_state[nodes, :n] += np.einsum("mk,mkq->mq", at_nodes, by_q)
+                by_state[nodes, 2 * n :] += np.einsum("mk,mkq->mq", at_nodes, by_z)
+                total += np.einsum("mk,mkq->q", at_nodes, by_theta)
+                fixed = list(self.system.prescribed_indices)
+                if fixed:
+                    last = np.minimum(nodes, len(sweep.effort) - 1)
+                    np.add.at(by_effort, last, np.einsum("mk,mkq->mq", at_nodes, by_e[:, :, fixed]))
+            swept = adjoint_gradient(
+                self.step, theta, sweep, wanted, by_state, None, by_effort, self.feedback(episode)
+            )
+            _, by_start, _, _ = self._begin(episode, theta, deviation, wanted)
+            own = np.concatenate([total + swept.by_theta, np.zeros(self._start_size)]) + swept.by_start @ by_start
+            gradient += self._placed(own[None, :], i, len(x))[0]
+        prior_residual, prior_jacobian = self._prior(x)
+        return evaluation.cost, gradient + prior_jacobian.T @ prior_residual, evaluation
+
+    # -- reports ------------------------------------------------------------------------------------------------------
+
+    def channel_errors(self, results: Sequence[EpisodeResult], episodes: Sequence[Episode]) -> dict[str, dict[str, float]]:
+        """Root mean square error of every channel: {channel: {rmse, unit, n}}.
+
+        For points the error of a sample is the Euclidean distance.
+        """
+        squares: dict[str, list[float]] = {}
+        units: dict[str, str] = {}
+        for result, episode in zip(results, episodes, strict=True):
+            for predicted, samples in zip(result.predicted, episode.samples, strict=True):
+                width = samples.sensor.width
+                difference = (predicted - samples.value).reshape(len(predicted), -1, width)
+                for c, channel in enumerate(samples.sensor.channels):
+                    square = np.sum(difference[:, c] ** 2, axis=1)
+                    squares.setdefault(channel, []).extend(square[np.isfinite(square)].tolist())
+                    units[channel] = samples.sensor.unit
+        return {
+            channel: {"rmse": float(np.sqrt(np.mean(values))), "unit": units[channel], "n": len(values)}  # type: ignore[dict-item]
+            for channel, values in squares.items()
+            if values
+        }
+
+    def validate(self, x: ArrayLike) -> list[tuple[Episode, EpisodeResult | str]]:
+        """Predict the held-out recordings with the shared parameters of `x`; local ones stay at their initial value."""
+        theta, _ = self.split(x, 0)
+        for name in self.local:
+            theta[self.system.parameters.index(name)] = self.theta[self.system.parameters.index(name)]
+        none = np.zeros(self._start_size)
+        return [(episode, self.run(episode, theta, none, derivatives=False)) for episode in self.held_out]
+
+    def with_free(self, free: Sequence[str], values: Mapping[str, float] | None = None) -> EstimationProblem:
+        """The same problem with other free parameters; recordings, step and options are shared."""
+        merged = dict(zip(self.system.parameters.names, self.theta, strict=True)) | dict(values or {})
+        keep = set(free)
+        options = replace(
+            self.options,
+            local=tuple(name for name in self.options.local if name in keep),
+            priors={name: std for name, std in self.options.priors.items() if name in keep},
+        )
+        return EstimationProblem(
+            self.step,
+            [episode.recording for episode in self.episodes],
+            free,
+            options,
+            merged,
+            [episode.recording for episode in self.held_out],
+        )
+
+    def _check_bounds(self) -> None:
+        for name in self.free:
+            entry = self.system.parameters[name]
+            value = self.theta[self.system.parameters.index(name)]
+            if not entry.lower <= value <= entry.upper:
+                raise ConfigError(
+                    f"initial value {value:g} {entry.unit} of {name} lies outside its bounds",
+                    where=f"parameters.{name}",
+                    allowed=f"{entry.lower:g} to {entry.upper:g} {entry.unit}",
+                )
+            if not entry.lower < entry.upper:
+                raise ConfigError(
+                    f"the bounds of {name} leave no room",
+                    where=f"parameters.{name}",
+                    allowed="lower below upper",
+                    hint="fix the parameter instead of closing its bounds",
+                )
+
+

@@ -1,0 +1,167 @@
+"""Measured samples beside their prediction: interpolation between nodes, weights, whitening, robust loss."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.data.recording import PointGroup, Recording
+from yid_ocp.errors import DataError, nearest
+from yid_ocp.problem.inputs import Grid
+from yid_ocp.sensors import Sensor
+
+Array = NDArray[np.float64]
+Weighting = Literal["whitened", "paper"]
+
+
+@dataclass(frozen=True)
+class Samples:
+    """What one sensor measured, placed on the nodes of a rollout.
+
+    Attributes
+    ----------
+    sensor : Sensor
+    node : ndarray of int, shape (M,)
+        Node before each sample.
+    fraction : ndarray, shape (M,)
+        Fraction of a step beyond it; predictions are interpolated linearly between the two nodes.
+    value : ndarray, shape (M, k)
+        Measured outputs, NaN where there is none.
+    weight : ndarray, shape (M, k)
+        Factor that turns a difference into a residual, zero where there is no measurement.
+    std : ndarray, shape (M, k)
+        Noise deviation, in the sensor's unit; NaN where it is not known.
+    """
+
+    sensor: Sensor
+    node: NDArray[np.int64]
+    fraction: Array
+    value: Array
+    weight: Array
+    std: Array
+
+    @property
+    def channel_of_column(self) -> tuple[str, ...]:
+        """Channel of each of the k outputs."""
+        return tuple(channel for channel in self.sensor.channels for _ in range(self.sensor.width))
+
+    @property
+    def nodes(self) -> NDArray[np.int64]:
+        """Nodes at which the sensor's function must be evaluated, sorted."""
+        after = self.node[self.fraction > 0] + 1
+        return np.unique(np.concatenate([self.node, after]))
+
+    def interpolate(self, at_nodes: Array) -> Array:
+        """Values at the samples from values at `nodes`, shape (len(nodes), ...) to (M, ...)."""
+        nodes = self.nodes
+        before = at_nodes[np.searchsorted(nodes, self.node)]
+        after = at_nodes[np.minimum(np.searchsorted(nodes, self.node + 1), len(nodes) - 1)]
+        fraction = self.fraction.reshape(-1, *([1] * (at_nodes.ndim - 1)))
+        return np.where(fraction > 0, (1 - fraction) * before + fraction * after, before)
+
+    def distribute(self, at_samples: Array) -> Array:
+        """Transpose of `interpolate`, shape (M, ...) to (len(nodes), ...)."""
+        nodes = self.nodes
+        result = np.zeros((len(nodes), *at_samples.shape[1:]))
+        fraction = self.fraction.reshape(-1, *([1] * (at_samples.ndim - 1)))
+        np.add.at(result, np.searchsorted(nodes, self.node), (1 - fraction) * at_samples)
+        between = self.fraction > 0
+        np.add.at(result, np.searchsorted(nodes, self.node[between] + 1), (fraction * at_samples)[between])
+        return result
+
+
+def point_samples(
+    recording: Recording, group: PointGroup, sensor: Sensor, points: tuple[str, ...], grid: Grid, std: float | None
+) -> Samples:
+    """Samples of a group of points.
+
+    Parameters
+    ----------
+    recording : Recording
+    group : PointGroup
+    sensor : Sensor
+    points : tuple of str
+        Points of the group, in the sensor's order.
+    grid : Grid
+    std : float, optional
+        Noise deviation to use instead of the recorded one [m].
+
+    Raises
+    ------
+    DataError
+        A point that is not in the group, or no noise level.
+    """
+    for point in points:
+        if point not in group.names:
+            raise DataError(
+                f"point '{point}' is not in group '{group.name}'",
+                where=recording.name,
+                hint=nearest(point, group.names),
+            )
+    columns = [group.names.index(point) for point in points]
+    inside = (group.t >= grid.start - 1e-9) & (group.t <= grid.times[-1] + 1e-9)
+    value = group.position[inside][:, columns].reshape(int(inside.sum()), -1)
+    if std is not None:
+        deviation = np.full(value.shape, float(std))
+    elif group.std is not None:
+        deviation = group.std[inside][:, columns].reshape(value.shape)
+    else:
+        raise DataError(
+            f"the noise level of group '{group.name}' is neither recorded nor given",
+            where=recording.name,
+            hint=f"set sensors.{group.name}.std [m]",
+        )
+    return make_samples(sensor, group.t[inside], value, deviation, grid, f"{recording.name}: {group.name}")
+
+
+def make_samples(sensor: Sensor, t: Array, value: Array, std: Array, grid: Grid, where: str) -> Samples:
+    """Whitened samples; `DataError` where a noise level is not positive."""
+    seen = np.isfinite(value)
+    if np.any(seen & ~(std > 0)):
+        raise DataError(
+            "a noise level is zero or missing", where=where, allowed="a positive deviation", hint="set it under `sensors`"
+        )
+    weight = np.where(seen, 1.0 / np.where(std > 0, std, 1.0), 0.0)
+    node, fraction = grid.locate(t)
+    return Samples(sensor, node, fraction, value, weight, np.where(seen, std, np.nan))
+
+
+def paper_weighting(samples: Samples, grid: Grid) -> Samples:
+    """The source paper's cost: sigma_k = 1 at the node nearest to a measurement, none at k = 0, the end counted twice.
+
+    J = sum_{k=1..N} 1/2 sigma_k |w_k - wbar_k|^2 + 1/2 |w_N - wbar_N|^2 for measured points [m^2].
+    """
+    nearest_node = samples.node + (samples.fraction >= 0.5)
+    weight = np.where(np.isfinite(samples.value), 1.0, 0.0)
+    weight[nearest_node == 0] = 0.0
+    weight[nearest_node == grid.steps] *= np.sqrt(2.0)
+    return Samples(
+        samples.sensor, nearest_node, np.zeros(len(nearest_node)), samples.value, weight, samples.std
+    )
+
+
+def huber(residual: Array, scale: float) -> tuple[float, Array]:
+    """Huber's loss of whitened residuals and the factor that makes it a weighted sum of squares.
+
+    Parameters
+    ----------
+    residual : ndarray, shape (nr,)
+    scale : float
+        Residual beyond which the loss grows linearly [standard deviations]; infinite for plain squares.
+
+    Returns
+    -------
+    cost : float
+        sum of rho(r)
+    factor : ndarray, shape (nr,)
+        Square root of rho'(r)/r.
+    """
+    size = np.abs(residual)
+    inside = size <= scale
+    with np.errstate(invalid="ignore"):
+        cost = np.where(inside, 0.5 * residual**2, scale * (size - 0.5 * scale) if np.isfinite(scale) else 0.0)
+    factor = np.where(inside, 1.0, np.sqrt(scale / np.maximum(size, 1e-300)))
+    return float(np.sum(cost)), factor

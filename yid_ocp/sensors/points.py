@@ -1,0 +1,47 @@
+"""Sensors that see points: a camera, motion capture, or the arm that holds the point."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+
+from yid_ocp.model.system import NodeState
+
+
+@dataclass(frozen=True)
+class PointSensor:
+    """Positions of named frames in the world.
+
+    Attributes
+    ----------
+    group : str
+        The recording's group, `points_camera` for example.
+    points : tuple of str
+        Names in the recording.
+    frames : tuple of str
+        Frames of the mechanism that they mark.
+    """
+
+    group: str
+    points: tuple[str, ...]
+    frames: tuple[str, ...]
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """`group.point` for every point."""
+        return tuple(f"{self.group}.{point}" for point in self.points)
+
+    @property
+    def unit(self) -> str:
+        """Metres."""
+        return "m"
+
+    @property
+    def width(self) -> int:
+        """Three coordinates."""
+        return 3
+
+    def output(self, state: NodeState) -> ca.SX:
+        """Positions one below the other, shape (3 np, 1) [m]."""
+        return ca.vertcat(*(state.kinematics.position(frame) for frame in self.frames))
