@@ -273,8 +273,7 @@ def read_bag(
 
 for _suffix in (".h5", ".hdf5"):
     READERS.register(_suffix)(read_recording)
-for _suffix in (".csv", ".txt"):
-    READERS.register(_suffix)(read_csv)
+READERS.register(".csv")(read_csv)
 for _suffix in (".bag", ".mcap", ".db3", "folder"):
     READERS.register(_suffix)(read_bag)
 

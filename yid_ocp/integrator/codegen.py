@@ -287,7 +287,7 @@ def _runs(entries: Indices, gap: int) -> list[tuple[int, int]]:
 
 @functools.cache
 def compiler() -> str | None:
-    """Path of the C compiler, or None with one notice; the environment variable CC chooses one, `CC=none` means none."""
+    """Path of the C compiler, or None with one notice; the variable CC chooses one, `CC=none` means none."""
     wanted = os.environ.get("CC")
     names = () if wanted == "none" else (wanted, "cc", "gcc", "clang")
     path = next((found for name in names if name and (found := shutil.which(name))), None)
@@ -349,7 +349,9 @@ def compile_library(source: str) -> ctypes.CDLL | None:
     path = compiler()
     if path is None:
         return None
-    key = hashlib.sha256("\0".join([source, *FLAGS, *NATIVE, _machine(), ca.CasadiMeta.version()]).encode()).hexdigest()[:32]
+    key = hashlib.sha256(
+        "\0".join([source, *FLAGS, *NATIVE, _machine(), ca.CasadiMeta.version()]).encode()
+    ).hexdigest()[:32]
     target = cache_folder() / f"{key}.so"
     if not target.exists():
         with tempfile.TemporaryDirectory(dir=target.parent) as work:

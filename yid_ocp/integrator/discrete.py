@@ -231,7 +231,7 @@ def discrete_equations(system: System, force_split: ForceSplit = "symmetric") ->
 
 
 def _constraint_derivatives(system: System, kinematics: Kinematics, q: ca.SX, lam: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Dphi(q) and d(Dphi(q)' lam)/dq; point grasps in closed form, where d2x/dq_i dq_j = w_i x dx/dq_j for i above j."""
+    """Dphi(q) and d(Dphi(q)' lam)/dq; point grasps in closed form: d2x/dq_i dq_j = w_i x dx/dq_j for i above j."""
     n = system.size
     blocks, hessian, row = [ca.SX(0, n)], ca.SX(n, n), 0
     for grasp in system.grasps:

@@ -37,7 +37,7 @@ class StepCode(IntEnum):
 
 MESSAGES = {
     StepCode.OK: "converged",
-    StepCode.NOT_CONVERGED: "Newton did not converge; try a smaller time step, more damping, or a start that fits the grasp",
+    StepCode.NOT_CONVERGED: "Newton did not converge; try a smaller time step, more damping, or a fitting start",
     StepCode.SINGULAR: "the step's equations are singular; look for redundant grasps or a coordinate without inertia",
     StepCode.NOT_FINITE: "the state is no longer finite; the motion is unstable open loop: add feedback or damping",
 }
@@ -183,7 +183,13 @@ class Kernel(Protocol):
     """What the compiled and the interpreted implementation of the sweeps have in common."""
 
     def sweep(
-        self, theta: Array, start: Array, torque: Array, path: Array, feedback: Feedback | None, wanted: Directions | None
+        self,
+        theta: Array,
+        start: Array,
+        torque: Array,
+        path: Array,
+        feedback: Feedback | None,
+        wanted: Directions | None,
     ) -> Sweep:
         """Roll out over len(torque) steps from the state `start`."""
         ...
@@ -224,7 +230,9 @@ class Step:
         self.equations: DiscreteEquations = discrete_equations(system, force_split)
         self.functions = codegen.step_functions(self.equations)
         self.structure = codegen.structure(self.functions)
-        library = codegen.compile_library(codegen.kernel_source(self.functions, self.structure)) if use_compiler else None
+        library = (
+            codegen.compile_library(codegen.kernel_source(self.functions, self.structure)) if use_compiler else None
+        )
         self.compiled = library is not None
         self.kernel: Kernel = InterpretedKernel(self) if library is None else CompiledKernel(self, library)
 
@@ -325,9 +333,7 @@ class Step:
     ) -> Sweep:
         sizes = self.sizes
         z0 = np.zeros(sizes["nz"]) if internal is None else check_shape("internal", internal, (sizes["nz"],))
-        start = np.concatenate(
-            [check_shape("q0", q0, (sizes["n"],)), check_shape("p0", p0, (sizes["n"],)), z0]
-        )
+        start = np.concatenate([check_shape("q0", q0, (sizes["n"],)), check_shape("p0", p0, (sizes["n"],)), z0])
         if prescribed is None:
             if sizes["nc"]:
                 raise ModelError(
@@ -467,7 +473,13 @@ class CompiledKernel:
         return struct, [values, w, iw]
 
     def sweep(
-        self, theta: Array, start: Array, torque: Array, path: Array, feedback: Feedback | None, wanted: Directions | None
+        self,
+        theta: Array,
+        start: Array,
+        torque: Array,
+        path: Array,
+        feedback: Feedback | None,
+        wanted: Directions | None,
     ) -> Sweep:
         """See `Kernel.sweep`."""
         sizes = self._step.sizes
@@ -626,7 +638,10 @@ class InterpretedKernel:
         plus, minus, lower, upper = (pairs[6 * n * i : 6 * n * (i + 1)].reshape(6, n) for i in range(4))
         turn, moment = pairs[24 * n : 27 * n].reshape(3, n), pairs[27 * n :].reshape(3, n)
         weight = moment.T @ turn
-        low, up = np.where(self._mask, lower.T @ plus + weight, 0.0), np.where(self._mask, weight - upper.T @ minus, 0.0)
+        low, up = (
+            np.where(self._mask, lower.T @ plus + weight, 0.0),
+            np.where(self._mask, weight - upper.T @ minus, 0.0),
+        )
         here = np.where(self._mask, weight - lower.T @ minus, 0.0)
         there = np.where(self._mask, weight + upper.T @ plus, 0.0)
         strict = np.tril(np.ones((n, n)), -1)
@@ -696,7 +711,9 @@ class InterpretedKernel:
                 q1[self._free] += factor * delta[: len(self._free)]
                 z1 += factor * delta[len(self._free) : count]
                 lam += factor * delta[count:]
-                trial = scipy.linalg.lu_solve(factors, self._rows(arguments, phi, scale)[0][self._unknown], check_finite=False)
+                trial = scipy.linalg.lu_solve(
+                    factors, self._rows(arguments, phi, scale)[0][self._unknown], check_finite=False
+                )
                 if np.max(np.abs(trial[:count]), initial=0.0) <= (1 - 0.25 * factor) * error:
                     break
                 if factor < 1e-4:
@@ -706,11 +723,17 @@ class InterpretedKernel:
         return StepCode.NOT_CONVERGED, error, np.full(n, np.nan), ITERATION_LIMIT
 
     def sweep(
-        self, theta: Array, start: Array, torque: Array, path: Array, feedback: Feedback | None, wanted: Directions | None
+        self,
+        theta: Array,
+        start: Array,
+        torque: Array,
+        path: Array,
+        feedback: Feedback | None,
+        wanted: Directions | None,
     ) -> Sweep:
         """See `Kernel.sweep`."""
         s = self._step.sizes
-        n, nz, m, nx = s["n"], s["nz"], s["m"], s["nx"]
+        n, m, nx = s["n"], s["m"], s["nx"]
         steps, d = len(torque), 0 if wanted is None else wanted.count
         scale, h = self._scales(theta)
         state = np.full((steps + 1, nx), np.nan)
@@ -731,7 +754,17 @@ class InterpretedKernel:
             guess = x if k == 0 else 2 * x - state[k - 1] if k == 1 else 3 * (x - state[k - 1]) + state[k - 2]
             q1, z1, lam = guess[:n].copy(), guess[2 * n :].copy(), lam.copy()
             q1[self._fixed] = path[k + 1]
-            arguments: list[Array | float] = [x[:n], q1, x[n : 2 * n], x[2 * n :], z1, lam, u, theta, self._step.time_step]
+            arguments: list[Array | float] = [
+                x[:n],
+                q1,
+                x[n : 2 * n],
+                x[2 * n :],
+                z1,
+                lam,
+                u,
+                theta,
+                self._step.time_step,
+            ]
             phi = self._matrix(arguments)
             code, error, p1, spent = self._newton(arguments, phi, scale)
             if code != StepCode.OK:
@@ -817,7 +850,7 @@ class InterpretedKernel:
     ) -> Gradient:
         """See `Kernel.adjoint`."""
         s = self._step.sizes
-        n, nz, nt = s["n"], s["nz"], s["n"] + s["nz"] + s["m"]
+        n, nt = s["n"], s["n"] + s["nz"] + s["m"]
         scale, h = self._scales(theta)
         steps = len(swept.multipliers)
         gradient, by_torque = np.zeros(len(names)), np.zeros((steps, s["nu"]))

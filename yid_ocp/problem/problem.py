@@ -438,7 +438,8 @@ class EstimationProblem:
             state, by_theta = self._starts[key].copy(), np.zeros((nx, len(wanted)))
         else:
             guess = self._starts.get(key)
-            rest = self.statics().solve(episode.posture, theta, guess=guess, names=wanted)
+            first = episode.torque[0] if self.system.driven else None
+            rest = self.statics().solve(episode.posture, theta, first, guess, wanted)
             if not rest.converged:
                 return rest.state, np.zeros((nx, len(wanted) + len(chosen))), rest, f"{episode.name}: {rest.message}"
             self._starts[key] = rest.state[:n]

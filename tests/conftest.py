@@ -1,0 +1,152 @@
+"""Shared fixtures: the paper's two systems with their compiled steps, the golden trajectories, small mechanisms."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from types import SimpleNamespace
+
+import casadi as ca
+import hypothesis
+import numpy as np
+import pytest
+
+from yid_ocp.integrator.step import compile_step
+from yid_ocp.model import Grasp, Mechanism, System, flexible_object
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+SIDES = {"single": ("left",), "dual": ("left", "right")}
+BAXTER_JOINTS = ("s0", "s1", "e0", "e1", "w0", "w1", "w2")
+STIFFNESSES = ("T1.bend", "T1.twist", "T2.bend", "T2.twist", "T3.bend", "T3.twist")
+
+hypothesis.settings.register_profile("tests", deadline=None, max_examples=20, derandomize=True)
+hypothesis.settings.load_profile("tests")
+
+
+def pytest_configure(config):
+    """Keep compiled code between runs, apart from the user's own, unless a place was chosen."""
+    if "YID_OCP_CACHE" not in os.environ:
+        folder = config.cache.mkdir("compiled")
+        folder.chmod(0o700)
+        os.environ["YID_OCP_CACHE"] = str(folder)
+
+
+@pytest.fixture(scope="session")
+def repository() -> Path:
+    return REPOSITORY
+
+
+@pytest.fixture(scope="session")
+def urdf_folder(repository) -> Path:
+    return repository / "models" / "urdf"
+
+
+@pytest.fixture(scope="session")
+def shared(repository) -> Path:
+    """The folder of reference data that stands beside the repository."""
+    folder = repository.parent / "shared"
+    if not (folder / "golden").is_dir():
+        pytest.skip(f"the reference data is not there: {folder}")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def golden(shared):
+    """Trajectory arrays (`.q`, `.p`, ...) and the model numbers (`.model`) of `single` or `dual`."""
+
+    def load(name: str) -> SimpleNamespace:
+        with np.load(shared / "golden" / f"trep_{name}_arm.npz") as arrays:
+            entries = {key: arrays[key] for key in arrays.files}
+        text = (shared / "golden" / f"trep_{name}_arm.model.json").read_text(encoding="utf-8")
+        return SimpleNamespace(**entries, model=json.loads(text))
+
+    loaded = {name: load(name) for name in SIDES}
+    return loaded.__getitem__
+
+
+@pytest.fixture(scope="session")
+def paper_systems():
+    """Baxter with one (`single`) or two (`dual`) arms on the foam Y."""
+
+    def build(sides: tuple[str, ...]) -> System:
+        names = [f"{side}_{joint}" for side in sides for joint in BAXTER_JOINTS]
+        robot = Mechanism.from_urdf("package:baxter", joints=names)
+        held = dict(zip(("left", "right"), ("w_T2", "w_T3"), strict=True))
+        grasps = [Grasp(side, f"{side}_gripper", held[side]) for side in sides]
+        objects = [(flexible_object(), None, None)]
+        return System.build(robot, objects=objects, grasps=grasps, driven=names, damping=0.05)
+
+    return {name: build(sides) for name, sides in SIDES.items()}
+
+
+@pytest.fixture(scope="session")
+def single_arm(paper_systems) -> System:
+    return paper_systems["single"]
+
+
+@pytest.fixture(scope="session")
+def dual_arm(paper_systems) -> System:
+    return paper_systems["dual"]
+
+
+@pytest.fixture(scope="session")
+def single_step(single_arm):
+    return compile_step(single_arm, 0.01, "left")
+
+
+@pytest.fixture(scope="session")
+def dual_step(dual_arm):
+    return compile_step(dual_arm, 0.01, "left")
+
+
+@pytest.fixture(scope="session")
+def theta_golden(golden, paper_systems):
+    """Parameters of the golden trajectories: theta_golden("single")."""
+
+    def theta(name: str) -> np.ndarray:
+        return paper_systems[name].parameters.vector(dict(zip(STIFFNESSES, golden(name).rho, strict=True)))
+
+    return theta
+
+
+@pytest.fixture(scope="session")
+def roll():
+    """roll(step, theta, q0, p0, steps, ...): a rollout from a state, with torque and path zero or held by default."""
+
+    def rollout(step, theta, q0, p0, steps, torque=None, path=None, z0=None, feedback=None, directions=None):
+        sizes = step.sizes
+        start = np.concatenate([q0, p0, np.zeros(sizes["nz"]) if z0 is None else z0])
+        torque = np.zeros((steps, sizes["nu"])) if torque is None else torque
+        fixed = list(step.system.prescribed_indices)
+        path = np.tile(start[fixed], (steps + 1, 1)) if path is None else path
+        start[fixed] = path[0]
+        return step.kernel.sweep(np.asarray(theta, float), start, torque, path, feedback, directions)
+
+    return rollout
+
+
+@pytest.fixture(scope="session")
+def momentum():
+    """momentum(step, q, v, theta): dL/dv of the bodies."""
+
+    def evaluate(step, q, v, theta):
+        e = step.equations
+        function = ca.Function("momentum", [e.q0, e.q1, e.theta, e.time_step], [e.rigid.by_v])
+        half = 0.5 * step.time_step * np.asarray(v, float)
+        return np.array(function(np.asarray(q) - half, np.asarray(q) + half, theta, step.time_step)).ravel()
+
+    return evaluate
+
+
+@pytest.fixture(scope="session")
+def violation():
+    """violation(step, q, theta): phi(q) of the grasps."""
+
+    def evaluate(step, q, theta):
+        e = step.equations
+        old, zero = [e.z1, e.lam], [np.zeros(e.z1.shape), np.zeros(e.lam.shape)]
+        phi = ca.substitute([e.constraint], old, [ca.SX(ca.DM(x)) for x in zero])[0]
+        return np.array(ca.Function("phi", [e.q1, e.theta, e.time_step], [phi])(q, theta, step.time_step)).ravel()
+
+    return evaluate

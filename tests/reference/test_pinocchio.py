@@ -1,0 +1,172 @@
+"""Kinematics, mass matrix, gravity and inverse dynamics against Pinocchio, joints and frames matched by name."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from yid_ocp.model import Mechanism, flexible_object, forward_kinematics
+from yid_ocp.model.kinematics import mass_matrix, rigid_body, second_derivatives
+from yid_ocp.model.mechanism import robot_description_file
+
+pin = pytest.importorskip("pinocchio", reason="the reference needs Pinocchio: pip install pin")
+
+GRAVITY = np.array([0.4, -0.3, -9.81])
+TOLERANCE = 1e-10
+ARMS = [f"{side}_{joint}" for side in ("left", "right") for joint in ("s0", "s1", "e0", "e1", "w0", "w1", "w2")]
+LOCKED = {"nod": 0.7, "slide": -0.15}
+
+# name: (file, joints kept, values of locked joints)
+ROBOTS = {
+    "baxter": ("package:baxter", ARMS, {"head_pan": 0.4}),
+    "panda": ("package:panda", None, {}),
+    "ur5": ("package:ur5", None, {}),
+    "y_object": ("y_object.urdf", None, {}),
+    "y_generated": (None, None, {}),
+    "mixed_joints": ("mixed_joints.urdf", None, {}),
+    "mixed_joints_locked": ("mixed_joints.urdf", ["extend", "hinge", "spin", "swing"], LOCKED),
+}
+
+
+@dataclass(frozen=True)
+class Twin:
+    """The same mechanism here and in Pinocchio."""
+
+    mechanism: Mechanism
+    model: object
+
+    def functions(self):
+        n = len(self.mechanism.joints)
+        q, v, a = (ca.SX.sym(name, n) for name in "qva")
+        kinematics = forward_kinematics(self.mechanism, q)
+        rigid = rigid_body(kinematics, v, ca.SX(ca.DM(GRAVITY)))
+        by_qv = second_derivatives(rigid, self.mechanism)[1]
+        M = mass_matrix(rigid, self.mechanism)
+        effort = M @ a + by_qv.T @ v - rigid.by_q
+        frames = list(self.mechanism.frames)
+        poses = [kinematics.pose(name).matrix() for name in frames]
+        jacobians = [
+            ca.vertcat(kinematics.point_jacobian(name), kinematics.angular_jacobian(name)) for name in frames
+        ]
+        dynamics = ca.Function("dynamics", [q, v, a], [M, rigid.by_q, effort, rigid.kinetic, rigid.potential])
+        return frames, ca.Function("poses", [q], poses), ca.Function("jacobians", [q], jacobians), dynamics
+
+    @property
+    def columns(self) -> list[int]:
+        """Velocity index in Pinocchio of each of our coordinates."""
+        return [self.model.joints[self.model.getJointId(name)].idx_v for name in self.mechanism.joint_names]
+
+    def configuration(self, q) -> np.ndarray:
+        """Pinocchio's q, in which a continuous joint is a cosine and a sine."""
+        result = pin.neutral(self.model)
+        for name, value in zip(self.mechanism.joint_names, q, strict=True):
+            joint = self.model.joints[self.model.getJointId(name)]
+            result[joint.idx_q : joint.idx_q + joint.nq] = [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
+        return result
+
+    def tangent(self, v) -> np.ndarray:
+        result = np.zeros(self.model.nv)
+        result[self.columns] = v
+        return result
+
+
+@pytest.fixture(scope="module", params=list(ROBOTS))
+def twin(request, urdf_folder):
+    file, joints, locked = ROBOTS[request.param]
+    if file is None or file == "y_object.urdf":
+        path = urdf_folder / "y_object.urdf"
+    elif file.startswith("package:"):
+        path = robot_description_file(file.removeprefix("package:"))
+    else:
+        path = urdf_folder / file
+    if file is None:
+        mechanism = flexible_object().mechanism.numeric()
+    else:
+        mechanism = Mechanism.from_urdf(path, joints=joints, locked=locked).numeric()
+    full = pin.buildModelFromUrdf(str(path))
+    full.gravity.linear = GRAVITY
+    if joints is None:
+        return Twin(mechanism, full)
+    whole = Twin(Mechanism.from_urdf(path).numeric(), full)
+    values = [locked.get(name, 0.0) for name in whole.mechanism.joint_names]
+    out = [i for i in range(1, full.njoints) if full.names[i] not in joints]
+    return Twin(mechanism, pin.buildReducedModel(full, out, whole.configuration(values)))
+
+
+def states(twin, count, seed):
+    rng = np.random.default_rng(seed)
+    n = len(twin.mechanism.joints)
+    for _ in range(count):
+        yield rng.uniform(-1.5, 1.5, n), rng.normal(size=n), rng.normal(size=n)
+
+
+def close(actual, expected, scale=1.0):
+    assert np.max(np.abs(actual - expected), initial=0.0) <= TOLERANCE * max(1.0, scale)
+
+
+def test_the_same_coordinates(twin):
+    assert sorted(twin.mechanism.joint_names) == sorted(twin.model.names[1:])
+    assert sorted(twin.columns) == list(range(twin.model.nv))
+
+
+def test_frames_and_their_jacobians(twin):
+    frames, poses, jacobians, _ = twin.functions()
+    data = twin.model.createData()
+    for q, _, _ in states(twin, 3, seed=1):
+        at = twin.configuration(q)
+        pin.computeJointJacobians(twin.model, data, at)
+        pin.updateFramePlacements(twin.model, data)
+        for name, pose, jacobian in zip(frames, poses.call([q]), jacobians.call([q]), strict=True):
+            assert twin.model.existFrame(name) or name == "object_root"
+            if not twin.model.existFrame(name):
+                continue
+            index = twin.model.getFrameId(name)
+            close(np.array(pose), data.oMf[index].homogeneous)
+            reference = pin.getFrameJacobian(twin.model, data, index, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
+            close(np.array(ca.densify(jacobian)), reference[:, twin.columns])
+
+
+def test_mass_matrix_gravity_and_inverse_dynamics(twin):
+    _, _, _, dynamics = twin.functions()
+    data = twin.model.createData()
+    order = np.ix_(twin.columns, twin.columns)
+    for q, v, a in states(twin, 5, seed=2):
+        at, speed, acceleration = twin.configuration(q), twin.tangent(v), twin.tangent(a)
+        M, _, effort, kinetic, potential = (np.array(ca.densify(x)).squeeze() for x in dynamics.call([q, v, a]))
+        at_rest = np.array(dynamics.call([q, 0 * v, a])[1]).ravel()
+        upper = np.triu(pin.crba(twin.model, data, at))
+        reference = upper + np.triu(upper, 1).T
+        close(M, reference[order], np.max(np.abs(reference)))
+        weight = pin.computeGeneralizedGravity(twin.model, data, at)[twin.columns]
+        close(-at_rest, weight, np.max(np.abs(weight)))
+        needed = pin.rnea(twin.model, data, at, speed, acceleration)[twin.columns]
+        close(effort, needed, np.max(np.abs(needed)))
+        energy = pin.computeKineticEnergy(twin.model, data, at, speed)
+        close(kinetic, energy, abs(energy))
+        height = pin.computePotentialEnergy(twin.model, data, at)
+        close(potential, height, abs(height))
+
+
+def test_generated_object_has_the_frames_of_its_urdf(urdf_folder):
+    model = pin.buildModelFromUrdf(str(urdf_folder / "y_object.urdf"))
+    assert all(model.existFrame(name) for name in flexible_object().mechanism.frames)
+
+
+@pytest.mark.parametrize("file", ["mixed_joints.urdf", "turntable.urdf"])
+def test_second_derivatives_against_automatic_differentiation(urdf_folder, file):
+    mechanism = Mechanism.from_urdf(urdf_folder / file).numeric()
+    n = len(mechanism.joints)
+    q, v = ca.SX.sym("q", n), ca.SX.sym("v", n)
+    rigid = rigid_body(forward_kinematics(mechanism, q), v, ca.SX(ca.DM(GRAVITY)))
+    lagrangian = rigid.kinetic - rigid.potential
+    by_q, by_v = ca.gradient(lagrangian, q), ca.gradient(lagrangian, v)
+    expected = [by_q, by_v, ca.jacobian(by_q, q), ca.jacobian(by_q, v), ca.jacobian(by_v, v)]
+    actual = [rigid.by_q, rigid.by_v, *second_derivatives(rigid, mechanism)]
+    difference = ca.Function("difference", [q, v], [ca.densify(a - e) for a, e in zip(actual, expected, strict=True)])
+    rng = np.random.default_rng(3)
+    for _ in range(5):
+        for entry in difference.call([rng.uniform(-1, 1, n), rng.normal(size=n)]):
+            close(np.array(entry), 0.0)
