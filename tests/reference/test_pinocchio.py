@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.model import Mechanism, flexible_object, forward_kinematics
+from yid_ocp.model import mechanism as mechanism_module
 from yid_ocp.model.kinematics import mass_matrix, rigid_body, second_derivatives
 from yid_ocp.model.mechanism import robot_description_file
 
@@ -75,7 +76,13 @@ class Twin:
 
 @pytest.fixture(scope="module", params=list(ROBOTS))
 def twin(request, urdf_folder):
-    file, joints, locked = ROBOTS[request.param]
+    """Read without rounding nearly exact entries, which Pinocchio does not do either."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mechanism_module, "SNAP", 0.0)
+        return make_twin(urdf_folder, *ROBOTS[request.param])
+
+
+def make_twin(urdf_folder, file, joints, locked):
     if file is None or file == "y_object.urdf":
         path = urdf_folder / "y_object.urdf"
     elif file.startswith("package:"):
@@ -148,6 +155,18 @@ def test_mass_matrix_gravity_and_inverse_dynamics(twin):
         close(kinetic, energy, abs(energy))
         height = pin.computePotentialEnergy(twin.model, data, at)
         close(potential, height, abs(height))
+
+
+@pytest.mark.parametrize("robot", ["baxter", "ur5"])
+def test_rounding_of_nearly_exact_placements_moves_nothing_visibly(robot, monkeypatch):
+    rounded = Mechanism.from_urdf(f"package:{robot}").numeric()
+    monkeypatch.setattr(mechanism_module, "SNAP", 0.0)
+    exact = Mechanism.from_urdf(f"package:{robot}").numeric()
+    moved = [
+        np.max(np.abs(np.array(ca.DM(a.placement.matrix() - b.placement.matrix()))))
+        for a, b in zip(rounded.joints, exact.joints, strict=True)
+    ]
+    assert 0 < max(moved) < 1e-11
 
 
 def test_generated_object_has_the_frames_of_its_urdf(urdf_folder):

@@ -78,9 +78,13 @@ def paper_system(arms: int) -> System:
 
 
 def initial_posture(
-    system: System, values: Mapping[str, float] | None = None, *, seed: Mapping[str, float] | None = None
+    system: System,
+    values: Mapping[str, float] | None = None,
+    *,
+    seed: Mapping[str, float] | None = None,
+    offsets: Mapping[str, ArrayLike] | None = None,
 ) -> dict[str, float]:
-    """Arm joint angles with which every gripper meets the end of the undeformed object.
+    """Arm joint angles with which every gripper meets the end of the undeformed object, or a point beside it.
 
     Only positions are asked for; of the solutions the search takes one near its start.
 
@@ -93,6 +97,9 @@ def initial_posture(
     seed : mapping of str to float, optional
         Start of the search by joint name [rad or m]. Where absent: `ELBOW_UP` for Baxter, else the middle of the
         joint's range (zero when it has none).
+    offsets : mapping of grasp to array_like, shape (3,), optional
+        Where each gripper stands beside the undeformed tube end, in the world [m]. Two arms that hold a straight Y are
+        at its full stretch, a singular posture: moving them towards it makes the start well defined.
 
     Returns
     -------
@@ -125,7 +132,9 @@ def initial_posture(
         gaps = []
         for grasp in system.grasps:
             offset = Placement(ca.SX(ca.DM.eye(3)), ca.SX(ca.DM(value(grasp.offset))))
-            gaps.append((kinematics.pose(grasp.holder) @ offset).translation - kinematics.position(grasp.held))
+            beside = ca.DM(np.asarray((offsets or {}).get(grasp.name, np.zeros(3)), float))
+            held = kinematics.position(grasp.held) + beside
+            gaps.append((kinematics.pose(grasp.holder) @ offset).translation - held)
         gap = ca.vertcat(*gaps)
         function = ca.Function("gap", [q], [gap, ca.jacobian(gap, q)[:, sought]])
 

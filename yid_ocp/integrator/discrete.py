@@ -5,7 +5,10 @@ Position-momentum form, with L_d(q0, q1) = h L((q0 + q1)/2, (q1 - q0)/h):
     p_k + D1 L_d(q_k, q_{k+1}) + f- - Dphi(q_k)' lam_k = 0        phi(q_{k+1}) - C lam_k / h = 0
     p_{k+1} = D2 L_d(q_k, q_{k+1}) + f+
 
-with f- = f+ = (h/2) F for the symmetric split, f- = h F and f+ = 0 for the left one. The first equation holds for
+with f- = f+ = (h/2) F for the symmetric split, f- = h F and f+ = 0 for the left one. The split `left_damping` is
+symmetric in all but the dampers, whose force goes left: the pull of a constraint acts at the node, and where its own
+stiffness exceeds 4 M/h^2 (a light twist under tension) only a damper on the left keeps the motion from growing with
+alternating sign. The first equation holds for
 free coordinates; at a prescribed one its left side is -h times the effort that the prescription needs at node k.
 Both equations of a compliant coordinate are multiplied by its compliance, its momentum with them: there p is the
 compliance times the momentum [rad s], which keeps the spring's force (1/compliance) finite and the rule's order two.
@@ -14,7 +17,7 @@ compliance times the momentum [rad s], which keeps the spring's force (1/complia
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import casadi as ca
 
@@ -23,7 +26,7 @@ from yid_ocp.model.kinematics import Kinematics, RigidBody, cross, forward_kinem
 from yid_ocp.model.mechanism import Frame, Placement
 from yid_ocp.model.system import Grasp, MidpointState, System
 
-ForceSplit = Literal["symmetric", "left"]
+ForceSplit = Literal["symmetric", "left", "left_damping"]
 
 
 @dataclass(frozen=True)
@@ -35,7 +38,7 @@ class DiscreteEquations:
     Attributes
     ----------
     system : System
-    force_split : "symmetric" or "left"
+    force_split : "symmetric", "left" or "left_damping"
     q0, q1 : casadi.SX, shape (n, 1)
         q_k and q_{k+1}.
     z0, z1 : casadi.SX, shape (nz, 1)
@@ -133,7 +136,7 @@ def discrete_equations(system: System, force_split: ForceSplit = "symmetric") ->
     Parameters
     ----------
     system : System
-    force_split : "symmetric" or "left"
+    force_split : "symmetric", "left" or "left_damping"
         How the force of a step is shared between its two ends.
 
     Returns
@@ -150,8 +153,8 @@ def discrete_equations(system: System, force_split: ForceSplit = "symmetric") ->
     Marsden and West (2001), Acta Numerica 10:357, section 3, doi:10.1017/S096249290100006X.
     Johnson and Murphey (2009), IEEE Trans. Robotics 25(6):1249, doi:10.1109/TRO.2009.2032955.
     """
-    if force_split not in ("symmetric", "left"):
-        raise ModelError(f"force_split = '{force_split}'", allowed="symmetric, left")
+    if force_split not in get_args(ForceSplit):
+        raise ModelError(f"force_split = '{force_split}'", allowed=", ".join(get_args(ForceSplit)))
     n, m = system.size, system.constraint_count
     names = tuple(system.internal)
     symbols = ca.vertcat(*system.internal.values()) if names else ca.SX(0, 1)
@@ -168,12 +171,13 @@ def discrete_equations(system: System, force_split: ForceSplit = "symmetric") ->
     rows = {name: i for i, name in enumerate(names)}
     state = MidpointState(system, kinematics, qm, vm, zm, z_rate, u, pull_rate, rows)
     energy = -system.elastic_energy(qm)
-    force = system.viscous_force(vm) + system.input_force(u)
+    force, viscous = system.input_force(u), system.viscous_force(vm)
     equations: dict[str, ca.SX] = {}
     for effect in system.effects:
         terms = effect.terms(state)
         energy += terms.lagrangian
         force = force if terms.force is None else force + terms.force
+        viscous = viscous if terms.viscous is None else viscous + terms.viscous
         equations.update(terms.internal)
     missing = [name for name in names if name not in equations]
     if missing:
@@ -189,14 +193,17 @@ def discrete_equations(system: System, force_split: ForceSplit = "symmetric") ->
     )
     pull = matrix.T @ lam
 
-    weight_left, weight_right = (h, ca.SX(0)) if force_split == "left" else (h / 2, h / 2)
+    share = 1.0 if force_split == "left" else 0.5
+    viscous_share = 0.5 if force_split == "symmetric" else 1.0
+    push_left = h * (share * force + viscous_share * viscous)
+    push_right = h * ((1 - share) * force + (1 - viscous_share) * viscous)
     row_scale, held = [ca.SX(1)] * n, [ca.SX(0)] * n
     for joint, compliance in system.compliant.items():
         index = system.mechanism.joint_index(joint)
         row_scale[index], held[index] = compliance, h / 2 * qm[index]
     scale, spring = ca.vertcat(*row_scale), ca.vertcat(*held)
-    balance_rest = scale * (h / 2 * extra_q - extra_v + weight_left * force) - spring
-    p1_rest = scale * (h / 2 * extra_q + extra_v + weight_right * force) - spring
+    balance_rest = scale * (h / 2 * extra_q - extra_v + push_left) - spring
+    p1_rest = scale * (h / 2 * extra_q + extra_v + push_right) - spring
     balance = p0 + scale * (h / 2 * rigid.by_q - rigid.by_v - pull) + balance_rest
     p1 = scale * (h / 2 * rigid.by_q + rigid.by_v) + p1_rest
 

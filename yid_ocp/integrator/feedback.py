@@ -78,7 +78,7 @@ def lqr_filter(
     reference, torques = np.asarray(measured, float), np.asarray(torque, float)
     system = step.system
     arms = _arms_only(system)
-    arm_step = compile_step(arms, step.time_step, step.force_split, use_compiler=step.compiled)  # type: ignore[arg-type]
+    arm_step = compile_step(arms, step.time_step, step.force_split, use_compiler=step.compiled)
     values = dict(zip(system.parameters.names, np.asarray(theta, float), strict=True))
     arm_theta = arms.parameters.vector({name: values[name] for name in arms.parameters.names})
     nu = len(system.driven)

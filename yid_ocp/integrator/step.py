@@ -21,8 +21,9 @@ from yid_ocp.model.system import System
 
 Array = NDArray[np.float64]
 
-# Newton stops when a correction of the coordinates is below this [rad or m].
-TOLERANCE = 1e-12
+# Newton stops when a correction of the coordinates is below TOLERANCE [rad or m], with short time steps below RATE_TOLERANCE
+# times the step: what is left undone is lost momentum, mass times correction over time step, in every step.
+TOLERANCE, RATE_TOLERANCE, ROUNDING = 1e-12, 1e-10, 1e-15
 ITERATION_LIMIT = 60
 
 
@@ -217,16 +218,25 @@ class Step:
     time_step : float
         h [s]
     force_split : str
+    tolerance : float
+        Newton's, on the coordinates [rad or m].
     equations : DiscreteEquations
     kernel : Kernel
     compiled : bool
         Whether generated C code is used.
     """
 
-    def __init__(self, system: System, time_step: float, force_split: ForceSplit, use_compiler: bool) -> None:
+    def __init__(
+        self,
+        system: System,
+        time_step: float,
+        force_split: ForceSplit,
+        use_compiler: bool,
+    ) -> None:
         self.system = system
         self.time_step = float(time_step)
-        self.force_split = force_split
+        self.force_split: ForceSplit = force_split
+        self.tolerance = max(ROUNDING, min(TOLERANCE, RATE_TOLERANCE * self.time_step))
         self.equations: DiscreteEquations = discrete_equations(system, force_split)
         self.functions = codegen.step_functions(self.equations)
         self.structure = codegen.structure(self.functions)
@@ -350,7 +360,11 @@ class Step:
 
 
 def compile_step(
-    system: System, time_step: float, force_split: ForceSplit = "symmetric", *, use_compiler: bool = True
+    system: System,
+    time_step: float,
+    force_split: ForceSplit = "symmetric",
+    *,
+    use_compiler: bool = True,
 ) -> Step:
     """Turn a system into a time step.
 
@@ -359,8 +373,8 @@ def compile_step(
     system : System
     time_step : float
         h [s], positive.
-    force_split : "symmetric" or "left"
-        Order two, or the rule of the paper's engine.
+    force_split : "symmetric", "left" or "left_damping"
+        Order two; the rule of the paper's engine; or order two but for the dampers (see `discrete_equations`).
     use_compiler : bool
         Whether to generate and compile C; without a compiler on the machine the interpreter is used with one notice.
 
@@ -519,7 +533,7 @@ class CompiledKernel:
             _pointer(by_effort),
             _pointer(given_torque),
             _pointer(given_path),
-            ctypes.c_double(TOLERANCE),
+            ctypes.c_double(self._step.tolerance),
             ctypes.c_int(ITERATION_LIMIT),
             _pointer(info),
         )
@@ -626,9 +640,9 @@ class InterpretedKernel:
         return phi
 
     def _rows(self, arguments: list[Array | float], phi: Array, scale: Array) -> tuple[Array, Array]:
-        balance, internal, constraint, p1 = self._step.functions.residual(*arguments)
-        pulled = np.array(balance).ravel() - scale * (phi.T @ np.asarray(arguments[5]))
-        return np.concatenate([pulled, np.array(internal).ravel(), np.array(constraint).ravel()]), np.array(p1).ravel()
+        balance, internal, constraint, p1 = (np.array(x).ravel() for x in self._step.functions.residual(*arguments))
+        pull = phi.T @ np.asarray(arguments[5])
+        return np.concatenate([balance - scale * pull, internal, constraint]), p1
 
     def _linearise(self, arguments: list[Array | float], phi: Array, scale: Array) -> _Linearised:
         s = self._step.sizes
@@ -685,7 +699,7 @@ class InterpretedKernel:
         assert isinstance(q1, np.ndarray)
         assert isinstance(z1, np.ndarray)
         assert isinstance(lam, np.ndarray)
-        previous, error = math.inf, 0.0
+        previous, error, tolerance = math.inf, 0.0, self._step.tolerance
         for iteration in range(1, ITERATION_LIMIT + 1):
             rows, p1 = self._rows(arguments, phi, scale)
             if not np.all(np.isfinite(rows[self._unknown])):
@@ -701,7 +715,7 @@ class InterpretedKernel:
             error = float(np.max(np.abs(delta[:count]), initial=0.0))
             if not math.isfinite(error):
                 return StepCode.SINGULAR, error, p1, iteration
-            if error <= TOLERANCE or (error < 1e3 * TOLERANCE and error > 0.5 * previous):
+            if error <= tolerance or (error < 1e3 * tolerance and error > 0.5 * previous):
                 lam += delta[count:]
                 return StepCode.OK, error, p1, iteration
             previous = error

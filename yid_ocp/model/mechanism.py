@@ -534,7 +534,7 @@ def _to_urdf(mechanism: Mechanism) -> str:
 
     def link_name(wanted: str, joint: int) -> str:
         frame = mechanism.frames.get(wanted)
-        same = frame is None or (frame.joint == joint and np.array_equal(ca.DM(frame.placement.matrix()), identity))
+        same = frame is None or (frame.joint == joint and np.array_equal(np.array(ca.DM(frame.placement.matrix())), identity))
         return wanted if same else link_name(f"{wanted}_", joint)
 
     def bounded(value: float) -> float:

@@ -71,6 +71,24 @@ class Grasp:
             rows.append(0.5 * ca.vertcat(*(error[i, j] - error[j, i] for i, j in pairs)))
         return ca.vertcat(*rows)
 
+    def alignment(self, kinematics: Kinematics) -> ca.SX:
+        """Differences of the axes that the grasp makes coincide, shape (0, 3 or 9; 1).
+
+        Redundant beside `residual`, but not zero where the axes point in opposite ways: for searches that start far off.
+        """
+        if self.kind == "point":
+            return ca.SX(0, 1)
+        difference = kinematics.pose(self.holder).rotation @ self.rotation - kinematics.pose(self.held).rotation
+        return difference[:, 2] if self.kind == "axis" else ca.vec(difference)
+
+
+@dataclass(frozen=True)
+class Spring:
+    """A spring 1/2 stiffness (q - rest)^2 on one joint of a robot, in N m/rad and rad (N/m and m where it slides)."""
+
+    stiffness: float
+    rest: float = 0.0
+
 
 @dataclass(frozen=True)
 class MidpointState:
@@ -139,12 +157,15 @@ class Terms:
         Scalar added to L(q, v) [J].
     force : casadi.SX, optional, shape (n, 1)
         Generalized force F(q, v, u, z) [N m or N].
+    viscous : casadi.SX, optional, shape (n, 1)
+        The part of the force that only takes energy out, in proportion to velocity [N m or N].
     internal : mapping of str to casadi.SX
         Equation (= 0) of each internal coordinate that the term owns, at the midpoint.
     """
 
     lagrangian: ca.SX = field(default_factory=lambda: ca.SX(0))
     force: ca.SX | None = None
+    viscous: ca.SX | None = None
     internal: Mapping[str, ca.SX] = field(default_factory=dict)
 
 
@@ -239,6 +260,7 @@ class System:
         gravity: ArrayLike = (0.0, 0.0, -9.81),
         points: Sequence[str] | None = None,
         effects: Sequence[Effect] = (),
+        springs: Mapping[str, Spring] | None = None,
     ) -> System:
         """Put robot, objects, grasps and effects together.
 
@@ -258,6 +280,8 @@ class System:
         points : sequence of str, optional
             Frames that sensors may see; the segments' tips `w_*` when absent.
         effects : sequence of Effect
+        springs : mapping of str to Spring, optional
+            By joint of the robot; become the parameters `JOINT.stiffness` and `JOINT.rest`.
 
         Returns
         -------
@@ -281,6 +305,13 @@ class System:
             entries.append(parameter)
             coefficients[joint] = parameter.symbol
         elastic: list[ElasticJoint] = []
+        for joint, spring in (springs or {}).items():
+            unit = tree.joints[tree.joint_index(joint)].unit
+            per = "N m/rad" if unit == "rad" else "N/m"
+            stiffness = Parameter(f"{joint}.stiffness", spring.stiffness, per, 0.0, math.inf, f"spring on {joint}")
+            rest = Parameter(f"{joint}.rest", spring.rest, unit, description=f"where the spring on {joint} is relaxed")
+            entries += [stiffness, rest]
+            elastic.append(ElasticJoint(joint, joint, "bend", "", stiffness.symbol, ca.SX(0), rest.symbol))
         segments: list[SegmentLayout] = []
         for item, frame, placement in objects:
             tree = tree.joined(item.mechanism, frame, placement)

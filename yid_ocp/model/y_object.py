@@ -58,6 +58,12 @@ class Segment:
         it sits between the parent's link and the first one.
     joint_order : str
         Axes of the three turns at each joint, base to tip.
+    separate_lengths : bool
+        Whether every link has a length parameter of its own (`SEGMENT.length_0`, ...) in place of `SEGMENT.length`,
+        for markers that sit elsewhere in every recording; masses do not follow them.
+    length_before : float, optional
+        Length of a flexible edge that a clamp keeps straight before a root segment; with `rigidity` its first joint
+        then counts half of it [m].
     """
 
     name: str
@@ -77,6 +83,8 @@ class Segment:
     rigidity: bool = False
     clamped: bool = False
     joint_order: str = "xyz"
+    separate_lengths: bool = False
+    length_before: float | None = None
 
 
 @dataclass(frozen=True)
@@ -151,8 +159,8 @@ def flexible_object(
     Returns
     -------
     FlexibleObject
-        Joints are named `SEGMENT_LINK_AXIS` (`T1_0_x`), parameters `SEGMENT.length`, `.mass`, `.radius`, `.bend`,
-        `.twist`, `.damping` (and `.twist_damping` where given).
+        Joints are named `SEGMENT_LINK_AXIS` (`T1_0_x`), parameters `SEGMENT.length` (or `.length_0`, ...), `.mass`,
+        `.radius`, `.bend`, `.twist`, `.damping` (and `.twist_damping` where given).
 
     Raises
     ------
@@ -175,14 +183,18 @@ def flexible_object(
         parameters += own.values()
         radius, mass = own["radius"].symbol, own["mass"].symbol
         shares = _shares(segment)
-        lengths = tuple(own["length"].symbol * float(share) for share in shares)
+        if segment.separate_lengths:
+            lengths = tuple(own[f"length_{i}"].symbol for i in range(len(shares)))
+        else:
+            lengths = tuple(own["length"].symbol * float(share) for share in shares)
         later: Sequence[ArrayLike | None] = (
             [None] * (len(shares) - 1) if segment.link_rotations is None else segment.link_rotations
         )
         rotations = [_rotation(entry) for entry in (segment.rotation, *later)]
-        before: ca.SX | None = None
+        before: ca.SX | None
         if segment.parent is None:
             carrier, tip = -1, root
+            before = None if segment.length_before is None or segment.clamped else ca.SX(segment.length_before)
         else:
             above = layouts[segment.parent]
             at = len(above.links) - 1 if segment.at_link is None else segment.at_link
@@ -315,7 +327,14 @@ def _segment_parameters(segment: Segment) -> dict[str, Parameter]:
     length = float(np.sum(segment.link_lengths)) if segment.link_lengths is not None else segment.length
     small = 1e-9
     entries = {
-        "length": (length, "m", small, "length of the segment"),
+        **(
+            {
+                f"length_{i}": (length * float(share), "m", small, f"length of link {i}")
+                for i, share in enumerate(_shares(segment))
+            }
+            if segment.separate_lengths
+            else {"length": (length, "m", small, "length of the segment")}
+        ),
         "mass": (segment.mass, "kg", small, "mass of the segment"),
         "radius": (segment.radius, "m", small, "radius of the solid cylinder"),
         "bend": (segment.bend, per, 0.0, "bending stiffness of every joint, about x and y"),

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
@@ -11,111 +13,225 @@ from numpy.typing import NDArray
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.rollout import momentum_of
 from yid_ocp.integrator.step import Step
+from yid_ocp.model import forward_kinematics
 from yid_ocp.problem.residuals import Samples
-from yid_ocp.sensors import PointSensor, sensor_function
+from yid_ocp.sensors import PointSensor, Sensor, sensor_function
 
 Array = NDArray[np.float64]
 
-# Deviation of the elastic prior: a bend of this size costs as much as one standard deviation of a measured point [rad].
+# Deviation of the elastic prior: a bend of this size at a joint of mean stiffness costs as much as one standard
+# deviation of a measured point [rad]; other joints in proportion to their stiffness.
 BEND_STD = 0.5
+# Joints without a spring, or with one far softer than the rest, are still held a little.
+LEAST_STIFFNESS = 1e-4
+# Deviation of a coordinate's rate where the points leave it open [rad/s].
+RATE_STD = 3.0
 CONSTRAINT_STD = 1e-5
+# The object is first pulled into place softly, by measurements of which each deviation is so many times as large: pulled
+# hard at once, it ends in knots.
+SOFTNESS = (1000.0, 100.0, 10.0, 1.0)
+# A parameter fitted along with the start is tried from so many values across its bounds.
+TRIALS = 4
 
 
-def fit_start(
-    step: Step, posture: Array, samples: Sequence[Samples], theta: Array, window: float, path: Array
-) -> Array:
-    """Configuration that fits the measured points at the first frames, and the momentum from their change.
+@dataclass(frozen=True)
+class FittedStart:
+    """A start that fits the first measured points.
 
-    Minimises |(w(q) - wbar)/std|^2 + |q - q_rest|^2/BEND_STD^2 + |phi(q)/CONSTRAINT_STD|^2 by Gauss-Newton at the first
-    and at the last frame of the window; the momentum is that of the velocity between the two.
+    Attributes
+    ----------
+    state : ndarray, shape (nx,)
+        (q, p, z) at node 0.
+    values : mapping of str to float
+        Parameters fitted along with it, by name, in their units.
+    """
+
+    state: Array
+    values: Mapping[str, float] = field(default_factory=dict)
+
+
+class StartFit:
+    """Fits start configurations of a step's system.
+
+    Minimises, by Gauss-Newton over q (and the parameters asked for) at the first frame,
+
+        |(w(q) - wbar)/std|^2 + sum kappa_i/kappa_mean (q_i - q_rest,i)^2/BEND_STD^2 + |phi(q)/CONSTRAINT_STD|^2,
+
+    so that among all shapes through the measured points it is the one of least elastic energy: that is what tells
+    apart turns which no point sees, such as the roll of a clamp. At the last frame of the window the prior is that the
+    rate between the two is small. The momentum is that of this rate.
 
     Parameters
     ----------
     step : Step
-    posture : ndarray, shape (nk,)
-        Driven, then prescribed coordinates at node 0.
-    samples : sequence of Samples
-        Only points are used.
-    theta : ndarray, shape (ntheta,)
-    window : float
-        How far from the start frames may be used [s].
-    path : ndarray, shape (N + 1, nc)
-        Prescribed coordinates.
-
-    Returns
-    -------
-    ndarray, shape (nx,)
-        (q, p, z) at node 0.
-
-    Raises
-    ------
-    DataError
-        No point is seen within the window.
+    local : sequence of str
+        Parameters fitted along with every start; their bounds must be finite.
     """
-    system = step.system
-    last = max(round(window / step.time_step), 1)
-    frames: dict[int, list[tuple[Samples, int]]] = {}
-    for group in samples:
-        if isinstance(group.sensor, PointSensor):
-            for row, (node, fraction) in enumerate(zip(group.node, group.fraction, strict=True)):
-                near = int(node + round(float(fraction)))
-                if near <= last and np.any(group.weight[row] > 0):
-                    frames.setdefault(near, []).append((group, row))
-    if not frames:
-        raise DataError(
-            f"no point is seen in the first {window:g} s, so the start state cannot be fitted",
-            hint="widen solver.start_window, or start from equilibrium",
-        )
-    nodes = sorted(frames)
-    chosen = [nodes[0]] if len(nodes) == 1 else [nodes[0], nodes[-1]]
-    fits = []
-    guess = np.zeros(system.size)
-    known = [*system.driven_indices, *system.prescribed_indices]
-    for node in chosen:
-        guess[known] = posture
-        guess[list(system.prescribed_indices)] = path[node]
-        guess = _fit_configuration(step, guess, frames[node], theta, known)
-        fits.append(guess.copy())
-    velocity = np.zeros(system.size)
-    if len(fits) == 2:
-        velocity = (fits[1] - fits[0]) / ((chosen[1] - chosen[0]) * step.time_step)
-    q0 = fits[0] - velocity * chosen[0] * step.time_step
-    q0[list(system.prescribed_indices)] = path[0]
-    momentum = momentum_of(step, q0, velocity, theta)
-    return np.concatenate([q0, momentum, np.zeros(step.sizes["nz"])])
 
+    def __init__(self, step: Step, local: Sequence[str] = ()) -> None:
+        self.step = step
+        self.local = tuple(local)
+        system, e = step.system, step.equations
+        self._known = [*system.driven_indices, *system.prescribed_indices]
+        self._free = [i for i in range(system.size) if i not in set(self._known)]
+        self._sensors: dict[Sensor, ca.Function] = {}
+        chosen = ca.vertcat(*(system.parameters[name].symbol for name in self.local)) if self.local else ca.SX(0, 1)
+        kinematics = forward_kinematics(system.mechanism, e.q1)
+        aligned = ca.vertcat(ca.SX(0, 1), *(grasp.alignment(kinematics) for grasp in system.grasps))
+        held = ca.vertcat(e.constraint, ca.substitute(aligned, ca.vertcat(ca.SX(0, 1), *system.internal.values()), e.z1))
+        outputs = [held, ca.jacobian(held, e.q1), ca.jacobian(held, chosen)]
+        self._phi = ca.Function("phi", [e.q1, e.z1, e.lam, e.theta, e.time_step], outputs)
+        at = [system.mechanism.joint_index(spring.joint) for spring in system.elastic]
+        stiffness, rest = ca.SX(system.size, 1), ca.SX(system.size, 1)
+        for index, spring in zip(at, system.elastic, strict=True):
+            stiffness[index] += spring.stiffness
+            rest[index] = spring.rest
+        self._elastic = ca.Function("elastic", [e.theta], [ca.densify(stiffness), ca.densify(rest)])
 
-def _fit_configuration(
-    step: Step, guess: Array, measured: list[tuple[Samples, int]], theta: Array, known: Sequence[int]
-) -> Array:
-    system, e = step.system, step.equations
-    free = [i for i in range(system.size) if i not in set(known)]
-    functions = [sensor_function(system, group.sensor, ()) for group, _ in measured]
-    phi = ca.Function(
-        "phi",
-        [e.q1, e.z1, e.lam, e.theta, e.time_step],
-        [e.constraint, ca.jacobian(e.constraint, e.q1)],
-    )
-    nz, m = step.sizes["nz"], step.sizes["m"]
-    q = guess.copy()
-    rest = np.zeros(system.size)
-    for _ in range(60):
-        rows, residuals = [], []
-        for function, (group, row) in zip(functions, measured, strict=True):
-            y, by_q, *_ = function(q, np.zeros(nz), np.zeros(system.size), theta)
-            weight = group.weight[row]
-            value = np.where(weight > 0, group.value[row], 0.0)
-            residuals.append(weight * (np.array(y).ravel() - value))
-            rows.append(weight[:, None] * np.array(ca.densify(by_q))[:, free])
-        if m:
-            gap, by_q = phi(q, np.zeros(nz), np.zeros(m), theta, step.time_step)
-            residuals.append(np.array(gap).ravel() / CONSTRAINT_STD)
-            rows.append(np.array(ca.densify(by_q))[:, free] / CONSTRAINT_STD)
-        residuals.append((q - rest)[free] / BEND_STD)
-        rows.append(np.eye(len(free)) / BEND_STD)
-        change = -np.linalg.lstsq(np.vstack(rows), np.concatenate(residuals), rcond=None)[0]
-        size = float(np.max(np.abs(change), initial=0.0))
-        q[free] += change * min(1.0, 0.5 / max(size, 1e-12))
-        if size < 1e-9:
-            break
-    return q
+    def solve(self, posture: Array, samples: Sequence[Samples], theta: Array, window: float, path: Array) -> FittedStart:
+        """Configuration that fits the measured points at the first frames, and the momentum from their change.
+
+        Parameters
+        ----------
+        posture : ndarray, shape (nk,)
+            Driven, then prescribed coordinates at node 0.
+        samples : sequence of Samples
+            Only points are used.
+        theta : ndarray, shape (ntheta,)
+        window : float
+            How far from the start frames may be used [s].
+        path : ndarray, shape (N + 1, nc)
+            Prescribed coordinates.
+
+        Returns
+        -------
+        FittedStart
+
+        Raises
+        ------
+        DataError
+            No point is seen within the window.
+        """
+        step, system = self.step, self.step.system
+        last = max(round(window / step.time_step), 1)
+        frames: dict[int, list[tuple[Samples, int]]] = {}
+        for group in samples:
+            if isinstance(group.sensor, PointSensor):
+                for row, (node, fraction) in enumerate(zip(group.node, group.fraction, strict=True)):
+                    near = int(node + round(float(fraction)))
+                    if near <= last and np.any(group.weight[row] > 0):
+                        frames.setdefault(near, []).append((group, row))
+        if not frames:
+            raise DataError(
+                f"no point is seen in the first {window:g} s, so the start state cannot be fitted",
+                hint="widen solver.start_window, or start from equilibrium",
+            )
+        nodes = sorted(frames)
+        first, then = nodes[0], nodes[-1]
+        index = [system.parameters.index(name) for name in self.local]
+        stiffness, rest = (np.array(x).ravel() for x in self._elastic(theta))
+        typical = float(np.mean(stiffness[stiffness > 0])) if np.any(stiffness > 0) else 1.0
+        weight = np.sqrt(np.where(stiffness > 0, np.maximum(stiffness / typical, LEAST_STIFFNESS), 1.0)) / BEND_STD
+        guess = rest.copy()
+        guess[self._known] = posture
+        guess[list(system.prescribed_indices)] = path[first]
+        q, values, best = guess, theta[index], np.inf
+        for trial in self._trials(theta[index]):
+            found = guess, trial, np.inf
+            for softness in SOFTNESS:
+                found = self._fit(*found[:2], frames[first], theta, rest, weight, len(index), softness)
+            if found[2] < best:
+                q, values, best = found
+        theta = theta.copy()
+        theta[index] = values
+        velocity = np.zeros(system.size)
+        if then > first:
+            guess = q.copy()
+            guess[list(system.prescribed_indices)] = path[then]
+            span = (then - first) * step.time_step
+            slow = np.full(system.size, 1 / (RATE_STD * span))
+            velocity = (self._fit(guess, values, frames[then], theta, guess, slow, 0, 1.0)[0] - q) / span
+        q0 = q - velocity * first * step.time_step
+        q0[list(system.prescribed_indices)] = path[0]
+        momentum = momentum_of(step, q0, velocity, theta)
+        state = np.concatenate([q0, momentum, np.zeros(step.sizes["nz"])])
+        return FittedStart(state, dict(zip(self.local, values.tolist(), strict=True)))
+
+    def _trials(self, values: Array) -> list[Array]:
+        if not self.local:
+            return [values]
+        lower, upper = self.step.system.parameters.bounds(self.local)
+        grids = [low + (high - low) * (np.arange(TRIALS) + 0.5) / TRIALS for low, high in zip(lower, upper, strict=True)]
+        return [values, *(np.array(entry) for entry in itertools.product(*grids))]
+
+    def _fit(
+        self,
+        guess: Array,
+        values: Array,
+        measured: list[tuple[Samples, int]],
+        theta: Array,
+        rest: Array,
+        prior: Array,
+        wanted: int,
+        softness: float,
+    ) -> tuple[Array, Array, float]:
+        """Configuration, values of the first `wanted` local parameters, and the sum of squares there."""
+        step, system, free = self.step, self.step.system, self._free
+        nz, m = step.sizes["nz"], step.sizes["m"]
+        index = [system.parameters.index(name) for name in self.local]
+        lower, upper = system.parameters.bounds(self.local)
+        q, theta = guess.copy(), theta.copy()
+        theta[index] = values
+
+        def rows(q: Array, theta: Array) -> tuple[Array, Array]:
+            residuals, jacobians = [], []
+            for group, row in measured:
+                y, by_q, _, _, by_theta = self._sensor(group.sensor)(q, np.zeros(nz), np.zeros(system.size), theta)
+                weight = group.weight[row] / softness
+                value = np.where(weight > 0, group.value[row], 0.0)
+                wide = np.hstack([np.array(ca.densify(by_q))[:, free], np.array(ca.densify(by_theta))[:, :wanted]])
+                residuals.append(weight * (np.array(y).ravel() - value))
+                jacobians.append(weight[:, None] * wide)
+            if m:
+                gap, by_q, by_theta = self._phi(q, np.zeros(nz), np.zeros(m), theta, step.time_step)
+                wide = np.hstack([np.array(ca.densify(by_q))[:, free], np.array(ca.densify(by_theta))[:, :wanted]])
+                residuals.append(np.array(gap).ravel() / (CONSTRAINT_STD * softness))
+                jacobians.append(wide / (CONSTRAINT_STD * softness))
+            residuals.append(((q - rest) * prior)[free])
+            jacobians.append(np.hstack([np.diag(prior[free]), np.zeros((len(free), wanted))]))
+            return np.concatenate(residuals), np.vstack(jacobians)
+
+        residual, jacobian = rows(q, theta)
+        cost, damping = float(residual @ residual), 1e-3
+        for _ in range(200):
+            scale = np.sqrt(damping) * np.maximum(np.linalg.norm(jacobian, axis=0), 1e-9)
+            stacked = np.vstack([jacobian, np.diag(scale)])
+            change = -np.linalg.lstsq(stacked, np.concatenate([residual, np.zeros(len(scale))]), rcond=None)[0]
+            size = float(np.max(np.abs(change), initial=0.0))
+            change *= min(1.0, 0.5 / max(size, 1e-12))
+            trial_q, trial_theta = q.copy(), theta.copy()
+            trial_q[free] += change[: len(free)]
+            for k in range(wanted):
+                span = upper[k] - lower[k]
+                value = theta[index[k]] + change[len(free) + k]
+                # an angle goes round, anything else stops at its bound
+                turn = abs(span - 2 * np.pi) < 1e-9
+                trial_theta[index[k]] = lower[k] + (value - lower[k]) % span if turn else np.clip(value, lower[k], upper[k])
+            new_residual, new_jacobian = rows(trial_q, trial_theta)
+            new_cost = float(new_residual @ new_residual)
+            if new_cost < cost:
+                done = size < 1e-9 or cost - new_cost < 1e-10 * cost
+                q, theta, residual, jacobian, cost = trial_q, trial_theta, new_residual, new_jacobian, new_cost
+                damping = max(damping / 10, 1e-12)
+                if done:
+                    break
+            else:
+                damping *= 10
+                if size < 1e-9 or damping > 1e8:
+                    break
+        return q, theta[index], cost
+
+    def _sensor(self, sensor: Sensor) -> ca.Function:
+        if sensor not in self._sensors:
+            self._sensors[sensor] = sensor_function(self.step.system, sensor, self.local)
+        return self._sensors[sensor]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import scipy.interpolate
@@ -32,11 +33,15 @@ class ClampPath:
         Point at which its origin sits.
     towards : str
         Point to which its z axis looks.
+    roll : "level" or "transported"
+        What the points do not tell, the turn about z: with `level` the third angle stays zero (x axis across world y);
+        with `transported` the clamp never turns about its own z axis, from `level` at the first node on.
     """
 
     clamp: str
     origin: str
     towards: str
+    roll: Literal["level", "transported"] = "level"
 
 
 @dataclass(frozen=True)
@@ -211,7 +216,11 @@ def _clamp_course(recording: Recording, clamp: ClampPath, grid: Grid, smoother: 
     about_y = np.arcsin(np.clip(d[:, 0], -1, 1))
     about_x = np.unwrap(np.arctan2(-d[:, 1], d[:, 2]))
     result = {f"{clamp.clamp}_{axis}": origin[:, i] for i, axis in enumerate("xyz")}
-    result |= {f"{clamp.clamp}_rx": about_x, f"{clamp.clamp}_ry": about_y, f"{clamp.clamp}_rz": np.zeros(len(d))}
+    about_z = np.zeros(len(d))
+    if clamp.roll == "transported":
+        # the angular velocity about z of Rx(a) Ry(b) Rz(c) is c' + a' sin b
+        about_z[1:] = -np.cumsum(np.diff(about_x) * np.sin((about_y[1:] + about_y[:-1]) / 2))
+    result |= {f"{clamp.clamp}_rx": about_x, f"{clamp.clamp}_ry": about_y, f"{clamp.clamp}_rz": about_z}
     return result
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -16,7 +17,7 @@ from yid_ocp.integrator.codegen import Mapped
 from yid_ocp.integrator.feedback import lqr_filter, proportional_filter
 from yid_ocp.integrator.rollout import Rest, Statics, adjoint_gradient, simulate
 from yid_ocp.integrator.step import Directions, Feedback, Step, Sweep
-from yid_ocp.problem.initial import fit_start
+from yid_ocp.problem.initial import FittedStart, StartFit
 from yid_ocp.problem.inputs import ClampPath, Grid, Smoother, columns, held_torque, make_grid, prescribed_path
 from yid_ocp.problem.residuals import Samples, Weighting, huber, make_samples, paper_weighting, point_samples
 from yid_ocp.sensors import EffortSensor, PointSensor, Sensor, sensor_function
@@ -39,12 +40,16 @@ class SensorOptions:
         Frame that a point marks where the two have different names.
     points : tuple of str, optional
         Points to use; all that the model has when absent.
+    position_std : float or mapping of joint to float, optional
+        Deviation of the encoders that give a prescribed motion, instead of the recorded one [rad]; the accelerations
+        worked out from it add to the deviation of predicted efforts.
     """
 
     use: bool = True
     std: float | Mapping[str, float] | None = None
     frames: Mapping[str, str] = field(default_factory=dict)
     points: tuple[str, ...] | None = None
+    position_std: float | Mapping[str, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -71,12 +76,21 @@ class ProblemOptions:
         Free parameters with a value of their own in every recording.
     priors : mapping of parameter to deviation
         Gaussian priors about the initial value, in the parameter's unit.
+    tie_break : float
+        Every other free parameter that is positive by nature gets a prior that calls this factor up or down one
+        standard deviation (log-normal about its start), so that one that the data do not inform stays near its start;
+        zero for none. Not used with the paper's weighting.
     configuration_std, velocity_std : float
         Prior of an estimated initial state [rad], [rad/s].
     duration : float, optional
         Use only the first seconds of every recording [s].
     start_window : float
         How long the measured points that fix a `given` start may reach [s].
+    start_parameters : tuple of str
+        Parameters that are fitted along with a `given` start in every recording, held-out ones included, from these
+        first points alone; none of them may be free.
+    recording_values : mapping of recording to mapping of parameter to value
+        Known values of parameters that differ from recording to recording, such as where markers sit.
     """
 
     initial_state: InitialState = "equilibrium"
@@ -89,10 +103,13 @@ class ProblemOptions:
     clamps: tuple[ClampPath, ...] = ()
     local: tuple[str, ...] = ()
     priors: Mapping[str, float] = field(default_factory=dict)
+    tie_break: float = 10.0
     configuration_std: float = 0.05
     velocity_std: float = 0.2
     duration: float | None = None
     start_window: float = 0.02
+    start_parameters: tuple[str, ...] = ()
+    recording_values: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -231,6 +248,8 @@ class EstimationProblem:
         self.held_out = tuple(self.prepare(recording) for recording in held_out)
         self._feedback: dict[int, Feedback | None] = {}
         self._starts: dict[int, Array] = {}
+        self._fitted: dict[int, FittedStart] = {}
+        self._start_fit: StartFit | None = None
 
     # -- the unknown vector -------------------------------------------------------------------------------------------
 
@@ -368,14 +387,11 @@ class EstimationProblem:
                 where=recording.name,
                 hint="set sensors.joints.effort.std [N m], from a stretch at rest or the data sheet",
             )
-        if isinstance(given, Mapping):
-            std = np.array([float(given[name]) for name in names])
-        else:
-            wide = np.broadcast_to(np.asarray(given, float), (len(joints.names),))
-            std = wide[at] if np.ndim(given) else np.full(len(names), float(np.asarray(given)))
+        std = _by_joint(given, joints.names, names, "sensors.joints.effort.std")
         step = float(np.median(np.diff(joints.t)))
         value_gain, _, second_gain = smoother.gains(step)
-        angle = 0.0 if joints.position_std is None else np.broadcast_to(joints.position_std, (len(joints.names),))[at]
+        known = choice.position_std if choice.position_std is not None else joints.position_std
+        angle = _by_joint(0.0 if known is None else known, joints.names, names, "sensors.joints.effort.position_std")
         inertia = self._apparent_inertia(names)
         total = np.sqrt((std * value_gain) ** 2 + (inertia * angle * second_gain) ** 2)
         # the impulse at node 0 depends on the motion before the recording, that at the last node on the motion after it
@@ -419,6 +435,27 @@ class EstimationProblem:
             self._feedback[key] = result
         return self._feedback[key]
 
+    def fitted_start(self, episode: Episode, theta: Array) -> FittedStart:
+        """The `given` start of an episode; worked out once, at the first parameters that it is asked for with."""
+        key = id(episode)
+        if key not in self._fitted:
+            if self._start_fit is None:
+                self._start_fit = StartFit(self.step, self.options.start_parameters)
+            window = self.options.start_window
+            self._fitted[key] = self._start_fit.solve(episode.posture, episode.samples, theta, window, episode.path)
+        return self._fitted[key]
+
+    def own_theta(self, episode: Episode, theta: Array) -> Array:
+        """theta with the values that belong to one recording: known ones, and those fitted along with its start."""
+        known = self.options.recording_values.get(episode.name, {})
+        own = theta.copy()
+        for name, value in known.items():
+            own[self.system.parameters.index(name)] = value
+        if self.options.initial_state == "given" and self.options.start_parameters:
+            for name, value in self.fitted_start(episode, own).values.items():
+                own[self.system.parameters.index(name)] = value
+        return own
+
     def _begin(
         self, episode: Episode, theta: Array, deviation: Array, wanted: tuple[str, ...]
     ) -> tuple[Array, Array, Rest | None, str]:
@@ -431,11 +468,7 @@ class EstimationProblem:
         key = id(episode)
         rest: Rest | None = None
         if self.options.initial_state == "given":
-            if key not in self._starts:
-                self._starts[key] = fit_start(
-                    self.step, episode.posture, episode.samples, theta, self.options.start_window, episode.path
-                )
-            state, by_theta = self._starts[key].copy(), np.zeros((nx, len(wanted)))
+            state, by_theta = self.fitted_start(episode, theta).state.copy(), np.zeros((nx, len(wanted)))
         else:
             guess = self._starts.get(key)
             first = episode.torque[0] if self.system.driven else None
@@ -458,6 +491,7 @@ class EstimationProblem:
     def run(self, episode: Episode, theta: Array, deviation: Array, derivatives: bool) -> EpisodeResult | str:
         """Roll one episode out and predict its samples; a text says why where that is impossible."""
         wanted = self._columns if derivatives else ()
+        theta = self.own_theta(episode, theta)
         state, by_start, rest, problem = self._begin(episode, theta, deviation, wanted)
         if problem:
             return problem
@@ -569,24 +603,76 @@ class EstimationProblem:
         wide[:, at : at + own] = block[:, shared:]
         return wide
 
-    def _prior(self, x: Array) -> tuple[Array, Array]:
-        names, start = self.names, self.start
-        rows, values = [], []
-        for i, name in enumerate(names):
+    @cached_property
+    def _prior_deviations(self) -> Array:
+        """Deviation of every unknown's stated Gaussian prior about its start, infinite where there is none."""
+        options = self.options
+        deviations = []
+        for name in self.names:
             base = name.split("[")[0]
-            std: float | None = self.options.priors.get(base)
             if base.startswith("start.q."):
-                std = self.options.configuration_std
+                deviations.append(options.configuration_std)
             elif base.startswith("start.p."):
-                joint = base.removeprefix("start.p.")
-                inertia = float(self._apparent_inertia((joint,))[0])
-                std = self.options.velocity_std * max(inertia, 1e-9)
-            if std is not None:
-                row = np.zeros(len(x))
-                row[i] = 1.0 / std
-                rows.append(row)
-                values.append((x[i] - start[i]) / std)
-        return np.array(values), np.array(rows).reshape(len(rows), len(x))
+                inertia = float(self._apparent_inertia((base.removeprefix("start.p."),))[0])
+                deviations.append(options.velocity_std * max(inertia, 1e-9))
+            else:
+                deviations.append(float(options.priors.get(base, np.inf)))
+        return np.array(deviations)
+
+    @cached_property
+    def _tied(self) -> NDArray[np.int64]:
+        """Unknowns under the tie-break."""
+        if self.options.weighting == "paper" or self.options.tie_break <= 1:
+            return np.zeros(0, int)
+        positive = (self.bounds[0] >= 0) & (self.start > 0)
+        return np.flatnonzero(positive & ~np.isfinite(self._prior_deviations))
+
+    @property
+    def stated_prior_rows(self) -> int:
+        """Rows of initial states' and stated priors, which stand before the tie-break's at the end of the residual."""
+        return int(np.isfinite(self._prior_deviations).sum())
+
+    @property
+    def tie_break_rows(self) -> int:
+        """Rows of the tie-break, the last of the residual."""
+        return len(self._tied)
+
+    @property
+    def scales(self) -> Array:
+        """Typical size of every unknown, for solvers: its start, its prior's deviation, or a tenth of its range."""
+        lower, upper = self.bounds
+        size = np.abs(self.start)
+        width = np.where(np.isfinite(upper - lower), upper - lower, 10.0)
+        stated = self._prior_deviations
+        fallback = np.where(np.isfinite(stated), stated, 0.1 * width)
+        return np.where(size > 0, size, fallback)
+
+    @property
+    def paper_noise(self) -> float:
+        """Root mean square noise deviation of the measured points, which the paper's weighting does not use [m]."""
+        found = [s.std[np.isfinite(s.std)] for episode in self.episodes for s in episode.samples]
+        return float(np.sqrt(np.mean(np.concatenate(found) ** 2)))
+
+    def _prior(self, x: Array) -> tuple[Array, Array]:
+        stated, tied = np.flatnonzero(np.isfinite(self._prior_deviations)), self._tied
+        rows = np.zeros((len(stated) + len(tied), len(x)))
+        weight = 1.0 / self._prior_deviations[stated]
+        rows[np.arange(len(stated)), stated] = weight
+        start = self.start
+        spread = np.log(max(self.options.tie_break, 1.0 + 1e-9))
+        ratio = np.maximum(x[tied] / start[tied], 1e-9)
+        rows[len(stated) + np.arange(len(tied)), tied] = 1.0 / (spread * ratio * start[tied])
+        return np.concatenate([weight * (x - start)[stated], np.log(ratio) / spread]), rows
+
+    def shortened(self, duration: float) -> EstimationProblem:
+        """The same problem over the first seconds of every recording."""
+        return EstimationProblem(
+            self.step,
+            [episode.recording for episode in self.episodes],
+            self.free,
+            replace(self.options, duration=duration),
+            dict(zip(self.system.parameters.names, self.theta, strict=True)),
+        )
 
     def gradient(self, x: ArrayLike) -> tuple[float, Array, Evaluation]:
         """Cost and its gradient by the adjoint sweep.
@@ -608,6 +694,7 @@ class EstimationProblem:
         for i, result in enumerate(evaluation.episodes):
             episode = self.episodes[i]
             theta, deviation = self.split(x, i)
+            theta = self.own_theta(episode, theta)
             sweep = result.sweep
             by_state, by_effort = np.zeros((episode.grid.steps + 1, nx)), np.zeros_like(sweep.effort)
             total = np.zeros(len(wanted))
@@ -703,3 +790,14 @@ class EstimationProblem:
                 )
 
 
+def _by_joint(
+    given: float | Array | Mapping[str, float], recorded: Sequence[str], names: Sequence[str], key: str
+) -> Array:
+    """One number for each of `names` from one for all, one for each recorded joint, or a mapping."""
+    if isinstance(given, Mapping):
+        for name in names:
+            if name not in given:
+                raise ConfigError(f"joint '{name}' has no value", where=key, hint=nearest(name, given))
+        return np.array([float(given[name]) for name in names])
+    wide = np.broadcast_to(np.asarray(given, float), (len(recorded),))
+    return wide[[list(recorded).index(name) for name in names]]

@@ -103,7 +103,7 @@ def point_samples(
             )
     columns = [group.names.index(point) for point in points]
     inside = (group.t >= grid.start - 1e-9) & (group.t <= grid.times[-1] + 1e-9)
-    value = group.position[inside][:, columns].reshape(int(inside.sum()), -1)
+    value = group.position[inside][:, columns].reshape(int(inside.sum()), 3 * len(columns))
     if std is not None:
         deviation = np.full(value.shape, float(std))
     elif group.std is not None:

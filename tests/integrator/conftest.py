@@ -1,0 +1,255 @@
+"""Small systems that together use every feature of a step, and effects that bring these features in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from yid_ocp.integrator.step import Feedback, Step, compile_step
+from yid_ocp.model import (
+    Grasp,
+    Kinematics,
+    Mechanism,
+    Parameter,
+    Parameters,
+    Segment,
+    System,
+    Terms,
+    flexible_object,
+    forward_kinematics,
+)
+from yid_ocp.model.mechanism import Placement
+from yid_ocp.model.system import floating_clamp
+
+
+@dataclass(frozen=True)
+class Added:
+    """An effect made of functions; `internal` names its coordinates without momentum."""
+
+    kind: str
+    location: str
+    parameters: Parameters
+    internal: Mapping[str, ca.SX] = field(default_factory=dict)
+    change: Callable = lambda effect, system: system
+    add: Callable = lambda effect, state: Terms()
+
+    def modify(self, system):
+        return self.change(self, system)
+
+    def terms(self, state):
+        return self.add(self, state)
+
+    def measure(self, channel, output, state):
+        return output
+
+
+def _parameters(kind, location, **values):
+    return Parameters(Parameter(f"{kind}@{location}.{name}", value, "SI") for name, value in values.items())
+
+
+def maxwell_branch(joint: str, stiffness: float, relaxation_time: float) -> Added:
+    """V += 1/2 k1 (q - z)^2 with (q - z) = relaxation_time dz/dt."""
+    parameters = _parameters("maxwell", joint, k1=stiffness, tau=relaxation_time)
+    name = f"maxwell@{joint}.z"
+
+    def add(effect, state):
+        k1, tau = effect.parameters.symbols[0], effect.parameters.symbols[1]
+        row = state.internal[name]
+        stretch = state.q[state.system.mechanism.joint_index(joint)] - state.z[row]
+        return Terms(lagrangian=-0.5 * k1 * stretch**2, internal={name: stretch - tau * state.z_rate[row]})
+
+    return Added("maxwell", joint, parameters, {name: ca.SX.sym(name)}, add=add)
+
+
+def soft_joint(joint: str, compliance: float) -> Added:
+    """The joint's spring replaced by a compliance."""
+    parameters = _parameters("soft", joint, compliance=compliance)
+
+    def change(effect, system):
+        elastic = tuple(spring for spring in system.elastic if spring.joint != joint)
+        compliant = {**system.compliant, joint: effect.parameters.symbols[0]}
+        return replace(system, elastic=elastic, compliant=compliant)
+
+    return Added("soft", joint, parameters, change=change)
+
+
+def soft_grasp(grasp: str, compliance: float) -> Added:
+    """phi(q_{k+1}) = C lam / h."""
+    parameters = _parameters("soft_grasp", grasp, compliance=compliance)
+
+    def change(effect, system):
+        changed = [replace(g, compliance=effect.parameters.symbols[0]) if g.name == grasp else g for g in system.grasps]
+        return replace(system, grasps=tuple(changed))
+
+    return Added("soft_grasp", grasp, parameters, change=change)
+
+
+def creeping_grasp(grasp: str, rate: float) -> Added:
+    """The grasped point creeps along the object: dz/dt = rate x axial load."""
+    parameters = _parameters("creep", grasp, rate=rate)
+    name = f"creep@{grasp}.z"
+    internal = {name: ca.SX.sym(name)}
+
+    def change(effect, system):
+        changed = [replace(g, slip=effect.internal[name]) if g.name == grasp else g for g in system.grasps]
+        return replace(system, grasps=tuple(changed))
+
+    def add(effect, state):
+        held = next(g.held for g in state.system.grasps if g.name == grasp)
+        load = ca.dot(state.kinematics.pose(held).rotation[:, 2], state.constraint_force[:3])
+        return Terms(internal={name: state.z_rate[state.internal[name]] - effect.parameters.symbols[0] * load})
+
+    return Added("creep", grasp, parameters, internal, change, add)
+
+
+def growing_link(joint: str, length: float, time: float) -> Added:
+    """The joint's placement moves along its x axis by z, which tends to `length`."""
+    parameters = _parameters("growth", joint, length=length, time=time)
+    name = f"growth@{joint}.z"
+    internal = {name: ca.SX.sym(name)}
+
+    def change(effect, system):
+        joints = list(system.mechanism.joints)
+        index = system.mechanism.joint_index(joint)
+        shift = Placement(ca.SX(ca.DM.eye(3)), ca.vertcat(effect.internal[name], 0, 0))
+        joints[index] = replace(joints[index], placement=joints[index].placement @ shift)
+        return replace(system, mechanism=replace(system.mechanism, joints=tuple(joints)))
+
+    def add(effect, state):
+        target, tau = effect.parameters.symbols[0], effect.parameters.symbols[1]
+        row = state.internal[name]
+        return Terms(internal={name: target - state.z[row] - tau * state.z_rate[row]})
+
+    return Added("growth", joint, parameters, internal, change, add)
+
+
+def cable(**changes) -> System:
+    """Three links, nine coordinates, standing on the ground."""
+    options = {"links": 3, "bend": 2.0, "twist": 1.0, "damping": 0.01, **changes.pop("segment", {})}
+    segment = Segment("C", 0.6, 0.3, 0.05, **options)
+    return System.build(objects=[(flexible_object([segment], name="cable"), None, None)], **changes)
+
+
+def tip(mechanism: Mechanism, frame: str, q: np.ndarray) -> np.ndarray:
+    """4x4 pose of a frame at nominal parameters."""
+    kinematics: Kinematics = forward_kinematics(mechanism.numeric(), ca.SX(ca.DM(q)))
+    return np.array(ca.DM(kinematics.pose(frame).matrix()))
+
+
+def clamped_cable(kind: str, effects=()) -> tuple[System, np.ndarray]:
+    """The cable, bent, its end held by a clamp whose six coordinates are prescribed; with its configuration."""
+    bent = np.array([0.3, -0.2, 0.1, 0.4, 0.2, -0.1, 0.2, 0.3, 0.15])
+    pose = tip(cable().mechanism, "w_C", bent)
+    clamp = floating_clamp("clamp")
+    grasp = Grasp("clamp", "clamp", "w_C", kind, rotation=ca.SX(ca.DM(pose[:3, :3])))
+    segment = Segment("C", 0.6, 0.3, 0.05, links=3, bend=2.0, twist=1.0, damping=0.01)
+    objects = [(flexible_object([segment], name="cable"), None, None)]
+    system = System.build(
+        clamp, objects=objects, grasps=[grasp], prescribed=clamp.joint_names, effects=effects
+    )
+    return system, np.concatenate([pose[:3, 3], np.zeros(3), bent])
+
+
+@dataclass(frozen=True)
+class Case:
+    """A step with a motion over a few steps."""
+
+    step: Step
+    theta: np.ndarray
+    start: np.ndarray
+    torque: np.ndarray
+    path: np.ndarray
+    feedback: Feedback
+
+    def sweep(self, theta=None, start=None, torque=None, path=None, feedback=None, directions=None, step=None):
+        chosen = [self.theta, self.start, self.torque, self.path]
+        given = [theta, start, torque, path]
+        values = [old if new is None else new for old, new in zip(chosen, given, strict=True)]
+        return (step or self.step).kernel.sweep(*values, feedback, directions)
+
+
+def make_case(system: System, q: np.ndarray, time_step=2e-3, steps=10, split="symmetric", values=None) -> Case:
+    step = compile_step(system, time_step, split)
+    sizes = step.sizes
+    rng = np.random.default_rng(5)
+    theta = system.parameters.vector(values)
+    start = np.concatenate([q, np.zeros(sizes["n"]), 0.01 * rng.normal(size=sizes["nz"])])
+    torque = rng.normal(size=(steps, sizes["nu"]))
+    time = np.arange(steps + 1)[:, None] * time_step
+    speed = 0.3 * rng.normal(size=sizes["nc"])
+    path = q[list(system.prescribed_indices)] + speed * time + 4.0 * rng.normal(size=sizes["nc"]) * time**2
+    index = rng.choice(sizes["nx"], size=5, replace=False).astype(np.int32)
+    gain = rng.normal(size=(steps, sizes["nu"], 5))
+    feedback = Feedback(index, gain, start[index] + 0.01 * rng.normal(size=(steps, 5)))
+    return Case(step, theta, start, torque, path, feedback)
+
+
+def closed_loop(urdf_folder, effects=()) -> tuple[System, np.ndarray]:
+    """mixed_joints with its two branches joined at a point: two joints driven, one prescribed."""
+    robot = Mechanism.from_urdf(urdf_folder / "mixed_joints.urdf")
+    q = np.zeros(len(robot.joints))
+    for name, value in {"slide": 0.1, "spin": 0.4, "hinge": -0.5, "extend": 0.15, "swing": 0.3, "nod": 0.7}.items():
+        q[robot.joint_index(name)] = value
+    holder, held = tip(robot, "tool", q), tip(robot, "nose", q)
+    offset = np.linalg.solve(holder, held)[:3, 3]
+    grasp = Grasp("loop", "tool", "nose", offset=ca.SX(ca.DM(offset)))
+    driven, prescribed = ["spin", "extend"], ["swing"]
+    system = System.build(
+        robot, grasps=[grasp], driven=driven, prescribed=prescribed, damping=0.3, effects=effects
+    )
+    return system, q
+
+
+BUILDERS = {
+    "closed_loop": lambda folder: make_case(*closed_loop(folder)),
+    "closed_loop_left": lambda folder: make_case(*closed_loop(folder), split="left"),
+    "welded_cable": lambda folder: make_case(*clamped_cable("weld")),
+    "aligned_cable": lambda folder: make_case(*clamped_cable("axis")),
+    "creeping_cable": lambda folder: make_case(
+        *clamped_cable("point", [creeping_grasp("clamp", 0.05), soft_grasp("clamp", 1e-4)])
+    ),
+    "soft_cable": lambda folder: make_case(
+        cable(
+            driven=["C_2_x", "C_1_z"],
+            effects=[maxwell_branch("C_0_x", 3.0, 0.02), soft_joint("C_1_y", 0.2), soft_joint("C_1_z", 0.0)],
+        ),
+        np.array([0.2, -0.1, 0.1, 0.15, 0.1, 0.0, 0.1, -0.2, 0.05]),
+    ),
+    "growing": lambda folder: make_case(
+        System.build(
+            Mechanism.from_urdf(folder / "mixed_joints.urdf"),
+            driven=["spin", "nod"],
+            damping=0.2,
+            effects=[growing_link("nod", 0.1, 0.01), growing_link("hinge", -0.2, 0.02)],
+        ),
+        np.array([0.1, 0.4, -0.5, 0.15, 0.3, 0.7]),
+    ),
+}
+
+
+@pytest.fixture(scope="session", params=list(BUILDERS))
+def case(request, urdf_folder) -> Case:
+    return BUILDERS[request.param](urdf_folder)
+
+
+@pytest.fixture(scope="session")
+def parts():
+    """The builders above, for tests that need a system of their own."""
+
+    class Parts:
+        Added = Added
+        maxwell_branch = staticmethod(maxwell_branch)
+        soft_joint = staticmethod(soft_joint)
+        soft_grasp = staticmethod(soft_grasp)
+        creeping_grasp = staticmethod(creeping_grasp)
+        cable = staticmethod(cable)
+        clamped_cable = staticmethod(clamped_cable)
+        closed_loop = staticmethod(closed_loop)
+        make_case = staticmethod(make_case)
+        tip = staticmethod(tip)
+
+    return Parts

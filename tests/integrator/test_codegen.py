@@ -1,0 +1,172 @@
+"""Compiled code: the private cache, the compiler's absence, index tables."""
+
+from __future__ import annotations
+
+import logging
+import os
+import stat
+
+import numpy as np
+import pytest
+
+from yid_ocp.errors import OutputError
+from yid_ocp.integrator import codegen
+from yid_ocp.integrator.step import compile_step
+from yid_ocp.model import Mechanism, System
+
+SOURCE = "int yid_answer(void) { return %d; }\n"
+
+needs_compiler = pytest.mark.skipif(codegen.compiler() is None, reason="this machine has no C compiler")
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """An empty cache, and no memory of the compiler."""
+    folder = tmp_path / "cache"
+    monkeypatch.setenv("YID_OCP_CACHE", str(folder))
+    yield folder
+    codegen.compiler.cache_clear()
+    codegen._machine.cache_clear()
+
+
+@pytest.fixture
+def pendulum(urdf_folder):
+    return System.build(Mechanism.from_urdf(urdf_folder / "double_pendulum.urdf"))
+
+
+@pytest.fixture
+def runs(monkeypatch):
+    """Commands that were run."""
+    commands = []
+    original = codegen.subprocess.run
+
+    def run(command, *arguments, **options):
+        commands.append(command)
+        return original(command, *arguments, **options)
+
+    monkeypatch.setattr(codegen.subprocess, "run", run)
+    return commands
+
+
+@needs_compiler
+def test_the_cache_folder_is_private(cache):
+    old = os.umask(0)
+    try:
+        assert codegen.cache_folder() == cache
+    finally:
+        os.umask(old)
+    assert stat.S_IMODE(cache.stat().st_mode) == 0o700
+    assert codegen.cache_folder() == cache
+
+
+@needs_compiler
+def test_the_second_compilation_reads_the_cache(cache, runs):
+    first = codegen.compile_library(SOURCE % 42)
+    assert first.yid_answer() == 42
+    compilations = [command for command in runs if "-shared" in command]
+    assert len(compilations) == 1
+    assert [path.suffix for path in cache.iterdir()] == [".so"]
+    del runs[:]
+    assert codegen.compile_library(SOURCE % 42).yid_answer() == 42
+    assert runs == []
+    assert codegen.compile_library(SOURCE % 43).yid_answer() == 43
+    assert len(list(cache.iterdir())) == 2
+
+
+@needs_compiler
+def test_a_step_compiled_again_runs_no_compiler(cache, runs, pendulum):
+    theta = pendulum.parameters.vector()
+    arguments = ([0.3, 0.1], [0.0, 0.0], [], theta)
+    step = compile_step(pendulum, 0.01)
+    expected = step.jacobians(*arguments)
+    compilations = [command for command in runs if "-shared" in command]
+    assert len(compilations) == 2  # the step, and its derivatives by theta
+    del runs[:]
+    again = compile_step(pendulum, 0.01)
+    for actual, one in zip(again.jacobians(*arguments), expected, strict=True):
+        np.testing.assert_array_equal(actual, one)
+    assert [command for command in runs if "-shared" in command] == []
+    other = compile_step(pendulum, 0.02)
+    assert other.compiled
+    assert [command for command in runs if "-shared" in command] == []
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="this system has no file owners and modes")
+@pytest.mark.parametrize("mode", [0o720, 0o702, 0o777])
+def test_a_cache_that_others_may_write_is_refused(cache, mode):
+    cache.mkdir()
+    cache.chmod(mode)
+    with pytest.raises(OutputError) as caught:
+        codegen.cache_folder()
+    for word in (str(cache), "chmod 700", "YID_OCP_CACHE"):
+        assert word in str(caught.value)
+
+
+def test_a_cache_that_cannot_be_made_is_an_output_error(tmp_path, monkeypatch):
+    blocked = tmp_path / "file"
+    blocked.write_text("not a folder", encoding="utf-8")
+    monkeypatch.setenv("YID_OCP_CACHE", str(blocked / "cache"))
+    with pytest.raises(OutputError, match="CC=none"):
+        codegen.cache_folder()
+
+
+def test_without_a_compiler_everything_works_after_one_notice(cache, monkeypatch, caplog, pendulum):
+    monkeypatch.setenv("CC", "none")
+    codegen.compiler.cache_clear()
+    with caplog.at_level(logging.INFO, logger="yid_ocp"):
+        step = compile_step(pendulum, 0.01)
+        q, _, _, status = step([0.3, 0.1], [0.0, 0.0], [], pendulum.parameters.vector())
+        assert not compile_step(pendulum, 0.02).compiled
+    assert status.ok
+    assert not step.compiled
+    assert np.all(np.isfinite(q))
+    assert [record.levelno for record in caplog.records] == [logging.WARNING]
+    assert "no C compiler" in caplog.text
+    assert not cache.exists()
+
+
+def test_an_interpreted_step_that_was_asked_for_is_not_remarked_upon(caplog, pendulum):
+    with caplog.at_level(logging.INFO, logger="yid_ocp"):
+        assert not compile_step(pendulum, 0.01, use_compiler=False).compiled
+    assert caplog.records == []
+
+
+def test_a_compiler_that_fails_leaves_the_interpreter(cache, tmp_path, monkeypatch, caplog, pendulum):
+    broken = tmp_path / "broken_cc"
+    broken.write_text("#!/bin/sh\necho no space left >&2\nexit 1\n", encoding="utf-8")
+    broken.chmod(0o755)
+    monkeypatch.setenv("CC", str(broken))
+    codegen.compiler.cache_clear()
+    codegen._machine.cache_clear()
+    with caplog.at_level(logging.INFO, logger="yid_ocp"):
+        step = compile_step(pendulum, 0.01)
+    assert not step.compiled
+    assert "no space left" in caplog.text
+    assert list(cache.iterdir()) == []
+
+
+@needs_compiler
+def test_a_damaged_library_leaves_the_interpreter(cache, caplog, pendulum):
+    assert compile_step(pendulum, 0.01).compiled
+    for path in cache.iterdir():
+        # a new file, because the old one is loaded
+        path.unlink()
+        path.write_bytes(b"not a library")
+    with caplog.at_level(logging.INFO, logger="yid_ocp"):
+        step = compile_step(pendulum, 0.01)
+    assert not step.compiled
+    assert "cannot be loaded" in caplog.text
+
+
+def test_elimination_fills_no_more_than_the_tree(single_step):
+    """Tips before roots and multipliers last: a pivot touches its ancestors, and the multipliers of grasps below it."""
+    tables, system = single_step.structure, single_step.system
+    size = len(tables.order)
+    names = [*system.mechanism.joint_names, *[f"lam{i}" for i in range(system.constraint_count)]]
+    ordered = [names[i] for i in tables.unknown_row[tables.order]]
+    assert ordered[0] == "T3_3_z"
+    assert ordered[-3:] == ["lam0", "lam1", "lam2"]
+    tip = [ordered[i] for i in tables.fill[0]]
+    chain = [system.mechanism.joint_names[i] for i in system.mechanism.ancestors(system.mechanism.joint_index("T3_3_z"))]
+    assert tip == chain[-2::-1]
+    assert sum(len(entries) for entries in tables.fill) < 0.75 * size * (size - 1) / 2

@@ -1,0 +1,196 @@
+"""Derivatives of steps and rollouts: implicit function theorem, forward sweep, adjoint sweep, differences, interpreter."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from yid_ocp.integrator.step import Directions, compile_step
+
+EPSILON = 1e-5
+
+
+def central(function, x, epsilon=EPSILON):
+    """Columns of the Jacobian by central differences; `function` gives an array."""
+    columns = []
+    for i in range(len(x)):
+        shift = np.zeros(len(x))
+        shift[i] = epsilon * max(1.0, abs(x[i]))
+        columns.append((function(x + shift) - function(x - shift)) / (2 * shift[i]))
+    return np.stack(columns, axis=-1)
+
+
+def agree(actual, expected, tolerance):
+    """Relative to the largest entry of each column."""
+    scale = np.maximum(np.max(np.abs(expected), axis=0, initial=0.0), 1e-2)
+    assert actual.shape == expected.shape
+    assert np.max(np.abs(actual - expected) / scale, initial=0.0) < tolerance
+
+
+def after_one(case, theta=None, start=None, torque=None, path=None):
+    swept = case.sweep(theta, start, case.torque[:1] if torque is None else torque[None, :], case.path[:2])
+    assert swept.status.ok, swept.status.message
+    return swept.state[1]
+
+
+def test_step_jacobians_against_differences(case):
+    step, n = case.step, case.step.system.size
+    q0, p0, z0 = case.start[:n], case.start[n : 2 * n], case.start[2 * n :]
+    prescribed = (case.path[0], case.path[1]) if step.sizes["nc"] else None
+    A, B_u, B_theta = step.jacobians(q0, p0, case.torque[0], case.theta, prescribed, z0)
+    agree(A, central(lambda x: after_one(case, start=x), case.start), 1e-6)
+    agree(B_theta, central(lambda x: after_one(case, theta=x), case.theta), 1e-6)
+    if step.sizes["nu"]:
+        agree(B_u, central(lambda x: after_one(case, torque=x), case.torque[0]), 1e-6)
+    else:
+        assert B_u.shape == (step.sizes["nx"], 0)
+
+
+def test_step_jacobians_of_the_grasped_y(golden, single_step, theta_golden):
+    trep, theta, step = golden("single"), theta_golden("single"), single_step
+    q, p, u, n = trep.q[40], trep.p[40], trep.u[40], step.system.size
+    A, B_u, B_theta = step.jacobians(q, p, u, theta)
+
+    def move(x):
+        q1, p1, _, status = step(x[:n], x[n : 2 * n], x[2 * n : 2 * n + 7], x[2 * n + 7 :])
+        assert status.ok, status.message
+        return np.concatenate([q1, p1])
+
+    expected = central(move, np.concatenate([q, p, u, theta]))
+    agree(A, expected[:, : 2 * n], 1e-6)
+    agree(B_u, expected[:, 2 * n : 2 * n + 7], 1e-6)
+    agree(B_theta, expected[:, 2 * n + 7 :], 1e-6)
+
+
+def test_chosen_parameters_only(case):
+    names = case.step.system.parameters.names
+    n = case.step.system.size
+    prescribed = (case.path[0], case.path[1]) if case.step.sizes["nc"] else None
+    arguments = (case.start[:n], case.start[n : 2 * n], case.torque[0], case.theta, prescribed, case.start[2 * n :])
+    everything = case.step.jacobians(*arguments)[2]
+    chosen = [names[-1], names[0]]
+    few = case.step.jacobians(*arguments, names=chosen)[2]
+    np.testing.assert_allclose(few, everything[:, [-1, 0]], rtol=1e-12, atol=1e-14)
+
+
+def random_cost(case, seed=11):
+    """Weights of a cost linear in every output of a rollout, scaled so that all parts count."""
+    rng = np.random.default_rng(seed)
+    s, steps = case.step.sizes, len(case.torque)
+    return SimpleNamespace(
+        state=rng.normal(size=(steps + 1, s["nx"])),
+        multipliers=0.1 * rng.normal(size=(steps, s["m"])),
+        effort=0.01 * rng.normal(size=(steps, s["nc"])),
+        value=lambda weights, swept: sum(
+            np.sum(getattr(weights, name) * getattr(swept, name)) for name in ("state", "multipliers", "effort")
+        ),
+    )
+
+
+@pytest.mark.parametrize("fed_back", [False, True], ids=["open_loop", "feedback"])
+def test_forward_equals_adjoint_equals_differences(case, fed_back):
+    s, steps, theta = case.step.sizes, len(case.torque), case.theta
+    if fed_back and not s["nu"]:
+        pytest.skip("nothing is driven in this system, so nothing can be fed back")
+    feedback = case.feedback if fed_back else None
+    names = case.step.system.parameters.names
+    fixed = list(case.step.system.prescribed_indices)
+    weights = random_cost(case)
+    rng = np.random.default_rng(12)
+
+    swept = case.sweep(feedback=feedback)
+    assert swept.status.ok, swept.status.message
+    gradient = case.step.kernel.adjoint(
+        theta, swept, feedback, names, weights.state, weights.multipliers, weights.effort
+    )
+
+    # columns: all of theta, then two of everything else at once
+    d = s["ntheta"] + 2
+    start, torque = np.zeros((s["nx"], d)), np.zeros((steps, s["nu"], d))
+    path = np.zeros((steps + 1, s["nc"], d))
+    start[:, -2:], torque[..., -2:] = rng.normal(size=(s["nx"], 2)), rng.normal(size=(steps, s["nu"], 2))
+    path[..., -1] = rng.normal(size=(steps + 1, s["nc"]))
+    start[fixed] = path[0]
+    forward = case.sweep(feedback=feedback, directions=Directions(names, start, torque, path))
+    slopes = (
+        np.tensordot(weights.state, forward.by_state, 2)
+        + np.tensordot(weights.multipliers, forward.by_multipliers, 2)
+        + np.tensordot(weights.effort, forward.by_effort, 2)
+    )
+
+    np.testing.assert_array_equal(forward.state, swept.state)
+    scale = np.max(np.abs(slopes))
+    np.testing.assert_allclose(slopes[:-2], gradient.by_theta, rtol=1e-8, atol=1e-9 * scale)
+    expected = np.sum(gradient.by_start * start[:, -2]) + np.sum(gradient.by_torque * torque[..., -2])
+    assert slopes[-2] == pytest.approx(expected, rel=1e-8, abs=1e-9 * scale)
+
+    def along(direction, epsilon):
+        moved = case.sweep(
+            theta + epsilon * direction[0],
+            case.start + epsilon * direction[1],
+            case.torque + epsilon * direction[2],
+            case.path + epsilon * direction[3],
+            feedback,
+        )
+        assert moved.status.ok, moved.status.message
+        return weights.value(weights, moved)
+
+    def difference(direction, epsilon=3e-6):
+        return (along(direction, epsilon) - along(direction, -epsilon)) / (2 * epsilon)
+
+    for column in (-2, -1):
+        direction = (0 * theta, start[:, column], torque[..., column], path[..., column])
+        assert slopes[column] == pytest.approx(difference(direction), rel=1e-5, abs=1e-5 * scale)
+    for column in rng.choice(s["ntheta"], size=4, replace=False):
+        unit = np.zeros(s["ntheta"])
+        unit[column] = max(1.0, abs(theta[column]))
+        zero = (0 * case.start, 0 * case.torque, 0 * case.path)
+        assert slopes[column] * unit[column] == pytest.approx(difference((unit, *zero)), rel=1e-5, abs=1e-5 * scale)
+
+
+def test_interpreter_equals_compiled(case):
+    plain = compile_step(case.step.system, case.step.time_step, case.step.force_split, use_compiler=False)
+    assert case.step.compiled
+    assert not plain.compiled
+    names = tuple(case.step.system.parameters.names[::2])
+    feedback = case.feedback if case.step.sizes["nu"] else None
+    nx, d = case.step.sizes["nx"], len(names) + 1
+    rng = np.random.default_rng(3)
+    torque = rng.normal(size=(*case.torque.shape, d))
+    path = rng.normal(size=(*case.path.shape, d))
+    directions = Directions(names, rng.normal(size=(nx, d)), torque, path)
+    directions.start[list(case.step.system.prescribed_indices)] = path[0]
+    one = case.sweep(feedback=feedback, directions=directions)
+    two = case.sweep(feedback=feedback, directions=directions, step=plain)
+    weights = random_cost(case)
+    partial = (weights.state, weights.multipliers, weights.effort)
+    back = [s.kernel.adjoint(case.theta, one, feedback, names, *partial) for s in (case.step, plain)]
+    pairs = [(getattr(one, key), getattr(two, key)) for key in ("state", "multipliers", "effort", "torque")]
+    pairs += [(getattr(one, key), getattr(two, key)) for key in ("by_state", "by_multipliers", "by_effort")]
+    pairs += [(getattr(back[0], key), getattr(back[1], key)) for key in ("by_theta", "by_start", "by_torque")]
+    for actual, expected in pairs:
+        assert np.all(np.isfinite(actual))
+        scale = max(1.0, np.max(np.abs(expected), initial=0.0))
+        np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-9 * scale)
+    np.testing.assert_allclose(one.status.internal, two.status.internal, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(one.status.effort, two.status.effort, rtol=0, atol=1e-9 * scale_of(two.status.effort))
+
+
+def scale_of(array):
+    return max(1.0, np.max(np.abs(array), initial=0.0))
+
+
+def test_a_sweep_is_its_steps(case):
+    n, s = case.step.system.size, case.step.sizes
+    swept = case.sweep()
+    for k, u in enumerate(case.torque):
+        x = swept.state[k]
+        pair = (case.path[k], case.path[k + 1]) if s["nc"] else None
+        q1, p1, lam, status = case.step(x[:n], x[n : 2 * n], u, case.theta, pair, x[2 * n :])
+        assert status.ok, status.message
+        after = np.concatenate([q1, p1, status.internal])
+        np.testing.assert_allclose(after, swept.state[k + 1], rtol=0, atol=1e-9 * scale_of(after))
+        np.testing.assert_allclose(lam, swept.multipliers[k], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(status.effort, swept.effort[k], rtol=0, atol=1e-7 * scale_of(status.effort))

@@ -1,0 +1,106 @@
+from __future__ import annotations
+
+import math
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from yid_ocp.errors import ConfigError, ModelError, YidError, nearest
+from yid_ocp.model import Parameter, Parameters
+
+NUMBERS = st.floats(-1e6, 1e6, allow_nan=False)
+
+
+@pytest.fixture
+def three():
+    return Parameters(
+        [
+            Parameter("T1.bend", 3.0, "N m/rad", 0.0),
+            Parameter("T1.mass", 0.064, "kg", 0.0, 1.0),
+            Parameter("wind@object.speed", -2.0, "m/s"),
+        ]
+    )
+
+
+def test_order_of_theta(three):
+    assert three.names == ("T1.bend", "T1.mass", "wind@object.speed")
+    np.testing.assert_array_equal(three.vector(), [3.0, 0.064, -2.0])
+    np.testing.assert_array_equal(three.vector({"T1.mass": 0.1, "T1.bend": 22.0}), [22.0, 0.1, -2.0])
+    assert [three.index(name) for name in three.names] == [0, 1, 2]
+    assert [entry.name for entry in three] == list(three.names)
+    assert len(three) == 3
+    assert "T1.mass" in three
+    assert "T1.weight" not in three
+
+
+def test_symbols_stand_for_the_entries(three):
+    function = ca.Function("f", [three.symbols], [three["T1.bend"].symbol * 10 + three["T1.mass"].symbol])
+    assert float(function([1.0, 2.0, 3.0])) == 12.0
+    assert three.symbols.shape == (3, 1)
+    assert Parameters().symbols.shape == (0, 1)
+
+
+def test_changed_sets_keep_order_and_symbols(three):
+    changed = three.with_values({"T1.bend": 5.0}).with_bounds({"T1.bend": (1.0, 6.0)})
+    assert changed.names == three.names
+    assert (changed["T1.bend"].value, changed["T1.bend"].lower, changed["T1.bend"].upper) == (5.0, 1.0, 6.0)
+    assert three["T1.bend"].value == 3.0
+    assert ca.is_equal(changed["T1.bend"].symbol, three["T1.bend"].symbol)
+    more = three.joined([Parameter("a", 1.0, "1")], [Parameter("b", 2.0, "1")])
+    assert more.names == (*three.names, "a", "b")
+
+
+def test_bounds(three):
+    lower, upper = three.bounds(["T1.mass", "wind@object.speed"])
+    np.testing.assert_array_equal(lower, [0.0, -math.inf])
+    np.testing.assert_array_equal(upper, [1.0, math.inf])
+
+
+@given(values=st.lists(NUMBERS, min_size=1, max_size=8), data=st.data())
+def test_vector_is_a_round_trip(values, data):
+    entries = Parameters(Parameter(f"p{i}", value, "1") for i, value in enumerate(values))
+    np.testing.assert_array_equal(entries.vector(), values)
+    chosen = data.draw(st.dictionaries(st.sampled_from(entries.names), NUMBERS))
+    theta = entries.vector(chosen)
+    expected = {**dict(zip(entries.names, values, strict=True)), **chosen}
+    assert dict(zip(entries.names, theta, strict=True)) == expected
+
+
+@pytest.mark.parametrize(
+    ("action", "words"),
+    [
+        (lambda p: p["T1.bent"], ["'T1.bent'", "did you mean 'T1.bend'?"]),
+        (lambda p: p.vector({"zz": 1.0}), ["'zz'", "T1.bend, T1.mass, wind@object.speed"]),
+        (lambda p: p.vector({"T1.bend": math.nan}), ["T1.bend = nan", "finite"]),
+        (lambda p: p.with_values({"T1.mass": 2.0}), ["T1.mass = 2 kg", "0 to 1 kg"]),
+        (lambda p: p.with_values({"T1.mas": 2.0}), ["did you mean 'T1.mass'?"]),
+        (lambda p: p.with_bounds({"T1.bend": (4.0, 5.0)}), ["T1.bend = 3 N m/rad", "4 to 5"]),
+        (lambda p: p.with_bounds({"bend": (4.0, 5.0)}), ["'bend'"]),
+        (lambda p: p.bounds(["T2.bend"]), ["'T2.bend'", "'T1.bend'"]),
+        (lambda p: p.joined([Parameter("T1.bend", 1.0, "1")]), ["named twice", "T1.bend"]),
+        (lambda p: Parameter("x", math.inf, "1"), ["x = inf"]),
+        (lambda p: Parameter("x", 1.0, "1", lower=2.0), ["x = 1 1", "2 to inf"]),
+    ],
+)
+def test_errors_name_what_is_wrong_and_what_is_allowed(three, action, words):
+    with pytest.raises(ConfigError) as caught:
+        action(three)
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_an_error_has_its_parts_on_lines_of_their_own():
+    error = ModelError("it broke", where="here", allowed="this", hint="that")
+    assert str(error) == "it broke\n  where: here\n  allowed: this\n  try: that"
+    assert isinstance(error, YidError)
+    assert (error.what, error.where, error.allowed, error.hint) == ("it broke", "here", "this", "that")
+    assert str(ModelError("it broke")) == "it broke"
+
+
+def test_nearest_name():
+    assert nearest("left_s3", ["left_s0", "head"]) == "did you mean 'left_s0'?"
+    assert nearest("zzz", ["b", "a"]) == "known: a, b"
+    assert nearest("zzz", []) == "known: none"

@@ -1,0 +1,162 @@
+"""What a variational step keeps when no force acts: momentum maps, time reversal, the symplectic form, energy."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from yid_ocp.integrator.step import compile_step
+from yid_ocp.model import Mechanism, Segment, System, flexible_object
+from yid_ocp.model.kinematics import mass_matrix
+from yid_ocp.model.mechanism import Joint, Placement
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def free(system):
+    """The same system without damping."""
+    names = [name for name in system.parameters.names if name.endswith(".damping")]
+    return system.parameters.vector(dict.fromkeys(names, 0.0))
+
+
+def case(system, time_step):
+    step = compile_step(system, time_step)
+    return SimpleNamespace(system=system, step=step, theta=free(system), n=system.size)
+
+
+def random_state(case, momentum, seed, spread=1.0):
+    rng = np.random.default_rng(seed)
+    q, v = spread * rng.uniform(-1, 1, case.n), spread * rng.normal(size=case.n)
+    return q, momentum(case.step, q, v, case.theta)
+
+
+@pytest.fixture(scope="module")
+def cases(urdf_folder):
+    def read(name, **options):
+        return System.build(Mechanism.from_urdf(urdf_folder / f"{name}.urdf"), **options)
+
+    arm = [f"left_{joint}" for joint in ("s0", "s1", "e0", "e1", "w0", "w1", "w2")]
+    cable = flexible_object([Segment("C", 0.6, 0.3, 0.02, links=3, bend=2.0, twist=1.0)])
+    return {
+        "mixed_joints": case(read("mixed_joints"), 2e-3),
+        "turntable": case(read("turntable"), 5e-3),
+        "double_pendulum": case(read("double_pendulum"), 2e-3),
+        "arm": case(System.build(Mechanism.from_urdf("package:baxter", joints=arm)), 5e-3),
+        "cable": case(System.build(objects=[(cable, None, None)]), 1e-3),
+        "foam_y": case(System.build(objects=[(flexible_object(), None, None)]), 1e-3),
+    }
+
+
+@pytest.fixture(scope="module")
+def gantry(urdf_folder):
+    """All joints of mixed_joints on two free horizontal rails."""
+    axes = {"rail_x": (1.0, 0.0, 0.0), "rail_y": (0.0, 1.0, 0.0)}
+    rails = [
+        Joint(name, "prismatic", i - 1, Placement.identity(), axis) for i, (name, axis) in enumerate(axes.items())
+    ]
+    other = Mechanism.from_urdf(urdf_folder / "mixed_joints.urdf")
+    shifted = [replace(joint, parent=joint.parent + 2) for joint in other.joints]
+    mechanism = Mechanism("gantry", (*rails, *shifted), {}, other.parameters)
+    return case(System.build(mechanism), 2e-3)
+
+
+@given(seed=SEEDS)
+def test_angular_momentum_about_a_free_axis(cases, roll, momentum, seed):
+    table = cases["turntable"]
+    q, p = random_state(table, momentum, seed)
+    swept = roll(table.step, table.theta, q, p, 300)
+    assert swept.status.ok, swept.status.message
+    kept = swept.state[:, table.n]
+    assert np.max(np.abs(kept - kept[0])) < 1e-9 * max(1.0, abs(kept[0]))
+    assert np.ptp(swept.state[:, table.n + 1]) > 1e-3
+
+
+@given(seed=SEEDS)
+def test_linear_momentum_along_free_rails(gantry, roll, momentum, seed):
+    q, p = random_state(gantry, momentum, seed, spread=0.5)
+    swept = roll(gantry.step, gantry.theta, q, p, 200)
+    assert swept.status.ok, swept.status.message
+    kept = swept.state[:, gantry.n : gantry.n + 2]
+    assert np.max(np.abs(kept - kept[0])) < 1e-9 * max(1.0, np.max(np.abs(kept[0])))
+
+
+@pytest.mark.parametrize("name", ["mixed_joints", "turntable", "arm", "cable", "foam_y"])
+@given(seed=SEEDS)
+def test_reversible(cases, momentum, name, seed):
+    """With F = 0 the step is its own inverse after the momenta are turned round."""
+    one = cases[name]
+    q0, p0 = random_state(one, momentum, seed, spread=0.3)
+    u = np.zeros(0)
+    q1, p1, _, there = one.step(q0, p0, u, one.theta)
+    q2, p2, _, back = one.step(q1, -p1, u, one.theta)
+    assert there.ok, there.message
+    assert back.ok, back.message
+    assert np.max(np.abs(q1 - q0)) > 1e-6
+    np.testing.assert_allclose(q2, q0, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(-p2, p0, rtol=0, atol=1e-9 * max(1.0, np.max(np.abs(p0))))
+
+
+def test_a_grasped_step_is_reversible_up_to_the_pull_of_the_grasp(golden, single_arm, theta_golden):
+    system = single_arm
+    step = compile_step(system, 0.01)
+    trep, theta = golden("single"), theta_golden("single")
+    damping = {name: 0.0 for name in system.parameters.names if name.endswith(".damping")}
+    theta[[system.parameters.index(name) for name in damping]] = 0.0
+    q0, p0, u = trep.q[20], trep.p[20], np.zeros(7)
+    q1, p1, lam, there = step(q0, p0, u, theta)
+    q2, p2, undone, back = step(q1, -p1, u, theta)
+    assert there.ok, there.message
+    assert back.ok, back.message
+    np.testing.assert_allclose(q2, q0, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(undone, 0.0, rtol=0, atol=1e-7 * np.max(np.abs(lam)) + 1e-9)
+    e = step.equations
+    matrix = ca.Function("matrix", [e.q0, e.theta], [ca.densify(e.constraint_matrix)])
+    np.testing.assert_allclose(-p2, p0 - np.array(matrix(q0, theta)).T @ lam, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["mixed_joints", "turntable", "double_pendulum", "arm", "cable", "foam_y"])
+@given(seed=SEEDS)
+def test_symplectic(cases, momentum, name, seed):
+    one = cases[name]
+    q, p = random_state(one, momentum, seed, spread=0.3)
+    A, _, _ = one.step.jacobians(q, p, np.zeros(0), one.theta, names=())
+    unit, none = np.eye(one.n), np.zeros((one.n, one.n))
+    form = np.block([[none, unit], [-unit, none]])
+    size = np.abs(A).T @ np.abs(form) @ np.abs(A)
+    assert np.max(np.abs(A.T @ form @ A - form)) < 1e-9 * max(1.0, np.max(size))
+
+
+def test_energy_shows_no_drift_over_a_hundred_thousand_steps(cases, roll, momentum):
+    one = cases["double_pendulum"]
+    q0 = np.array([0.9, -0.3])
+    swept = roll(one.step, one.theta, q0, momentum(one.step, q0, np.array([0.5, 1.0]), one.theta), 100_000)
+    assert swept.status.ok, swept.status.message
+    e, p = one.step.equations, ca.SX.sym("p", 2)
+    M = mass_matrix(e.rigid, one.system.mechanism)
+    energy = ca.substitute([0.5 * ca.dot(p, ca.solve(M, p)) + e.rigid.potential], [e.q1], [e.q0])
+    every = swept.state[::10]
+    function = ca.Function("energy", [e.q0, p, e.theta, e.time_step], energy)
+    values = np.array(function(every[:, :2].T, every[:, 2:4].T, one.theta, one.step.time_step)).ravel()
+    error = np.abs(values - values[0])
+    tenth = len(error) // 10
+    assert 0 < np.max(error) < 1e-4  # [J], of about two that swing to and fro
+    assert np.max(error[-tenth:]) < 1.5 * np.max(error[:tenth])
+    assert abs(np.mean(values[-tenth:]) - np.mean(values[:tenth])) < 0.1 * np.max(error)
+
+
+@pytest.mark.parametrize("name", ["single", "dual"])
+def test_constraints_do_not_drift(golden, theta_golden, paper_systems, single_step, dual_step, roll, violation, name):
+    """Along the golden torques; with the other force split the motion, unstable as it is, soon becomes another one."""
+    trep, theta = golden(name), theta_golden(name)
+    left = {"single": single_step, "dual": dual_step}[name]
+    for step, steps in ((left, 300), (compile_step(paper_systems[name], 0.01), 100)):
+        swept = roll(step, theta, trep.q[0], trep.p[0], steps, torque=trep.u[:steps])
+        assert swept.status.ok, swept.status.message
+        worst = max(np.max(np.abs(violation(step, x[: trep.q.shape[1]], theta))) for x in swept.state[1::7])
+        assert worst < 1e-10

@@ -1,0 +1,121 @@
+"""One step from each state of trep's trajectories, its first derivatives, and the numbers of the model."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from yid_ocp.integrator.step import compile_step
+from yid_ocp.model import forward_kinematics
+from yid_ocp.model.mechanism import merged
+
+NAMES = ("single", "dual")
+TIPS = {"wT1": "w_T1", "wT2": "w_T2", "wT3": "w_T3", "left": "left_gripper", "right": "right_gripper"}
+
+
+@pytest.fixture(scope="module", params=NAMES)
+def case(request, golden, paper_systems, theta_golden, single_step, dual_step):
+    step = {"single": single_step, "dual": dual_step}[request.param]
+    return golden(request.param), paper_systems[request.param], step, theta_golden(request.param)
+
+
+def compare_step(trep, step, theta, k):
+    q1, p1, lam, status = step(trep.q[k], trep.p[k], trep.u[k], theta)
+    assert status.ok, status.message
+    np.testing.assert_allclose(q1, trep.q[k + 1], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(p1, trep.p[k + 1], rtol=0, atol=1e-9)
+    # trep was given pi as the URDF rounds it (to 5e-12), which shows in small multipliers: relative to the largest one
+    np.testing.assert_allclose(lam, trep.lam[k], rtol=0, atol=1e-8 * np.max(np.abs(trep.lam)))
+
+
+def compare_derivatives(trep, step, theta, k):
+    A, B_u, B_theta = step.jacobians(trep.q[k], trep.p[k], trep.u[k], theta, names=())
+    for actual, expected in ((A, getattr(trep, f"A_{k}")), (B_u, getattr(trep, f"Bu_{k}"))):
+        np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-8 * np.max(np.abs(expected)))
+    assert B_theta.shape == (2 * step.system.size, 0)
+
+
+def test_sizes(case):
+    trep, system, step, _ = case
+    assert step.compiled
+    assert step.time_step == float(trep.dt)
+    assert (system.size, system.constraint_count) == (trep.q.shape[1], trep.lam.shape[1])
+
+
+def test_every_step(case):
+    trep, _, step, theta = case
+    for k in range(len(trep.u)):
+        compare_step(trep, step, theta, k)
+
+
+@pytest.mark.parametrize("k", [0, 10, 299])
+def test_first_derivatives(case, k):
+    trep, _, step, theta = case
+    compare_derivatives(trep, step, theta, k)
+
+
+def test_start_of_the_rollout(case, roll):
+    trep, _, step, theta = case
+    swept = roll(step, theta, trep.q[0], trep.p[0], 50, torque=trep.u[:50])
+    assert swept.status.ok, swept.status.message
+    np.testing.assert_allclose(swept.state[:, : trep.q.shape[1]], trep.q[:51], rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_interpreter(name, golden, paper_systems, theta_golden):
+    trep = golden(name)
+    step = compile_step(paper_systems[name], 0.01, "left", use_compiler=False)
+    assert not step.compiled
+    for k in (0, 1, 120, 299):
+        compare_step(trep, step, theta_golden(name), k)
+    compare_derivatives(trep, step, theta_golden(name), 10)
+
+
+def test_measured_points(case):
+    trep, system, _, theta = case
+    q = ca.SX.sym("q", system.size)
+    kinematics = forward_kinematics(system.mechanism, q)
+    points = ca.horzcat(*(kinematics.position(name) for name in ("w_T1", "w_T2", "w_T3")))
+    function = ca.Function("points", [q, system.parameters.symbols], [points])
+    for k in range(0, 300, 30):
+        np.testing.assert_allclose(np.array(function(trep.q[k + 1], theta)).T, trep.w[k], rtol=0, atol=1e-10)
+
+
+def number(mechanism_expression) -> np.ndarray:
+    return np.array(ca.DM(mechanism_expression))
+
+
+def test_model_numbers(case):
+    trep, system, _, theta = case
+    values = dict(zip(system.parameters.names, theta, strict=True))
+    mechanism = system.mechanism.numeric({name: values[name] for name in system.mechanism.parameters.names})
+    springs = {spring.joint: spring.stiffness for spring in system.elastic}
+    assert len(mechanism.joints) == len(trep.model["nodes"])
+    for joint, node in zip(mechanism.joints, trep.model["nodes"], strict=True):
+        assert joint.parent == node["parent"]
+        np.testing.assert_allclose(number(joint.placement.matrix()), node["X"], rtol=0, atol=1e-10)
+        np.testing.assert_array_equal(joint.axis, np.eye(3)["xyz".index(node["axis"])])
+        body = merged(joint.bodies)
+        if body is None:
+            assert not node["mass"]
+        else:
+            assert float(body.mass) == pytest.approx(node["mass"], abs=1e-10)
+            np.testing.assert_allclose(number(body.com).ravel(), node["com"], rtol=0, atol=1e-10)
+            np.testing.assert_allclose(number(body.about_com), node["I"], rtol=0, atol=1e-10)
+        stiffness = springs.get(joint.name)
+        if stiffness is None:
+            assert node["stiffness"] is None
+        else:
+            assert ca.is_equal(stiffness, system.parameters[node["stiffness"].replace("_", ".")].symbol)
+
+
+def test_model_tips_and_grasps(case):
+    trep, system, _, _ = case
+    mechanism = system.mechanism.numeric()
+    for name, tip in trep.model["tips"].items():
+        frame = mechanism.frame(TIPS[name])
+        assert frame.joint == tip["node"]
+        np.testing.assert_allclose(number(frame.placement.matrix()), tip["X"], rtol=0, atol=1e-10)
+    grasps = [[grasp.holder, grasp.held] for grasp in system.grasps]
+    assert grasps == [[TIPS[holder], TIPS[held]] for holder, held in trep.model["grasps"]]

@@ -1,0 +1,170 @@
+"""Predictions that need no model, to be beaten: nothing moves, all moves with the clamps, the clamps' motion carried."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.data.recording import PointGroup, Recording
+from yid_ocp.errors import DataError, nearest
+
+Array = NDArray[np.float64]
+
+
+def group_with(recording: Recording, points: Sequence[str]) -> PointGroup:
+    """The group of a recording that holds all the points; `DataError` where there is none."""
+    for group in recording.points:
+        if set(points) <= set(group.names):
+            return group
+    missing = [point for point in points if point not in recording.point_names]
+    raise DataError(
+        f"point '{missing[0]}' is not recorded" if missing else "the points stand in several groups",
+        where=recording.name,
+        hint=nearest(missing[0], recording.point_names) if missing else "put points of one object in one group",
+    )
+
+
+def stay(recording: Recording, points: Sequence[str], given: int = 2) -> Array:
+    """Every point stays where it was in the last given frame.
+
+    Parameters
+    ----------
+    recording : Recording
+    points : sequence of str
+        To predict.
+    given : int
+        How many frames of them are known.
+
+    Returns
+    -------
+    ndarray, shape (M, len(points), 3)
+        [m]; the given frames as measured.
+
+    Raises
+    ------
+    DataError
+        A point that is not recorded or not seen in the last given frame, or too few frames.
+    """
+    return _carried(recording, points, (), given, np.zeros((len(points), 0)))
+
+
+def move_with_clamps(recording: Recording, points: Sequence[str], clamped: Sequence[str], given: int = 2) -> Array:
+    """Every point moves by the mean displacement of the clamped points since the last given frame.
+
+    Parameters and errors as in `stay`; `clamped` names the points whose path is known throughout.
+
+    Returns
+    -------
+    ndarray, shape (M, len(points), 3)
+        [m]
+    """
+    share = np.full((len(points), len(clamped)), 1.0 / max(len(clamped), 1))
+    return _carried(recording, points, clamped, given, share)
+
+
+def linear_carry(
+    recording: Recording,
+    points: Sequence[str],
+    parent: Sequence[str],
+    children: Mapping[str, Sequence[str]] | None = None,
+    clamped: Sequence[str] | None = None,
+    given: int = 2,
+) -> Array:
+    """Displacement interpolated linearly in arc length along the parent; children move with their junction.
+
+    Parameters
+    ----------
+    recording : Recording
+    points : sequence of str
+        To predict.
+    parent : sequence of str
+        Points of the parent from end to end.
+    children : mapping of str to sequence of str, optional
+        Points of each child, the first one the parent's point at which it leaves.
+    clamped : sequence of str, optional
+        Points of the parent between which is interpolated; its two ends when absent.
+    given : int
+
+    Returns
+    -------
+    ndarray, shape (M, len(points), 3)
+        [m]
+
+    Raises
+    ------
+    DataError
+        A point that is not recorded or not seen in the last given frame, a point of no branch, too few frames.
+    """
+    known = tuple(clamped) if clamped is not None else (parent[0], parent[-1])
+    at = _given_frame(recording, parent, given)
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(at, axis=0), axis=1))])
+    place = dict(zip(parent, arc, strict=True))
+    knots = sorted(known, key=lambda point: place[point])
+    positions = [place[point] for point in knots]
+    leaves = {point: branch[0] for branch in (children or {}).values() for point in branch[1:]}
+
+    def weights(point: str) -> Array:
+        carrier = leaves.get(point, point)
+        if carrier not in place:
+            raise DataError(f"point '{point}' belongs to no branch", hint=nearest(point, [*place, *leaves]))
+        return np.array([np.interp(place[carrier], positions, row) for row in np.eye(len(knots))])
+
+    share = np.array([weights(point) for point in points])
+    return _carried(recording, points, knots, given, share)
+
+
+def prediction_error(predicted: Array, measured: Array, given: int = 2) -> float:
+    """Square root of the mean squared Euclidean error over points and frames.
+
+    Parameters
+    ----------
+    predicted, measured : ndarray, shape (M, np, 3)
+        [m]; frames in which a point was not measured do not count.
+    given : int
+        Frames at the start that were given and so do not count.
+
+    Returns
+    -------
+    float
+        [m]; NaN where nothing is left to compare.
+
+    Raises
+    ------
+    DataError
+        The two differ in shape.
+    """
+    if predicted.shape != measured.shape:
+        raise DataError(f"prediction {predicted.shape} and measurement {measured.shape} differ in shape")
+    square = np.sum((predicted - measured)[given:] ** 2, axis=2)
+    seen = np.isfinite(measured[given:]).all(axis=2)
+    return float(np.sqrt(np.mean(square[seen]))) if np.any(seen) else float("nan")
+
+
+def positions(recording: Recording, points: Sequence[str]) -> Array:
+    """Measured positions of some points of one group, shape (M, len(points), 3) [m]."""
+    group = group_with(recording, points)
+    return group.position[:, [group.names.index(point) for point in points]]
+
+
+def _given_frame(recording: Recording, points: Sequence[str], given: int) -> Array:
+    at = positions(recording, points)
+    if not 1 <= given < len(at):
+        raise DataError(f"given = {given} frames", where=recording.name, allowed=f"1 to {len(at) - 1}")
+    if not np.all(np.isfinite(at[given - 1])):
+        hidden = points[int(np.argmin(np.isfinite(at[given - 1]).all(axis=1)))]
+        raise DataError(f"point '{hidden}' is not seen in the last given frame", where=recording.name)
+    return np.asarray(at[given - 1])
+
+
+def _carried(recording: Recording, points: Sequence[str], known: Sequence[str], given: int, share: Array) -> Array:
+    """Given frames as measured, then the last one plus each point's share of the known points' displacement."""
+    here = _given_frame(recording, points, given)
+    result = np.array(positions(recording, points))
+    moved = np.zeros((len(result), len(points), 3))
+    if known:
+        paths = positions(recording, known)
+        moved = np.einsum("pk,mkx->mpx", share, paths - _given_frame(recording, known, given))
+    result[given:] = here + moved[given:]
+    return result

@@ -1,0 +1,361 @@
+"""A branched cable held by two clamps: its model from measured vertices, and what an estimation on it needs.
+
+The parent runs from one clamp to the other; its first and its last edge are held. Children leave it at vertices. Every
+edge is a rigid link, before each link sits a joint that bends about x and y and twists about z:
+
+    M = rigidity x (angle - rest angle) x 2/(length before + length after)
+
+The first edge is rigid in `clamp_start`, whose six coordinates follow two measured points. The last edge is held by
+`clamp_end` in five equations (place and direction; the roll stays free) or in six.
+
+Motion capture measures neither force nor mass, and multiplying masses, rigidities and dampings by one number changes
+no motion. The linear density is therefore fixed at a nominal value and every result is per unit of it: a bending
+rigidity of B at a density rho means B/rho [N m^2 per kg/m], or B/(rho g) per unit weight.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from yid_ocp.data.recording import Recording
+from yid_ocp.errors import DataError, ModelError, nearest
+from yid_ocp.model import Grasp, Mechanism, System, flexible_object
+from yid_ocp.model.mechanism import Frame, Placement
+from yid_ocp.model.parameters import Parameter, Parameters
+from yid_ocp.model.system import floating_clamp
+from yid_ocp.model.y_object import FlexibleObject, Segment, polyline_rotations
+from yid_ocp.problem.inputs import ClampPath
+
+Array = NDArray[np.float64]
+START, END = "clamp_start", "clamp_end"
+START_ROLL, END_ROLL = f"{START}.roll", f"{END}.roll"
+START_EDGE, LAST_EDGE = f"{START}_edge", "last_edge"
+
+
+@dataclass(frozen=True)
+class Cable:
+    """Which vertices a cable has and how they hang together.
+
+    Attributes
+    ----------
+    parent : tuple of str
+        Vertices of the parent from one clamp to the other; the first two and the last two are held.
+    children : mapping of str to tuple of str
+        Name of each child to its vertices, the first one that of the parent at which it leaves.
+    undeformed : mapping of str to array_like, shape (3,)
+        Every vertex of the cable at rest without load [m], in any frame.
+    parent_name : str
+        Segment name of the parent.
+    """
+
+    parent: tuple[str, ...]
+    children: Mapping[str, tuple[str, ...]]
+    undeformed: Mapping[str, ArrayLike]
+    parent_name: str = "parent"
+
+    def __post_init__(self) -> None:
+        if len(self.parent) < 5:
+            raise ModelError(
+                f"the parent has {len(self.parent)} vertices", where="cable", allowed="5 or more: two held at each end"
+            )
+        for name, vertices in self.children.items():
+            if len(vertices) < 2 or vertices[0] not in self.parent[2:-2]:
+                raise ModelError(
+                    f"child '{name}' does not leave the parent at one of its free vertices",
+                    where="cable",
+                    allowed=", ".join(self.parent[2:-2]),
+                )
+        for vertex in self.vertices:
+            if vertex not in self.undeformed:
+                raise ModelError(
+                    f"vertex '{vertex}' has no undeformed position", where="cable", hint=nearest(vertex, self.undeformed)
+                )
+        if len(set(self.vertices)) != len(self.vertices):
+            raise ModelError("a vertex belongs to two branches", where="cable")
+
+    @property
+    def vertices(self) -> tuple[str, ...]:
+        """All vertices, the parent's first."""
+        return (*self.parent, *(vertex for chain in self.children.values() for vertex in chain[1:]))
+
+    @property
+    def held(self) -> tuple[str, ...]:
+        """The four vertices in the clamps."""
+        return (*self.parent[:2], *self.parent[-2:])
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """All vertices that no clamp holds; the ones that a prediction is judged by."""
+        return tuple(vertex for vertex in self.vertices if vertex not in self.held)
+
+    @property
+    def chains(self) -> dict[str, tuple[str, ...]]:
+        """Vertices of every branch, the parent first."""
+        return {self.parent_name: self.parent, **self.children}
+
+    @property
+    def edges(self) -> tuple[tuple[str, str], ...]:
+        """Pairs of neighbouring vertices, branch by branch."""
+        return tuple(pair for chain in self.chains.values() for pair in zip(chain[:-1], chain[1:], strict=True))
+
+    @property
+    def clamps(self) -> tuple[ClampPath, ClampPath]:
+        """What drives the two clamps."""
+        p = self.parent
+        return ClampPath(START, p[0], p[1], "transported"), ClampPath(END, p[-2], p[-1], "transported")
+
+    def shape(self, chain: Sequence[str]) -> Array:
+        """Undeformed positions of some vertices, shape (len(chain), 3) [m]."""
+        return np.array([np.asarray(self.undeformed[vertex], float) for vertex in chain])
+
+
+@dataclass(frozen=True)
+class BranchOptions:
+    """Nominal properties of one branch.
+
+    Attributes
+    ----------
+    bend, twist : float
+        Rigidity [N m^2].
+    damping, twist_damping : float
+        Viscous damping per curvature rate of bends and of twists [N m^2 s].
+    density : float
+        Mass per length [kg/m].
+    """
+
+    bend: float = 1.5e-3
+    twist: float = 1.0e-3
+    damping: float = 5e-5
+    twist_damping: float | None = None
+    density: float = 0.05
+
+
+@dataclass(frozen=True)
+class CableOptions:
+    """How a cable is modelled.
+
+    Attributes
+    ----------
+    branches : mapping of str to BranchOptions
+        By segment name; the default for those that are not named.
+    default : BranchOptions
+    radius : float
+        Of the solid cylinders that give the links' inertia [m].
+    end : "axis" or "weld"
+        Whether the end clamp leaves the roll free or holds it at the parameter `clamp_end.roll`.
+    rest_shape : bool
+        Whether the undeformed shape of every branch is its rest shape; else each branch is straight at rest and only
+        the directions in which children leave are kept.
+    rigid_clamp : bool
+        Whether the cable is clamped rigidly up to the second vertex, so that the first joint bends over half of the
+        next edge only; else over half of both.
+    separate_lengths : bool
+        Whether every edge has a length parameter of its own.
+    gravity : tuple of float
+        [m/s^2]
+    """
+
+    branches: Mapping[str, BranchOptions] = field(default_factory=dict)
+    default: BranchOptions = field(default_factory=BranchOptions)
+    radius: float = 0.005
+    end: Literal["axis", "weld"] = "axis"
+    rest_shape: bool = True
+    rigid_clamp: bool = False
+    separate_lengths: bool = True
+    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
+
+
+def read_vertices(path: str | Path) -> dict[str, Array]:
+    """Vertices from a CSV table with the columns point, x, y, z [m].
+
+    Raises
+    ------
+    DataError
+        No such file, missing columns, or an entry that is not a number.
+    """
+    try:
+        with Path(path).open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+        return {row["point"]: np.array([float(row[axis]) for axis in "xyz"]) for row in rows}
+    except OSError as error:
+        raise DataError(f"the vertices cannot be read: {error.strerror}", where=str(path)) from error
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(
+            "the table of vertices is malformed", where=str(path), allowed="columns point, x, y, z with numbers in metres"
+        ) from error
+
+
+def edge_lengths(
+    cable: Cable, recordings: Sequence[Recording], frames: int | None = None
+) -> dict[tuple[str, str], float]:
+    """Median over recordings of the mean measured length of every edge [m].
+
+    Parameters
+    ----------
+    cable : Cable
+    recordings : sequence of Recording
+    frames : int, optional
+        Use only that many frames from the start of each.
+
+    Raises
+    ------
+    DataError
+        No recording, or an edge that none of them ever shows.
+    """
+    result: dict[tuple[str, str], float] = {}
+    for edge in cable.edges:
+        seen = []
+        for recording in recordings:
+            difference = measured(recording, edge[1])[:frames] - measured(recording, edge[0])[:frames]
+            length = np.linalg.norm(difference, axis=1)
+            if np.any(np.isfinite(length)):
+                seen.append(float(np.nanmean(length)))
+        if not seen:
+            raise DataError(f"edge {edge[0]} to {edge[1]} is never seen", hint="give recordings in which it is")
+        result[edge] = float(np.median(seen))
+    return result
+
+
+def measured(recording: Recording, point: str) -> Array:
+    """Measured positions of a point, shape (M, 3) [m], NaN where it was not seen."""
+    for group in recording.points:
+        if point in group.names:
+            return group.position[:, group.names.index(point)]
+    raise DataError(
+        f"point '{point}' is not recorded", where=recording.name, hint=nearest(point, recording.point_names)
+    )
+
+
+def length_values(cable: Cable, recording: Recording, frames: int = 2) -> dict[str, float]:
+    """Values of the edge length parameters in the first frames of a recording [m]."""
+    lengths = edge_lengths(cable, [recording], frames)
+    values = {f"{START}.length": lengths[cable.parent[0], cable.parent[1]]}
+    for name, chain in cable.chains.items():
+        first = 1 if name == cable.parent_name else 0
+        for i, edge in enumerate(zip(chain[first:-1], chain[first + 1 :], strict=True)):
+            values[f"{name}.length_{i}"] = lengths[edge]
+    return values
+
+
+def cable_system(recordings: Sequence[Recording], cable: Cable, options: CableOptions | None = None) -> System:
+    """The model of a cable held by two clamps.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+        Give the edges' lengths.
+    cable : Cable
+    options : CableOptions, optional
+
+    Returns
+    -------
+    System
+        Prescribed: the twelve coordinates of `clamp_start` and `clamp_end`. Frames: every vertex by its name,
+        `junction_CHILD`, and `last_edge`. Parameters: those of each segment (`parent.bend`, ...), `clamp_start.length`,
+        `clamp_start.roll` and, where welded, `clamp_end.roll` [rad].
+
+    Raises
+    ------
+    DataError
+        An edge that is never seen.
+    ModelError
+        A cable that does not fit together.
+    """
+    options = options or CableOptions()
+    lengths = edge_lengths(cable, recordings)
+    item = flexible_object(_segments(cable, lengths, options), name="cable")
+    clamps = _start_clamp(lengths[cable.parent[0], cable.parent[1]], cable).joined(floating_clamp(END))
+    end_roll = Parameter(END_ROLL, 0.0, "rad", -np.pi, np.pi, "roll of the end clamp about the last edge")
+    if options.end == "weld":
+        clamps = Mechanism(clamps.name, clamps.joints, clamps.frames, clamps.parameters.joined([end_roll]))
+    rotation = _about_z(end_roll.symbol) if options.end == "weld" else ca.SX(ca.DM.eye(3))
+    return System.build(
+        clamps,
+        objects=((_with_vertices(item, cable), START_EDGE, None),),
+        grasps=(Grasp(END, END, LAST_EDGE, options.end, rotation),),
+        prescribed=tuple(f"{clamp}_{prefix}{axis}" for clamp in (START, END) for prefix in ("", "r") for axis in "xyz"),
+        damping={},
+        gravity=options.gravity,
+        points=cable.vertices,
+    )
+
+
+def _with_vertices(item: FlexibleObject, cable: Cable) -> FlexibleObject:
+    tree = item.mechanism
+    frames = dict(tree.frames)
+    for name, chain in cable.chains.items():
+        first = 2 if name == cable.parent_name else 1
+        frames |= {vertex: frames[f"{name}_{i}_tip"] for i, vertex in enumerate(chain[first:])}
+        if name != cable.parent_name:
+            frames[f"junction_{name}"] = frames[chain[0]]
+    last = tree.joint_index(item.segment(cable.parent_name).links[-1][-1])
+    frames[LAST_EDGE] = Frame(last, Placement.identity())
+    return replace(item, mechanism=replace(tree, frames=frames))
+
+
+def _about_z(angle: ca.SX) -> ca.SX:
+    c, s = ca.cos(angle), ca.sin(angle)
+    return ca.vertcat(ca.horzcat(c, -s, 0), ca.horzcat(s, c, 0), ca.horzcat(0, 0, 1))
+
+
+def _start_clamp(length: float, cable: Cable) -> Mechanism:
+    clamp = floating_clamp(START)
+    roll = Parameter(START_ROLL, 0.0, "rad", -np.pi, np.pi, "roll of the start clamp about the first edge")
+    edge = Parameter(f"{START}.length", length, "m", 1e-9, np.inf, "length of the first edge")
+    carrier = clamp.frame(START)
+    tip = Frame(carrier.joint, Placement(_about_z(roll.symbol), ca.vertcat(0, 0, edge.symbol)))
+    frames = {**clamp.frames, cable.parent[0]: carrier, cable.parent[1]: tip, START_EDGE: tip}
+    return Mechanism(START, clamp.joints, frames, Parameters([roll, edge]))
+
+
+def _segments(cable: Cable, lengths: Mapping[tuple[str, str], float], options: CableOptions) -> list[Segment]:
+    def of(chain: Sequence[str]) -> list[float]:
+        return [lengths[edge] for edge in zip(chain[:-1], chain[1:], strict=True)]
+
+    parent = cable.parent
+    turns = polyline_rotations(cable.shape(parent))
+    # rest frame of every parent edge, from which children's directions are measured
+    carried = [turns[0]]
+    for turn in turns[1:]:
+        carried.append(carried[-1] @ turn)
+    segments = []
+    for name, chain in cable.chains.items():
+        branch = options.branches.get(name, options.default)
+        if name == cable.parent_name:
+            chain, at, own, before = chain[1:], None, turns[1:], lengths[parent[0], parent[1]]
+        else:
+            junction = parent.index(chain[0])
+            own, before = polyline_rotations(cable.shape(chain), carried[junction - 1]), None
+            at = junction - 2
+        rest = own if options.rest_shape else [own[0] if at is not None else np.eye(3), *[np.eye(3)] * (len(own) - 1)]
+        edges = of(chain)
+        segments.append(
+            Segment(
+                name,
+                sum(edges),
+                branch.density * sum(edges),
+                options.radius,
+                link_lengths=edges,
+                parent=None if at is None else cable.parent_name,
+                at_link=at,
+                rotation=rest[0],
+                link_rotations=rest[1:],
+                bend=branch.bend,
+                twist=branch.twist,
+                damping=branch.damping,
+                twist_damping=branch.twist_damping,
+                rigidity=True,
+                clamped=options.rigid_clamp and at is None,
+                length_before=before,
+                separate_lengths=options.separate_lengths,
+            )
+        )
+    return segments

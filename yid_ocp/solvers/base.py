@@ -1,0 +1,333 @@
+"""What all solvers share: the solution, its history, statuses, uncertainty and verdicts, and the entry point."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.errors import SolverError
+from yid_ocp.problem.problem import EstimationProblem, Evaluation
+from yid_ocp.registry import Registry
+
+log = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+
+IDENTIFIABLE = 0.1
+WEAK = 5.0
+
+
+class Status(str, Enum):
+    """How a solver ended."""
+
+    CONVERGED = "converged"
+    ITERATION_LIMIT = "iteration_limit"
+    STALLED = "stalled"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True)
+class Iterate:
+    """One accepted point.
+
+    Attributes
+    ----------
+    iteration : int
+    cost : float
+    x : ndarray, shape (nx,)
+    gradient : float
+        Largest scaled component of the projected gradient.
+    evaluations : int
+        Rollouts of all recordings so far.
+    seconds : float
+        Wall time so far.
+    note : str
+        Anything out of the ordinary, such as a shortened horizon.
+    """
+
+    iteration: int
+    cost: float
+    x: Array
+    gradient: float
+    evaluations: int
+    seconds: float
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One parameter after the fit.
+
+    Attributes
+    ----------
+    value, std : float
+        In `unit`; `std` is infinite where the data do not inform the parameter.
+    unit : str
+    initial, lower, upper : float
+    free : bool
+    verdict : str
+        identifiable (relative deviation up to 10 %), weak (up to 500 %), not_identifiable, or fixed.
+    """
+
+    value: float
+    std: float
+    unit: str
+    initial: float
+    lower: float
+    upper: float
+    free: bool
+    verdict: str
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Outcome of an identification.
+
+    Attributes
+    ----------
+    status : Status
+    message : str
+        Why it ended, and what to try where it did not converge.
+    names : tuple of str
+        Unknowns, in the order of `x`.
+    x : ndarray, shape (nx,)
+        Best point so far.
+    covariance : ndarray, shape (nx, nx)
+        From the data and stated priors (the tie-break excluded), scaled by chi2 per degree of freedom where that exceeds one.
+    parameters : dict of str to Estimate
+        Free parameters shared by all recordings, and the fixed ones that the problem's model has.
+    cost : float
+    chi2_per_dof : float
+        NaN for a cost that is not whitened.
+    history : tuple of Iterate
+    iterations, evaluations : int
+    seconds : float
+    evaluation : Evaluation or None
+        At `x`.
+    method : str
+    """
+
+    status: Status
+    message: str
+    names: tuple[str, ...]
+    x: Array
+    covariance: Array
+    parameters: dict[str, Estimate]
+    cost: float
+    chi2_per_dof: float
+    history: tuple[Iterate, ...]
+    iterations: int
+    evaluations: int
+    seconds: float
+    evaluation: Evaluation | None
+    method: str
+
+    @property
+    def std(self) -> dict[str, float]:
+        """Standard deviation of every shared free parameter."""
+        return {name: entry.std for name, entry in self.parameters.items() if entry.free}
+
+
+Callback = Callable[[Iterate], None]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a method's own loop returns: the best point, why it stopped, and how it got there."""
+
+    status: Status
+    message: str
+    x: Array
+    history: tuple[Iterate, ...]
+    evaluations: int
+
+
+@runtime_checkable
+class Solver(Protocol):
+    """A method with its settings; a frozen dataclass registered under its name."""
+
+    name: str
+
+    def run(self, problem: EstimationProblem, start: Array, callback: Callback | None) -> Outcome:
+        """Minimise the problem's cost from `start`."""
+        ...
+
+
+SOLVERS: Registry[type[Solver]] = Registry("solver")
+
+
+@dataclass
+class Recorder:
+    """Counts evaluations and time, keeps the history, and tells the callback."""
+
+    callback: Callback | None
+    begun: float = field(default_factory=time.perf_counter)
+    evaluations: int = 0
+    history: list[Iterate] = field(default_factory=list)
+
+    def accept(self, cost: float, x: Array, gradient: float, note: str = "") -> None:
+        """Enter an accepted point."""
+        seconds = time.perf_counter() - self.begun
+        entry = Iterate(len(self.history), cost, x.copy(), gradient, self.evaluations, seconds, note)
+        self.history.append(entry)
+        if self.callback is not None:
+            self.callback(entry)
+
+
+# A start from which the rollout fails is approached over shorter horizons, each the start of the next [fraction].
+CONTINUATION = (0.06, 0.12, 0.25, 0.5)
+
+
+def solve(
+    problem: EstimationProblem, solver: Solver, start: Sequence[float] | None = None, callback: Callback | None = None
+) -> Solution:
+    """Run a solver on a problem and say what was found, how sure, and what was not.
+
+    Where the rollout fails at the start (a soft object snaps, an arm falls), the problem is first solved over its first
+    seconds only, and then over longer and longer horizons.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    solver : Solver
+    start : sequence of float, optional
+        Initial unknown vector; the problem's when absent.
+    callback : callable, optional
+        Called with every `Iterate`.
+
+    Returns
+    -------
+    Solution
+        Never raises for non-convergence: the status and the best point so far tell.
+    """
+    begun = time.perf_counter()
+    x = problem.start if start is None else np.asarray(start, float).copy()
+    lower, upper = problem.bounds
+    x = np.clip(x, lower, upper)
+    history: list[Iterate] = []
+    evaluations = 0
+    needs_rollout = getattr(solver, "needs_rollout", True)
+    first = problem.evaluate(x, derivatives=False) if needs_rollout else None
+    if first is not None and not first.ok:
+        log.info("the rollout fails at the start (%s); going by shorter horizons", first.message)
+        longest = max(episode.grid.steps for episode in problem.episodes) * problem.step.time_step
+        for fraction in CONTINUATION:
+            shorter = problem.shortened(fraction * longest)
+            if not shorter.evaluate(x, derivatives=False).ok:
+                continue
+            part = solver.run(shorter, x, callback)
+            x, evaluations = part.x, evaluations + part.evaluations
+            history += [replace(entry, note=f"first {fraction * longest:.3g} s") for entry in part.history]
+            if problem.evaluate(x, derivatives=False).ok:
+                break
+    outcome = solver.run(problem, x, callback)
+    history += outcome.history
+    finish = problem.evaluate(outcome.x)
+    covariance, chi2 = uncertainty(problem, finish)
+    status, message = outcome.status, outcome.message
+    if not finish.ok:
+        status, message = Status.FAILED, finish.message
+    return Solution(
+        status,
+        message,
+        problem.names,
+        outcome.x,
+        covariance,
+        estimates(problem, outcome.x, covariance),
+        finish.cost,
+        chi2,
+        tuple(history),
+        max(len(history) - 1, 0),
+        evaluations + outcome.evaluations,
+        time.perf_counter() - begun,
+        finish if finish.ok else None,
+        solver.name,
+    )
+
+
+def uncertainty(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, float]:
+    """Covariance of the unknowns from data and stated priors, not the tie-break, and chi2 per degree of freedom.
+
+    Directions that the data do not inform get a variance of (1e8 x scale)^2 rather than an infinite one.
+    """
+    count = len(problem.start)
+    if evaluation.jacobian is None or not evaluation.ok:
+        return np.full((count, count), np.nan), math.nan
+    total = len(evaluation.residual) - problem.tie_break_rows
+    data_rows = total - problem.stated_prior_rows
+    scale = problem.scales
+    noise = problem.paper_noise if problem.options.weighting == "paper" else 1.0
+    informing = evaluation.jacobian[:data_rows] / noise
+    jacobian = np.vstack([informing, evaluation.jacobian[data_rows:total]]) * scale
+    _, singular, vectors = np.linalg.svd(jacobian, full_matrices=False)
+    inverse = np.zeros(count)
+    inverse[: len(singular)] = singular
+    inverse = 1.0 / np.maximum(inverse, 1e-8)
+    basis = np.eye(count) if len(vectors) == 0 else _completed(vectors, count)
+    covariance = (basis.T * inverse**2) @ basis * np.outer(scale, scale)
+    residual = evaluation.residual[:data_rows] / noise
+    degrees = max(total - count, 1)
+    chi2 = float(residual @ residual) / degrees
+    return covariance * max(1.0, chi2), chi2
+
+
+def _completed(vectors: Array, count: int) -> Array:
+    if len(vectors) == count:
+        return vectors
+    rest = np.linalg.svd(np.eye(count) - vectors.T @ vectors)[0][:, : count - len(vectors)]
+    return np.vstack([vectors, rest.T])
+
+
+def verdict(value: float, std: float) -> str:
+    """identifiable, weak or not_identifiable, by the relative standard deviation (limits 10 % and 500 %)."""
+    if not math.isfinite(std):
+        return "not_identifiable"
+    relative = std / max(abs(value), 1e-12)
+    if relative <= IDENTIFIABLE:
+        return "identifiable"
+    return "weak" if relative <= WEAK else "not_identifiable"
+
+
+def estimates(problem: EstimationProblem, x: Array, covariance: Array) -> dict[str, Estimate]:
+    """Every parameter of the model with its value, deviation and verdict."""
+    theta, _ = problem.split(x, 0)
+    deviation = np.sqrt(np.maximum(np.diag(covariance), 0.0)) if len(covariance) else np.zeros(0)
+    result: dict[str, Estimate] = {}
+    for i, entry in enumerate(problem.system.parameters):
+        free = entry.name in problem.shared
+        at = problem.shared.index(entry.name) if free else -1
+        # a deviation is measured against the larger of value and start, so that an estimate at zero has a verdict
+        std = float(deviation[at]) if free else 0.0
+        size = max(abs(float(theta[i])), abs(float(problem.theta[i])))
+        informed = std < 1e6 * max(size, 1e-12)
+        result[entry.name] = Estimate(
+            float(theta[i]),
+            std if informed else math.inf,
+            entry.unit,
+            float(problem.theta[i]),
+            entry.lower,
+            entry.upper,
+            free,
+            verdict(size, std if informed else math.inf) if free else "fixed",
+        )
+    return result
+
+
+def projected_gradient(x: Array, gradient: Array, lower: Array, upper: Array, scale: Array) -> float:
+    """Largest component of scale * gradient that does not push against a bound."""
+    free = ~(((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0)))
+    return float(np.max(np.abs(scale * gradient)[free], initial=0.0))
+
+
+def check_positive(name: str, value: float) -> None:
+    """Raise `SolverError` unless a setting is a positive number."""
+    if not (math.isfinite(value) and value > 0):
+        raise SolverError(f"{name} = {value}", where="solver", allowed="a positive number")

@@ -1,0 +1,80 @@
+"""The source paper's solver: steepest descent projected on the bounds, with Armijo's rule."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.problem.problem import EstimationProblem
+from yid_ocp.solvers.base import SOLVERS, Callback, Outcome, Recorder, Status, projected_gradient
+
+Array = NDArray[np.float64]
+
+
+@SOLVERS.register("steepest_descent")
+@dataclass(frozen=True)
+class SteepestDescent:
+    """x <- P(x - s g), P the projection on the bounds, s by backtracking until the cost falls enough.
+
+    The gradient comes from the adjoint. Unscaled on purpose: this is what the paper did.
+
+    Attributes
+    ----------
+    iterations : int
+    gradient_tolerance : float
+        Converged when the projected gradient, times the size of the unknowns and over the cost, is below this.
+    sufficient_decrease : float
+        Armijo's constant.
+    shrink : float
+        Backtracking factor.
+
+    References
+    ----------
+    Armijo (1966), Pacific J. Math. 16:1, doi:10.2140/pjm.1966.16.1.
+    Bertsekas (1976), IEEE Trans. Automatic Control 21(2):174, doi:10.1109/TAC.1976.1101194 (projection).
+    """
+
+    iterations: int = 200
+    gradient_tolerance: float = 1e-5
+    sufficient_decrease: float = 1e-4
+    shrink: float = 0.5
+    name: str = "steepest_descent"
+
+    def run(self, problem: EstimationProblem, start: Array, callback: Callback | None) -> Outcome:
+        """See `Solver.run`."""
+        lower, upper = problem.bounds
+        recorder = Recorder(callback)
+        x = start.copy()
+        cost, gradient, evaluation = problem.gradient(x)
+        recorder.evaluations += 1
+        if not evaluation.ok:
+            return Outcome(Status.FAILED, evaluation.message, x, (), recorder.evaluations)
+        # the first trial moves the unknowns by about a tenth of their size
+        length = 0.1 * float(np.linalg.norm(problem.scales)) / max(float(np.linalg.norm(gradient)), 1e-300)
+        for _ in range(self.iterations):
+            size = np.maximum(np.abs(x), problem.scales)
+            slope = projected_gradient(x, gradient, lower, upper, size)
+            recorder.accept(cost, x, slope)
+            if slope <= self.gradient_tolerance * max(cost, 1e-300):
+                return self._end(Status.CONVERGED, "the projected gradient vanishes", x, recorder)
+            while True:
+                trial = np.clip(x - length * gradient, lower, upper)
+                attempt = problem.evaluate(trial, derivatives=False)
+                recorder.evaluations += 1
+                needed = self.sufficient_decrease * float(gradient @ (x - trial))
+                if attempt.ok and attempt.cost <= cost - needed:
+                    break
+                length *= self.shrink
+                if np.max(np.abs(length * gradient) / size) < 1e-12:
+                    return self._end(Status.STALLED, "no step along the gradient lowers the cost", x, recorder)
+            x = trial
+            cost, gradient, _ = problem.gradient(x)
+            recorder.evaluations += 1
+            length /= self.shrink
+        message = f"no convergence in {self.iterations} iterations, as is usual for this method; try gauss_newton"
+        return self._end(Status.ITERATION_LIMIT, message, x, recorder)
+
+    def _end(self, status: Status, message: str, x: Array, recorder: Recorder) -> Outcome:
+        return Outcome(status, message, x, tuple(recorder.history), recorder.evaluations)

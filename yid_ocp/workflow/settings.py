@@ -1,0 +1,273 @@
+"""The settings of one run: what a configuration file may say, with units, defaults and allowed values.
+
+Plain frozen dataclasses; `config` fills them from YAML and the JSON Schema follows from them. A new key is one line
+here and one use in `build`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Literal
+
+from annotated_types import Ge, Gt, Le, Len, Lt
+
+from yid_ocp.errors import ConfigError
+from yid_ocp.solvers import SOLVERS, GaussNewton
+from yid_ocp.solvers.base import Solver
+
+
+@dataclass(frozen=True)
+class About:
+    """What a key means and its unit; markers may stand in any part of a type.
+
+    Attributes
+    ----------
+    text : str
+    unit : str
+        SI, empty for text and pure numbers.
+    path : bool
+        Whether the text names a file, relative to the configuration; `package:NAME` and `default:NAME` are kept.
+    """
+
+    text: str = ""
+    unit: str = ""
+    path: bool = False
+
+
+Triple = tuple[float, float, float]
+Interval = tuple[float, float]
+FilePath = Annotated[str, About("a file, relative to the configuration", path=True)]
+RecordingPath = Annotated[str, About("a recording, relative to the configuration, or default:NAME.h5", path=True)]
+ArmMode = Literal["driven", "prescribed", "free"]
+GraspName = Literal["point", "axis", "weld"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MountSettings:
+    """Where the root of an object sits."""
+
+    frame: Annotated[str | None, About("frame of the robot that carries the object; the world when absent")] = None
+    xyz: Annotated[Triple, About("position in that frame", "m")] = (0.0, 0.0, 0.0)
+    rpy: Annotated[Triple, About("roll, pitch, yaw in that frame", "rad")] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class YObject:
+    """The paper's foam letter Y."""
+
+    kind: Literal["y"] = "y"
+    links: Annotated[int, Ge(1), Le(64), About("rigid links of every tube")] = 4
+    mount: Annotated[MountSettings | None, About("the trunk's foot; the paper's when absent")] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class SegmentSettings:
+    """One tube, branch or beam of a chain of rigid links."""
+
+    length: Annotated[float | None, Gt(0), Le(50), About("length; not needed beside link_lengths", "m")] = None
+    mass: Annotated[float, Gt(0), About("mass of the whole segment", "kg")]
+    radius: Annotated[float, Gt(0), Le(5), About("radius of the solid cylinder", "m")]
+    links: Annotated[int, Ge(1), Le(64), About("number of equal links")] = 4
+    link_lengths: Annotated[tuple[float, ...] | None, About("unequal links, base to tip", "m")] = None
+    parent: Annotated[str | None, About("segment on which it grows; the mount when absent")] = None
+    at_link: Annotated[int | None, Ge(0), About("it leaves at the tip of this link of the parent; the last")] = None
+    rpy: Annotated[Triple, About("turn of its first link at rest against what carries it", "rad")] = (0.0, 0.0, 0.0)
+    bend: Annotated[float, Ge(0), About("bending stiffness of every joint, or rigidity", "N m/rad or N m^2")] = 3.0
+    twist: Annotated[float, Ge(0), About("twisting stiffness of every joint, or rigidity", "N m/rad or N m^2")] = 3.0
+    damping: Annotated[float | None, Ge(0), About("damping; model.damping when absent", "N m s/rad or N m^2 s")] = None
+    twist_damping: Annotated[float | None, Ge(0), About("of twists, where another", "N m s/rad or N m^2 s")] = None
+    rigidity: Annotated[bool, About("whether stiffness and damping are per curvature")] = False
+    clamped: Annotated[bool, About("whether it starts at a rigid wall or gripper")] = False
+    joint_order: Annotated[str, About("axes of the turns at a joint, base to tip")] = "xyz"
+    separate_lengths: Annotated[bool, About("whether every link has a length parameter of its own")] = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class SegmentedObject:
+    """Any object of segments: a beam, a tube with branches."""
+
+    kind: Literal["segments"] = "segments"
+    segments: Annotated[Mapping[str, SegmentSettings], About("by name, parents first")] = field(default_factory=dict)
+    mount: Annotated[MountSettings, About("where its root sits")] = field(default_factory=MountSettings)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GraspSettings:
+    """A frame of the robot that holds a frame of the object."""
+
+    holder: Annotated[str, About("frame of the robot")]
+    held: Annotated[str, About("frame of the object")]
+    kind: Annotated[GraspName, About("3, 5 or 6 equations")] = "point"
+    rpy: Annotated[Triple, About("orientation of held in holder, for axis and weld", "rad")] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpringSettings:
+    """A spring (and a damper) on one joint of the robot."""
+
+    stiffness: Annotated[float, Ge(0), About("stiffness", "N m/rad or N/m")]
+    rest: Annotated[float, About("coordinate at which it is relaxed", "rad or m")] = 0.0
+    damping: Annotated[float | None, Ge(0), About("viscous; model.damping when absent", "N m s/rad or N s/m")] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArmSettings:
+    """Which joints of the robot move, and what is known of them."""
+
+    joints: Annotated[tuple[str, ...] | None, About("in configuration order; all movable ones when absent")] = None
+    mode: Annotated[ArmMode, About("driven by measured effort, moved as measured, or passive")] = "driven"
+    locked: Annotated[Mapping[str, float], About("value of joints that do not move", "rad or m")] = field(
+        default_factory=dict
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelSettings:
+    """What the world is made of."""
+
+    robot: Annotated[FilePath | None, About("URDF file, or package:NAME of example-robot-data")] = None
+    arms: Annotated[ArmSettings, About("the robot's joints")] = field(default_factory=ArmSettings)
+    object: Annotated[YObject | SegmentedObject | None, About("the flexible object")] = None
+    grasp: Annotated[Mapping[str, GraspSettings], About("by name: left, right, gripper")] = field(default_factory=dict)
+    springs: Annotated[Mapping[str, SpringSettings], About("by joint of the robot")] = field(default_factory=dict)
+    damping: Annotated[
+        Annotated[float, Ge(0)] | Mapping[str, Annotated[float, Ge(0)]],
+        About("viscous damping of every coordinate, or of the robot's joints by name", "N m s/rad"),
+    ] = 0.05
+    gravity: Annotated[Triple, About("acceleration of free fall in the world", "m/s^2")] = (0.0, 0.0, -9.81)
+    points: Annotated[tuple[str, ...] | None, About("frames that sensors may see; the segments' tips")] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingSettings:
+    """Which recordings are used for what."""
+
+    estimate: Annotated[tuple[RecordingPath, ...], About("to estimate on")] = ()
+    held_out: Annotated[tuple[RecordingPath, ...], About("only predicted, never touched by the fit")] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorSettings:
+    """How one group of the recordings is used: points, points_NAME or joints.effort."""
+
+    use: Annotated[bool, About("whether the estimation sees it")] = True
+    std: Annotated[
+        Annotated[float, Gt(0)] | Mapping[str, Annotated[float, Gt(0)]] | None,
+        About("noise deviation instead of the recorded one, by joint where they differ", "m or N m"),
+    ] = None
+    position_std: Annotated[
+        Annotated[float, Gt(0)] | Mapping[str, Annotated[float, Gt(0)]] | None,
+        About("noise deviation of the encoders whose motion is prescribed (joints.effort only)", "rad"),
+    ] = None
+    frames: Annotated[Mapping[str, str], About("frame of the model that a point marks")] = field(default_factory=dict)
+    points: Annotated[tuple[str, ...] | None, About("points to use; all that the model has")] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ParameterSettings:
+    """What is presumed of one parameter, or of all that a pattern such as T*.bend names."""
+
+    initial: Annotated[float | None, About("value, or where the search starts", "that of the parameter")] = None
+    bounds: Annotated[Interval | None, About("lower and upper bound", "that of the parameter")] = None
+    free: Annotated[bool | None, About("whether it is estimated")] = None
+    prior: Annotated[float | None, Gt(0), About("deviation of a Gaussian prior", "that of the parameter")] = None
+    local: Annotated[bool | None, About("whether it has a value of its own in every recording")] = None
+
+
+def _method(raw: Mapping[str, Any]) -> type:
+    name = raw.get("name", "gauss_newton")
+    return SOLVERS[name] if isinstance(name, str) and name in SOLVERS else GaussNewton
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolverSettings:
+    """How the cost is made up and lowered; the settings of the named method stand beside these."""
+
+    name: Annotated[str, About("the method")] = "gauss_newton"
+    time_step: Annotated[float, Gt(0), Le(0.1), About("of the integrator", "s")] = 0.01
+    force_split: Annotated[Literal["symmetric", "left"], About("rule for forces; left is the paper's")] = "symmetric"
+    feedback: Annotated[Literal["none", "proportional", "lqr"], About("tracking filter of driven arms")] = "lqr"
+    gains: Annotated[tuple[Annotated[float, Ge(0)], ...], Len(1), About("of the proportional filter", "N m/rad")] = (
+        80.0,
+        80.0,
+        60.0,
+        60.0,
+        15.0,
+        15.0,
+        8.0,
+    )
+    initial_state: Annotated[
+        Literal["equilibrium", "estimated", "given"], About("at rest; at rest plus a free deviation; fitted to points")
+    ] = "equilibrium"
+    start_window: Annotated[float, Gt(0), About("how long points that fix a given start may reach", "s")] = 0.02
+    configuration_std: Annotated[float, Gt(0), About("prior of an estimated start", "rad")] = 0.05
+    velocity_std: Annotated[float, Gt(0), About("prior of an estimated start", "rad/s")] = 0.2
+    weighting: Annotated[Literal["whitened", "paper"], About("cost in deviations, or the paper's")] = "whitened"
+    robust_scale: Annotated[float, Gt(0), About("Huber scale in deviations; .inf for squares")] = math.inf
+    tie_break: Annotated[float, Ge(0), About("prior of free parameters as a multiple of their start; 0 for none")] = 10.0
+    path_cutoff: Annotated[float, Gt(0), About("low-pass cutoff of prescribed paths and efforts", "Hz")] = 10.0
+    duration: Annotated[float | None, Gt(0), About("use only the first seconds of every recording", "s")] = None
+    compiler: Annotated[bool, About("whether to compile the step where a C compiler is found")] = True
+    method: Solver = field(default_factory=GaussNewton, metadata={"choose": _method, "among": SOLVERS})
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiagnosisSettings:
+    """How the gap between model and recordings is searched for its cause."""
+
+    candidates: Annotated[
+        Literal["all"] | tuple[str, ...], About("effects to try: all, or a list of kind or kind@location")
+    ] = "all"
+    level: Annotated[float, Gt(0), Lt(1), About("significance below which a gap counts as one")] = 0.01
+    effects: Annotated[int, Ge(1), Le(10), About("how many effects may be added")] = 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutputSettings:
+    """Where results go."""
+
+    folder: Annotated[FilePath | None, About("in which run folders are made; `runs` in the working folder")] = None
+    report: Annotated[bool, About("whether report.html is written")] = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """Everything that one run needs to know.
+
+    Attributes
+    ----------
+    name : str
+        Stem of the configuration file.
+    file : str
+        Path of the configuration file, empty for none.
+    places : mapping of key path to text
+        File and line of every key, for error messages.
+    """
+
+    description: Annotated[str, About("one sentence for the report")] = ""
+    model: Annotated[ModelSettings, About("what the world is made of")] = field(default_factory=ModelSettings)
+    recordings: Annotated[RecordingSettings, About("the data")] = field(default_factory=RecordingSettings)
+    sensors: Annotated[Mapping[str, SensorSettings], About("by group of the recordings")] = field(default_factory=dict)
+    parameters: Annotated[Mapping[str, ParameterSettings], About("by name or pattern")] = field(default_factory=dict)
+    solver: Annotated[SolverSettings, About("how the cost is lowered")] = field(default_factory=SolverSettings)
+    diagnosis: Annotated[DiagnosisSettings, About("how a gap is diagnosed")] = field(default_factory=DiagnosisSettings)
+    output: Annotated[OutputSettings, About("where results go")] = field(default_factory=OutputSettings)
+    name: str = field(default="run", metadata={"internal": True})
+    file: str = field(default="", metadata={"internal": True}, compare=False)
+    places: Mapping[tuple[str | int, ...], str] = field(
+        default_factory=dict, metadata={"internal": True}, compare=False, repr=False
+    )
+
+    def where(self, *path: str | int) -> str:
+        """File, line and key of a setting, for the `where` of an error."""
+        key = ".".join(str(part) for part in path)
+        for count in range(len(path), 0, -1):
+            if path[:count] in self.places:
+                return f"{self.places[path[:count]]}: {key}"
+        return f"{self.file}: {key}" if self.file else key
+
+    def refuse(self, what: str, *path: str | int, allowed: str = "", hint: str = "") -> ConfigError:
+        """A `ConfigError` that points at a setting."""
+        return ConfigError(what, where=self.where(*path), allowed=allowed, hint=hint)
