@@ -24,9 +24,17 @@ TRUTH = {
     "T3.bend": 11.5,
     "T3.twist": 9.7,
 }
-MOTION_SEEDS = {(1, "estimate"): 7, (1, "held_out"): 2, (2, "estimate"): 7, (2, "held_out"): 4}
+MOTION_SEEDS = {(1, "estimate"): 1, (1, "held_out"): 7, (2, "estimate"): 7, (2, "held_out"): 2}
 NOISE_SEEDS = {(1, "estimate"): 101, (1, "held_out"): 102, (2, "estimate"): 201, (2, "held_out"): 202}
 INNER_STEP = 5e-5
+# How far the grippers travel, and where they stand at the start beside the ends of the undeformed Y [m]: with two arms
+# the Y is pushed together and forward, because at its full stretch it snaps from shape to shape.
+TRAVEL = {1: 0.15, 2: 0.13}
+TOGETHER, FORWARD = 0.05 * 0.5**0.5, 0.08
+OFFSETS = {
+    1: {},
+    2: {"left": (FORWARD, -TOGETHER, -TOGETHER), "right": (FORWARD, TOGETHER, -TOGETHER)},
+}
 
 
 def compress(path: Path) -> None:
@@ -46,10 +54,10 @@ def compress(path: Path) -> None:
 def make(folder: Path) -> None:
     for arms, word, hands in ((1, "single", "one arm"), (2, "dual", "two arms")):
         system = paper_system(arms)
-        posture = initial_posture(system, TRUTH)
+        posture = initial_posture(system, TRUTH, offsets=OFFSETS[arms])
         for purpose in ("estimate", "held_out"):
             seed = MOTION_SEEDS[arms, purpose]
-            motion = Motion.multisine(system, TRUTH, seed=seed, posture=posture)
+            motion = Motion.multisine(system, TRUTH, seed=seed, posture=posture, travel=TRAVEL[arms])
             for vision in (False, True):
                 name = f"{word}_arm_{'vision' if vision else 'no_vision'}_{purpose}"
                 recording = virtual_experiment(

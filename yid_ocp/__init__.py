@@ -1,1 +1,98 @@
-"""Stiffness of flexible objects from robot recordings, and a diagnosis of the sim-to-real gap that is left."""
+"""Stiffness of flexible objects from robot recordings, and a diagnosis of the sim-to-real gap that is left.
+
+Names load on first use, so that `import yid_ocp` and `yid-ocp --help` are quick.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from yid_ocp.config import load_config as load_config
+    from yid_ocp.config import load_problem as load_problem
+    from yid_ocp.config import load_system as load_system
+    from yid_ocp.data import Recording as Recording
+    from yid_ocp.data import read_any as read_any
+    from yid_ocp.data import read_recording as read_recording
+    from yid_ocp.data import write_recording as write_recording
+    from yid_ocp.errors import YidError as YidError
+    from yid_ocp.integrator.rollout import simulate as simulate
+    from yid_ocp.integrator.step import compile_step as compile_step
+    from yid_ocp.model import FlexibleObject as FlexibleObject
+    from yid_ocp.model import Grasp as Grasp
+    from yid_ocp.model import Mechanism as Mechanism
+    from yid_ocp.model import Segment as Segment
+    from yid_ocp.model import System as System
+    from yid_ocp.model import flexible_object as flexible_object
+    from yid_ocp.problem import EstimationProblem as EstimationProblem
+    from yid_ocp.problem import ProblemOptions as ProblemOptions
+    from yid_ocp.problem import SensorOptions as SensorOptions
+    from yid_ocp.solvers import GaussNewton as GaussNewton
+    from yid_ocp.solvers import SingleShooting as SingleShooting
+    from yid_ocp.solvers import Solution as Solution
+    from yid_ocp.solvers import Status as Status
+    from yid_ocp.solvers import SteepestDescent as SteepestDescent
+    from yid_ocp.solvers import solve as solve
+
+    __version__: str
+
+# One row for each module; what a later part of the package offers (identifiability, diagnose, MultipleShooting,
+# compare) is entered here and imported above.
+_HOMES: dict[str, tuple[str, ...]] = {
+    "config": ("load_config", "load_problem", "load_system"),
+    "data": ("Recording", "read_any", "read_recording", "write_recording"),
+    "errors": ("YidError",),
+    "integrator.rollout": ("simulate",),
+    "integrator.step": ("compile_step",),
+    "model": ("FlexibleObject", "Grasp", "Mechanism", "Segment", "System", "flexible_object"),
+    "problem": ("EstimationProblem", "ProblemOptions", "SensorOptions"),
+    "solvers": ("GaussNewton", "SingleShooting", "Solution", "Status", "SteepestDescent", "solve"),
+}
+_MODULE_OF = {name: module for module, names in _HOMES.items() for name in names}
+
+__all__ = [
+    "EstimationProblem",
+    "FlexibleObject",
+    "GaussNewton",
+    "Grasp",
+    "Mechanism",
+    "ProblemOptions",
+    "Recording",
+    "Segment",
+    "SensorOptions",
+    "SingleShooting",
+    "Solution",
+    "Status",
+    "SteepestDescent",
+    "System",
+    "YidError",
+    "__version__",
+    "compile_step",
+    "flexible_object",
+    "load_config",
+    "load_problem",
+    "load_system",
+    "read_any",
+    "read_recording",
+    "simulate",
+    "solve",
+    "write_recording",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib import metadata
+
+        try:
+            return metadata.version("yid-ocp")
+        except metadata.PackageNotFoundError:
+            return "0+unknown"
+    if name in _MODULE_OF:
+        return getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
+    raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    return __all__

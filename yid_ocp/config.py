@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import io
 import json
 import math
 import re
@@ -27,6 +26,7 @@ from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.workflow.build import build_problem, build_system
 from yid_ocp.workflow.settings import About, Run
+from yid_ocp.workflow.settings import dump_config as dump_config
 
 KeyPath = tuple[str | int, ...]
 DEFAULT = "dual_arm_vision.yaml"
@@ -74,15 +74,6 @@ def load_system(path: str | Path, overrides: Sequence[str] = ()) -> System:
 def load_problem(path: str | Path, overrides: Sequence[str] = ()) -> EstimationProblem:
     """The estimation problem that a configuration file describes; errors as `load_config` and `build_problem`."""
     return build_problem(load_config(path, overrides))
-
-
-def dump_config(run: Run) -> str:
-    """A run's settings as YAML that `load_config` reads back to the same run, every default written out."""
-    stream = io.StringIO()
-    yaml = YAML()
-    yaml.width = 120
-    yaml.dump(_plain(run), stream)
-    return stream.getvalue()
 
 
 def schema() -> dict[str, Any]:
@@ -462,29 +453,7 @@ def _bare_words(hint: Any) -> str:
     return "a section"
 
 
-# -- writing ----------------------------------------------------------------------------------------------------------
-
-
-def _plain(value: Any) -> Any:
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        result: dict[str, Any] = {}
-        for entry in dataclasses.fields(value):
-            item = getattr(value, entry.name)
-            if entry.metadata.get("internal"):
-                continue
-            if "choose" in entry.metadata:
-                result |= {name: v for name, v in _plain(item).items() if name not in result}
-            elif item is not None:
-                result[entry.name] = _plain(item)
-        return result
-    if isinstance(value, Mapping):
-        return {name: _plain(item) for name, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        sequence = CommentedSeq([_plain(item) for item in value])
-        if not any(isinstance(item, dict) for item in sequence):
-            sequence.fa.set_flow_style()
-        return sequence
-    return value
+# -- schema -----------------------------------------------------------------------------------------------------------
 
 
 def _schema(hint: Any) -> dict[str, Any]:

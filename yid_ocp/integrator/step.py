@@ -21,8 +21,8 @@ from yid_ocp.model.system import System
 
 Array = NDArray[np.float64]
 
-# Newton stops when a correction of the coordinates is below TOLERANCE [rad or m], with short time steps below RATE_TOLERANCE
-# times the step: what is left undone is lost momentum, mass times correction over time step, in every step.
+# Newton stops when a correction of the coordinates is below TOLERANCE [rad or m], with short time steps below
+# RATE_TOLERANCE times the step: what is left undone is momentum lost in every step, mass times correction over step.
 TOLERANCE, RATE_TOLERANCE, ROUNDING = 1e-12, 1e-10, 1e-15
 ITERATION_LIMIT = 60
 
@@ -622,7 +622,7 @@ class InterpretedKernel:
             self._mask[j, chain] = True
         self._theta_functions: dict[tuple[str, ...], ca.Function] = {}
         patterns = step.functions.patterns
-        self._triplets = {key: tuple(np.array(part) for part in s.get_triplet()) for key, s in patterns.items()}
+        self._triplets = {key: tuple(np.array(part, np.intp) for part in s.get_triplet()) for key, s in patterns.items()}
         self._unknown = step.structure.unknown_row
         self._free = np.array(step.system.free_indices, np.intp)
         self._fixed = np.array(step.system.prescribed_indices, np.intp)

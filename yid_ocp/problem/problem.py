@@ -624,8 +624,16 @@ class EstimationProblem:
         """Unknowns under the tie-break."""
         if self.options.weighting == "paper" or self.options.tie_break <= 1:
             return np.zeros(0, int)
-        positive = (self.bounds[0] >= 0) & (self.start > 0)
-        return np.flatnonzero(positive & ~np.isfinite(self._prior_deviations))
+        return np.flatnonzero(self.positive & ~np.isfinite(self._prior_deviations))
+
+    @property
+    def positive(self) -> NDArray[np.bool_]:
+        """Unknowns that are positive by nature and start above zero."""
+        return (self.bounds[0] >= 0) & (self.start > 0)
+
+    def forget_starts(self) -> None:
+        """Look for the shape at rest anew instead of following the last one."""
+        self._starts.clear()
 
     @property
     def stated_prior_rows(self) -> int:

@@ -184,6 +184,10 @@ class Recorder:
 
 # A start from which the rollout fails is approached over shorter horizons, each the start of the next [fraction].
 CONTINUATION = (0.06, 0.12, 0.25, 0.5)
+# A fit whose chi2 per degree of freedom exceeds this may be a wrong valley (a soft object has several shapes at rest):
+# it is started again from these multiples of the initial values, and the best is kept.
+POOR_FIT = 5.0
+RESTARTS = (4.0, 2.0, 10.0)
 
 
 def solve(
@@ -192,7 +196,7 @@ def solve(
     """Run a solver on a problem and say what was found, how sure, and what was not.
 
     Where the rollout fails at the start (a soft object snaps, an arm falls), the problem is first solved over its first
-    seconds only, and then over longer and longer horizons.
+    seconds only, and then over longer and longer horizons. A poor fit is started again from other initial values.
 
     Parameters
     ----------
@@ -209,15 +213,54 @@ def solve(
         Never raises for non-convergence: the status and the best point so far tell.
     """
     begun = time.perf_counter()
-    x = problem.start if start is None else np.asarray(start, float).copy()
     lower, upper = problem.bounds
-    x = np.clip(x, lower, upper)
+    first = np.clip(problem.start if start is None else np.asarray(start, float), lower, upper)
+    best, evaluations, history = _attempt(problem, solver, first, callback)
+    tried = 1
+    for factor in RESTARTS:
+        if _good_fit(problem, best[1]):
+            break
+        x = np.where(problem.positive, np.clip(first * factor, lower, upper), first)
+        log.info("starting again from %g times the initial values", factor)
+        problem.forget_starts()
+        again, more, steps = _attempt(problem, solver, x, callback)
+        tried, evaluations = tried + 1, evaluations + more
+        history += [replace(entry, note=f"start x {factor:g}") for entry in steps]
+        if again[1].cost < best[1].cost:
+            best = again
+    outcome, finish = best
+    problem.forget_starts()
+    covariance, chi2 = uncertainty(problem, finish)
+    status, message = outcome.status, outcome.message
+    if not finish.ok:
+        status, message = Status.FAILED, finish.message
+    elif tried > 1:
+        message += f" (best of {tried} starts)"
+    return Solution(
+        status,
+        message,
+        problem.names,
+        outcome.x,
+        covariance,
+        estimates(problem, outcome.x, covariance),
+        finish.cost,
+        chi2,
+        tuple(history),
+        max(len(history) - 1, 0),
+        evaluations,
+        time.perf_counter() - begun,
+        finish if finish.ok else None,
+        solver.name,
+    )
+
+
+def _attempt(
+    problem: EstimationProblem, solver: Solver, x: Array, callback: Callback | None
+) -> tuple[tuple[Outcome, Evaluation], int, list[Iterate]]:
+    """One run from one start, by shorter horizons where the rollout fails there."""
     history: list[Iterate] = []
     evaluations = 0
-    needs_rollout = getattr(solver, "needs_rollout", True)
-    first = problem.evaluate(x, derivatives=False) if needs_rollout else None
-    if first is not None and not first.ok:
-        log.info("the rollout fails at the start (%s); going by shorter horizons", first.message)
+    if getattr(solver, "needs_rollout", True) and not problem.evaluate(x, derivatives=False).ok:
         longest = max(episode.grid.steps for episode in problem.episodes) * problem.step.time_step
         for fraction in CONTINUATION:
             shorter = problem.shortened(fraction * longest)
@@ -230,27 +273,14 @@ def solve(
                 break
     outcome = solver.run(problem, x, callback)
     history += outcome.history
-    finish = problem.evaluate(outcome.x)
-    covariance, chi2 = uncertainty(problem, finish)
-    status, message = outcome.status, outcome.message
-    if not finish.ok:
-        status, message = Status.FAILED, finish.message
-    return Solution(
-        status,
-        message,
-        problem.names,
-        outcome.x,
-        covariance,
-        estimates(problem, outcome.x, covariance),
-        finish.cost,
-        chi2,
-        tuple(history),
-        max(len(history) - 1, 0),
-        evaluations + outcome.evaluations,
-        time.perf_counter() - begun,
-        finish if finish.ok else None,
-        solver.name,
-    )
+    return (outcome, problem.evaluate(outcome.x)), evaluations + outcome.evaluations, history
+
+
+def _good_fit(problem: EstimationProblem, finish: Evaluation) -> bool:
+    """Whether a fit needs no other start: good, or with a cost that says nothing of noise."""
+    if problem.options.weighting == "paper":
+        return finish.ok
+    return finish.ok and uncertainty(problem, finish)[1] < POOR_FIT
 
 
 def uncertainty(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, float]:

@@ -6,12 +6,16 @@ here and one use in `build`.
 
 from __future__ import annotations
 
+import dataclasses
+import io
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, Gt, Le, Len, Lt
+from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedSeq
 
 from yid_ocp.errors import ConfigError
 from yid_ocp.solvers import SOLVERS, GaussNewton
@@ -271,3 +275,34 @@ class Run:
     def refuse(self, what: str, *path: str | int, allowed: str = "", hint: str = "") -> ConfigError:
         """A `ConfigError` that points at a setting."""
         return ConfigError(what, where=self.where(*path), allowed=allowed, hint=hint)
+
+
+def dump_config(run: Run) -> str:
+    """A run's settings as YAML that `load_config` reads back to the same run, every default written out."""
+    stream = io.StringIO()
+    yaml = YAML()
+    yaml.width = 120
+    yaml.dump(_plain(run), stream)
+    return stream.getvalue()
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        result: dict[str, Any] = {}
+        for entry in dataclasses.fields(value):
+            item = getattr(value, entry.name)
+            if entry.metadata.get("internal"):
+                continue
+            if "choose" in entry.metadata:
+                result |= {name: v for name, v in _plain(item).items() if name not in result}
+            elif item is not None:
+                result[entry.name] = _plain(item)
+        return result
+    if isinstance(value, Mapping):
+        return {name: _plain(item) for name, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        sequence = CommentedSeq([_plain(item) for item in value])
+        if not any(isinstance(item, dict) for item in sequence):
+            sequence.fa.set_flow_style()
+        return sequence
+    return value

@@ -1,0 +1,230 @@
+"""Run folders: written under a temporary name, renamed when complete, never half there."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import math
+import os
+import platform
+import secrets
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Protocol, TextIO
+
+import numpy as np
+
+from yid_ocp.data.recording import file_sha256
+from yid_ocp.errors import OutputError
+from yid_ocp.solvers import Iterate
+from yid_ocp.workflow.build import recording_file, robot_file
+from yid_ocp.workflow.settings import Run
+
+
+class Monitor(Protocol):
+    """Whoever wants to know how a long run is doing."""
+
+    def stage(self, text: str) -> None:
+        """A new part of the work begins."""
+        ...
+
+    def iterate(self, entry: Iterate) -> None:
+        """A solver accepted a point."""
+        ...
+
+
+class Silent:
+    """A monitor that tells nobody."""
+
+    def stage(self, text: str) -> None:
+        """Nothing."""
+
+    def iterate(self, entry: Iterate) -> None:
+        """Nothing."""
+
+
+@dataclass
+class RunFolder:
+    """A folder of results in the making.
+
+    Attributes
+    ----------
+    target : Path
+        Its name when complete.
+    path : Path
+        Where it is now; the same as `target` in the end.
+    """
+
+    target: Path
+    path: Path
+    _log: TextIO = field(repr=False)
+    _begun: float = field(default_factory=time.perf_counter, repr=False)
+
+    def log(self, event: str, **entries: Any) -> None:
+        """Add a line to log.jsonl."""
+        line = {"seconds": round(time.perf_counter() - self._begun, 4), "event": event, **entries}
+        self._log.write(json.dumps(jsonable(line), allow_nan=False) + "\n")
+        self._log.flush()
+
+    def write(self, name: str, text: str) -> None:
+        """Write a text file."""
+        (self.path / name).write_text(text, encoding="utf-8")
+
+    def write_json(self, name: str, data: Mapping[str, Any]) -> dict[str, Any]:
+        """Write JSON without infinities: they become null, and `notes` says where; returns what was written."""
+        notes: list[str] = []
+        clean = jsonable(data, notes)
+        if notes:
+            clean["notes"] = [*clean.get("notes", []), *notes]
+        self.write(name, json.dumps(clean, indent=1, allow_nan=False) + "\n")
+        return dict(clean)
+
+
+class _Lines(logging.Handler):
+    def __init__(self, folder: RunFolder) -> None:
+        super().__init__(logging.INFO)
+        self._folder = folder
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._folder.log("message", level=record.levelname, source=record.name, text=record.getMessage())
+
+
+def jsonable(value: Any, notes: list[str] | None = None, path: str = "") -> Any:
+    """A value in JSON's types; numbers that are not finite become None and a line in `notes`."""
+    if isinstance(value, Mapping):
+        return {str(k): jsonable(v, notes, f"{path}.{k}" if path else str(k)) for k, v in value.items()}
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [jsonable(v, notes, f"{path}[{i}]") for i, v in enumerate(value)]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        if notes is not None:
+            notes.append(f"{path} is {'not known' if math.isnan(value) else 'infinite'}")
+        return None
+    return value if value is None or isinstance(value, (bool, int, float, str)) else str(value)
+
+
+@contextlib.contextmanager
+def new_run_folder(run: Run, out: str | Path | None = None) -> Iterator[RunFolder]:
+    """Make a run folder that appears under its name when the block ends, and not at all when it is left by an error.
+
+    Parameters
+    ----------
+    run : Run
+    out : str or Path, optional
+        Its name; `NAME-YYYYmmdd-HHMMSS` in `output.folder` when absent.
+
+    Yields
+    ------
+    RunFolder
+
+    Raises
+    ------
+    OutputError
+        The folder exists and is not empty, or cannot be made or written to.
+    """
+    target = _target(run, out)
+    made = [parent for parent in (target.parent, *target.parent.parents) if not parent.exists()]
+    temporary = target.parent / f".{target.name}.{secrets.token_hex(4)}.partial"
+    try:
+        temporary.mkdir(parents=True)
+        log = (temporary / "log.jsonl").open("w", encoding="utf-8")
+    except OSError as error:
+        _clear(temporary, made)
+        raise OutputError(
+            f"the run folder cannot be made: {error.strerror or error}",
+            where=str(target),
+            hint="choose a writable folder with --out",
+        ) from error
+    folder = RunFolder(target, temporary, log)
+    lines, logger = _Lines(folder), logging.getLogger("yid_ocp")
+    level = logger.level
+    logger.addHandler(lines)
+    logger.setLevel(min(logger.getEffectiveLevel(), logging.INFO))
+    try:
+        yield folder
+        log.close()
+        if target.is_dir():
+            target.rmdir()
+        os.replace(temporary, target)
+        folder.path = target
+    except OSError as error:
+        log.close()
+        _clear(temporary, made)
+        raise OutputError(
+            f"the run folder cannot be written: {error.strerror or error}",
+            where=str(target),
+            hint="choose a folder on a disk with room, with --out",
+        ) from error
+    except BaseException:
+        log.close()
+        _clear(temporary, made)
+        raise
+    finally:
+        logger.removeHandler(lines)
+        logger.setLevel(level)
+
+
+def _target(run: Run, out: str | Path | None) -> Path:
+    if out is not None:
+        target = Path(out).expanduser().absolute()
+        if target.is_dir() and any(target.iterdir()):
+            raise OutputError(
+                "the run folder exists and is not empty",
+                where=str(target),
+                allowed="a new name, or an empty folder",
+                hint="choose another name with --out, or leave it out for a numbered one",
+            )
+        if target.exists() and not target.is_dir():
+            raise OutputError("the run folder's name is that of a file", where=str(target), hint="choose another --out")
+        return target
+    parent = Path(run.output.folder) if run.output.folder is not None else Path.cwd() / "runs"
+    stem = f"{run.name}-{time.strftime('%Y%m%d-%H%M%S')}"
+    names = (stem, *(f"{stem}-{i}" for i in range(2, 1000)))
+    return next(parent / name for name in names if not (parent / name).exists())
+
+
+def _clear(temporary: Path, made: list[Path]) -> None:
+    shutil.rmtree(temporary, ignore_errors=True)
+    for parent in made:
+        with contextlib.suppress(OSError):
+            parent.rmdir()
+
+
+def input_hashes(run: Run) -> dict[str, str]:
+    """SHA-256 of every file that a run reads: the configuration, the robot, the recordings."""
+    files: dict[str, Path] = {}
+    if run.file:
+        files["configuration"] = Path(run.file)
+    robot = robot_file(run)
+    if robot is not None and run.model.robot is not None:
+        files[run.model.robot] = robot
+    for path in (*run.recordings.estimate, *run.recordings.held_out):
+        files[path] = recording_file(path)
+    return {name: file_sha256(path) for name, path in files.items()}
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python, this package and what its numbers depend on."""
+    result = {"python": platform.python_version(), "platform": f"{platform.system()} {platform.machine()}"}
+    for package in ("yid-ocp", "casadi", "numpy", "scipy", "h5py"):
+        try:
+            result[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            result[package] = "not installed"
+    return result
+
+
+def both(*callbacks: Callable[[Iterate], None]) -> Callable[[Iterate], None]:
+    """One callback that calls several."""
+
+    def call(entry: Iterate) -> None:
+        for callback in callbacks:
+            callback(entry)
+
+    return call

@@ -1,0 +1,207 @@
+"""The command `solve`: estimate the free parameters, predict the held-out recordings, write the run folder."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from yid_ocp.errors import OutputError
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.problem import Episode, EpisodeResult
+from yid_ocp.report.html import write_report
+from yid_ocp.report.sections import Findings
+from yid_ocp.sensors import EffortSensor, PointSensor
+from yid_ocp.solvers import Solution, Status, solve
+from yid_ocp.solvers.base import Callback
+from yid_ocp.workflow.build import build_problem
+from yid_ocp.workflow.folder import Monitor, RunFolder, Silent, both, input_hashes, new_run_folder, versions
+from yid_ocp.workflow.settings import Run, dump_config
+
+FORMAT = "yid-solve/1"
+TRAJECTORIES = "yid-trajectories/1"
+
+
+@dataclass(frozen=True)
+class SolveOutcome:
+    """What `run_solve` leaves.
+
+    Attributes
+    ----------
+    folder : Path
+        The finished run folder.
+    result : dict
+        Contents of result.json.
+    solution : Solution
+    problem : EstimationProblem
+    """
+
+    folder: Path
+    result: dict[str, Any]
+    solution: Solution
+    problem: EstimationProblem
+
+    @property
+    def ok(self) -> bool:
+        """Whether the solver converged."""
+        return self.solution.status == Status.CONVERGED
+
+
+def run_solve(run: Run, out: str | Path | None = None, monitor: Monitor | None = None) -> SolveOutcome:
+    """Estimate, validate and write the run folder.
+
+    Parameters
+    ----------
+    run : Run
+    out : str or Path, optional
+        The run folder; see `new_run_folder`.
+    monitor : Monitor, optional
+        Told about stages and iterates.
+
+    Returns
+    -------
+    SolveOutcome
+        Also where the solver failed: the run folder then holds the reason and the best point.
+
+    Raises
+    ------
+    ConfigError, DataError, ModelError, OutputError
+    """
+    watcher = monitor or Silent()
+    with new_run_folder(run, out) as folder:
+        inputs = input_hashes(run)
+        folder.write("config.yaml", dump_config(run))
+        watcher.stage("building the model and its compiled step")
+        folder.log("start", command="solve", versions=versions(), inputs=inputs)
+        problem = build_problem(run)
+        watcher.stage(f"solving for {len(problem.start)} unknowns by {run.solver.name}")
+
+        def note(entry: Any) -> None:
+            values = {name: float(value) for name, value in zip(problem.shared, entry.x, strict=False)}
+            folder.log("iterate", iteration=entry.iteration, cost=entry.cost, gradient=entry.gradient, x=values)
+
+        solution = solve(problem, run.solver.method, callback=both(note, watcher.iterate))
+        watcher.stage("predicting the held-out recordings")
+        held_out = problem.validate(solution.x)
+        result = solve_result(problem, solution, held_out) | {"inputs": inputs, "versions": versions()}
+        folder.log("end", status=solution.status.value, message=solution.message, seconds_solving=solution.seconds)
+        write_trajectories(folder.path / "trajectories.h5", problem, solution, held_out)
+        written = folder.write_json("result.json", result)
+        if run.output.report:
+            watcher.stage("writing the report")
+            findings = Findings(run.name, run.description, written, problem, solution, tuple(held_out))
+            write_report(folder.path / "report.html", findings)
+    return SolveOutcome(folder.path, written, solution, problem)
+
+
+def solve_result(
+    problem: EstimationProblem, solution: Solution, held_out: Sequence[tuple[Episode, EpisodeResult | str]]
+) -> dict[str, Any]:
+    """`yid-solve/1` without inputs and versions."""
+    residuals: Mapping[str, Any] = {}
+    if solution.evaluation is not None:
+        residuals = problem.channel_errors(solution.evaluation.episodes, problem.episodes)
+    return {
+        "format": FORMAT,
+        "status": solution.status.value,
+        "message": solution.message,
+        "parameters": {name: asdict(entry) for name, entry in solution.parameters.items()},
+        "cost": solution.cost,
+        "iterations": solution.iterations,
+        "evaluations": solution.evaluations,
+        "seconds": solution.seconds,
+        "residuals": residuals,
+        "held_out": [_held_out(problem, episode, outcome) for episode, outcome in held_out],
+    }
+
+
+def _held_out(problem: EstimationProblem, episode: Episode, outcome: EpisodeResult | str) -> dict[str, Any]:
+    entry: dict[str, Any] = {"recording": episode.name}
+    if isinstance(outcome, str):
+        entry |= {"rmse": {}, "message": outcome}
+    else:
+        errors = problem.channel_errors([outcome], [episode])
+        entry["rmse"] = {channel: error["rmse"] for channel, error in errors.items()}
+    return entry | {"baselines": baselines(episode)}
+
+
+def baselines(episode: Episode) -> dict[str, dict[str, float]]:
+    """Errors of predictions that need no model, per channel: points that stay where first seen, efforts of zero."""
+    result: dict[str, dict[str, float]] = {}
+    for samples in episode.samples:
+        blocks = samples.value.reshape(len(samples.value), -1, samples.sensor.width)
+        for c, channel in enumerate(samples.sensor.channels):
+            seen = blocks[np.all(np.isfinite(blocks[:, c]), axis=1), c]
+            if not len(seen):
+                continue
+            if isinstance(samples.sensor, PointSensor):
+                name, reference = "stays", seen[0]
+            elif isinstance(samples.sensor, EffortSensor):
+                name, reference = "zero", np.zeros(samples.sensor.width)
+            else:
+                continue
+            error = float(np.sqrt(np.mean(np.sum((seen - reference) ** 2, axis=1))))
+            result.setdefault(name, {})[channel] = error
+    return result
+
+
+def write_trajectories(
+    path: Path, problem: EstimationProblem, solution: Solution, held_out: Sequence[tuple[Episode, EpisodeResult | str]]
+) -> None:
+    """Trajectories, predictions and the unknowns with their covariance, as `yid-trajectories/1` (HDF5).
+
+    `unknowns/`: names, x, covariance. `recordings/NAME/`: `t` (N+1,) [s], `q`, `p` (N+1, n), `multipliers` (N, m)
+    [N s], `torque` (N, nu) [N m], `effort` (N, nc) [N m], and for every sensor `GROUP/` with `t`, `measured`,
+    `predicted`, `std` and the attributes `channels`, `unit`.
+
+    Raises
+    ------
+    OutputError
+    """
+    pairs: list[tuple[str, Episode, EpisodeResult | str]] = [("held_out", *pair) for pair in held_out]
+    if solution.evaluation is not None:
+        done = solution.evaluation.episodes
+        pairs = [("estimate", e, r) for e, r in zip(problem.episodes, done, strict=True)] + pairs
+    text = h5py.string_dtype()
+    try:
+        with h5py.File(path, "w") as file:
+            file.attrs["format"] = TRAJECTORIES
+            unknowns = file.create_group("unknowns")
+            unknowns.attrs["names"] = np.array(solution.names, dtype=text)
+            unknowns.create_dataset("x", data=solution.x)
+            unknowns.create_dataset("covariance", data=solution.covariance)
+            for role, episode, outcome in pairs:
+                group = file.require_group("recordings").create_group(episode.name)
+                group.attrs["role"] = role
+                group.attrs["joints"] = np.array(problem.system.mechanism.joint_names, dtype=text)
+                if isinstance(outcome, str):
+                    group.attrs["message"] = outcome
+                    continue
+                _write_episode(group, problem, episode, outcome)
+    except OSError as error:
+        raise OutputError(f"the trajectories cannot be written: {error}", where=str(path)) from error
+
+
+def _write_episode(group: h5py.Group, problem: EstimationProblem, episode: Episode, outcome: EpisodeResult) -> None:
+    n, sweep = problem.system.size, outcome.sweep
+    arrays = {
+        "t": episode.grid.times,
+        "q": sweep.state[:, :n],
+        "p": sweep.state[:, n : 2 * n],
+        "multipliers": sweep.multipliers,
+        "torque": sweep.torque,
+        "effort": sweep.effort,
+    }
+    for name, array in arrays.items():
+        group.create_dataset(name, data=array, compression="gzip", shuffle=True)
+    for samples, predicted in zip(episode.samples, outcome.predicted, strict=True):
+        part = group.create_group(samples.sensor.group)
+        part.attrs["channels"] = np.array(samples.sensor.channels, dtype=h5py.string_dtype())
+        part.attrs["unit"] = samples.sensor.unit
+        times = episode.grid.start + problem.step.time_step * (samples.node + samples.fraction)
+        for name, array in (("t", times), ("measured", samples.value), ("predicted", predicted), ("std", samples.std)):
+            part.create_dataset(name, data=array, compression="gzip", shuffle=True)
