@@ -26,7 +26,7 @@ hypothesis.settings.load_profile("tests")
 
 def pytest_configure(config):
     """Keep compiled code between runs, apart from the user's own, unless a place was chosen."""
-    if "YID_OCP_CACHE" not in os.environ:
+    if "YID_OCP_CACHE" not in os.environ and hasattr(config, "cache"):
         folder = config.cache.mkdir("compiled")
         folder.chmod(0o700)
         os.environ["YID_OCP_CACHE"] = str(folder)

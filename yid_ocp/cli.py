@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +16,14 @@ from typing import TYPE_CHECKING, Any
 from yid_ocp.errors import YidError
 
 if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
+    from yid_ocp.data import Recording
+    from yid_ocp.solvers import Iterate
+    from yid_ocp.workflow.folder import Monitor
     from yid_ocp.workflow.settings import Run
+
+Rows = list[Sequence[str]]
 
 DONE, FAILED, WRONG_INPUT, BUG, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -75,8 +83,117 @@ def _solve(arguments: argparse.Namespace) -> int:
     return DONE if outcome.ok else FAILED
 
 
+def _simulate(arguments: argparse.Namespace) -> int:
+    from yid_ocp.workflow.simulate import run_simulate
+
+    run = _load(arguments)
+    with _progress(arguments.quiet) as monitor:
+        outcome = run_simulate(run, arguments.out, monitor, arguments.seed, arguments.noise)
+    if not arguments.quiet:
+        if outcome.recording is None:
+            _print([f"failed: {outcome.result['message']}"])
+        else:
+            groups = outcome.result["groups"].items()
+            rows: Rows = [("group", "samples"), *((name, str(entry["samples"])) for name, entry in groups)]
+            _print([*table(rows), "", f"{outcome.recording.duration:g} s in recording.h5"])
+    _say_folder(outcome.folder, arguments.quiet)
+    return DONE if outcome.ok else FAILED
+
+
+def _simulate_arguments(parser: argparse.ArgumentParser) -> None:
+    configured()(parser)
+    parser.add_argument("--seed", type=int, default=0, help="of the noise and of a virtual experiment's motion")
+    parser.add_argument("--noise", action="store_true", help="add noise of the recorded deviations")
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    from yid_ocp.workflow.check import run_check
+
+    run = _load(arguments)
+    with _progress(arguments.quiet) as monitor:
+        outcome = run_check(run, arguments.out, monitor)
+    if not arguments.quiet:
+        _print(check_summary(outcome.result))
+    _say_folder(outcome.folder, arguments.quiet)
+    return DONE
+
+
+def _inspect(arguments: argparse.Namespace) -> int:
+    from yid_ocp.workflow.inspect import run_inspect
+
+    run = _load(arguments)
+    with _progress(arguments.quiet) as monitor:
+        outcome = run_inspect(run, arguments.out, monitor)
+    if not arguments.quiet:
+        _print(inspect_summary(outcome.result))
+    _say_folder(outcome.folder, arguments.quiet)
+    return DONE
+
+
+def _import(arguments: argparse.Namespace) -> int:
+    from yid_ocp.data import read_any, write_recording
+
+    recording = read_any(arguments.file)
+    write_recording(recording, arguments.out)
+    if not arguments.quiet:
+        _print(recording_summary(recording))
+    print(arguments.out if arguments.quiet else f"recording: {arguments.out}")
+    return DONE
+
+
+def _import_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("file", metavar="FILE", help="CSV file or folder, rosbag, MCAP, or a recording")
+    parser.add_argument("--out", metavar="RECORDING.h5", required=True, help="recording to write")
+    parser.add_argument("--quiet", action="store_true", help="print nothing but the recording's path")
+
+
+def _export(arguments: argparse.Namespace) -> int:
+    from yid_ocp.data import export_csv, read_recording
+
+    recording = read_recording(arguments.recording, allow_nan_effort=True)
+    files = export_csv(recording, arguments.out)
+    if not arguments.quiet:
+        _print(recording_summary(recording))
+    _print([str(file) for file in files])
+    return DONE
+
+
+def _export_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("recording", metavar="RECORDING.h5", help="recording to write as CSV")
+    parser.add_argument("--out", metavar="DIR", required=True, help="folder for the CSV files")
+    parser.add_argument("--quiet", action="store_true", help="print nothing but the files' paths")
+
+
+def _schema(arguments: argparse.Namespace) -> int:
+    import json
+
+    from yid_ocp.config import schema
+    from yid_ocp.errors import OutputError
+
+    text = json.dumps(schema(), indent=1)
+    if arguments.out is None:
+        print(text)
+        return DONE
+    try:
+        Path(arguments.out).write_text(text + "\n", encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"the schema cannot be written: {error.strerror}", where=arguments.out) from error
+    print(arguments.out)
+    return DONE
+
+
+def _schema_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", metavar="FILE", help="file to write; printed when absent")
+
+
 COMMANDS: tuple[Command, ...] = (
     Command("solve", "estimate the free parameters from recordings", _solve, configured(optional=True)),
+    Command("simulate", "write what the model says would be recorded", _simulate, _simulate_arguments),
+    Command("check", "validate a configuration, its recordings and the model before a long run", _check, configured()),
+    Command("inspect", "show the model's equations in numbers", _inspect, configured()),
+    Command("import", "turn CSV, rosbag or MCAP into a recording", _import, _import_arguments),
+    Command("export", "turn a recording into CSV", _export, _export_arguments),
+    Command("schema", "print the JSON Schema of configuration files, for editors", _schema, _schema_arguments),
 )
 
 
@@ -86,11 +203,13 @@ COMMANDS: tuple[Command, ...] = (
 def solve_summary(result: dict[str, Any]) -> list[str]:
     """Lines that tell a person what a `yid-solve/1` result says."""
     free = {name: entry for name, entry in result["parameters"].items() if entry["free"]}
+    failed = result["status"] == "failed"
     words = {"identifiable": "found", "weak": "weakly determined", "not_identifiable": "cannot be found"}
-    rows = [("parameter", "value", "± std", "unit", "verdict", "start")]
+    rows: Rows = [("parameter", "value", "± std", "unit", "verdict", "start")]
     for name, entry in free.items():
         std = "unknown" if entry["std"] is None else f"{entry['std']:.2g}"
-        rows.append((name, f"{entry['value']:.4g}", std, entry["unit"], words[entry["verdict"]], f"{entry['initial']:.4g}"))
+        verdict = "" if failed else words[entry["verdict"]]
+        rows.append((name, f"{entry['value']:.4g}", std, entry["unit"], verdict, f"{entry['initial']:.4g}"))
     lines = [*table(rows), ""]
     rows = [("channel", "error (rms)", "unit", "samples")]
     rows += [(c, f"{e['rmse']:.3g}", e["unit"], str(e["n"])) for c, e in result["residuals"].items()]
@@ -102,21 +221,111 @@ def solve_summary(result: dict[str, Any]) -> list[str]:
         if "message" in entry:
             lines += [f"held-out recording {entry['recording']} could not be predicted: {entry['message']}", ""]
         for channel, rmse in entry["rmse"].items():
-            without = [f"{errors[channel]:.3g} ({name})" for name, errors in entry["baselines"].items() if channel in errors]
+            without = [
+                f"{errors[channel]:.3g} ({name})" for name, errors in entry["baselines"].items() if channel in errors
+            ]
             rows.append((entry["recording"], channel, f"{rmse:.3g}", units.get(channel, ""), ", ".join(without)))
     if len(rows) > 1:
         lines += [*table(rows), ""]
     lost = [name for name, entry in free.items() if entry["verdict"] == "not_identifiable"]
     weak = [name for name, entry in free.items() if entry["verdict"] == "weak"]
-    if lost:
+    if failed:
+        lines.append("the values are the best point that was reached; nothing can be said about how sure they are")
+    if lost and not failed:
         lines.append(f"cannot be found from these recordings: {', '.join(lost)}")
-    if weak:
+    if weak and not failed:
         lines.append(f"only weakly determined: {', '.join(weak)}")
-    lines.append(f"{result['status']}: {result['message']}" f" ({result['iterations']} iterations, {result['seconds']:.1f} s)")
+    lines.append(
+        f"{result['status']}: {result['message']} ({result['iterations']} iterations, {result['seconds']:.1f} s)"
+    )
     return lines
 
 
-def table(rows: Sequence[Sequence[str]]) -> list[str]:
+def check_summary(result: dict[str, Any]) -> list[str]:
+    """Lines that tell a person what a `yid-check/1` result says."""
+    model = result["model"]
+    lines = [
+        f"model: {model['n']} coordinates, {model['m']} constraints, {model['nu']} driven, {model['nc']} prescribed, "
+        f"{model['ntheta']} parameters",
+        "",
+    ]
+    rows: Rows = [("recording", "use", "group", "samples", "rate", "longest gap", "noise (median)")]
+    for entry in result["recordings"]:
+        for name, group in entry["groups"].items():
+            noise = entry["noise"].get(name) or entry["noise"].get(f"{name}.effort")
+            shown = "" if noise is None or noise["std"] is None else f"{noise['std']:.3g} {noise['unit']}"
+            rows.append(
+                (
+                    entry["recording"],
+                    "held out" if entry["role"] == "held_out" else "estimate",
+                    name,
+                    str(group["samples"]),
+                    f"{group['rate']:.4g} Hz",
+                    f"{group['longest_gap']:.3g} s",
+                    shown,
+                )
+            )
+    lines += [*table(rows), ""] if len(rows) > 1 else []
+    for entry in result["recordings"]:
+        gaps = [f"{name} {1e3 * gap:.2g} mm" for name, gap in entry["grasp_gaps"].items()]
+        rest = entry.get("equilibrium")
+        said = [] if rest is None else ["equilibrium found" if rest["found"] else f"no equilibrium: {rest['message']}"]
+        if gaps or said:
+            lines.append(
+                f"{entry['recording']}: " + "; ".join([*said, *(["grasp gaps " + ", ".join(gaps)] if gaps else [])])
+            )
+    convergence = result["convergence"]
+    for key, head in (("links", "links"), ("time_step", "time step [s]")):
+        rows = [(head, "lowest frequencies [Hz]", "")]
+        for row in convergence[key]:
+            note = row["message"] or (f"{row['growing']} modes grow" if row["growing"] else "")
+            rows.append((f"{row['value']:g}", ", ".join(f"{f:.4g}" for f in row["hertz"]), note))
+        lines += ["", *table(rows)] if len(rows) > 1 else []
+    if convergence["message"]:
+        lines += ["", f"frequencies: {convergence['message']}"]
+    lines += ["", *(f"warning: {text}" for text in result["warnings"])]
+    lines.append(
+        "nothing stands in the way of a run" if not result["warnings"] else "a run is possible; see the warnings"
+    )
+    return lines
+
+
+def inspect_summary(result: dict[str, Any]) -> list[str]:
+    """Lines that tell a person what a `yid-inspect/1` result says."""
+    roles = [entry["role"] for entry in result["variables"]]
+    counts = [f"{roles.count(role)} {role}" for role in ("driven", "prescribed", "free") if role in roles]
+    equations = result["equations"]
+    lines = [f"coordinates: {len(roles)} ({', '.join(counts)}), constraints: {equations['sizes']['m']}", ""]
+    rows: Rows = [("parameter", "value", "unit", "bounds", "")]
+    for name, entry in result["parameters"].items():
+        low, high = ("inf" if entry[key] is None else f"{entry[key]:g}" for key in ("lower", "upper"))
+        low = "-inf" if entry["lower"] is None else low
+        rows.append((name, f"{entry['value']:.6g}", entry["unit"], f"{low} to {high}", "free" if entry["free"] else ""))
+    lines += [*table(rows), ""]
+    rows = [("function", "operations", "nonzeros")]
+    rows += [(f["name"], str(f["operations"]), str(f["nonzeros"])) for f in equations["functions"]]
+    count = equations["unknowns"]
+    lines += [*table(rows), ""]
+    lines.append(f"Jacobian of the step: {count} x {count}, {equations['jacobian_nonzeros']} nonzeros (sparsity.png)")
+    linear = result["linearisation"]
+    lines.append(f"linearised at {linear['at']}: spectral radius of A {linear['spectral_radius']:.6g}")
+    rows = [("matrix", "norm", "largest difference from finite differences")]
+    rows += [
+        (name, f"{norm:.4g}", f"{linear['finite_difference_errors'][name]:.1e}")
+        for name, norm in linear["norms"].items()
+    ]
+    return [*lines, *table(rows), "matrices: linearisation.h5"]
+
+
+def recording_summary(recording: Recording) -> list[str]:
+    """Lines that tell a person what a recording holds."""
+    rows: Rows = [("group", "samples", "names")]
+    for group in recording.groups:
+        rows.append((getattr(group, "name", "joints"), str(len(group.t)), ", ".join(group.names)))
+    return [*table(rows), "", f"{recording.duration:g} s"]
+
+
+def table(rows: Rows) -> list[str]:
     """Rows as aligned lines, the first one as head."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
@@ -132,10 +341,59 @@ def _load(arguments: argparse.Namespace) -> Run:
     return load_config(arguments.config, arguments.overrides)
 
 
-def _progress(quiet: bool) -> Any:
-    from yid_ocp.progress import console_progress
+class _PlainProgress:
+    """A line for every stage and iterate, for logs and pipes."""
 
-    return console_progress(quiet)
+    def stage(self, text: str) -> None:
+        print(f"{text} ...", file=sys.stderr, flush=True)
+
+    def iterate(self, entry: Iterate) -> None:
+        print(f"  {_iterate_words(entry)}", file=sys.stderr, flush=True)
+
+
+class _BarProgress:
+    """A moving bar for the stage that runs."""
+
+    def __init__(self, bars: Progress) -> None:
+        self._bars = bars
+        self._task: TaskID | None = None
+        self._text = ""
+
+    def stage(self, text: str) -> None:
+        self.close()
+        self._text = text
+        self._task = self._bars.add_task(text, total=None)
+
+    def iterate(self, entry: Iterate) -> None:
+        if self._task is not None:
+            self._bars.update(self._task, description=f"{self._text}: {_iterate_words(entry)}")
+
+    def close(self) -> None:
+        """Mark the running stage as done."""
+        if self._task is not None:
+            self._bars.update(self._task, total=1, completed=1)
+
+
+def _iterate_words(entry: Iterate) -> str:
+    note = f", {entry.note}" if entry.note else ""
+    return f"iteration {entry.iteration}, cost {entry.cost:.6g}, {entry.seconds:.1f} s{note}"
+
+
+@contextlib.contextmanager
+def _progress(quiet: bool) -> Iterator[Monitor | None]:
+    if quiet:
+        yield None
+    elif not sys.stderr.isatty():
+        yield _PlainProgress()
+    else:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+        columns = (BarColumn(bar_width=24), TextColumn("{task.description}", markup=False), TimeElapsedColumn())
+        with Progress(*columns, console=Console(stderr=True)) as bars:
+            monitor = _BarProgress(bars)
+            yield monitor
+            monitor.close()
 
 
 def _print(lines: Sequence[str]) -> None:
@@ -151,7 +409,9 @@ def parser() -> argparse.ArgumentParser:
     """The argument parser of all commands."""
     from yid_ocp import __version__
 
-    top = argparse.ArgumentParser(prog="yid-ocp", description=__doc__ and "Stiffness of flexible objects from robot recordings.")
+    top = argparse.ArgumentParser(
+        prog="yid-ocp", description=__doc__ and "Stiffness of flexible objects from robot recordings."
+    )
     top.add_argument("--version", action="version", version=f"yid-ocp {__version__}")
     commands = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for row in COMMANDS:
@@ -182,9 +442,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("interrupted; no run folder was left", file=sys.stderr)
         return INTERRUPTED
     except Exception as error:  # whatever else comes up here is a mistake of ours
-        with tempfile.NamedTemporaryFile(
-            "w", prefix="yid-ocp-", suffix=".log", delete=False, encoding="utf-8"
-        ) as file:
+        with tempfile.NamedTemporaryFile("w", prefix="yid-ocp-", suffix=".log", delete=False, encoding="utf-8") as file:
             traceback.print_exc(file=file)
         print(f"bug: {type(error).__name__}: {error}\n  please report it with {file.name}", file=sys.stderr)
         return BUG

@@ -95,7 +95,9 @@ def _read(path: Path) -> str:
         raise ConfigError("there is no such configuration file", where=str(path), hint=hint) from error
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
-        raise ConfigError(f"the configuration cannot be read: {reason}", where=str(path)) from error
+        raise ConfigError(
+            f"the configuration cannot be read: {reason}", where=str(path), allowed="a YAML file in UTF-8"
+        ) from error
 
 
 def _parse(text: str, origin: str) -> tuple[dict[str, Any], dict[KeyPath, str]]:
@@ -104,8 +106,9 @@ def _parse(text: str, origin: str) -> tuple[dict[str, Any], dict[KeyPath, str]]:
     except MarkedYAMLError as error:
         line = f", line {error.problem_mark.line + 1}" if error.problem_mark is not None else ""
         problem = str(error.problem or error.context).split("\n")[0]
+        twice = re.match(r'found duplicate key "(.*?)"', problem)
         raise ConfigError(
-            f"the file is not valid YAML: {re.split(r' with value | in ', problem)[0]}",
+            f"the key '{twice[1]}' stands twice" if twice else f"the file is not valid YAML: {problem}",
             where=f"{origin}{line}",
             hint="check indentation, brackets, colons and keys that stand twice",
         ) from error
@@ -149,7 +152,9 @@ def _override(data: dict[str, Any], places: dict[KeyPath, str], text: str) -> No
     try:
         value = YAML(typ="rt").load(value_text) if value_text.strip() else None
     except YAMLError as error:
-        raise ConfigError(f"the value '{value_text}' is not valid YAML", where=origin) from error
+        raise ConfigError(
+            f"the value '{value_text}' is not valid YAML", where=origin, allowed="a number, text, [list] or {key: value}"
+        ) from error
     parent = data
     for part in path[:-1]:
         entry = parent.get(part)
@@ -243,7 +248,8 @@ def _options(hint: Any) -> tuple[Any, ...]:
 
 def _member(hint: Any, raw: Any) -> Any:
     """The settings class that a value is meant for, chosen by its `kind` among several; None for other types."""
-    classes = [member for member in map(lambda m: _stripped(m)[0], _options(hint)) if dataclasses.is_dataclass(member)]
+    bare = [_stripped(member)[0] for member in _options(hint)]
+    classes = [member for member in bare if dataclasses.is_dataclass(member)]
     if len(classes) > 1:
         wanted = raw.get("kind") if isinstance(raw, dict) else None
         return next((member for member in classes if _kind(member) == wanted), classes[0])
@@ -313,7 +319,9 @@ class _Reader:
     def _settings(self, kind: type, raw: Any, path: KeyPath) -> Any:
         if not isinstance(raw, dict):
             allowed = "keys: " + ", ".join(_fields(kind, None))
-            raise ConfigError(f"{self._name(path)} = {_shown(raw)} is not a section", where=self.where(path), allowed=allowed)
+            raise ConfigError(
+                f"{self._name(path)} = {_shown(raw)} is not a section", where=self.where(path), allowed=allowed
+            )
         fields = _fields(kind, raw)
         for name in raw:
             if name not in fields:
@@ -329,14 +337,16 @@ class _Reader:
             if name in raw:
                 value = self.build(entry.hint, raw[name], (*path, name))
             elif entry.default is MISSING:
-                raise ConfigError(f"the key '{name}' is missing", where=self.where(path), allowed=_described(entry.hint))
+                raise ConfigError(
+                    f"the key '{name}' is missing", where=self.where(path), allowed=_described(entry.hint)
+                )
             else:
                 value = entry.default
             (flat.setdefault(entry.holder, {}) if entry.holder else values)[name] = value
-        for entry in dataclasses.fields(kind):
-            if "choose" in entry.metadata:
-                self._known_choice(entry, raw, path)
-                values[entry.name] = entry.metadata["choose"](raw)(**flat.get(entry.name, {}))
+        for member in dataclasses.fields(kind):
+            if "choose" in member.metadata:
+                self._known_choice(member, raw, path)
+                values[member.name] = member.metadata["choose"](raw)(**flat.get(member.name, {}))
         return kind(**values)
 
     def _known_choice(self, entry: dataclasses.Field, raw: Mapping[str, Any], path: KeyPath) -> None:
@@ -367,7 +377,10 @@ class _Reader:
             if unit and match[2].strip() != unit:
                 hint_text += f": convert it from {match[2].strip()}"
         return ConfigError(
-            f"{self._name(path)} = {_shown(raw)} is not allowed", where=self.where(path), allowed=_described(hint), hint=hint_text
+            f"{self._name(path)} = {_shown(raw)} is not allowed",
+            where=self.where(path),
+            allowed=_described(hint),
+            hint=hint_text,
         )
 
     @staticmethod

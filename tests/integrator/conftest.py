@@ -23,7 +23,7 @@ from yid_ocp.model import (
     forward_kinematics,
 )
 from yid_ocp.model.mechanism import Placement
-from yid_ocp.model.system import floating_clamp
+from yid_ocp.model.system import ClosedForce, floating_clamp
 
 
 @dataclass(frozen=True)
@@ -77,12 +77,14 @@ def soft_joint(joint: str, compliance: float) -> Added:
     return Added("soft", joint, parameters, change=change)
 
 
-def soft_grasp(grasp: str, compliance: float) -> Added:
-    """phi(q_{k+1}) = C lam / h."""
-    parameters = _parameters("soft_grasp", grasp, compliance=compliance)
+def soft_grasp(grasp: str, compliance: float, relaxation: float | None = None) -> Added:
+    """phi(q_{k+1}) + T (phi(q_{k+1}) - phi(q_k)) / h = C lam / h."""
+    values = {"compliance": compliance} | ({} if relaxation is None else {"relaxation": relaxation})
+    parameters = _parameters("soft_grasp", grasp, **values)
 
     def change(effect, system):
-        changed = [replace(g, compliance=effect.parameters.symbols[0]) if g.name == grasp else g for g in system.grasps]
+        values = {name.split(".")[-1]: effect.parameters[name].symbol for name in effect.parameters.names}
+        changed = [replace(g, **values) if g.name == grasp else g for g in system.grasps]
         return replace(system, grasps=tuple(changed))
 
     return Added("soft_grasp", grasp, parameters, change=change)
@@ -127,6 +129,28 @@ def growing_link(joint: str, length: float, time: float) -> Added:
     return Added("growth", joint, parameters, internal, change, add)
 
 
+def thick_air(joint: str, coefficient: float, viscosity: float, buoyancy: float) -> Added:
+    """A cubic drag with given slopes, a viscous drag, and one link that weighs less than its mass."""
+    parameters = _parameters("air", joint, coefficient=coefficient, viscosity=viscosity, buoyancy=buoyancy)
+
+    def change(effect, system):
+        joints = list(system.mechanism.joints)
+        index = system.mechanism.joint_index(joint)
+        lighter = tuple(replace(body, weight=1 - effect.parameters.symbols[2]) for body in joints[index].bodies)
+        joints[index] = replace(joints[index], bodies=lighter)
+        return replace(system, mechanism=replace(system.mechanism, joints=tuple(joints)))
+
+    def add(effect, state):
+        c, b = effect.parameters.symbols[0], effect.parameters.symbols[1]
+        q, v = state.q, state.v
+        stretch = 1 + ca.sumsqr(q)
+        force = -c * stretch * v**3
+        closed = ClosedForce(force, -2 * c * (v**3) @ q.T, ca.diag(-3 * c * stretch * v**2))
+        return Terms(viscous=-b * v, closed=closed)
+
+    return Added("air", joint, parameters, change=change, add=add)
+
+
 def cable(**changes) -> System:
     """Three links, nine coordinates, standing on the ground."""
     options = {"links": 3, "bend": 2.0, "twist": 1.0, "damping": 0.01, **changes.pop("segment", {})}
@@ -149,7 +173,12 @@ def clamped_cable(kind: str, effects=()) -> tuple[System, np.ndarray]:
     segment = Segment("C", 0.6, 0.3, 0.05, links=3, bend=2.0, twist=1.0, damping=0.01)
     objects = [(flexible_object([segment], name="cable"), None, None)]
     system = System.build(
-        clamp, objects=objects, grasps=[grasp], prescribed=clamp.joint_names, effects=effects
+        clamp,
+        objects=objects,
+        grasps=[grasp],
+        prescribed=clamp.joint_names,
+        driven=["C_1_x", "C_2_z"],
+        effects=effects,
     )
     return system, np.concatenate([pose[:3, 3], np.zeros(3), bent])
 
@@ -199,20 +228,30 @@ def closed_loop(urdf_folder, effects=()) -> tuple[System, np.ndarray]:
     offset = np.linalg.solve(holder, held)[:3, 3]
     grasp = Grasp("loop", "tool", "nose", offset=ca.SX(ca.DM(offset)))
     driven, prescribed = ["spin", "extend"], ["swing"]
-    system = System.build(
-        robot, grasps=[grasp], driven=driven, prescribed=prescribed, damping=0.3, effects=effects
-    )
+    system = System.build(robot, grasps=[grasp], driven=driven, prescribed=prescribed, damping=0.3, effects=effects)
     return system, q
 
 
 BUILDERS = {
     "closed_loop": lambda folder: make_case(*closed_loop(folder)),
     "closed_loop_left": lambda folder: make_case(*closed_loop(folder), split="left"),
-    "welded_cable": lambda folder: make_case(*clamped_cable("weld")),
-    "aligned_cable": lambda folder: make_case(*clamped_cable("axis")),
+    "welded_cable": lambda folder: make_case(*clamped_cable("weld"), strength=0.05),
+    "aligned_cable": lambda folder: make_case(*clamped_cable("axis"), strength=0.05),
     "creeping_cable": lambda folder: make_case(
-        *clamped_cable("point", [creeping_grasp("clamp", 0.05), soft_grasp("clamp", 1e-4)]), time_step=5e-4
+        *clamped_cable("point", [creeping_grasp("clamp", 0.05), soft_grasp("clamp", 1e-4)]),
+        time_step=5e-4,
+        strength=0.05,
     ),
+    "relaxing_cable": lambda folder: make_case(
+        *clamped_cable("point", [creeping_grasp("clamp", 0.05), soft_grasp("clamp", 1e-4, relaxation=2e-3)]),
+        time_step=5e-4,
+        strength=0.05,
+        split="left_damping",
+    ),
+    "thick_air": lambda folder: make_case(
+        *closed_loop(folder, [thick_air("nod", 0.05, 0.2, 0.4)]), split="left_damping"
+    ),
+    "thick_air_symmetric": lambda folder: make_case(*closed_loop(folder, [thick_air("slide", 0.05, 0.2, -0.4)])),
     "soft_cable": lambda folder: make_case(
         cable(
             driven=["C_2_x", "C_1_z"],
@@ -247,6 +286,7 @@ def parts():
         maxwell_branch = staticmethod(maxwell_branch)
         soft_joint = staticmethod(soft_joint)
         soft_grasp = staticmethod(soft_grasp)
+        thick_air = staticmethod(thick_air)
         creeping_grasp = staticmethod(creeping_grasp)
         cable = staticmethod(cable)
         clamped_cable = staticmethod(clamped_cable)

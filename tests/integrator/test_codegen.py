@@ -163,6 +163,7 @@ def test_elimination_fills_no_more_than_the_tree(single_step):
     assert ordered[0] == "T3_3_z"
     assert ordered[-3:] == ["lam0", "lam1", "lam2"]
     tip = [ordered[i] for i in tables.fill[0]]
-    chain = [system.mechanism.joint_names[i] for i in system.mechanism.ancestors(system.mechanism.joint_index("T3_3_z"))]
+    tree = system.mechanism
+    chain = [tree.joint_names[i] for i in tree.ancestors(tree.joint_index("T3_3_z"))]
     assert tip == chain[-2::-1]
     assert sum(len(entries) for entries in tables.fill) < 0.75 * size * (size - 1) / 2

@@ -144,7 +144,7 @@ def test_effects_are_appended(robot):
     np.testing.assert_allclose(numbers(gravity(system.parameters.vector())).ravel(), [0, 0, -9.81])
     double = system.parameters.vector({"heavier@world.fraction": 1.0})
     np.testing.assert_allclose(numbers(gravity(double)).ravel(), [0, 0, -2 * 9.81])
-    with pytest.raises(ConfigError, match="heavier@world.fraction"):
+    with pytest.raises(ConfigError, match=r"heavier@world\.fraction"):
         system.with_effects([Heavier()])
 
 

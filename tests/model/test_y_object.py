@@ -62,7 +62,7 @@ def test_the_paper_y_stands_where_it_should():
     foot, junction, left, right = positions(item, ["object_root", "w_T1", "w_T2", "w_T3"])
     half = math.sqrt(0.5)
     np.testing.assert_allclose(foot, [0.85, 0.0, -0.93])
-    np.testing.assert_allclose(junction, foot + [0, 0, 0.813])
+    np.testing.assert_allclose(junction, foot + np.array([0, 0, 0.813]))
     np.testing.assert_allclose(left, junction + 0.610 * half * np.array([0, 1, 1]), atol=1e-15)
     np.testing.assert_allclose(right, junction + 0.737 * half * np.array([0, -1, 1]), atol=1e-15)
     moved = flexible_object(foot=transform(np.eye(3), [0.0, 0.0, 1.0]))
@@ -188,17 +188,17 @@ def test_inertia_is_physical_for_every_theta(length, mass, radius, links, unequa
 
 
 WRONG = {
-    "unknown_parent": (dict(parent="T9"), ["'T9'", "does not come before"]),
-    "no_length": (dict(length=0.0), ["length = 0.0", "positive"]),
-    "negative_mass": (dict(mass=-1.0), ["mass = -1.0", "positive"]),
-    "no_radius": (dict(radius=math.nan), ["radius = nan", "positive"]),
-    "no_links": (dict(links=0), ["links = 0"]),
-    "empty_link": (dict(link_lengths=[0.1, 0.0]), ["a link has no length"]),
-    "no_link_lengths": (dict(link_lengths=[]), ["a link has no length"]),
-    "rotations": (dict(links=3, link_rotations=[np.eye(3)]), ["1 link rotations for 3 links", "2"]),
-    "at_link": (dict(parent="T1", at_link=4), ["at_link = 4", "0 to 3"]),
-    "joint_order": (dict(joint_order="xxz"), ["joint_order = 'xxz'", "x, y, z once each"]),
-    "same_name": (dict(name="T1"), ["two segments are called 'T1'"]),
+    "unknown_parent": ({"parent": "T9"}, ["'T9'", "does not come before"]),
+    "no_length": ({"length": 0.0}, ["length = 0.0", "positive"]),
+    "negative_mass": ({"mass": -1.0}, ["mass = -1.0", "positive"]),
+    "no_radius": ({"radius": math.nan}, ["radius = nan", "positive"]),
+    "no_links": ({"links": 0}, ["links = 0"]),
+    "empty_link": ({"link_lengths": [0.1, 0.0]}, ["a link has no length"]),
+    "no_link_lengths": ({"link_lengths": []}, ["a link has no length"]),
+    "rotations": ({"links": 3, "link_rotations": [np.eye(3)]}, ["1 link rotations for 3 links", "2"]),
+    "at_link": ({"parent": "T1", "at_link": 4}, ["at_link = 4", "0 to 3"]),
+    "joint_order": ({"joint_order": "xxz"}, ["joint_order = 'xxz'", "x, y, z once each"]),
+    "same_name": ({"name": "T1"}, ["two segments are called 'T1'"]),
 }
 
 
@@ -222,7 +222,9 @@ def test_unknown_segment_has_a_near_name():
         flexible_object().segment("T11")
 
 
-@pytest.mark.parametrize("vertices", [[[0, 0, 0]], [[0, 0], [1, 1]], [[0, 0, 0], [0, 0, 0]], [[0, 0, 0], [math.nan, 0, 0]]])
+@pytest.mark.parametrize(
+    "vertices", [[[0, 0, 0]], [[0, 0], [1, 1]], [[0, 0, 0], [0, 0, 0]], [[0, 0, 0], [math.nan, 0, 0]]]
+)
 def test_a_degenerate_polyline_is_refused(vertices):
     with pytest.raises(ModelError, match="vertices"):
         polyline_rotations(vertices)

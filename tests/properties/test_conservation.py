@@ -57,9 +57,7 @@ def cases(urdf_folder):
 def gantry(urdf_folder):
     """All joints of mixed_joints on two free horizontal rails."""
     axes = {"rail_x": (1.0, 0.0, 0.0), "rail_y": (0.0, 1.0, 0.0)}
-    rails = [
-        Joint(name, "prismatic", i - 1, Placement.identity(), axis) for i, (name, axis) in enumerate(axes.items())
-    ]
+    rails = [Joint(name, "prismatic", i - 1, Placement.identity(), axis) for i, (name, axis) in enumerate(axes.items())]
     other = Mechanism.from_urdf(urdf_folder / "mixed_joints.urdf")
     shifted = [replace(joint, parent=joint.parent + 2) for joint in other.joints]
     mechanism = Mechanism("gantry", (*rails, *shifted), {}, other.parameters)

@@ -49,9 +49,7 @@ class Twin:
         effort = M @ a + by_qv.T @ v - rigid.by_q
         frames = list(self.mechanism.frames)
         poses = [kinematics.pose(name).matrix() for name in frames]
-        jacobians = [
-            ca.vertcat(kinematics.point_jacobian(name), kinematics.angular_jacobian(name)) for name in frames
-        ]
+        jacobians = [ca.vertcat(kinematics.point_jacobian(name), kinematics.angular_jacobian(name)) for name in frames]
         dynamics = ca.Function("dynamics", [q, v, a], [M, rigid.by_q, effort, rigid.kinetic, rigid.potential])
         return frames, ca.Function("poses", [q], poses), ca.Function("jacobians", [q], jacobians), dynamics
 

@@ -23,7 +23,7 @@ import platformdirs
 from numpy.typing import NDArray
 
 from yid_ocp.errors import OutputError
-from yid_ocp.integrator.discrete import DiscreteEquations
+from yid_ocp.integrator.discrete import DiscreteEquations, Push
 
 log = logging.getLogger(__name__)
 
@@ -70,6 +70,9 @@ def step_functions(equations: DiscreteEquations) -> StepFunctions:
     h, rigid = e.h, e.rigid
     bodies, bodies_p = (e.row_scale * (h / 2 * rigid.by_q + sign * rigid.by_v) for sign in (-1, 1))
     balance = e.balance_rest + e.p0 + bodies
+    if e.pushes is not None:
+        balance += e.pushes[0].impulse
+        bodies, bodies_p = (part + p.impulse for part, p in zip((bodies, bodies_p), e.pushes, strict=True))
     plus, minus = rigid.S + h / 2 * rigid.D, rigid.S - h / 2 * rigid.D
     lower, upper = rigid.B / 2 - rigid.F / h, rigid.B / 2 + rigid.F / h
     parts = (plus, minus, lower, upper, rigid.S[:3, :], h / 4 * rigid.G)
@@ -86,10 +89,28 @@ def step_functions(equations: DiscreteEquations) -> StepFunctions:
         gaps = [ca.SX(rows, count) for count in (n, e.lam.numel() + n, e.u.numel())]
         return ca.horzcat(gaps[0], blocks[0], gaps[1], blocks[1], gaps[2])
 
-    rest = ca.jacobian(ca.vertcat(e.balance_rest, e.internal), inputs)
-    rest = ca.sparsify(rest + by_internal(ca.vertcat(bodies, ca.SX(e.z0.numel(), 1))))
-    rest_p = ca.sparsify(ca.jacobian(e.p1_rest, inputs) + by_internal(bodies_p))
+    def by_pushes(rows: int, p: Push) -> ca.SX:
+        """Slopes given in closed form, in the columns of q_{k+1} and q_k."""
+        wide = ca.SX(rows, inputs.numel())
+        n, at = e.q0.numel(), unknown.numel()
+        wide[:n, :n], wide[:n, at : at + n] = p.by_q1, p.by_q0
+        return wide
+
+    m = e.lam.numel()
+    rest = ca.jacobian(ca.vertcat(e.balance_rest, e.internal, ca.SX(m, 1)), inputs)
+    rest += by_internal(ca.vertcat(bodies, ca.SX(e.z0.numel() + m, 1)))
+    rest_p = ca.jacobian(e.p1_rest, inputs) + by_internal(bodies_p)
+    if e.pushes is not None:
+        rest += by_pushes(rest.size1(), e.pushes[0])
+        rest_p += by_pushes(rest_p.size1(), e.pushes[1])
     by_q1 = ca.substitute(e.constraint_matrix, old, ca.vertcat(e.q1, e.z1))
+    if e.constraint_gain is not None:
+        # the rows of a relaxing grasp depend on where it was before as well
+        by_q1 = e.constraint_gain * by_q1
+        at, n = unknown.numel(), e.q0.numel()
+        rest[-m:, at : at + n] = (1 - e.constraint_gain) * e.constraint_matrix
+        rest[-m:, at + n : at + old.numel()] = ca.jacobian(e.constraint, e.z0)
+    rest, rest_p = ca.sparsify(rest), ca.sparsify(rest_p)
     by_rest = ca.jacobian(e.constraint, ca.vertcat(e.z1, e.lam))
     by_unknown = ca.sparsify(ca.horzcat(by_q1, by_rest))
     by_z = ca.jacobian(e.constraint_matrix.T @ e.lam, e.z0)

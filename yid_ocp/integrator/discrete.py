@@ -24,9 +24,25 @@ import casadi as ca
 from yid_ocp.errors import ModelError
 from yid_ocp.model.kinematics import Kinematics, RigidBody, cross, forward_kinematics, rigid_body
 from yid_ocp.model.mechanism import Frame, Placement
-from yid_ocp.model.system import Grasp, MidpointState, System
+from yid_ocp.model.system import ClosedForce, Grasp, MidpointState, System
 
 ForceSplit = Literal["symmetric", "left", "left_damping"]
+
+
+@dataclass(frozen=True)
+class Push:
+    """The impulse of a force with slopes in closed form on one side of a step, and its derivatives.
+
+    Attributes
+    ----------
+    impulse : casadi.SX, shape (n, 1)
+        [N m s]
+    by_q0, by_q1 : casadi.SX, shape (n, n)
+    """
+
+    impulse: ca.SX
+    by_q0: ca.SX
+    by_q1: ca.SX
 
 
 @dataclass(frozen=True)
@@ -55,15 +71,21 @@ class DiscreteEquations:
         Left side of the DEL equation.
     internal : casadi.SX, shape (nz, 1)
         Midpoint equations of the internal coordinates.
+    internal_at_rest : casadi.SX, shape (nz, 1)
+        Equations of the internal coordinates in a static equilibrium.
     constraint : casadi.SX, shape (m, 1)
         phi(q_{k+1}) - C lam / h.
+    constraint_gain : casadi.SX or None, shape (m, 1)
+        Where a grasp relaxes: 1 + T/h, the factor on phi(q_{k+1}) in `constraint`; phi(q_k) then has 1 minus it.
     p1 : casadi.SX, shape (n, 1)
         p_{k+1}.
     rigid : RigidBody
         Closed-form derivatives of the bodies' Lagrangian at the midpoint.
     balance_rest, p1_rest : casadi.SX, shape (n, 1)
-        What is left of `momentum_balance` and `p1` when the bodies' Lagrangian, p_k and the constraints' pull are
-        taken out; with the closed form this gives the Jacobians without differentiating the tree.
+        What is left of `momentum_balance` and `p1` when the bodies' Lagrangian, p_k, the constraints' pull and the
+        pushes are taken out; with the closed form this gives the Jacobians without differentiating the tree.
+    pushes : pair of Push, or None
+        In `momentum_balance` and in `p1`: forces that effects give with their slopes.
     constraint_matrix : casadi.SX, shape (m, n)
         Dphi(q_k), so that the pull is its transpose times lam.
     pull_by_q : casadi.SX, shape (n, n)
@@ -86,11 +108,14 @@ class DiscreteEquations:
     h: ca.SX
     momentum_balance: ca.SX
     internal: ca.SX
+    internal_at_rest: ca.SX
     constraint: ca.SX
+    constraint_gain: ca.SX | None
     p1: ca.SX
     rigid: RigidBody
     balance_rest: ca.SX
     p1_rest: ca.SX
+    pushes: tuple[Push, Push] | None
     constraint_matrix: ca.SX
     pull_by_q: ca.SX
     row_scale: ca.SX
@@ -104,6 +129,13 @@ class DiscreteEquations:
     def residual(self) -> ca.SX:
         """Residual of the step's unknowns: free rows of the balance, internal and constraint equations."""
         return ca.vertcat(self.momentum_balance[list(self.system.free_indices)], self.internal, self.constraint)
+
+    @property
+    def closure(self) -> ca.SX:
+        """phi(q) - C lam / h at (q1, z1), whatever came before, shape (m, 1)."""
+        if self.constraint_gain is None:
+            return self.constraint
+        return ca.substitute(self.constraint, ca.vertcat(self.q0, self.z0), ca.vertcat(self.q1, self.z1))
 
     @property
     def unknowns(self) -> ca.SX:
@@ -173,12 +205,16 @@ def discrete_equations(system: System, force_split: ForceSplit = "symmetric") ->
     energy = -system.elastic_energy(qm)
     force, viscous = system.input_force(u), system.viscous_force(vm)
     equations: dict[str, ca.SX] = {}
+    at_rest: dict[str, ca.SX] = {}
+    closed: list[ClosedForce] = []
     for effect in system.effects:
         terms = effect.terms(state)
         energy += terms.lagrangian
         force = force if terms.force is None else force + terms.force
         viscous = viscous if terms.viscous is None else viscous + terms.viscous
         equations.update(terms.internal)
+        at_rest.update(terms.at_rest)
+        closed += [] if terms.closed is None else [terms.closed]
     missing = [name for name in names if name not in equations]
     if missing:
         raise ModelError(f"internal coordinate '{missing[0]}' has no equation")
@@ -210,6 +246,19 @@ def discrete_equations(system: System, force_split: ForceSplit = "symmetric") ->
     def placed(expression: ca.SX) -> ca.SX:
         return ca.densify(ca.substitute(expression, midpoint, midpoint_values))
 
+    def push(part: float) -> Push:
+        by_q, by_v = (sum((getattr(c, name) for c in closed), ca.SX(n, n)) for name in ("by_q", "by_v"))
+        by_q0, by_q1 = (part * scale * (h / 2 * by_q + sign * by_v) for sign in (-1, 1))
+        impulse = part * h * scale * sum((c.force for c in closed), ca.SX(n, 1))
+        there = (ca.sparsify(ca.substitute(x, midpoint, midpoint_values)) for x in (by_q0, by_q1))
+        return Push(placed(impulse), *there)
+
+    pushes = (push(viscous_share), push(1 - viscous_share)) if closed else None
+    relaxation = system.constraint_relaxation()
+    gain = None if relaxation is None else 1 + relaxation / h
+    if gain is not None:
+        phi_here = system.constraints(forward_kinematics(system.mechanism, q0))
+        phi_there = gain * phi_there + (1 - gain) * ca.substitute(phi_here, symbols, z0)
     fields = ("by_q", "by_v", "kinetic", "potential", "S", "D", "F", "B", "G")
     return DiscreteEquations(
         system=system,
@@ -224,13 +273,18 @@ def discrete_equations(system: System, force_split: ForceSplit = "symmetric") ->
         theta=system.parameters.symbols,
         time_step=time_step,
         h=h,
-        momentum_balance=placed(balance),
+        momentum_balance=placed(balance) if pushes is None else placed(balance) + pushes[0].impulse,
         internal=placed(ca.vertcat(*(equations[name] for name in names)) if names else ca.SX(0, 1)),
+        internal_at_rest=placed(
+            ca.vertcat(*(at_rest.get(name, equations[name]) for name in names)) if names else ca.SX(0, 1)
+        ),
         constraint=ca.densify(phi_there - system.constraint_compliance() * lam / h),
-        p1=placed(p1),
+        constraint_gain=gain,
+        p1=placed(p1) if pushes is None else placed(p1) + pushes[1].impulse,
         rigid=RigidBody(**{name: placed(getattr(rigid, name)) for name in fields}),
         balance_rest=placed(balance_rest),
         p1_rest=placed(p1_rest),
+        pushes=pushes,
         constraint_matrix=matrix,
         pull_by_q=pull_by_q,
         row_scale=ca.densify(scale),
@@ -238,34 +292,68 @@ def discrete_equations(system: System, force_split: ForceSplit = "symmetric") ->
 
 
 def _constraint_derivatives(system: System, kinematics: Kinematics, q: ca.SX, lam: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Dphi(q) and d(Dphi(q)' lam)/dq; point grasps in closed form: d2x/dq_i dq_j = w_i x dx/dq_j for i above j."""
+    """Dphi(q) and d(Dphi(q)' lam)/dq in closed form.
+
+    A point moves with d2x/dq_i dq_j = w_i x dx/dq_j, a direction with d2v/dq_i dq_j = w_i x (w_j x v), for i above j.
+    """
     n = system.size
     blocks, hessian, row = [ca.SX(0, n)], ca.SX(n, n), 0
+
+    def add(i: int, j: int, entry: ca.SX) -> None:
+        hessian[i, j] += entry
+        if i != j:
+            hessian[j, i] += entry
+
     for grasp in system.grasps:
         part = lam[row : row + grasp.equations]
         row += grasp.equations
-        if grasp.kind != "point":
-            phi = grasp.residual(kinematics)
-            matrix = ca.jacobian(phi, q)
-            blocks.append(matrix)
-            hessian += ca.jacobian(matrix.T @ part, q)
-            continue
+        holder, held = _grasped(system, grasp, "holder"), _grasped(system, grasp, "held")
         block = ca.SX(3, n)
-        for frame, sign in ((_grasped(system, grasp, "holder"), 1.0), (_grasped(system, grasp, "held"), -1.0)):
+        for frame, sign in ((holder, 1.0), (held, -1.0)):
             jacobian = kinematics.point_jacobian(frame)
             block += sign * jacobian
             chain = system.mechanism.ancestors(frame.joint)
             for above, i in enumerate(chain):
                 if system.mechanism.joints[i].kind == "prismatic":
                     continue
-                turned = cross(part, kinematics.screws[i][:3])
+                turned = cross(part[:3], kinematics.screws[i][:3])
                 for j in chain[above:]:
-                    entry = sign * ca.dot(jacobian[:, j], turned)
-                    hessian[i, j] += entry
-                    if i != j:
-                        hessian[j, i] += entry
+                    add(i, j, sign * ca.dot(jacobian[:, j], turned))
         blocks.append(block)
+        rows = _direction_products(grasp, kinematics)
+        if not rows:
+            continue
+        relative = kinematics.angular_jacobian(holder) - kinematics.angular_jacobian(held)
+        blocks += [sum((cross(a, b).T @ relative for a, b in pairs), ca.SX(1, n)) for pairs in rows]
+        for a, b in [(part[3 + k] * a, b) for k, pairs in enumerate(rows) for a, b in pairs]:
+            swept: list[dict[int, ca.SX]] = []
+            for frame, vector, other in ((holder, a, b), (held, b, a)):
+                chain = _turning(system, frame)
+                swept.append({j: cross(kinematics.screws[j][:3], vector) for j in chain})
+                for above, i in enumerate(chain):
+                    turned = cross(other, kinematics.screws[i][:3])
+                    for j in chain[above:]:
+                        add(i, j, ca.dot(swept[-1][j], turned))
+            for i, by_i in swept[0].items():
+                for j, by_j in swept[1].items():
+                    add(i, j, (2 if i == j else 1) * ca.dot(by_i, by_j))
     return ca.sparsify(ca.vertcat(*blocks)), ca.sparsify(hessian)
+
+
+def _direction_products(grasp: Grasp, kinematics: Kinematics) -> list[list[tuple[ca.SX, ca.SX]]]:
+    """Each orientation row of a grasp as a sum of products of a vector on the holder with one on the held frame."""
+    if grasp.kind == "point":
+        return []
+    a = ca.horzsplit(kinematics.pose(grasp.holder).rotation @ grasp.rotation)
+    b = ca.horzsplit(kinematics.pose(grasp.held).rotation)
+    if grasp.kind == "axis":
+        return [[(a[0], b[2])], [(a[1], b[2])]]
+    return [[(0.5 * a[i], b[j]), (-0.5 * a[j], b[i])] for i, j in ((2, 1), (0, 2), (1, 0))]
+
+
+def _turning(system: System, frame: Frame) -> tuple[int, ...]:
+    joints = system.mechanism.joints
+    return tuple(j for j in system.mechanism.ancestors(frame.joint) if joints[j].kind != "prismatic")
 
 
 def _grasped(system: System, grasp: Grasp, side: str) -> Frame:

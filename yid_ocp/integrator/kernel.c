@@ -244,29 +244,36 @@ static void solve_transposed(Work *k, const double *b, double *x) {
     for (int a = 0; a < NY; a++) x[order[a]] = y[a];
 }
 
+/* Sensitivities are worked on in blocks of columns that fit into registers. */
+typedef double Lanes __attribute__((vector_size(64), aligned(8), may_alias));
+#define BLOCK 16
+
 /* Y <- A^-1 Y for d right-hand sides; rows of Y are already in elimination order. */
 static void solve_many(Work *k, double *Y, int d) {
-    for (int p = 0; p < NY; p++) {
-        const double *source = Y + (size_t)p * d;
-        for (int rr = fill_start[p]; rr < fill_start[p + 1]; rr++)
-            for (int i = fill_run[2 * rr]; i < fill_run[2 * rr + 1]; i++) {
-                const double factor = k->LT[p][i];
-                double *target = Y + (size_t)i * d;
-#pragma omp simd
-                for (int c = 0; c < d; c++) target[c] -= factor * source[c];
-            }
-    }
-    for (int p = NY - 1; p >= 0; p--) {
-        double *target = Y + (size_t)p * d;
-        for (int rr = fill_start[p]; rr < fill_start[p + 1]; rr++)
-            for (int i = fill_run[2 * rr]; i < fill_run[2 * rr + 1]; i++) {
-                const double factor = k->A[p][i];
-                const double *source = Y + (size_t)i * d;
-#pragma omp simd
-                for (int c = 0; c < d; c++) target[c] -= factor * source[c];
-            }
-        const double inverse = k->inverse[p];
-        for (int c = 0; c < d; c++) target[c] *= inverse;
+    Lanes B[ONE(NY)][2];
+    memset(B, 0, sizeof B);
+    for (int first = 0; first < d; first += BLOCK) {
+        const size_t size = sizeof(double) * (size_t)(d - first < BLOCK ? d - first : BLOCK);
+        for (int p = 0; p < NY; p++) memcpy(B[p], Y + (size_t)p * d + first, size);
+        for (int p = 0; p < NY; p++) {
+            const Lanes s0 = B[p][0], s1 = B[p][1];
+            for (int rr = fill_start[p]; rr < fill_start[p + 1]; rr++)
+                for (int i = fill_run[2 * rr]; i < fill_run[2 * rr + 1]; i++) {
+                    B[i][0] -= k->LT[p][i] * s0;
+                    B[i][1] -= k->LT[p][i] * s1;
+                }
+        }
+        for (int p = NY - 1; p >= 0; p--) {
+            Lanes s0 = B[p][0], s1 = B[p][1];
+            for (int rr = fill_start[p]; rr < fill_start[p + 1]; rr++)
+                for (int i = fill_run[2 * rr]; i < fill_run[2 * rr + 1]; i++) {
+                    s0 -= k->A[p][i] * B[i][0];
+                    s1 -= k->A[p][i] * B[i][1];
+                }
+            B[p][0] = s0 * k->inverse[p];
+            B[p][1] = s1 * k->inverse[p];
+        }
+        for (int p = 0; p < NY; p++) memcpy(Y + (size_t)p * d + first, B[p], size);
     }
 }
 
@@ -398,16 +405,22 @@ static void prepare(Work *k, const double *theta, const double *time_step) {
     scales(args, res, k->iw, k->w, 0);
 }
 
-/* C[rows] += A X for the listed nonzero columns of each row; A has `width` columns, X has d. */
+/* C[rows] += A X for the listed nonzero columns of each row; A has `width` columns, X has d, and room for BLOCK entries
+ * after its last one, which are read but not used. */
 static void multiply_rows(const double *A, int width, const int *start, const int *column, int rows, const double *X,
                           int d, double *C) {
-    for (int r = 0; r < rows; r++) {
-        double *target = C + (size_t)r * d;
-        for (int e = start[r]; e < start[r + 1]; e++) {
-            const double factor = A[(size_t)r * width + column[e]];
-            const double *source = X + (size_t)column[e] * d;
-#pragma omp simd
-            for (int c = 0; c < d; c++) target[c] += factor * source[c];
+    for (int first = 0; first < d; first += BLOCK) {
+        const int wide = d - first < BLOCK ? d - first : BLOCK;
+        for (int r = 0; r < rows; r++) {
+            Lanes sum[2] = {{0}, {0}};
+            for (int e = start[r]; e < start[r + 1]; e++) {
+                const double factor = A[(size_t)r * width + column[e]];
+                const Lanes *source = (const Lanes *)(X + (size_t)column[e] * d + first);
+                sum[0] += factor * source[0];
+                sum[1] += factor * source[1];
+            }
+            double *target = C + (size_t)r * d + first;
+            for (int c = 0; c < wide; c++) target[c] += ((const double *)sum)[c];
         }
     }
 }
@@ -536,7 +549,8 @@ int yid_rollout(int steps, const double *theta, double time_step, const double *
     prepare(k, theta, &time_step);
     const int d = dir ? dir->count : 0;
     const int feeds = feedback && feedback->count > 0;
-    double *buffer = d ? malloc(sizeof(double) * (size_t)d * (3 * ONE(NT) + ONE(NY) + ONE(NU) + ONE(NQZ))) : NULL;
+    const size_t buffered = (size_t)d * (2 * ONE(NT) + ONE(NY) + ONE(NU) + ONE(NQZ)) + BLOCK;
+    double *buffer = d ? calloc(buffered, sizeof(double)) : NULL;
     if (d && !buffer) {
         work_free(k);
         return SINGULAR;
@@ -601,11 +615,11 @@ int yid_rollout(int steps, const double *theta, double time_step, const double *
 
 /* Backward sweep along a finished rollout. by_state: (steps+1, NX) partial derivatives of the cost, by_multiplier
  * (steps, M), by_effort (steps, NC) or NULL. Writes the gradient by the chosen parameters (theta_count), by the initial
- * state (NX) and by the nominal torque (steps, NU) where asked for. */
+ * state (NX), by the nominal torque (steps, NU) where asked for, and by the path (steps+1, NC). */
 int yid_adjoint(int steps, const double *theta, double time_step, const double *applied, const Feedback *feedback,
                 const double *state, const double *multipliers, const Directions *dir, const double *by_state,
                 const double *by_multiplier, const double *by_effort, double *gradient, double *by_start,
-                double *by_torque, double *info) {
+                double *by_torque, double *by_path, double *info) {
     Work *k = work_new();
     if (!k) return SINGULAR;
     prepare(k, theta, &time_step);
@@ -638,6 +652,13 @@ int yid_adjoint(int steps, const double *theta, double time_step, const double *
         memset(full, 0, sizeof full);
         for (int b = 0; b < NY; b++) full[unknown_row[b]] = nu[b];
         for (int j = 0; effort && j < NC; j++) full[prescribed_index[j]] = -effort[j] / k->h;
+        for (int j = 0; j < NC; j++) {
+            const int at = prescribed_index[j];
+            double sum = costate[at];
+            for (int r = 0; r < NT; r++) sum += k->R1[r][at] * full[r];
+            for (int r = 0; r < N; r++) sum += k->P1[r][at] * weight[r];
+            by_path[(size_t)(step + 1) * NC + j] = sum;
+        }
         for (int i = 0; i < NQZ; i++) {
             double sum = 0;
             for (int r = 0; r < NT; r++) sum += k->R0[r][i] * full[r];
@@ -670,7 +691,51 @@ int yid_adjoint(int steps, const double *theta, double time_step, const double *
         for (int i = 0; i < NX; i++) costate[i] = mu[i] + by_state[(size_t)step * NX + i];
     }
     memcpy(by_start, costate, sizeof(double) * NX);
+    for (int j = 0; j < NC; j++) by_path[j] = costate[prescribed_index[j]];
     info[0] = step;
     work_free(k);
     return status;
+}
+
+/* Rows, p1 and their Jacobians at `count` steps of a trajectory that need not satisfy the equations (a transcription's
+ * iterate). state: (count + 1, NX). Matrix arguments may be NULL together; with directions also the parameter columns. */
+int yid_stages(int count, const double *theta, double time_step, const double *state, const double *multipliers,
+               const double *applied, const Directions *dir, double *rows, double *p1, double *R1, double *R0,
+               double *Ru, double *P1, double *P0, double *Pu, double *Rtheta, double *Ptheta) {
+    Work *k = work_new();
+    if (!k) return SINGULAR;
+    prepare(k, theta, &time_step);
+    double q1[ONE(N)], z1[ONE(NZ)], lam[ONE(M)], none[ONE(NU)];
+    memset(none, 0, sizeof none);
+    for (int step = 0; step < count; step++) {
+        const double *x = state + (size_t)step * NX, *next = x + NX;
+        memcpy(q1, next, sizeof(double) * N);
+        memcpy(z1, next + 2 * N, sizeof(double) * NZ);
+        memcpy(lam, multipliers + (size_t)step * M, sizeof(double) * M);
+        Point a = {x, x + N, x + 2 * N, NU ? applied + (size_t)step * NU : none, theta, &time_step, q1, z1, lam};
+        constraint_matrix(k, &a);
+        evaluate(k, &a);
+        double *r = rows + (size_t)step * NT;
+        memcpy(r, k->balance, sizeof(double) * N);
+        memcpy(r + N, k->internal, sizeof(double) * NZ);
+        memcpy(r + N + NZ, k->constraint, sizeof(double) * M);
+        memcpy(p1 + (size_t)step * N, k->p1, sizeof(double) * N);
+        if (!R1) continue;
+        linearise(k, &a, 1);
+        memcpy(R1 + (size_t)step * NT * NT, k->R1, sizeof(double) * NT * NT);
+        memcpy(R0 + (size_t)step * NT * NQZ, k->R0, sizeof(double) * NT * NQZ);
+        memcpy(P1 + (size_t)step * N * NT, k->P1, sizeof(double) * N * NT);
+        memcpy(P0 + (size_t)step * N * NQZ, k->P0, sizeof(double) * N * NQZ);
+        if (NU) {
+            memcpy(Ru + (size_t)step * NT * NU, k->Ru, sizeof(double) * NT * NU);
+            memcpy(Pu + (size_t)step * N * NU, k->Pu, sizeof(double) * N * NU);
+        }
+        if (dir && dir->theta_count) {
+            theta_columns(dir, &a);
+            add_sparse(dir->rows_nz, dir->rows_pattern, 0, NT, Rtheta + (size_t)step * NT * dir->count, dir->count);
+            add_sparse(dir->p1_nz, dir->p1_pattern, 0, N, Ptheta + (size_t)step * N * dir->count, dir->count);
+        }
+    }
+    work_free(k);
+    return OK;
 }

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 import scipy.linalg
+import scipy.linalg.lapack
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import ModelError
@@ -33,6 +34,8 @@ class Rest:
         Derivative of `state` by the parameters asked for.
     by_posture : ndarray, shape (nx, nk)
         Derivative by the known coordinates (driven, then prescribed).
+    by_torque : ndarray, shape (nx, nu)
+        Derivative by the measured torque.
     converged : bool
     error : float
         Largest remaining imbalance [N m] or constraint violation [m].
@@ -44,6 +47,7 @@ class Rest:
     constraint_force: Array
     by_theta: Array
     by_posture: Array
+    by_torque: Array
     converged: bool
     error: float
     message: str
@@ -89,7 +93,7 @@ class Statics:
             old = [e.q0, e.q1, e.z0, e.z1, e.lam, e.u]
             return [ca.densify(x) for x in ca.substitute(list(expressions), old, [q, q, z, z, h * force, u])]
 
-        p_rest, balance, internal, constraint = at_rest(e.p1, e.momentum_balance, e.internal, e.constraint)
+        p_rest, balance, internal, constraint = at_rest(e.p1, e.momentum_balance, e.internal_at_rest, e.constraint)
         balance = ca.substitute(balance, e.p0, p_rest) / h
         w = ca.vertcat(sought, z, force)
         residual = ca.vertcat(balance[list(self.unknown)], internal, constraint)
@@ -160,7 +164,9 @@ class Statics:
                 f"{abs(give[joint]):.3g} rad"
             )
         count = len(self.unknown) + step.sizes["nz"]
-        return Rest(state, holding, w[count:], by_theta, by_posture, not failed, error, message)
+        # torque and posture enter together, as the torque plus the holding spring's stiffness times the posture
+        by_torque = by_posture[:, : step.sizes["nu"]] / stiffness
+        return Rest(state, holding, w[count:], by_theta, by_posture, by_torque, not failed, error, message)
 
     def _guesses(self, given: Array, guess: ArrayLike | None) -> list[Array]:
         """Starts of the search: the given configuration or the undeformed object, then small bends of it.
@@ -201,7 +207,7 @@ class Statics:
         e, n = step.equations, system.size
         if not system.grasps or not np.all(np.isfinite(state)):
             return text
-        phi = ca.Function("phi", [e.q1, e.z1, e.lam, e.theta, e.time_step], [e.constraint])
+        phi = ca.Function("phi", [e.q1, e.z1, e.lam, e.theta, e.time_step], [e.closure])
         gap = np.array(phi(state[:n], state[2 * n :], 0, theta, step.time_step)).ravel()
         row = 0
         for grasp in system.grasps:
@@ -228,10 +234,11 @@ def _damped_newton(
     for _ in range(100):
         if error <= tolerance or not math.isfinite(error):
             return w, error, error <= tolerance
-        try:
-            factors = scipy.linalg.lu_factor(jacobian)
-        except (ValueError, scipy.linalg.LinAlgError):
+        # LAPACK itself: SciPy's wrapper prints a warning where a trial point is singular
+        triangles, pivots, info = scipy.linalg.lapack.dgetrf(jacobian)
+        if info != 0:
             return w, error, False
+        factors = (triangles, pivots)
         delta = -scipy.linalg.lu_solve(factors, residual)
         scale = np.maximum(np.abs(w), 1.0)
         size = float(np.max(np.abs(delta / scale)))
@@ -355,14 +362,43 @@ def adjoint_gradient(
     return step.kernel.adjoint(values, swept, feedback, tuple(names), outer, last, effort)
 
 
-def momentum_of(step: Step, q: ArrayLike, v: ArrayLike, theta: ArrayLike) -> Array:
-    """Generalized momentum dL/dv at (q, v), shape (n,) [N m s]."""
+def relaxed(step: Step, q: ArrayLike, theta: ArrayLike) -> Array:
+    """Internal coordinates of an object that has long been at a configuration, shape (nz,)."""
     e = step.equations
-    half = np.asarray(v, float) * step.time_step / 2
-    q = np.asarray(q, float)
+    nz = e.z0.numel()
+    if nz == 0:
+        return np.zeros(0)
+    z = ca.SX.sym("z", nz)
+    old = ca.vertcat(e.q0, e.q1, e.z0, e.z1, e.p0, e.lam, e.u)
+    at = ca.SX.sym("q", e.q0.numel())
+    still = ca.vertcat(at, at, z, z, ca.SX(ca.DM.zeros(e.p0.numel() + e.lam.numel() + e.u.numel())))
+    residual = ca.substitute(e.internal_at_rest, old, still)
+    function = ca.Function("relaxed", [z, at, e.theta, e.time_step], [residual, ca.jacobian(residual, z)])
+    arguments = (np.asarray(q, float), np.asarray(theta, float), step.time_step)
+    return _damped_newton(lambda x: function(x, *arguments), np.zeros(nz), 1e-12)[0]
+
+
+def momentum_of(step: Step, q: ArrayLike, v: ArrayLike, theta: ArrayLike) -> Array:
+    """Generalized momentum dL/dv at (q, v) [N m s].
+
+    Parameters
+    ----------
+    step : Step
+    q, v : array_like, shape (n,) or (K, n)
+        Configurations and velocities.
+    theta : array_like, shape (ntheta,)
+
+    Returns
+    -------
+    ndarray, of the shape of q
+    """
+    e, s = step.equations, step.sizes
+    half = np.atleast_2d(np.asarray(v, float)) * step.time_step / 2
+    middle = np.atleast_2d(np.asarray(q, float))
     function = ca.Function("momentum", e.arguments, [e.rigid.by_v])
-    s = step.sizes
-    zero = np.zeros
-    return np.array(
-        function(q - half, q + half, zero(s["n"]), zero(s["nz"]), zero(s["nz"]), zero(s["m"]), zero(s["nu"]), theta, step.time_step)
-    ).ravel()
+    none = [np.zeros(s[key]) for key in ("n", "nz", "nz", "m", "nu")]
+    rows = [
+        np.array(function(m - d, m + d, *none, theta, step.time_step)).ravel()
+        for m, d in zip(middle, half, strict=True)
+    ]
+    return np.array(rows).reshape(np.shape(q))

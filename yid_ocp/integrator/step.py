@@ -171,6 +171,8 @@ class Gradient:
         By the initial state.
     by_torque : ndarray, shape (N, nu)
         By the nominal torque.
+    by_path : ndarray, shape (N + 1, nc)
+        By the prescribed coordinates at every node, those at node 0 as in `by_start`.
 
     All NaN where a step's equations turned out singular.
     """
@@ -178,6 +180,39 @@ class Gradient:
     by_theta: Array
     by_start: Array
     by_torque: Array
+    by_path: Array
+
+
+@dataclass(frozen=True)
+class Stages:
+    """Equations of many steps at once, along a trajectory that need not satisfy them.
+
+    Attributes
+    ----------
+    rows : ndarray, shape (N, nt)
+        Balance (n), internal (nz) and constraint (m) rows of every step.
+    p1 : ndarray, shape (N, n)
+        What p_{k+1} should be.
+    rows_new, p1_new : ndarray, shape (N, nt, nt) and (N, n, nt)
+        Derivatives by (q_{k+1}, z_{k+1}, lam_k).
+    rows_old, p1_old : ndarray, shape (N, nt, n + nz) and (N, n, n + nz)
+        Derivatives by (q_k, z_k); that of the balance by p_k is the identity.
+    rows_input, p1_input : ndarray, shape (N, nt, nu) and (N, n, nu)
+        Derivatives by the torque.
+    rows_theta, p1_theta : ndarray, shape (N, nt, ntheta) and (N, n, ntheta)
+        Derivatives by the chosen parameters.
+    """
+
+    rows: Array
+    p1: Array
+    rows_new: Array
+    rows_old: Array
+    rows_input: Array
+    p1_new: Array
+    p1_old: Array
+    p1_input: Array
+    rows_theta: Array
+    p1_theta: Array
 
 
 class Kernel(Protocol):
@@ -206,6 +241,18 @@ class Kernel(Protocol):
         by_effort: Array | None,
     ) -> Gradient:
         """Gradient of a cost whose partial derivatives along the rollout are given."""
+        ...
+
+    def stages(
+        self,
+        theta: Array,
+        state: Array,
+        multipliers: Array,
+        torque: Array,
+        names: tuple[str, ...],
+        derivatives: bool,
+    ) -> Stages:
+        """Equations of len(torque) steps along a trajectory, with their Jacobians where asked for."""
         ...
 
 
@@ -555,7 +602,7 @@ class CompiledKernel:
         sizes = self._step.sizes
         steps = len(swept.multipliers)
         gradient, by_start = np.zeros(max(len(names), 1)), np.zeros(sizes["nx"])
-        by_torque = np.zeros((steps, sizes["nu"]))
+        by_torque, by_path = np.zeros((steps, sizes["nu"])), np.zeros((steps + 1, sizes["nc"]))
         info = np.zeros(4)
         struct, keep = self._directions(names, len(names))
         loop, held = _feedback_struct(feedback)
@@ -574,13 +621,65 @@ class CompiledKernel:
             _pointer(gradient),
             _pointer(by_start),
             _pointer(by_torque),
+            _pointer(by_path),
             _pointer(info),
         )
         del keep, held
         if code != StepCode.OK:
-            for array in (gradient, by_start, by_torque):
+            for array in (gradient, by_start, by_torque, by_path):
                 array[:] = np.nan
-        return Gradient(gradient[: len(names)], by_start, by_torque)
+        return Gradient(gradient[: len(names)], by_start, by_torque, by_path)
+
+    def stages(
+        self,
+        theta: Array,
+        state: Array,
+        multipliers: Array,
+        torque: Array,
+        names: tuple[str, ...],
+        derivatives: bool,
+    ) -> Stages:
+        """See `Kernel.stages`."""
+        inputs = [np.ascontiguousarray(a, dtype=float) for a in (theta, state, multipliers, torque)]
+        stages = _empty_stages(self._step.sizes, len(torque), len(names), derivatives)
+        struct, keep = self._directions(names, len(names))
+        matrices = [getattr(stages, field) if derivatives else None for field in _STAGE_MATRICES]
+        self._library.yid_stages(
+            ctypes.c_int(len(torque)),
+            _pointer(inputs[0]),
+            ctypes.c_double(self._step.time_step),
+            *(_pointer(a) for a in inputs[1:]),
+            ctypes.byref(struct),
+            _pointer(stages.rows),
+            _pointer(stages.p1),
+            *(_pointer(matrix) for matrix in matrices),
+        )
+        del keep
+        return stages
+
+
+# The order in which `yid_stages` takes them.
+_STAGE_MATRICES = (
+    "rows_new",
+    "rows_old",
+    "rows_input",
+    "p1_new",
+    "p1_old",
+    "p1_input",
+    "rows_theta",
+    "p1_theta",
+)
+
+
+def _empty_stages(sizes: dict[str, int], count: int, width: int, derivatives: bool) -> Stages:
+    n, nz, m, nu = sizes["n"], sizes["nz"], sizes["m"], sizes["nu"]
+    nt, steps = n + nz + m, count if derivatives else 0
+    return Stages(
+        np.zeros((count, nt)),
+        np.zeros((count, n)),
+        *(np.zeros((steps, rows, columns)) for rows in (nt, n) for columns in (nt, n + nz, nu)),
+        *(np.zeros((steps, rows, width)) for rows in (nt, n)),
+    )
 
 
 def _feedback_struct(feedback: Feedback | None) -> tuple[_Feedback | None, list[object]]:
@@ -622,7 +721,9 @@ class InterpretedKernel:
             self._mask[j, chain] = True
         self._theta_functions: dict[tuple[str, ...], ca.Function] = {}
         patterns = step.functions.patterns
-        self._triplets = {key: tuple(np.array(part, np.intp) for part in s.get_triplet()) for key, s in patterns.items()}
+        self._triplets = {
+            key: tuple(np.array(part, np.intp) for part in s.get_triplet()) for key, s in patterns.items()
+        }
         self._unknown = step.structure.unknown_row
         self._free = np.array(step.system.free_indices, np.intp)
         self._fixed = np.array(step.system.prescribed_indices, np.intp)
@@ -707,11 +808,10 @@ class InterpretedKernel:
             if len(self._unknown) == 0:
                 return StepCode.OK, 0.0, p1, iteration
             jacobian = self._linearise(arguments, phi, scale).rows_new[np.ix_(self._unknown, self._unknown)]
-            try:
-                factors = scipy.linalg.lu_factor(jacobian)
-            except (ValueError, scipy.linalg.LinAlgError):
+            *factors, singular = scipy.linalg.lapack.dgetrf(jacobian)
+            if singular:
                 return StepCode.SINGULAR, error, p1, iteration
-            delta = -scipy.linalg.lu_solve(factors, rows[self._unknown])
+            delta = -scipy.linalg.lu_solve(factors, rows[self._unknown], check_finite=False)
             error = float(np.max(np.abs(delta[:count]), initial=0.0))
             if not math.isfinite(error):
                 return StepCode.SINGULAR, error, p1, iteration
@@ -867,7 +967,7 @@ class InterpretedKernel:
         n, nt = s["n"], s["n"] + s["nz"] + s["m"]
         scale, h = self._scales(theta)
         steps = len(swept.multipliers)
-        gradient, by_torque = np.zeros(len(names)), np.zeros((steps, s["nu"]))
+        gradient, by_torque, by_path = np.zeros(len(names)), np.zeros((steps, s["nu"])), np.zeros((steps + 1, s["nc"]))
         costate = by_state[steps].copy()
         for k in reversed(range(steps)):
             x, after = swept.state[k], swept.state[k + 1]
@@ -895,10 +995,49 @@ class InterpretedKernel:
             if names:
                 by_rows, by_p1, partial = self._by_theta(names, arguments)
                 gradient += full @ by_rows + weight @ by_p1 + effort @ partial
+            by_path[k + 1] = outer[self._fixed] + full @ matrices.rows_new[:, self._fixed]
             full[self._fixed] = -effort / h
             old = matrices.rows_old.T @ full + matrices.p1_old.T @ weight
             by_torque[k] = matrices.rows_input.T @ full + matrices.p1_input.T @ weight
             costate = np.concatenate([old[:n], full[:n], old[n:]]) + by_state[k]
             if feedback is not None:
                 np.subtract.at(costate, feedback.index, feedback.gain[k].T @ by_torque[k])
-        return Gradient(gradient, costate, by_torque)
+        by_path[0] = costate[self._fixed]
+        return Gradient(gradient, costate, by_torque, by_path)
+
+    def stages(
+        self,
+        theta: Array,
+        state: Array,
+        multipliers: Array,
+        torque: Array,
+        names: tuple[str, ...],
+        derivatives: bool,
+    ) -> Stages:
+        """See `Kernel.stages`."""
+        s = self._step.sizes
+        n = s["n"]
+        scale, _ = self._scales(theta)
+        stages = _empty_stages(s, len(torque), len(names), derivatives)
+        for k, u in enumerate(torque):
+            x, after = state[k], state[k + 1]
+            arguments: list[Array | float] = [
+                x[:n],
+                after[:n],
+                x[n : 2 * n],
+                x[2 * n :],
+                after[2 * n :],
+                multipliers[k],
+                u,
+                theta,
+                self._step.time_step,
+            ]
+            phi = self._matrix(arguments)
+            stages.rows[k], stages.p1[k] = self._rows(arguments, phi, scale)
+            if derivatives:
+                matrices = self._linearise(arguments, phi, scale)
+                for name in _STAGE_MATRICES[:6]:
+                    getattr(stages, name)[k] = getattr(matrices, name)
+                if names:
+                    stages.rows_theta[k], stages.p1_theta[k], _ = self._by_theta(names, arguments)
+        return stages

@@ -170,6 +170,9 @@ def rigid_body(kinematics: Kinematics, v: ca.SX, gravity: ca.SX) -> RigidBody:
     first = [ca.SX(ca.DM.zeros(3))] * n
     second = [ca.SX(ca.DM.zeros(3, 3))] * n
     momentum = [zero6] * n
+    # with one body whose weight is not its mass times gravity, weight is summed apart from inertia
+    apart = any(body.weight is not None for joint in mechanism.joints for body in joint.bodies)
+    heavy, heavy_first = list(mass), list(first)
     kinetic, potential = ca.SX(0), ca.SX(0)
     for j, joint in enumerate(mechanism.joints):
         for body in joint.bodies:
@@ -180,9 +183,12 @@ def rigid_body(kinematics: Kinematics, v: ca.SX, gravity: ca.SX) -> RigidBody:
             spin = about_com @ angular
             wrench = ca.vertcat(spin + cross(com, impulse), impulse)
             kinetic += 0.5 * (ca.dot(impulse, linear) + ca.dot(spin, angular))
-            potential -= body.mass * ca.dot(gravity, com)
+            heaviness = body.mass if body.weight is None else body.mass * body.weight
+            potential -= heaviness * ca.dot(gravity, com)
             mass[j] = mass[j] + body.mass
             first[j] = first[j] + body.mass * com
+            if apart:
+                heavy[j], heavy_first[j] = heavy[j] + heaviness, heavy_first[j] + heaviness * com
             second[j] = second[j] + about_com + body.mass * (ca.dot(com, com) * ca.SX.eye(3) - com @ com.T)
             momentum[j] = momentum[j] + wrench
     for j in reversed(range(n)):
@@ -190,8 +196,13 @@ def rigid_body(kinematics: Kinematics, v: ca.SX, gravity: ca.SX) -> RigidBody:
         if parent >= 0:
             mass[parent] = mass[parent] + mass[j]
             first[parent] = first[parent] + first[j]
+            heavy[parent] = heavy[parent] + heavy[j]
+            heavy_first[parent] = heavy_first[parent] + heavy_first[j]
             second[parent] = second[parent] + second[j]
             momentum[parent] = momentum[parent] + momentum[j]
+
+    if not apart:
+        heavy, heavy_first = mass, first
 
     def inertia_times(j: int, motion: ca.SX) -> ca.SX:
         force = mass[j] * motion[3:] + cross(motion[:3], first[j])
@@ -199,13 +210,13 @@ def rigid_body(kinematics: Kinematics, v: ca.SX, gravity: ca.SX) -> RigidBody:
 
     by_q, by_v, F, B, G = [], [], [], [], []
     for j in range(n):
-        moment, weight = cross(first[j], gravity), mass[j] * gravity
+        moment, weight = cross(heavy_first[j], gravity), heavy[j] * gravity
         axis, linear = S[j][:3], S[j][3:]
         by_v.append(ca.dot(S[j], momentum[j]))
         by_q.append(ca.dot(D[j], momentum[j]) + ca.dot(axis, moment) + ca.dot(linear, weight))
         F.append(inertia_times(j, S[j]))
         B.append(inertia_times(j, D[j]) + force_cross(S[j], momentum[j]))
-        G.append(cross(axis, moment) + cross(linear, weight) + cross(first[j], cross(gravity, axis)))
+        G.append(cross(axis, moment) + cross(linear, weight) + cross(heavy_first[j], cross(gravity, axis)))
 
     def columns(entries: Sequence[ca.SX], rows: int) -> ca.SX:
         return ca.densify(ca.horzcat(ca.SX(rows, 0), *entries))

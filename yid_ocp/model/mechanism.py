@@ -8,7 +8,7 @@ import math
 import site
 import sys
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -56,6 +56,10 @@ class Placement:
     def __matmul__(self, other: Placement) -> Placement:
         return Placement(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
 
+    def mapped(self, change: Callable[[ca.SX], ca.SX]) -> Placement:
+        """Both expressions replaced by what `change` makes of them."""
+        return Placement(change(self.rotation), change(self.translation))
+
     def matrix(self) -> ca.SX:
         """The 4x4 homogeneous matrix."""
         return ca.vertcat(ca.horzcat(self.rotation, self.translation), ca.SX(ca.DM([[0.0, 0.0, 0.0, 1.0]])))
@@ -63,11 +67,15 @@ class Placement:
 
 @dataclass(frozen=True)
 class Inertia:
-    """Mass, centre of mass [m] and inertia about it [kg m^2], in the frame of the joint that carries the body."""
+    """Mass, centre of mass [m] and inertia about it [kg m^2], in the frame of the joint that carries the body.
+
+    `weight` multiplies the pull of gravity on the body, not its inertia; None means 1.
+    """
 
     mass: ca.SX
     com: ca.SX
     about_com: ca.SX
+    weight: ca.SX | None = None
 
     @staticmethod
     def of(mass: float, com: ArrayLike, about_com: ArrayLike) -> Inertia:
@@ -76,12 +84,18 @@ class Inertia:
 
     def scaled(self, factor: ca.SX) -> Inertia:
         """Mass and inertia multiplied by `factor`, the centre kept."""
-        return Inertia(self.mass * factor, self.com, self.about_com * factor)
+        return replace(self, mass=self.mass * factor, about_com=self.about_com * factor)
 
     def moved(self, placement: Placement) -> Inertia:
         """The same body seen from the frame in which its own frame has `placement`."""
         rotation = placement.rotation
-        return Inertia(self.mass, rotation @ self.com + placement.translation, rotation @ self.about_com @ rotation.T)
+        com = rotation @ self.com + placement.translation
+        return replace(self, com=com, about_com=rotation @ self.about_com @ rotation.T)
+
+    def mapped(self, change: Callable[[ca.SX], ca.SX]) -> Inertia:
+        """Every expression replaced by what `change` makes of it."""
+        weight = None if self.weight is None else change(self.weight)
+        return Inertia(change(self.mass), change(self.com), change(self.about_com), weight)
 
 
 @dataclass(frozen=True)
@@ -229,19 +243,40 @@ class Mechanism:
             function = ca.Function("number", [symbols], [expression])
             return ca.SX(ca.densify(function(theta)))
 
-        def placed(placement: Placement) -> Placement:
-            return Placement(number(placement.rotation), number(placement.translation))
+        return replace(self.mapped(number), parameters=Parameters())
 
+    def mapped(self, change: Callable[[ca.SX], ca.SX]) -> Mechanism:
+        """The mechanism with every expression in placements and inertias replaced by what `change` makes of it."""
         joints = tuple(
             replace(
-                joint,
-                placement=placed(joint.placement),
-                bodies=tuple(Inertia(number(b.mass), number(b.com), number(b.about_com)) for b in joint.bodies),
+                joint, placement=joint.placement.mapped(change), bodies=tuple(b.mapped(change) for b in joint.bodies)
             )
             for joint in self.joints
         )
-        frames = {name: Frame(frame.joint, placed(frame.placement)) for name, frame in self.frames.items()}
-        return Mechanism(self.name, joints, frames)
+        frames = {name: Frame(frame.joint, frame.placement.mapped(change)) for name, frame in self.frames.items()}
+        return replace(self, joints=joints, frames=frames)
+
+    def inserted(self, index: int, chain: Sequence[Joint]) -> Mechanism:
+        """Put a chain of joints into the tree at a place in its order; what shall hang on it is then yet to be told.
+
+        Parameters
+        ----------
+        index : int
+            Index of the first new joint; it and what follows move back.
+        chain : sequence of Joint
+            The first one's parent stands before `index`, every other one's is the one before it whatever it says.
+        """
+        count = len(chain)
+
+        def moved(joint: int) -> int:
+            return joint + count if joint >= index else joint
+
+        joints = [replace(joint, parent=moved(joint.parent)) for joint in self.joints]
+        joints[index:index] = [
+            joint if i == 0 else replace(joint, parent=index + i - 1) for i, joint in enumerate(chain)
+        ]
+        frames = {name: Frame(moved(frame.joint), frame.placement) for name, frame in self.frames.items()}
+        return replace(self, joints=tuple(joints), frames=frames)
 
     @staticmethod
     def from_urdf(
@@ -296,6 +331,8 @@ def merged(bodies: Iterable[Inertia]) -> Inertia | None:
     mass = sum((b.mass for b in entries), ca.SX(0))
     if mass.is_zero():
         return None
+    if not all(b.weight is None or b.weight.is_one() for b in entries):
+        raise ModelError("a body whose weight is not its mass times gravity cannot be merged or written to a file")
     com = sum((b.mass * b.com for b in entries), ca.SX(ca.DM.zeros(3))) / mass
     inertia = ca.SX(ca.DM.zeros(3, 3))
     for body in entries:
@@ -530,11 +567,11 @@ def _to_urdf(mechanism: Mechanism) -> str:
         translation = np.array(ca.DM(placement.translation)).ravel()
         ElementTree.SubElement(element, "origin", xyz=text(translation), rpy=text(_angles(rotation)))
 
-    identity = np.eye(4)
-
     def link_name(wanted: str, joint: int) -> str:
         frame = mechanism.frames.get(wanted)
-        same = frame is None or (frame.joint == joint and np.array_equal(np.array(ca.DM(frame.placement.matrix())), identity))
+        if frame is None:
+            return wanted
+        same = frame.joint == joint and np.array_equal(np.array(ca.DM(frame.placement.matrix())), np.eye(4))
         return wanted if same else link_name(f"{wanted}_", joint)
 
     def bounded(value: float) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol, runtime_checkable
 
@@ -41,6 +41,8 @@ class Grasp:
         How far the grasped point has crept along the object's z axis [m].
     compliance : casadi.SX
         C in phi(q_{k+1}) = C lam_k / h [m/N]; zero for a rigid grasp.
+    relaxation : casadi.SX, optional
+        T in phi(q_{k+1}) + T (phi(q_{k+1}) - phi(q_k)) / h = C lam_k / h, damping over stiffness of the grasp [s].
     """
 
     name: str
@@ -51,11 +53,23 @@ class Grasp:
     offset: ca.SX = field(default_factory=lambda: ca.SX(ca.DM.zeros(3)))
     slip: ca.SX = field(default_factory=lambda: ca.SX(0))
     compliance: ca.SX = field(default_factory=lambda: ca.SX(0))
+    relaxation: ca.SX | None = None
 
     @property
     def equations(self) -> int:
         """Number of scalar constraints."""
         return EQUATIONS[self.kind]
+
+    def mapped(self, change: Callable[[ca.SX], ca.SX]) -> Grasp:
+        """Every expression replaced by what `change` makes of it."""
+        return replace(
+            self,
+            rotation=change(self.rotation),
+            offset=change(self.offset),
+            slip=change(self.slip),
+            compliance=change(self.compliance),
+            relaxation=None if self.relaxation is None else change(self.relaxation),
+        )
 
     def residual(self, kinematics: Kinematics) -> ca.SX:
         """phi(q), shape (equations, 1): positions [m], then direction or orientation [rad]."""
@@ -74,7 +88,7 @@ class Grasp:
     def alignment(self, kinematics: Kinematics) -> ca.SX:
         """Differences of the axes that the grasp makes coincide, shape (0, 3 or 9; 1).
 
-        Redundant beside `residual`, but not zero where the axes point in opposite ways: for searches that start far off.
+        Redundant beside `residual`, but not zero where axes point in opposite ways: for a search that starts far off.
         """
         if self.kind == "point":
             return ca.SX(0, 1)
@@ -137,6 +151,10 @@ class NodeState:
         Torque at every joint that has one: the motor torque where driven, the predicted effort where prescribed.
     internal : mapping of str to int
         Row of each internal coordinate in `z`, by name.
+    camera : Placement or None
+        Pose in the world of the camera that measures; None for any other sensor.
+    frame : str or None
+        Frame of the mechanism that the channel marks; None for a joint.
     """
 
     system: System
@@ -145,6 +163,25 @@ class NodeState:
     z: ca.SX
     effort: ca.SX
     internal: Mapping[str, int]
+    camera: Placement | None = None
+    frame: str | None = None
+
+
+@dataclass(frozen=True)
+class ClosedForce:
+    """A generalized force F(q, v) that takes energy out, with its derivatives in closed form.
+
+    Attributes
+    ----------
+    force : casadi.SX, shape (n, 1)
+        [N m or N]
+    by_q, by_v : casadi.SX, shape (n, n)
+        dF/dq and dF/dv.
+    """
+
+    force: ca.SX
+    by_q: ca.SX
+    by_v: ca.SX
 
 
 @dataclass(frozen=True)
@@ -161,12 +198,18 @@ class Terms:
         The part of the force that only takes energy out, in proportion to velocity [N m or N].
     internal : mapping of str to casadi.SX
         Equation (= 0) of each internal coordinate that the term owns, at the midpoint.
+    at_rest : mapping of str to casadi.SX
+        Equation (= 0) that takes its place in a static equilibrium, where its own says nothing or cannot hold.
+    closed : ClosedForce, optional
+        A dissipative force whose slopes are given, because differentiating it would cost too much.
     """
 
     lagrangian: ca.SX = field(default_factory=lambda: ca.SX(0))
     force: ca.SX | None = None
     viscous: ca.SX | None = None
     internal: Mapping[str, ca.SX] = field(default_factory=dict)
+    at_rest: Mapping[str, ca.SX] = field(default_factory=dict)
+    closed: ClosedForce | None = None
 
 
 @runtime_checkable
@@ -199,7 +242,28 @@ class Effect(Protocol):
         ...
 
     def measure(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
-        """What a sensor reads where it would have read `output`; `channel` is `group.point` or `joints.quantity`."""
+        """What a sensor reads instead of `output`; `channel` is `group.point` or `joints.quantity.JOINT`."""
+        ...
+
+
+@runtime_checkable
+class RecordedEffect(Effect, Protocol):
+    """An effect that also says how recorded inputs and times differ from the true ones.
+
+    Recorded torques drive the model, recorded angles prescribe it or are followed: there the reading is known and the
+    true value is sought, the opposite of `measure`.
+    """
+
+    def correct(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
+        """The true value behind a reading of `joints.position.JOINT` or `joints.effort.JOINT`, at the true `effort`."""
+        ...
+
+    def delay(self, channel: str, camera: bool) -> ca.SX:
+        """How long before its recorded time a reading was true [s].
+
+        `channel` is as in `measure`, or `torque.JOINT` for a recorded torque that drives the model: it then acts so
+        much later than it was recorded.
+        """
         ...
 
 
@@ -399,6 +463,28 @@ class System:
                 return entry
         raise ModelError(f"there is no segment '{name}'", hint=nearest(name, [s.name for s in self.segments]))
 
+    def mapped(self, change: Callable[[ca.SX], ca.SX]) -> System:
+        """The system with every expression of its description replaced by what `change` makes of it."""
+        elastic = tuple(
+            replace(e, stiffness=change(e.stiffness), damping=change(e.damping), rest=change(e.rest))
+            for e in self.elastic
+        )
+        segments = tuple(
+            replace(s, lengths=tuple(change(x) for x in s.lengths), radius=change(s.radius), mass=change(s.mass))
+            for s in self.segments
+        )
+        return replace(
+            self,
+            mechanism=self.mechanism.mapped(change),
+            elastic=elastic,
+            damping={joint: change(value) for joint, value in self.damping.items()},
+            grasps=tuple(grasp.mapped(change) for grasp in self.grasps),
+            gravity=change(self.gravity),
+            time_scale=change(self.time_scale),
+            compliant={joint: change(value) for joint, value in self.compliant.items()},
+            segments=segments,
+        )
+
     def elastic_energy(self, q: ca.SX) -> ca.SX:
         """Sum of 1/2 stiffness (q - rest)^2 over the elastic joints [J]."""
         energy = ca.SX(0)
@@ -428,6 +514,15 @@ class System:
     def constraints(self, kinematics: Kinematics) -> ca.SX:
         """phi(q) of all grasps, shape (m, 1)."""
         return ca.vertcat(*(grasp.residual(kinematics) for grasp in self.grasps)) if self.grasps else ca.SX(0, 1)
+
+    def constraint_relaxation(self) -> ca.SX | None:
+        """T in phi + T dphi/dt = C lam / h, shape (m, 1) [s]; None where no grasp has any."""
+        if all(grasp.relaxation is None for grasp in self.grasps):
+            return None
+        zero = ca.SX(0)
+        return ca.vertcat(
+            *(zero if g.relaxation is None else g.relaxation for g in self.grasps for _ in range(g.equations))
+        )
 
     def constraint_compliance(self) -> ca.SX:
         """Diagonal of C in phi(q_{k+1}) = C lam_k / h, shape (m, 1)."""

@@ -1,4 +1,4 @@
-"""Predictions that need no model, to be beaten: nothing moves, all moves with the clamps, the clamps' motion carried."""
+"""Predictions without a model, to be beaten: nothing moves, all moves with the clamps, the clamps' motion carried."""
 
 from __future__ import annotations
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -32,11 +33,19 @@ from yid_ocp.model.mechanism import Frame, Placement
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.system import floating_clamp
 from yid_ocp.model.y_object import FlexibleObject, Segment, polyline_rotations
+from yid_ocp.problem.baselines import group_with, prediction_error
+from yid_ocp.problem.initial import PRESET, START_SPEED
 from yid_ocp.problem.inputs import ClampPath
+from yid_ocp.problem.problem import EstimationProblem, ProblemOptions, SensorOptions
+from yid_ocp.sensors import PointSensor
 
 Array = NDArray[np.float64]
 START, END = "clamp_start", "clamp_end"
 START_ROLL, END_ROLL = f"{START}.roll", f"{END}.roll"
+REST = ".rest"
+SPEED_SCALE = "start.speed_scale"
+# Keeps load/stiffness finite where a stiffness is zero [N m/rad].
+LEAST_STIFFNESS = 1e-9
 START_EDGE, LAST_EDGE = f"{START}_edge", "last_edge"
 
 
@@ -75,9 +84,8 @@ class Cable:
                 )
         for vertex in self.vertices:
             if vertex not in self.undeformed:
-                raise ModelError(
-                    f"vertex '{vertex}' has no undeformed position", where="cable", hint=nearest(vertex, self.undeformed)
-                )
+                hint = nearest(vertex, self.undeformed)
+                raise ModelError(f"vertex '{vertex}' has no undeformed position", where="cable", hint=hint)
         if len(set(self.vertices)) != len(self.vertices):
             raise ModelError("a vertex belongs to two branches", where="cable")
 
@@ -104,7 +112,7 @@ class Cable:
     @property
     def edges(self) -> tuple[tuple[str, str], ...]:
         """Pairs of neighbouring vertices, branch by branch."""
-        return tuple(pair for chain in self.chains.values() for pair in zip(chain[:-1], chain[1:], strict=True))
+        return tuple(pair for chain in self.chains.values() for pair in pairwise(chain))
 
     @property
     def clamps(self) -> tuple[ClampPath, ClampPath]:
@@ -159,6 +167,13 @@ class CableOptions:
         next edge only; else over half of both.
     separate_lengths : bool
         Whether every edge has a length parameter of its own.
+    memory : float, optional
+        How far the rest shape is that of the recording's start rather than the undeformed one: each joint then rests at
+        (1 - memory) x undeformed + memory x (start angle - load/stiffness), the load being what the joint bears at the
+        start if the cable is at rest there. Becomes the parameter `SEGMENT.memory`; it counts less for a recording that
+        starts in motion, by the factor 1/(1 + (start speed/`start.speed_scale`)^2).
+    rest_angles : bool
+        Whether every joint has a parameter `JOINT.rest` [rad], its rest angle beside the undeformed shape's.
     gravity : tuple of float
         [m/s^2]
     """
@@ -170,6 +185,8 @@ class CableOptions:
     rest_shape: bool = True
     rigid_clamp: bool = False
     separate_lengths: bool = True
+    memory: float | None = None
+    rest_angles: bool = False
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
 
 
@@ -188,9 +205,8 @@ def read_vertices(path: str | Path) -> dict[str, Array]:
     except OSError as error:
         raise DataError(f"the vertices cannot be read: {error.strerror}", where=str(path)) from error
     except (KeyError, TypeError, ValueError) as error:
-        raise DataError(
-            "the table of vertices is malformed", where=str(path), allowed="columns point, x, y, z with numbers in metres"
-        ) from error
+        allowed = "columns point, x, y, z with numbers in metres"
+        raise DataError("the table of vertices is malformed", where=str(path), allowed=allowed) from error
 
 
 def edge_lengths(
@@ -240,9 +256,98 @@ def length_values(cable: Cable, recording: Recording, frames: int = 2) -> dict[s
     values = {f"{START}.length": lengths[cable.parent[0], cable.parent[1]]}
     for name, chain in cable.chains.items():
         first = 1 if name == cable.parent_name else 0
-        for i, edge in enumerate(zip(chain[first:-1], chain[first + 1 :], strict=True)):
+        for i, edge in enumerate(pairwise(chain[first:])):
             values[f"{name}.length_{i}"] = lengths[edge]
     return values
+
+
+def cable_problem_options(
+    cable: Cable,
+    recordings: Sequence[Recording],
+    noise: float,
+    model_error: float,
+    rest_std: float = 0.3,
+    path_cutoff: float = 8.0,
+    options: CableOptions | None = None,
+) -> ProblemOptions:
+    """Options of an estimation on a cable that uses of each recording what a prediction may use.
+
+    That is the clamps' four vertices throughout and the free ones in the first two frames: from these come the edges'
+    lengths, the start, and the rolls of the clamps. The fit alone compares with the free vertices later on.
+
+    Parameters
+    ----------
+    cable : Cable
+    recordings : sequence of Recording
+        All that will be used, held-out ones as well.
+    noise : float
+        Noise deviation of a measured vertex [m], for the start.
+    model_error : float
+        Deviation of a vertex that the fit allows for [m]: a model's error lasts for many frames, so that this is the
+        error that is hoped for times the square root of the number of frames it lasts.
+    rest_std : float
+        Prior deviation of rest angles where they are free [rad].
+    path_cutoff : float
+        Low-pass cutoff of the clamps' paths [Hz].
+    options : CableOptions, optional
+        Those of the system.
+    """
+    options = options or CableOptions()
+    group = group_with(recordings[0], cable.vertices)
+    period = float(np.median(np.diff(group.t)))
+    known = {r.name: length_values(cable, r) for r in recordings} if options.separate_lengths else {}
+    rest = [name for name in free_parameters(cable, options) if name.endswith(REST)]
+    return ProblemOptions(
+        initial_state="given",
+        path_cutoff=path_cutoff,
+        sensors={group.name: SensorOptions(std=model_error, points=cable.free)},
+        clamps=cable.clamps,
+        priors=dict.fromkeys(rest, rest_std),
+        start_window=period,
+        start_std=noise,
+        start_parameters=(START_ROLL, END_ROLL) if options.end == "weld" else (START_ROLL,),
+        recording_values=known,
+    )
+
+
+def free_parameters(cable: Cable, options: CableOptions | None = None) -> tuple[str, ...]:
+    """What can be estimated of a cable when only its motion is seen: stiffness, damping and rest shape, no mass."""
+    options = options or CableOptions()
+    names: list[str] = []
+    for name in cable.chains:
+        names += [f"{name}.bend", f"{name}.twist", f"{name}.damping"]
+        if options.branches.get(name, options.default).twist_damping is not None:
+            names.append(f"{name}.twist_damping")
+        if options.memory is not None:
+            names.append(f"{name}.memory")
+    if options.memory is not None:
+        names.append(SPEED_SCALE)
+    if options.rest_angles:
+        for name, chain in cable.chains.items():
+            links = len(chain) - (2 if name == cable.parent_name else 1)
+            names += [f"{name}_{i}_{axis}{REST}" for i in range(links) for axis in "xyz"]
+    return tuple(names)
+
+
+def vertex_errors(problem: EstimationProblem, cable: Cable, x: ArrayLike) -> dict[str, float]:
+    """Prediction error of every recording of a problem, the held-out ones too, over the free vertices [m].
+
+    NaN for a recording whose rollout fails. The first two frames are given and do not count.
+    """
+    x = np.asarray(x, float)
+    errors = {}
+    episodes = [(episode, problem.split(x, i)) for i, episode in enumerate(problem.episodes)]
+    episodes += [(episode, problem.split(x, 0)) for episode in problem.held_out]
+    for episode, (theta, deviation) in episodes:
+        result = problem.run(episode, theta, deviation, derivatives=False)
+        if isinstance(result, str):
+            errors[episode.name] = float("nan")
+            continue
+        for samples, predicted in zip(episode.samples, result.predicted, strict=True):
+            if isinstance(samples.sensor, PointSensor) and samples.sensor.points == cable.free:
+                shape = (len(predicted), len(cable.free), 3)
+                errors[episode.name] = prediction_error(predicted.reshape(shape), samples.value.reshape(shape))
+    return errors
 
 
 def cable_system(recordings: Sequence[Recording], cable: Cable, options: CableOptions | None = None) -> System:
@@ -272,6 +377,10 @@ def cable_system(recordings: Sequence[Recording], cable: Cable, options: CableOp
     options = options or CableOptions()
     lengths = edge_lengths(cable, recordings)
     item = flexible_object(_segments(cable, lengths, options), name="cable")
+    if options.rest_angles:
+        item = _with_rest_angles(item)
+    if options.memory is not None:
+        item = _with_memory(item, options.memory)
     clamps = _start_clamp(lengths[cable.parent[0], cable.parent[1]], cable).joined(floating_clamp(END))
     end_roll = Parameter(END_ROLL, 0.0, "rad", -np.pi, np.pi, "roll of the end clamp about the last edge")
     if options.end == "weld":
@@ -286,6 +395,36 @@ def cable_system(recordings: Sequence[Recording], cable: Cable, options: CableOp
         gravity=options.gravity,
         points=cable.vertices,
     )
+
+
+def _with_rest_angles(item: FlexibleObject) -> FlexibleObject:
+    entries = [
+        Parameter(f"{spring.joint}{REST}", 0.0, "rad", -np.pi, np.pi, "rest angle beside the undeformed shape's")
+        for spring in item.elastic
+    ]
+    elastic = tuple(replace(s, rest=s.rest + e.symbol) for s, e in zip(item.elastic, entries, strict=True))
+    tree = replace(item.mechanism, parameters=item.mechanism.parameters.joined(entries))
+    return replace(item, mechanism=tree, elastic=elastic)
+
+
+def _with_memory(item: FlexibleObject, memory: float) -> FlexibleObject:
+    shares = {
+        s.name: Parameter(f"{s.name}.memory", memory, "1", 0.0, 1.0, "share of the start's shape in the rest shape")
+        for s in item.segments
+    }
+    speed = Parameter(START_SPEED, 0.0, "m/s", 0.0, np.inf, "speed of the vertices at the recording's start")
+    scale = Parameter(SPEED_SCALE, 0.3, "m/s", 1e-3, np.inf, "start speed at which the memory counts half")
+    trust = 1 / (1 + (speed.symbol / scale.symbol) ** 2)
+    entries, elastic = [*shares.values(), speed, scale], []
+    for spring in item.elastic:
+        angle = Parameter(f"{spring.joint}.{PRESET[0]}", 0.0, "rad", description="angle at the recording's start")
+        load = Parameter(f"{spring.joint}.{PRESET[1]}", 0.0, "N m", description="torque borne at the recording's start")
+        entries += [angle, load]
+        shift = angle.symbol - load.symbol / (spring.stiffness + LEAST_STIFFNESS)
+        share = trust * shares[spring.segment].symbol
+        elastic.append(replace(spring, rest=spring.rest + share * (shift - spring.rest)))
+    tree = replace(item.mechanism, parameters=item.mechanism.parameters.joined(entries))
+    return replace(item, mechanism=tree, elastic=tuple(elastic))
 
 
 def _with_vertices(item: FlexibleObject, cable: Cable) -> FlexibleObject:
@@ -318,7 +457,7 @@ def _start_clamp(length: float, cable: Cable) -> Mechanism:
 
 def _segments(cable: Cable, lengths: Mapping[tuple[str, str], float], options: CableOptions) -> list[Segment]:
     def of(chain: Sequence[str]) -> list[float]:
-        return [lengths[edge] for edge in zip(chain[:-1], chain[1:], strict=True)]
+        return [lengths[edge] for edge in pairwise(chain)]
 
     parent = cable.parent
     turns = polyline_rotations(cable.shape(parent))

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.errors import DataError
-from yid_ocp.integrator.rollout import momentum_of
+from yid_ocp.integrator.rollout import momentum_of, relaxed
 from yid_ocp.integrator.step import Step
 from yid_ocp.model import forward_kinematics
 from yid_ocp.problem.residuals import Samples
@@ -27,9 +27,13 @@ LEAST_STIFFNESS = 1e-4
 # Deviation of a coordinate's rate where the points leave it open [rad/s].
 RATE_STD = 3.0
 CONSTRAINT_STD = 1e-5
-# The object is first pulled into place softly, by measurements of which each deviation is so many times as large: pulled
-# hard at once, it ends in knots.
+# The object is first pulled into place softly, by measurements with so many times their deviation: pulled hard at once,
+# it ends in knots.
 SOFTNESS = (1000.0, 100.0, 10.0, 1.0)
+# Parameters of a joint whose rest angle is told from the start: its angle there [rad] and the torque it bears [N m].
+PRESET = ("start", "load")
+# Parameter that is told the root mean square speed of the measured points at the start [m/s].
+START_SPEED = "start.speed"
 # A parameter fitted along with the start is tried from so many values across its bounds.
 TRIALS = 4
 
@@ -78,7 +82,7 @@ class StartFit:
         chosen = ca.vertcat(*(system.parameters[name].symbol for name in self.local)) if self.local else ca.SX(0, 1)
         kinematics = forward_kinematics(system.mechanism, e.q1)
         aligned = ca.vertcat(ca.SX(0, 1), *(grasp.alignment(kinematics) for grasp in system.grasps))
-        held = ca.vertcat(e.constraint, ca.substitute(aligned, ca.vertcat(ca.SX(0, 1), *system.internal.values()), e.z1))
+        held = ca.vertcat(e.closure, ca.substitute(aligned, ca.vertcat(ca.SX(0, 1), *system.internal.values()), e.z1))
         outputs = [held, ca.jacobian(held, e.q1), ca.jacobian(held, chosen)]
         self._phi = ca.Function("phi", [e.q1, e.z1, e.lam, e.theta, e.time_step], outputs)
         at = [system.mechanism.joint_index(spring.joint) for spring in system.elastic]
@@ -87,8 +91,16 @@ class StartFit:
             stiffness[index] += spring.stiffness
             rest[index] = spring.rest
         self._elastic = ca.Function("elastic", [e.theta], [ca.densify(stiffness), ca.densify(rest)])
+        self._presets = tuple(
+            (index, spring.joint)
+            for index, spring in zip(at, system.elastic, strict=True)
+            if f"{spring.joint}.{PRESET[0]}" in system.parameters
+        )
+        self._load = ca.Function("load", e.arguments, [e.rigid.by_q, e.constraint_matrix])
 
-    def solve(self, posture: Array, samples: Sequence[Samples], theta: Array, window: float, path: Array) -> FittedStart:
+    def solve(
+        self, posture: Array, samples: Sequence[Samples], theta: Array, window: float, path: Array
+    ) -> FittedStart:
         """Configuration that fits the measured points at the first frames, and the momentum from their change.
 
         Parameters
@@ -154,14 +166,39 @@ class StartFit:
         q0 = q - velocity * first * step.time_step
         q0[list(system.prescribed_indices)] = path[0]
         momentum = momentum_of(step, q0, velocity, theta)
-        state = np.concatenate([q0, momentum, np.zeros(step.sizes["nz"])])
-        return FittedStart(state, dict(zip(self.local, values.tolist(), strict=True)))
+        state = np.concatenate([q0, momentum, relaxed(step, q0, theta)])
+        own = dict(zip(self.local, values.tolist(), strict=True)) | self._preset(q, theta, stiffness)
+        if START_SPEED in system.parameters:
+            own[START_SPEED] = _speed(frames[first], frames[then], (then - first) * step.time_step)
+        return FittedStart(state, own)
+
+    def _preset(self, q: Array, theta: Array, stiffness: Array) -> dict[str, float]:
+        """Angle of every joint with a preset, and the torque that its spring holds there if the object is at rest.
+
+        The clamps' unknown reactions f are those of least elastic energy: min_f sum (kappa q - g - G' f)^2/kappa.
+        """
+        if not self._presets:
+            return {}
+        s = self.step.sizes
+        zero = np.zeros
+        by_q, pull = self._load(
+            q, q, zero(s["n"]), zero(s["nz"]), zero(s["nz"]), zero(s["m"]), zero(s["nu"]), theta, self.step.time_step
+        )
+        at = [index for index, _ in self._presets]
+        weight = 1 / np.sqrt(np.maximum(stiffness[at], 1e-12))
+        free = np.array(by_q).ravel()[at]
+        columns = np.array(ca.densify(pull))[:, at].T
+        reaction = np.linalg.lstsq(weight[:, None] * columns, weight * (stiffness[at] * q[at] - free), rcond=None)[0]
+        load = free + columns @ reaction
+        angles = {f"{joint}.{PRESET[0]}": float(q[index]) for index, joint in self._presets}
+        return angles | {f"{j}.{PRESET[1]}": float(v) for (_, j), v in zip(self._presets, load, strict=True)}
 
     def _trials(self, values: Array) -> list[Array]:
         if not self.local:
             return [values]
         lower, upper = self.step.system.parameters.bounds(self.local)
-        grids = [low + (high - low) * (np.arange(TRIALS) + 0.5) / TRIALS for low, high in zip(lower, upper, strict=True)]
+        shares = (np.arange(TRIALS) + 0.5) / TRIALS
+        grids = [low + (high - low) * shares for low, high in zip(lower, upper, strict=True)]
         return [values, *(np.array(entry) for entry in itertools.product(*grids))]
 
     def _fit(
@@ -215,8 +252,9 @@ class StartFit:
                 span = upper[k] - lower[k]
                 value = theta[index[k]] + change[len(free) + k]
                 # an angle goes round, anything else stops at its bound
+                round_again = lower[k] + (value - lower[k]) % span
                 turn = abs(span - 2 * np.pi) < 1e-9
-                trial_theta[index[k]] = lower[k] + (value - lower[k]) % span if turn else np.clip(value, lower[k], upper[k])
+                trial_theta[index[k]] = round_again if turn else np.clip(value, lower[k], upper[k])
             new_residual, new_jacobian = rows(trial_q, trial_theta)
             new_cost = float(new_residual @ new_residual)
             if new_cost < cost:
@@ -235,3 +273,14 @@ class StartFit:
         if sensor not in self._sensors:
             self._sensors[sensor] = sensor_function(self.step.system, sensor, self.local)
         return self._sensors[sensor]
+
+
+def _speed(before: Sequence[tuple[Samples, int]], after: Sequence[tuple[Samples, int]], span: float) -> float:
+    """Root mean square speed of the points seen in both frames, zero where there is one frame only [m/s]."""
+    squares = []
+    for samples, row in before:
+        for other, later in after:
+            if other is samples and span > 0:
+                moved = (samples.value[later] - samples.value[row]).reshape(-1, samples.sensor.width)
+                squares += np.sum(moved**2, axis=1).tolist()
+    return float(np.sqrt(np.nanmean(squares))) / span if np.any(np.isfinite(squares)) else 0.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,7 +12,7 @@ import scipy.interpolate
 import scipy.signal
 from numpy.typing import ArrayLike, NDArray
 
-from yid_ocp.data.recording import JointGroup, Recording
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import DataError, nearest
 from yid_ocp.model.system import System
 
@@ -86,8 +86,20 @@ def make_grid(recording: Recording, time_step: float, duration: float | None = N
     return Grid(float(t[0]), time_step, steps)
 
 
-def held_torque(joints: JointGroup, driven: tuple[str, ...], grid: Grid, where: str) -> Array:
+def held_torque(
+    joints: JointGroup, driven: tuple[str, ...], grid: Grid, where: str, delay: Array | None = None
+) -> Array:
     """Mean over every step of the effort, taken as held from sample to sample, shape (steps, nu) [N m].
+
+    Parameters
+    ----------
+    joints : JointGroup
+    driven : tuple of str
+    grid : Grid
+    where : str
+        Name of the recording.
+    delay : ndarray, shape (nu,), optional
+        How much later than recorded each effort acts [s].
 
     Raises
     ------
@@ -108,9 +120,76 @@ def held_torque(joints: JointGroup, driven: tuple[str, ...], grid: Grid, where: 
     # the last sample is held as long as the one before it
     t = np.append(joints.t, joints.t[-1] + widths[-1])
     total = np.vstack([total, total[-1] + effort[-1] * widths[-1]])
-    integral = scipy.interpolate.interp1d(t, total, axis=0, bounds_error=False, fill_value="extrapolate")
-    nodes = grid.times
-    return np.asarray(np.diff(integral(nodes), axis=0) / grid.time_step)
+    late = np.zeros(len(driven)) if delay is None else delay
+    # before the first sample and after the last one torque is held
+    parts = (
+        scipy.interpolate.interp1d(t, column, bounds_error=False, fill_value="extrapolate")(grid.times - shift)
+        for column, shift in zip(total.T, late, strict=True)
+    )
+    return np.asarray(np.diff(np.stack(list(parts), axis=1), axis=0) / grid.time_step)
+
+
+def held_torque_slope(joints: JointGroup, driven: tuple[str, ...], grid: Grid, where: str, delay: Array) -> Array:
+    """Derivative of `held_torque` by each joint's delay, shape (steps, nu) [N m/s]; at a jump the mean of both sides."""
+    assert joints.effort is not None
+    effort = joints.effort[:, columns(joints, driven, where)]
+
+    def held(times: Array, column: Array, side: Literal["left", "right"]) -> Array:
+        near = 1e-9 if side == "right" else -1e-9
+        return np.asarray(column[np.clip(np.searchsorted(joints.t, times + near, side) - 1, 0, len(column) - 1)])
+
+    result = []
+    for column, shift in zip(effort.T, delay, strict=True):
+        at = grid.times - shift
+        result.append(-np.diff(held(at, column, "left") + held(at, column, "right")) / 2 / grid.time_step)
+    return np.stack(result, axis=1)
+
+
+def joint_loads(recording: Recording, names: tuple[str, ...], grid: Grid, smoother: Smoother) -> Array:
+    """Smoothed recorded effort of joints at every node, shape (steps + 1, len(names)) [N m].
+
+    Raises
+    ------
+    DataError
+        No effort recorded, or a joint that is missing.
+    """
+    joints = recording.joints
+    if joints is None or joints.effort is None:
+        raise DataError(
+            "the model's gears give way under an effort that the recording does not have",
+            where=f"{recording.name}: joints/effort",
+            hint="leave series_elasticity and backlash out",
+        )
+    effort = smoother(joints.t, joints.effort[:, columns(joints, names, recording.name)])
+    return np.stack([np.interp(grid.times, joints.t, column) for column in effort.T], axis=1)
+
+
+def camera_pose(group: PointGroup) -> tuple[tuple[float, ...], ...] | None:
+    """Pose of the camera that saw a group of points, None where it was none.
+
+    A group is a camera's when it has a pose, or when its name or its sensor says `camera`; without a pose the camera
+    then counts as standing in the world's origin.
+    """
+    if group.pose is not None:
+        return tuple(tuple(float(x) for x in row) for row in group.pose)
+    if "camera" in group.name.lower() or "camera" in group.sensor.lower():
+        return tuple(tuple(row) for row in np.eye(4).tolist())
+    return None
+
+
+def sensors_present(recordings: Sequence[Recording]) -> frozenset[str]:
+    """What the recordings hold, in the words of `effects.candidates`."""
+    found = set()
+    for recording in recordings:
+        if recording.joints is not None:
+            found.add("joints.position")
+            if recording.joints.effort is not None:
+                found.add("joints.effort")
+        if any(camera_pose(group) is not None for group in recording.points):
+            found.add("camera")
+        if any(group.clock == "nominal" for group in recording.groups):
+            found.add("nominal_clock")
+    return frozenset(found)
 
 
 def columns(joints: JointGroup, names: tuple[str, ...], where: str) -> list[int]:

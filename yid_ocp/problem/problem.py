@@ -18,7 +18,19 @@ from yid_ocp.integrator.feedback import lqr_filter, proportional_filter
 from yid_ocp.integrator.rollout import Rest, Statics, adjoint_gradient, simulate
 from yid_ocp.integrator.step import Directions, Feedback, Step, Sweep
 from yid_ocp.problem.initial import FittedStart, StartFit
-from yid_ocp.problem.inputs import ClampPath, Grid, Smoother, columns, held_torque, make_grid, prescribed_path
+from yid_ocp.problem.inputs import (
+    ClampPath,
+    Grid,
+    Smoother,
+    camera_pose,
+    columns,
+    held_torque,
+    held_torque_slope,
+    joint_loads,
+    make_grid,
+    prescribed_path,
+)
+from yid_ocp.problem.readings import Inputs, Readings
 from yid_ocp.problem.residuals import Samples, Weighting, huber, make_samples, paper_weighting, point_samples
 from yid_ocp.sensors import EffortSensor, PointSensor, Sensor, sensor_function
 
@@ -86,6 +98,9 @@ class ProblemOptions:
         Use only the first seconds of every recording [s].
     start_window : float
         How long the measured points that fix a `given` start may reach [s].
+    start_std : float, optional
+        Noise deviation of the points in the fit of a `given` start, where the sensors' one stands for the model's error
+        as well [m].
     start_parameters : tuple of str
         Parameters that are fitted along with a `given` start in every recording, held-out ones included, from these
         first points alone; none of them may be free.
@@ -108,6 +123,7 @@ class ProblemOptions:
     velocity_std: float = 0.2
     duration: float | None = None
     start_window: float = 0.02
+    start_std: float | None = None
     start_parameters: tuple[str, ...] = ()
     recording_values: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
@@ -127,6 +143,8 @@ class Episode:
     measured_arm : ndarray, shape (N + 1, nu)
         Measured angles of the driven joints at every node.
     samples : tuple of Samples
+    load : ndarray, shape (N + 1, nk)
+        Recorded effort of driven, then prescribed joints, where an effect makes their true angle depend on it.
     """
 
     recording: Recording
@@ -136,6 +154,7 @@ class Episode:
     posture: Array
     measured_arm: Array
     samples: tuple[Samples, ...]
+    load: Array
 
     @property
     def name(self) -> str:
@@ -243,6 +262,7 @@ class EstimationProblem:
         if not recordings:
             raise DataError("there is no recording to estimate on", hint="give at least one under recordings.estimate")
         self._statics: Statics | None = None
+        self.readings = Readings(self.system, step.compiled)
         self._functions: dict[tuple[Sensor, tuple[str, ...]], Mapped] = {}
         self.episodes = tuple(self.prepare(recording) for recording in recordings)
         self.held_out = tuple(self.prepare(recording) for recording in held_out)
@@ -339,7 +359,11 @@ class EstimationProblem:
             )
         if options.weighting == "paper":
             samples = tuple(paper_weighting(s, grid) for s in samples)
-        return Episode(recording, grid, torque, path, posture, arm, samples)
+        known = (*system.driven, *system.prescribed)
+        load = np.zeros((grid.steps + 1, len(known)))
+        if self.readings.angles_need_effort:
+            load = joint_loads(recording, known, grid, smoother)
+        return Episode(recording, grid, torque, path, posture, arm, samples, load)
 
     def _samples(self, recording: Recording, grid: Grid, smoother: Smoother) -> list[Samples]:
         system, options = self.system, self.options
@@ -358,7 +382,7 @@ class EstimationProblem:
                     allowed=", ".join(system.points),
                     hint=f"name them under sensors.{group.name}.frames, or switch the group off",
                 )
-            sensor = PointSensor(group.name, known, tuple(frames[p] for p in known))
+            sensor = PointSensor(group.name, known, tuple(frames[p] for p in known), camera_pose(group))
             std = choice.std
             if isinstance(std, Mapping):
                 raise ConfigError("a group of points takes one std", where=f"sensors.{group.name}.std")
@@ -398,7 +422,13 @@ class EstimationProblem:
         inner = slice(1, grid.steps)
         deviation = np.broadcast_to(total, measured.shape)[inner]
         return make_samples(
-            EffortSensor(names), grid.times[inner], measured[inner], deviation, grid, f"{recording.name}: joints.effort"
+            EffortSensor(names),
+            grid.times[inner],
+            measured[inner],
+            deviation,
+            grid,
+            f"{recording.name}: joints.effort",
+            (1, grid.steps - 1),
         )
 
     def _apparent_inertia(self, names: tuple[str, ...]) -> Array:
@@ -441,8 +471,12 @@ class EstimationProblem:
         if key not in self._fitted:
             if self._start_fit is None:
                 self._start_fit = StartFit(self.step, self.options.start_parameters)
+            samples: Sequence[Samples] = episode.samples
+            if self.options.start_std is not None:
+                std = self.options.start_std
+                samples = [replace(s, weight=np.where(s.weight > 0, 1.0 / std, 0.0)) for s in samples]
             window = self.options.start_window
-            self._fitted[key] = self._start_fit.solve(episode.posture, episode.samples, theta, window, episode.path)
+            self._fitted[key] = self._start_fit.solve(episode.posture, samples, theta, window, episode.path)
         return self._fitted[key]
 
     def own_theta(self, episode: Episode, theta: Array) -> Array:
@@ -451,7 +485,7 @@ class EstimationProblem:
         own = theta.copy()
         for name, value in known.items():
             own[self.system.parameters.index(name)] = value
-        if self.options.initial_state == "given" and self.options.start_parameters:
+        if self.options.initial_state == "given":
             for name, value in self.fitted_start(episode, own).values.items():
                 own[self.system.parameters.index(name)] = value
         return own
@@ -471,14 +505,83 @@ class EstimationProblem:
             state, by_theta = self.fitted_start(episode, theta).state.copy(), np.zeros((nx, len(wanted)))
         else:
             guess = self._starts.get(key)
-            first = episode.torque[0] if self.system.driven else None
-            rest = self.statics().solve(episode.posture, theta, first, guess, wanted)
+            inputs = self.inputs(episode, theta, wanted)
+            first = inputs.first_torque if self.system.driven else None
+            rest = self.statics().solve(inputs.posture, theta, first, guess, wanted)
             if not rest.converged:
                 return rest.state, np.zeros((nx, len(wanted) + len(chosen))), rest, f"{episode.name}: {rest.message}"
             self._starts[key] = rest.state[:n]
-            state, by_theta = rest.state.copy(), rest.by_theta
+            state = rest.state.copy()
+            by_theta = rest.by_theta + rest.by_posture @ inputs.by_posture(len(wanted))
+            if inputs.by_first_torque is not None:
+                by_theta += rest.by_torque @ inputs.by_first_torque
         state[chosen] += deviation
         return state, np.hstack([by_theta, by_deviation]), rest, ""
+
+    @property
+    def start_rows(self) -> tuple[int, ...]:
+        """Rows of the initial state that are estimated: q and p of the coordinates that are neither driven nor known."""
+        if not self._start_size:
+            return ()
+        return (*self._start_rows, *(self.system.size + row for row in self._start_rows))
+
+    @property
+    def start_deviations(self) -> Array:
+        """Prior deviation of every estimated row of an initial state."""
+        at = len(self.shared) + len(self.local)
+        return self._prior_deviations[at : at + self._start_size]
+
+    def start_state(
+        self, episode: Episode, theta: Array, deviation: Array | None = None
+    ) -> tuple[Array, Array, str]:
+        """Initial state of an episode, its derivative by (free parameters, deviation), and what went wrong.
+
+        Parameters
+        ----------
+        episode : Episode
+        theta : ndarray, shape (ntheta,)
+        deviation : ndarray, optional
+            Of an estimated start from rest.
+
+        Returns
+        -------
+        state : ndarray, shape (nx,)
+        by_unknowns : ndarray, shape (nx, number of free parameters and of estimated start rows)
+        message : str
+            Empty where all is well.
+        """
+        own = self.own_theta(episode, theta)
+        none = np.zeros(self._start_size) if deviation is None else deviation
+        state, by_all, _, message = self._begin(episode, own, none, self._columns)
+        return state, by_all, message
+
+    def predict_along(
+        self, samples: Samples, state: Array, by_state: Array, theta: Array
+    ) -> tuple[Array, Array]:
+        """Readings along a given trajectory and their derivatives.
+
+        Parameters
+        ----------
+        samples : Samples
+        state : ndarray, shape (N + 1, nx)
+        by_state : ndarray, shape (N + 1, nx, d)
+            The first of the d directions are the free parameters.
+        theta : ndarray, shape (ntheta,)
+
+        Returns
+        -------
+        predicted : ndarray, shape (M, k)
+        sensitivities : ndarray, shape (M, k, d)
+        """
+        n, nodes = self.system.size, samples.nodes
+        effort = np.zeros((len(nodes), n))
+        q, z = state[nodes, :n], state[nodes, 2 * n :]
+        y, by_q, by_z, _, by_theta = self.sensor(samples.sensor, self._columns)(q, z, effort, theta)
+        total = by_q @ by_state[nodes, :n]
+        if z.shape[1]:
+            total += by_z @ by_state[nodes, 2 * n :]
+        total[:, :, : len(self._columns)] += by_theta
+        return samples.interpolate(y[:, :, 0]), samples.interpolate(total)
 
     def sensor(self, sensor: Sensor, wanted: tuple[str, ...]) -> Mapped:
         """Compiled readings of a sensor, with derivatives by the named parameters."""
@@ -495,16 +598,17 @@ class EstimationProblem:
         state, by_start, rest, problem = self._begin(episode, theta, deviation, wanted)
         if problem:
             return problem
-        directions = Directions(wanted, by_start) if derivatives and by_start.shape[1] else None
+        inputs = self.inputs(episode, theta, wanted)
+        feedback, driven = self.feedback(episode), self.system.driven_indices
+        directions = None
+        if derivatives and by_start.shape[1]:
+            extra = ((0, 0), (0, 0), (0, by_start.shape[1] - len(wanted)))
+            moved = (inputs.torque_directions(feedback, driven), inputs.by_path)
+            by_torque, by_path = (None if by is None else np.pad(by, extra) for by in moved)
+            directions = Directions(wanted, by_start, by_torque, by_path)
+        feedback = inputs.guided(feedback, driven, episode.measured_arm)
         sweep = simulate(
-            self.step,
-            theta,
-            state,
-            episode.grid.steps,
-            episode.torque,
-            episode.path,
-            self.feedback(episode),
-            directions,
+            self.step, theta, state, episode.grid.steps, inputs.torque, inputs.path, feedback, directions
         )
         if not sweep.status.ok:
             return f"{episode.name}: {sweep.status.message}"
@@ -526,6 +630,9 @@ class EstimationProblem:
     def _predict(
         self, samples: Samples, sweep: Sweep, theta: Array, wanted: tuple[str, ...], derivatives: bool
     ) -> tuple[Array, Array]:
+        unmoved, late = samples, self.lateness(samples, theta, wanted)
+        if late is not None:
+            samples = samples.late(late[0])
         n, nodes = self.system.size, samples.nodes
         q, z = sweep.state[nodes, :n], sweep.state[nodes, 2 * n :]
         effort = self._efforts(sweep)[nodes]
@@ -540,7 +647,58 @@ class EstimationProblem:
         if fixed and sweep.by_effort is not None and np.any(by_effort):
             total += by_effort[:, :, fixed] @ sweep.by_effort[np.minimum(nodes, len(sweep.effort) - 1)]
         total[:, :, : len(wanted)] += by_theta
-        return predicted, samples.interpolate(total)
+        slopes = samples.interpolate(total)
+        if late is not None:
+            slopes[:, :, : len(wanted)] -= samples.slope(y[:, :, 0], unmoved, late[0])[:, :, None] * late[1]
+        return predicted, slopes
+
+    def lateness(self, samples: Samples, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array] | None:
+        """By how many steps each output is late, shape (k,), and its derivative, (k, d); None where none ever is."""
+        found = self.readings.sensor_delay(samples.sensor, theta, wanted)
+        return None if found is None else (found[0] / self.step.time_step, found[1] / self.step.time_step)
+
+    def inputs(self, episode: Episode, theta: Array, wanted: tuple[str, ...]) -> Inputs:
+        """What drives an episode's rollout: the recording, as far as no effect says that it reads something else.
+
+        Parameters
+        ----------
+        episode : Episode
+        theta : ndarray, shape (ntheta,)
+        wanted : tuple of str
+            Parameters by which to differentiate.
+        """
+        readings, nu = self.readings, len(self.system.driven)
+        first = episode.torque[0] if nu else np.zeros(0)
+        if not readings.active:
+            return Inputs(episode.torque, first, episode.path, episode.measured_arm)
+        torque, arm, path, by_torque, by_first, by_arm, by_path = (
+            episode.torque,
+            episode.measured_arm,
+            episode.path,
+            *(None,) * 4,
+        )
+        fill = np.zeros((1, len(self.system.prescribed)))
+        joints = episode.recording.joints
+        if nu and (readings.delays_torque or readings.corrects_efforts):
+            assert joints is not None
+            delay, by_delay = readings.torque_delay(theta, wanted)
+            where = (joints, self.system.driven, episode.grid, episode.name)
+            if readings.delays_torque:
+                torque = held_torque(*where, delay)
+            rows = np.vstack([torque, first])
+            padded = np.hstack([rows, np.tile(fill, (len(rows), 1))])
+            _, true, _, by_theta, by_reading = readings.true(np.zeros_like(padded), padded, theta, wanted)
+            by_theta = by_theta[:, :nu].copy()
+            if readings.delays_torque and wanted:
+                slope = by_reading[:-1, :nu] * held_torque_slope(*where, delay)
+                by_theta[:-1] += slope[:, :, None] * by_delay
+            torque, first = true[:-1, :nu], true[-1, :nu]
+            by_torque, by_first = by_theta[:-1], by_theta[-1]
+        if readings.corrects_angles:
+            measured = np.hstack([episode.measured_arm, episode.path])
+            true, _, by_angle, _, _ = readings.true(measured, episode.load, theta, wanted)
+            arm, path, by_arm, by_path = true[:, :nu], true[:, nu:], by_angle[:, :nu], by_angle[:, nu:]
+        return Inputs(torque, first, path, arm, by_torque, by_first, by_path, by_arm)
 
     def evaluate(self, x: ArrayLike, derivatives: bool = True) -> Evaluation:
         """Residual, cost and, where asked for, Jacobian at an unknown vector.
@@ -586,7 +744,7 @@ class EstimationProblem:
                 if derivatives and result.sensitivities is not None:
                     slope = (factor * samples.weight)[:, :, None] * result.sensitivities[k]
                     jacobians.append(self._placed(slope.reshape(-1, slope.shape[2])[keep], i, len(x)))
-        prior_residual, prior_jacobian = self._prior(x)
+        prior_residual, prior_jacobian = self.prior(x)
         residual = np.concatenate([*residuals, prior_residual])
         cost += 0.5 * float(prior_residual @ prior_residual)
         jacobian = np.vstack([*jacobians, prior_jacobian]) if derivatives else None
@@ -661,7 +819,7 @@ class EstimationProblem:
         found = [s.std[np.isfinite(s.std)] for episode in self.episodes for s in episode.samples]
         return float(np.sqrt(np.mean(np.concatenate(found) ** 2)))
 
-    def _prior(self, x: Array) -> tuple[Array, Array]:
+    def prior(self, x: Array) -> tuple[Array, Array]:
         stated, tied = np.flatnonzero(np.isfinite(self._prior_deviations)), self._tied
         rows = np.zeros((len(stated) + len(tied), len(x)))
         weight = 1.0 / self._prior_deviations[stated]
@@ -709,11 +867,17 @@ class EstimationProblem:
             for k, samples in enumerate(episode.samples):
                 raw = samples.weight * np.where(samples.weight > 0, result.predicted[k] - samples.value, 0.0)
                 _, factor = huber(raw, self.options.robust_scale)
-                at_nodes = samples.distribute(factor**2 * raw * samples.weight)
+                pull = factor**2 * raw * samples.weight
+                unmoved, late = samples, self.lateness(samples, theta, wanted)
+                if late is not None:
+                    samples = samples.late(late[0])
+                at_nodes = samples.distribute(pull)
                 nodes = samples.nodes
                 q, z = sweep.state[nodes, :n], sweep.state[nodes, 2 * n :]
                 efforts = self._efforts(sweep)[nodes]
-                _, by_q, by_z, by_e, by_theta = self.sensor(samples.sensor, wanted)(q, z, efforts, theta)
+                y, by_q, by_z, by_e, by_theta = self.sensor(samples.sensor, wanted)(q, z, efforts, theta)
+                if late is not None:
+                    total -= np.sum(pull * samples.slope(y[:, :, 0], unmoved, late[0]), axis=0) @ late[1]
                 by_state[nodes, :n] += np.einsum("mk,mkq->mq", at_nodes, by_q)
                 by_state[nodes, 2 * n :] += np.einsum("mk,mkq->mq", at_nodes, by_z)
                 total += np.einsum("mk,mkq->q", at_nodes, by_theta)
@@ -721,13 +885,19 @@ class EstimationProblem:
                 if fixed:
                     last = np.minimum(nodes, len(sweep.effort) - 1)
                     np.add.at(by_effort, last, np.einsum("mk,mkq->mq", at_nodes, by_e[:, :, fixed]))
-            swept = adjoint_gradient(
-                self.step, theta, sweep, wanted, by_state, None, by_effort, self.feedback(episode)
-            )
+            feedback = self.feedback(episode)
+            swept = adjoint_gradient(self.step, theta, sweep, wanted, by_state, None, by_effort, feedback)
+            inputs = self.inputs(episode, theta, wanted)
+            by_torque = inputs.torque_directions(feedback, self.system.driven_indices)
+            if by_torque is not None:
+                total += np.einsum("ku,kuw->w", swept.by_torque, by_torque)
+            if inputs.by_path is not None:
+                # node 0 is part of the start state
+                total += np.einsum("kc,kcw->w", swept.by_path[1:], inputs.by_path[1:])
             _, by_start, _, _ = self._begin(episode, theta, deviation, wanted)
             own = np.concatenate([total + swept.by_theta, np.zeros(self._start_size)]) + swept.by_start @ by_start
             gradient += self._placed(own[None, :], i, len(x))[0]
-        prior_residual, prior_jacobian = self._prior(x)
+        prior_residual, prior_jacobian = self.prior(x)
         return evaluation.cost, gradient + prior_jacobian.T @ prior_residual, evaluation
 
     # -- reports ------------------------------------------------------------------------------------------------------
@@ -742,7 +912,7 @@ class EstimationProblem:
         for result, episode in zip(results, episodes, strict=True):
             for predicted, samples in zip(result.predicted, episode.samples, strict=True):
                 width = samples.sensor.width
-                difference = (predicted - samples.value).reshape(len(predicted), -1, width)
+                difference = (predicted - samples.value).reshape(len(predicted), len(samples.sensor.channels), width)
                 for c, channel in enumerate(samples.sensor.channels):
                     square = np.sum(difference[:, c] ** 2, axis=1)
                     squares.setdefault(channel, []).extend(square[np.isfinite(square)].tolist())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -24,9 +24,9 @@ class Samples:
     Attributes
     ----------
     sensor : Sensor
-    node : ndarray of int, shape (M,)
+    node : ndarray of int, shape (M,), or (M, k) where outputs are late by different times
         Node before each sample.
-    fraction : ndarray, shape (M,)
+    fraction : ndarray, shape of `node`
         Fraction of a step beyond it; predictions are interpolated linearly between the two nodes.
     value : ndarray, shape (M, k)
         Measured outputs, NaN where there is none.
@@ -34,6 +34,8 @@ class Samples:
         Factor that turns a difference into a residual, zero where there is no measurement.
     std : ndarray, shape (M, k)
         Noise deviation, in the sensor's unit; NaN where it is not known.
+    span : (int, int)
+        First and last node at which the sensor can be predicted.
     """
 
     sensor: Sensor
@@ -42,6 +44,7 @@ class Samples:
     value: Array
     weight: Array
     std: Array
+    span: tuple[int, int]
 
     @property
     def channel_of_column(self) -> tuple[str, ...]:
@@ -51,25 +54,71 @@ class Samples:
     @property
     def nodes(self) -> NDArray[np.int64]:
         """Nodes at which the sensor's function must be evaluated, sorted."""
+        if self.node.ndim > 1:
+            # with the neighbours that a slope needs
+            low, high = int(self.node.min(initial=self.span[1])), int(self.node.max(initial=self.span[0]))
+            return np.arange(max(low - 1, self.span[0]), min(high + 2, self.span[1] + 1))
         after = self.node[self.fraction > 0] + 1
         return np.unique(np.concatenate([self.node, after]))
+
+    def late(self, steps: Array) -> Samples:
+        """The same samples, each output that of so many steps before, within the span.
+
+        Parameters
+        ----------
+        steps : ndarray, shape (k,)
+        """
+        position = np.clip((self.node + self.fraction)[:, None] - steps, *self.span)
+        near = np.rint(position)
+        position = np.where(np.abs(position - near) < 1e-9, near, position)
+        node = np.minimum(np.floor(position), max(self.span[1] - 1, self.span[0])).astype(np.int64)
+        return replace(self, node=node, fraction=position - node)
+
+    def slope(self, at_nodes: Array, unmoved: Samples, steps: Array) -> Array:
+        """Change of a prediction per step of time for late samples; at a node the mean of both sides, shape (M, k).
+
+        Parameters
+        ----------
+        at_nodes : ndarray, shape (len(nodes), k)
+        unmoved : Samples
+            Those from which they were made by `late`.
+        steps : ndarray, shape (k,)
+        """
+        nodes, column = self.nodes, np.arange(at_nodes.shape[1])
+        place = self.node - nodes[0]
+
+        def at(index: NDArray[np.int64]) -> Array:
+            return np.asarray(at_nodes[np.clip(index, 0, len(nodes) - 1), column])
+
+        on = np.isclose(self.fraction, np.rint(self.fraction), rtol=0, atol=1e-9)
+        middle = place + np.rint(self.fraction).astype(np.int64)
+        rate = np.where(on, (at(middle + 1) - at(middle - 1)) / 2, at(place + 1) - at(place))
+        position = (unmoved.node + unmoved.fraction)[:, None] - steps
+        return np.where((position < self.span[0] - 1e-9) | (position > self.span[1] + 1e-9), 0.0, rate)
 
     def interpolate(self, at_nodes: Array) -> Array:
         """Values at the samples from values at `nodes`, shape (len(nodes), ...) to (M, ...)."""
         nodes = self.nodes
-        before = at_nodes[np.searchsorted(nodes, self.node)]
-        after = at_nodes[np.minimum(np.searchsorted(nodes, self.node + 1), len(nodes) - 1)]
-        fraction = self.fraction.reshape(-1, *([1] * (at_nodes.ndim - 1)))
+        column = () if self.node.ndim == 1 else (np.arange(at_nodes.shape[1]),)
+        before = at_nodes[(np.searchsorted(nodes, self.node), *column)]
+        after = at_nodes[(np.minimum(np.searchsorted(nodes, self.node + 1), len(nodes) - 1), *column)]
+        fraction = self.fraction.reshape(*self.fraction.shape, *([1] * (at_nodes.ndim - self.fraction.ndim)))
         return np.where(fraction > 0, (1 - fraction) * before + fraction * after, before)
 
     def distribute(self, at_samples: Array) -> Array:
         """Transpose of `interpolate`, shape (M, ...) to (len(nodes), ...)."""
         nodes = self.nodes
         result = np.zeros((len(nodes), *at_samples.shape[1:]))
-        fraction = self.fraction.reshape(-1, *([1] * (at_samples.ndim - 1)))
-        np.add.at(result, np.searchsorted(nodes, self.node), (1 - fraction) * at_samples)
+        fraction = self.fraction.reshape(*self.fraction.shape, *([1] * (at_samples.ndim - self.fraction.ndim)))
         between = self.fraction > 0
-        np.add.at(result, np.searchsorted(nodes, self.node[between] + 1), (fraction * at_samples)[between])
+        place = np.searchsorted(nodes, self.node)
+        if self.node.ndim == 1:
+            np.add.at(result, place, (1 - fraction) * at_samples)
+            np.add.at(result, np.searchsorted(nodes, self.node[between] + 1), (fraction * at_samples)[between])
+            return result
+        column = np.broadcast_to(np.arange(self.node.shape[1]), self.node.shape)
+        np.add.at(result, (place, column), (1 - fraction) * at_samples)
+        np.add.at(result, (place[between] + 1, column[between]), (fraction * at_samples)[between])
         return result
 
 
@@ -117,7 +166,9 @@ def point_samples(
     return make_samples(sensor, group.t[inside], value, deviation, grid, f"{recording.name}: {group.name}")
 
 
-def make_samples(sensor: Sensor, t: Array, value: Array, std: Array, grid: Grid, where: str) -> Samples:
+def make_samples(
+    sensor: Sensor, t: Array, value: Array, std: Array, grid: Grid, where: str, span: tuple[int, int] | None = None
+) -> Samples:
     """Whitened samples; `DataError` where a noise level is not positive."""
     seen = np.isfinite(value)
     if np.any(seen & ~(std > 0)):
@@ -126,7 +177,7 @@ def make_samples(sensor: Sensor, t: Array, value: Array, std: Array, grid: Grid,
         )
     weight = np.where(seen, 1.0 / np.where(std > 0, std, 1.0), 0.0)
     node, fraction = grid.locate(t)
-    return Samples(sensor, node, fraction, value, weight, np.where(seen, std, np.nan))
+    return Samples(sensor, node, fraction, value, weight, np.where(seen, std, np.nan), span or (0, grid.steps))
 
 
 def paper_weighting(samples: Samples, grid: Grid) -> Samples:
@@ -138,9 +189,7 @@ def paper_weighting(samples: Samples, grid: Grid) -> Samples:
     weight = np.where(np.isfinite(samples.value), 1.0, 0.0)
     weight[nearest_node == 0] = 0.0
     weight[nearest_node == grid.steps] *= np.sqrt(2.0)
-    return Samples(
-        samples.sensor, nearest_node, np.zeros(len(nearest_node)), samples.value, weight, samples.std
-    )
+    return replace(samples, node=nearest_node, fraction=np.zeros(len(nearest_node)), weight=weight)
 
 
 def huber(residual: Array, scale: float) -> tuple[float, Array]:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Protocol, runtime_checkable
 
 import casadi as ca
 
 from yid_ocp.model.kinematics import forward_kinematics
+from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import NodeState, System
 
 
@@ -40,6 +42,16 @@ class Sensor(Protocol):
         """Number of outputs of one channel."""
         ...
 
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """Frame of the mechanism that each channel marks; none for joints."""
+        ...
+
+    @property
+    def camera(self) -> Placement | None:
+        """Pose in the world of the camera that looks; None for any other sensor."""
+        ...
+
     def output(self, state: NodeState) -> ca.SX:
         """What the sensor reads at a node, shape (width * len(channels), 1)."""
         ...
@@ -63,12 +75,14 @@ def sensor_function(system: System, sensor: Sensor, names: tuple[str, ...]) -> c
     rows = {name: i for i, name in enumerate(system.internal)}
     q, z = ca.SX.sym("q", system.size), ca.SX.sym("z", len(rows))
     effort = ca.SX.sym("effort", system.size)
-    state = NodeState(system, forward_kinematics(system.mechanism, q), q, z, effort, rows)
+    kinematics = forward_kinematics(system.mechanism, q)
+    state = NodeState(system, kinematics, q, z, effort, rows, sensor.camera)
     parts = ca.vertsplit(sensor.output(state), sensor.width)
     read = []
-    for channel, part in zip(sensor.channels, parts, strict=True):
+    marked = sensor.frames or (None,) * len(sensor.channels)
+    for channel, part, frame in zip(sensor.channels, parts, marked, strict=True):
         for effect in system.effects:
-            part = effect.measure(channel, part, state)
+            part = effect.measure(channel, part, replace(state, frame=frame))
         read.append(part)
     output = ca.vertcat(*read)
     symbols = ca.vertcat(*system.internal.values()) if rows else ca.SX(0, 1)

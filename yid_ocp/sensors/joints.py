@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
+from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import NodeState
 
 
@@ -30,6 +31,16 @@ class AngleSensor:
     def width(self) -> int:
         """One output a joint."""
         return 1
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """No points."""
+        return ()
+
+    @property
+    def camera(self) -> Placement | None:
+        """No camera."""
+        return None
 
     def output(self, state: NodeState) -> ca.SX:
         """Coordinates of the joints, shape (nj, 1)."""
@@ -57,6 +68,16 @@ class EffortSensor:
     def width(self) -> int:
         """One output a joint."""
         return 1
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """No points."""
+        return ()
+
+    @property
+    def camera(self) -> Placement | None:
+        """No camera."""
+        return None
 
     def output(self, state: NodeState) -> ca.SX:
         """Efforts of the joints, shape (nj, 1) [N m]."""

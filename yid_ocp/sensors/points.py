@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
+from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import NodeState
 
 
@@ -21,11 +22,14 @@ class PointSensor:
         Names in the recording.
     frames : tuple of str
         Frames of the mechanism that they mark.
+    pose : tuple of tuple of float, optional
+        4x4 pose of the camera in the world; None for a sensor that is no camera.
     """
 
     group: str
     points: tuple[str, ...]
     frames: tuple[str, ...]
+    pose: tuple[tuple[float, ...], ...] | None = None
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -41,6 +45,11 @@ class PointSensor:
     def width(self) -> int:
         """Three coordinates."""
         return 3
+
+    @property
+    def camera(self) -> Placement | None:
+        """Pose of the camera."""
+        return None if self.pose is None else Placement.of(self.pose)
 
     def output(self, state: NodeState) -> ca.SX:
         """Positions one below the other, shape (3 np, 1) [m]."""

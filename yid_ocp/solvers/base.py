@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 IDENTIFIABLE = 0.1
-WEAK = 5.0
+WEAK = 4.0
 
 
 class Status(str, Enum):
@@ -74,7 +74,7 @@ class Estimate:
     initial, lower, upper : float
     free : bool
     verdict : str
-        identifiable (relative deviation up to 10 %), weak (up to 500 %), not_identifiable, or fixed.
+        identifiable (relative deviation up to 10 %), weak (up to 400 %), not_identifiable, or fixed.
     """
 
     value: float
@@ -154,7 +154,10 @@ class Outcome:
 class Solver(Protocol):
     """A method with its settings; a frozen dataclass registered under its name."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """Under which it is registered."""
+        ...
 
     def run(self, problem: EstimationProblem, start: Array, callback: Callback | None) -> Outcome:
         """Minimise the problem's cost from `start`."""
@@ -317,7 +320,7 @@ def _completed(vectors: Array, count: int) -> Array:
 
 
 def verdict(value: float, std: float) -> str:
-    """identifiable, weak or not_identifiable, by the relative standard deviation (limits 10 % and 500 %)."""
+    """identifiable, weak or not_identifiable, by the relative standard deviation (limits 10 % and 400 %)."""
     if not math.isfinite(std):
         return "not_identifiable"
     relative = std / max(abs(value), 1e-12)
@@ -334,19 +337,18 @@ def estimates(problem: EstimationProblem, x: Array, covariance: Array) -> dict[s
     for i, entry in enumerate(problem.system.parameters):
         free = entry.name in problem.shared
         at = problem.shared.index(entry.name) if free else -1
-        # a deviation is measured against the larger of value and start, so that an estimate at zero has a verdict
         std = float(deviation[at]) if free else 0.0
-        size = max(abs(float(theta[i])), abs(float(problem.theta[i])))
-        informed = std < 1e6 * max(size, 1e-12)
+        value, initial = float(theta[i]), float(problem.theta[i])
+        std = std if std < 1e6 * max(abs(value), abs(initial), 1e-12) else math.inf
         result[entry.name] = Estimate(
-            float(theta[i]),
-            std if informed else math.inf,
+            value,
+            std,
             entry.unit,
-            float(problem.theta[i]),
+            initial,
             entry.lower,
             entry.upper,
             free,
-            verdict(size, std if informed else math.inf) if free else "fixed",
+            verdict(value, std) if free else "fixed",
         )
     return result
 

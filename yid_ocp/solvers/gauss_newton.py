@@ -66,7 +66,7 @@ class GaussNewton:
             if len(recorder.history) > self.iterations:
                 message = f"no convergence in {self.iterations} iterations; raise solver.iterations or free fewer parameters"
                 return self._end(Status.ITERATION_LIMIT, message, x, recorder)
-            step = _bounded_step(jacobian * size, residual, mu, (lower - x) / size, (upper - x) / size) * size
+            step = bounded_step(jacobian * size, residual, mu, (lower - x) / size, (upper - x) / size) * size
             promised = -float(gradient @ step) - 0.5 * float(np.sum((jacobian @ step) ** 2))
             if promised <= self.cost_tolerance * max(now.cost, 1e-300):
                 return self._end(Status.CONVERGED, "the cost cannot be lowered any further", x, recorder)
@@ -96,7 +96,7 @@ class GaussNewton:
         return Outcome(status, message, x, tuple(recorder.history), recorder.evaluations)
 
 
-def _bounded_step(jacobian: Array, residual: Array, mu: float, lower: Array, upper: Array) -> Array:
+def bounded_step(jacobian: Array, residual: Array, mu: float, lower: Array, upper: Array) -> Array:
     """Solve min |J d + r|^2 + mu c |d|^2 with lower <= d <= upper, c the largest squared column norm."""
     count = jacobian.shape[1]
     factor = scipy.linalg.qr(np.column_stack([jacobian, residual]), mode="r", check_finite=False)[0][: count + 1]

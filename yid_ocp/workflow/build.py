@@ -12,6 +12,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 
+from yid_ocp.analysis.convergence import grasp_gaps
 from yid_ocp.data.recording import Recording, read_recording
 from yid_ocp.errors import DataError, ModelError, YidError, nearest
 from yid_ocp.integrator.step import Step, compile_step
@@ -21,8 +22,18 @@ from yid_ocp.model.parameters import Parameters
 from yid_ocp.model.system import Spring, placement_matrix
 from yid_ocp.model.y_object import y_segments
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.workflow.settings import MountSettings, ParameterSettings, Run, SegmentedObject, YObject
+from yid_ocp.problem.cable import (
+    BranchOptions,
+    Cable,
+    CableOptions,
+    cable_system,
+    length_values,
+    read_vertices,
+)
+from yid_ocp.problem.problem import Episode
+from yid_ocp.workflow.settings import CableObject, MountSettings, ParameterSettings, Run, SegmentedObject, YObject
 
+LARGEST_GAP = 0.01  # what encoder noise and a slightly wrong length of the object can make of a grasp [m]
 Placed = tuple[FlexibleObject, str | None, np.ndarray | None]
 
 
@@ -58,6 +69,8 @@ def build_system(run: Run, links: int | None = None) -> System:
         Names that do not exist, values outside their bounds; the error names the setting.
     """
     model = run.model
+    if isinstance(model.object, CableObject):
+        return _cable_model(run)
     robot = _robot(run)
     by_name = dict(model.damping) if isinstance(model.damping, Mapping) else None
     everywhere = 0.05 if by_name is not None else float(model.damping)  # type: ignore[arg-type]
@@ -65,9 +78,7 @@ def build_system(run: Run, links: int | None = None) -> System:
     if by_name is not None:
         for name in by_name:
             if name not in joints:
-                raise run.refuse(
-                    f"there is no joint '{name}'", "model", "damping", name, hint=nearest(name, joints)
-                )
+                raise run.refuse(f"there is no joint '{name}'", "model", "damping", name, hint=nearest(name, joints))
     damping = dict.fromkeys(joints, everywhere) | (by_name or {})
     for name, spring in model.springs.items():
         if name not in joints:
@@ -98,37 +109,101 @@ def build_system(run: Run, links: int | None = None) -> System:
     return replace(system, parameters=_set_parameters(run, system.parameters))
 
 
+def _cable_model(run: Run) -> System:
+    cable, item = build_cable(run), run.model.object
+    assert cable is not None
+    assert isinstance(item, CableObject)
+    for key in ("robot", "grasp", "springs"):
+        if getattr(run.model, key):
+            raise run.refuse(f"a cable takes no {key}: its clamps hold it", "model", key, hint=f"remove {key}")
+    for name in item.branches:
+        if name not in cable.chains:
+            raise run.refuse(
+                f"there is no branch '{name}'", "model", "object", "branches", name, hint=nearest(name, cable.chains)
+            )
+    recordings = read_recordings(run, "estimate")
+    if not recordings:
+        raise run.refuse("a cable's lengths come from recordings", "recordings", "estimate", hint="list at least one")
+    options = CableOptions(
+        {name: BranchOptions(**vars(branch)) for name, branch in item.branches.items()},
+        radius=item.radius,
+        end=item.end,
+        rest_shape=item.rest_shape,
+        rigid_clamp=item.rigid_clamp,
+        separate_lengths=item.separate_lengths,
+        memory=item.memory,
+        rest_angles=item.rest_angles,
+        gravity=run.model.gravity,
+    )
+    with located(run, "model", "object"):
+        system = cable_system(recordings, cable, options)
+    return replace(system, parameters=_set_parameters(run, system.parameters))
+
+
+def build_cable(run: Run) -> Cable | None:
+    """The cable that a run's object describes, None for another object."""
+    item = run.model.object
+    if not isinstance(item, CableObject):
+        return None
+    with located(run, "model", "object", "undeformed"):
+        undeformed = read_vertices(item.undeformed)
+    with located(run, "model", "object"):
+        return Cable(item.parent, dict(item.children), undeformed)
+
+
 def _robot(run: Run) -> Mechanism | None:
     model = run.model
     if model.robot is None:
         return None
-    with located(run, "model", "robot"):
-        file = robot_file(run)
-        if file is not None and not file.is_file():
-            near = nearest(file.name, (entry.name for entry in file.parent.glob("*.urdf"))) if file.parent.is_dir() else ""
-            raise ModelError("there is no such URDF file", where=str(file), hint=near)
+    input_files(run)
     with located(run, "model", "arms", "joints"):
         return Mechanism.from_urdf(model.robot, joints=model.arms.joints, locked=model.arms.locked)
 
 
-def robot_file(run: Run) -> Path | None:
-    """The URDF file of a run's robot, None without one."""
-    if run.model.robot is None:
-        return None
-    name = run.model.robot
-    return robot_description_file(name.removeprefix("package:")) if name.startswith("package:") else Path(name)
+def input_files(run: Run) -> dict[str, Path]:
+    """Every file that a run reads, by its name in the settings: configuration, robot, recordings.
+
+    Raises
+    ------
+    ConfigError
+        One does not exist; the error names the setting and the nearest file that does.
+    """
+    files: dict[str, Path] = {}
+    if run.file:
+        files["configuration"] = Path(run.file)
+    robot = run.model.robot
+    if robot is not None:
+        with located(run, "model", "robot"):
+            package = robot.startswith("package:")
+            file = robot_description_file(robot.removeprefix("package:")) if package else Path(robot)
+        files[robot] = _existing(run, file, "URDF file", "model", "robot")
+    if isinstance(run.model.object, CableObject):
+        file = Path(run.model.object.undeformed)
+        files[str(file)] = _existing(run, file, "table of points", "model", "object", "undeformed")
+    for which in ("estimate", "held_out"):
+        for i, path in enumerate(getattr(run.recordings, which)):
+            files[path] = _existing(run, recording_file(path), "recording", "recordings", which, i)
+    return files
+
+
+def _existing(run: Run, file: Path, noun: str, *key: str | int) -> Path:
+    if file.is_file():
+        return file
+    folder = file.parent
+    names = [entry.name for entry in folder.glob(f"*{file.suffix}")] if folder.is_dir() else []
+    hint = nearest(file.name, names) if names else "check the path, which is relative to the configuration file"
+    raise run.refuse(f"there is no such {noun}: {file}", *key, hint=hint)
 
 
 def _objects(run: Run, damping: float, links: int | None) -> list[Placed]:
     item = run.model.object
-    if item is None:
+    if item is None or isinstance(item, CableObject):
         return []
     if isinstance(item, YObject):
         count = item.links if links is None else links
         factor = count / item.links
         segments = [
-            replace(s, links=count, bend=s.bend * factor, twist=s.twist * factor, damping=damping)
-            for s in y_segments()
+            replace(s, links=count, bend=s.bend * factor, twist=s.twist * factor, damping=damping) for s in y_segments()
         ]
         if item.mount is None:
             foot = placement_matrix((0.85, 0.0, -0.93))
@@ -146,7 +221,9 @@ def _segments(item: SegmentedObject, damping: float, links: int | None) -> list[
     result = []
     for name, s in item.segments.items():
         if s.length is None and s.link_lengths is None:
-            raise ModelError(f"segment '{name}' has no length", where=f"segments.{name}", hint="set length or link_lengths")
+            raise ModelError(
+                f"segment '{name}' has no length", where=f"segments.{name}", hint="set length or link_lengths"
+            )
         count = s.links if links is None or s.link_lengths is not None else links
         # a rigidity does not depend on the number of links, a stiffness per joint does
         factor = 1.0 if s.rigidity else count / s.links
@@ -236,13 +313,7 @@ def recording_file(path: str) -> Path:
     """File of a recording in the settings; `default:NAME` is one that ships with the package."""
     if not path.startswith("default:"):
         return Path(path)
-    folder = Path(str(resources.files("yid_ocp.data").joinpath("defaults")))
-    name = path.removeprefix("default:")
-    file = folder / name
-    if not file.is_file():
-        known = sorted(entry.name for entry in folder.glob("*.h5"))
-        raise DataError(f"no recording '{name}' ships with the package", allowed=", ".join(known), hint=nearest(name, known))
-    return file
+    return Path(str(resources.files("yid_ocp.data").joinpath("defaults", path.removeprefix("default:"))))
 
 
 def read_recordings(run: Run, which: str) -> list[Recording]:
@@ -256,8 +327,9 @@ def read_recordings(run: Run, which: str) -> list[Recording]:
     paths: Sequence[str] = getattr(run.recordings, which)
     result: list[Recording] = []
     for i, path in enumerate(paths):
+        file = _existing(run, recording_file(path), "recording", "recordings", which, i)
         with located(run, "recordings", which, i):
-            recording = read_recording(recording_file(path))
+            recording = read_recording(file)
         if recording.name in [entry.name for entry in result]:
             recording = replace(recording, name=f"{recording.name}_{i}")
         result.append(recording)
@@ -275,12 +347,34 @@ def build_step(run: Run, system: System | None = None) -> Step:
     )
 
 
-def problem_options(run: Run, parameters: Parameters) -> ProblemOptions:
-    """What the settings say about the estimation problem."""
+def problem_options(run: Run, parameters: Parameters, recordings: Sequence[Recording] = ()) -> ProblemOptions:
+    """What the settings say about the estimation problem.
+
+    Parameters
+    ----------
+    run : Run
+    parameters : Parameters
+        Of the system.
+    recordings : sequence of Recording
+        Where values differ from recording to recording (a cable's edges), those of these.
+    """
     solver, chosen = run.solver, parameter_settings(run, parameters)
+    for name in solver.start_parameters:
+        if name not in parameters:
+            raise run.refuse(
+                f"there is no parameter '{name}'", "solver", "start_parameters", hint=nearest(name, parameters.names)
+            )
     sensors = {
         name: SensorOptions(s.use, s.std, dict(s.frames), s.points, s.position_std) for name, s in run.sensors.items()
     }
+    cable = build_cable(run)
+    own: dict[str, dict[str, float]] = {}
+    if cable is not None and isinstance(run.model.object, CableObject):
+        for group in {group.name for recording in recordings for group in recording.points}:
+            said = sensors.get(group, SensorOptions())
+            sensors[group] = said if said.points is not None else replace(said, points=cable.free)
+        if run.model.object.separate_lengths:
+            own = {recording.name: length_values(cable, recording) for recording in recordings}
     return ProblemOptions(
         initial_state=solver.initial_state,
         feedback=solver.feedback,
@@ -289,6 +383,7 @@ def problem_options(run: Run, parameters: Parameters) -> ProblemOptions:
         robust_scale=solver.robust_scale,
         path_cutoff=solver.path_cutoff,
         sensors=sensors,
+        clamps=() if cable is None else cable.clamps,
         local=tuple(name for name, said in chosen.items() if said.local),
         priors={name: said.prior for name, said in chosen.items() if said.prior is not None},
         tie_break=solver.tie_break,
@@ -296,6 +391,9 @@ def problem_options(run: Run, parameters: Parameters) -> ProblemOptions:
         velocity_std=solver.velocity_std,
         duration=solver.duration,
         start_window=solver.start_window,
+        start_std=solver.start_std,
+        start_parameters=solver.start_parameters,
+        recording_values=own,
     )
 
 
@@ -315,7 +413,7 @@ def build_problem(run: Run, step: Step | None = None) -> EstimationProblem:
     Raises
     ------
     ConfigError, DataError, ModelError
-        Settings, recordings or names that do not fit.
+        Settings, recordings or names that do not fit, a grasp that cannot be closed.
     """
     system = build_system(run) if step is None else step.system
     free = [name for name, said in parameter_settings(run, system.parameters).items() if said.free]
@@ -324,7 +422,11 @@ def build_problem(run: Run, step: Step | None = None) -> EstimationProblem:
     same = sorted(set(run.recordings.estimate) & set(run.recordings.held_out))
     if same:
         raise run.refuse(
-            "a recording is both estimated on and held out", "recordings", "held_out", allowed="one of the two", hint=same[0]
+            "a recording is both estimated on and held out",
+            "recordings",
+            "held_out",
+            allowed="one of the two",
+            hint=same[0],
         )
     estimate, held_out = read_recordings(run, "estimate"), read_recordings(run, "held_out")
     if not estimate:
@@ -332,9 +434,43 @@ def build_problem(run: Run, step: Step | None = None) -> EstimationProblem:
             "there is no recording to estimate on", "recordings", "estimate", hint="list at least one recording"
         )
     _check_sensors(run, [*estimate, *held_out])
-    options = problem_options(run, system.parameters)
+    options = problem_options(run, system.parameters, [*estimate, *held_out])
     step = build_step(run, system) if step is None else step
-    return EstimationProblem(step, estimate, free, options, None, held_out)
+    problem = EstimationProblem(step, estimate, free, options, None, held_out)
+    check_grasps(run, problem)
+    return problem
+
+
+def first_gaps(problem: EstimationProblem, episode: Episode) -> dict[str, float]:
+    """Distance to which every grasp can be closed at the first posture of a recording [m]."""
+    system = problem.system
+    if not system.grasps:
+        return {}
+    posture = dict(zip((*system.driven, *system.prescribed), map(float, episode.posture), strict=True))
+    theta = problem.theta.copy()
+    for name, value in problem.options.recording_values.get(episode.name, {}).items():
+        theta[system.parameters.index(name)] = value
+    return grasp_gaps(system, posture, theta)
+
+
+def check_grasps(run: Run, problem: EstimationProblem) -> None:
+    """Refuse recordings at whose first posture a grasp cannot be closed, however the object bends.
+
+    Raises
+    ------
+    DataError
+        Naming the recording, the grasp and the distance.
+    """
+    for episode in (*problem.episodes, *problem.held_out):
+        for name, gap in first_gaps(problem, episode).items():
+            if gap > LARGEST_GAP:
+                raise DataError(
+                    f"grasp '{name}' cannot be closed at the first posture of '{episode.name}': "
+                    f"{1e3 * gap:.3g} mm are missing",
+                    where=run.where("model", "grasp", name),
+                    allowed=f"at most {1e3 * LARGEST_GAP:g} mm",
+                    hint="check the object's lengths and mount, the grasp's frames and the recording's joints",
+                )
 
 
 def _check_sensors(run: Run, recordings: Sequence[Recording]) -> None:
@@ -343,5 +479,9 @@ def _check_sensors(run: Run, recordings: Sequence[Recording]) -> None:
     for name in run.sensors:
         if name not in known:
             raise run.refuse(
-                f"no recording has a group '{name}'", "sensors", name, allowed=", ".join(sorted(known)), hint=nearest(name, known)
+                f"no recording has a group '{name}'",
+                "sensors",
+                name,
+                allowed=", ".join(sorted(known)),
+                hint=nearest(name, known),
             )

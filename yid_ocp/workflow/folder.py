@@ -22,7 +22,7 @@ import numpy as np
 from yid_ocp.data.recording import file_sha256
 from yid_ocp.errors import OutputError
 from yid_ocp.solvers import Iterate
-from yid_ocp.workflow.build import recording_file, robot_file
+from yid_ocp.workflow.build import input_files
 from yid_ocp.workflow.settings import Run
 
 
@@ -80,7 +80,7 @@ class RunFolder:
         notes: list[str] = []
         clean = jsonable(data, notes)
         if notes:
-            clean["notes"] = [*clean.get("notes", []), *notes]
+            clean["notes"] = _grouped(notes)
         self.write(name, json.dumps(clean, indent=1, allow_nan=False) + "\n")
         return dict(clean)
 
@@ -109,8 +109,19 @@ def jsonable(value: Any, notes: list[str] | None = None, path: str = "") -> Any:
     return value if value is None or isinstance(value, (bool, int, float, str)) else str(value)
 
 
+def _grouped(notes: list[str]) -> list[str]:
+    """Notes on the same key of many entries as one."""
+    groups: dict[str, list[str]] = {}
+    for note in notes:
+        groups.setdefault(note.rpartition(".")[2], []).append(note)
+    result: list[str] = []
+    for tail, texts in groups.items():
+        result += [f"{tail} ({len(texts)} times)"] if len(texts) > 3 else texts
+    return result
+
+
 @contextlib.contextmanager
-def new_run_folder(run: Run, out: str | Path | None = None) -> Iterator[RunFolder]:
+def new_run_folder(run: Run, out: str | Path | None = None, command: str = "") -> Iterator[RunFolder]:
     """Make a run folder that appears under its name when the block ends, and not at all when it is left by an error.
 
     Parameters
@@ -118,6 +129,8 @@ def new_run_folder(run: Run, out: str | Path | None = None) -> Iterator[RunFolde
     run : Run
     out : str or Path, optional
         Its name; `NAME-YYYYmmdd-HHMMSS` in `output.folder` when absent.
+    command : str
+        Enters the name: `NAME-COMMAND-...`.
 
     Yields
     ------
@@ -128,7 +141,7 @@ def new_run_folder(run: Run, out: str | Path | None = None) -> Iterator[RunFolde
     OutputError
         The folder exists and is not empty, or cannot be made or written to.
     """
-    target = _target(run, out)
+    target = _target(run, out, command)
     made = [parent for parent in (target.parent, *target.parent.parents) if not parent.exists()]
     temporary = target.parent / f".{target.name}.{secrets.token_hex(4)}.partial"
     try:
@@ -170,7 +183,7 @@ def new_run_folder(run: Run, out: str | Path | None = None) -> Iterator[RunFolde
         logger.setLevel(level)
 
 
-def _target(run: Run, out: str | Path | None) -> Path:
+def _target(run: Run, out: str | Path | None, command: str) -> Path:
     if out is not None:
         target = Path(out).expanduser().absolute()
         if target.is_dir() and any(target.iterdir()):
@@ -184,7 +197,7 @@ def _target(run: Run, out: str | Path | None) -> Path:
             raise OutputError("the run folder's name is that of a file", where=str(target), hint="choose another --out")
         return target
     parent = Path(run.output.folder) if run.output.folder is not None else Path.cwd() / "runs"
-    stem = f"{run.name}-{time.strftime('%Y%m%d-%H%M%S')}"
+    stem = "-".join(part for part in (run.name, command, time.strftime("%Y%m%d-%H%M%S")) if part)
     names = (stem, *(f"{stem}-{i}" for i in range(2, 1000)))
     return next(parent / name for name in names if not (parent / name).exists())
 
@@ -197,16 +210,8 @@ def _clear(temporary: Path, made: list[Path]) -> None:
 
 
 def input_hashes(run: Run) -> dict[str, str]:
-    """SHA-256 of every file that a run reads: the configuration, the robot, the recordings."""
-    files: dict[str, Path] = {}
-    if run.file:
-        files["configuration"] = Path(run.file)
-    robot = robot_file(run)
-    if robot is not None and run.model.robot is not None:
-        files[run.model.robot] = robot
-    for path in (*run.recordings.estimate, *run.recordings.held_out):
-        files[path] = recording_file(path)
-    return {name: file_sha256(path) for name, path in files.items()}
+    """SHA-256 of every file that a run reads; errors as `input_files`."""
+    return {name: file_sha256(path) for name, path in input_files(run).items()}
 
 
 def versions() -> dict[str, str]:

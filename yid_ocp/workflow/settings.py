@@ -18,6 +18,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedSeq
 
 from yid_ocp.errors import ConfigError
+from yid_ocp.integrator.discrete import ForceSplit
 from yid_ocp.solvers import SOLVERS, GaussNewton
 from yid_ocp.solvers.base import Solver
 
@@ -98,6 +99,39 @@ class SegmentedObject:
 
 
 @dataclass(frozen=True, kw_only=True)
+class BranchSettings:
+    """Nominal properties of one branch of a cable."""
+
+    bend: Annotated[float, Ge(0), About("bending rigidity", "N m^2")] = 1.5e-3
+    twist: Annotated[float, Ge(0), About("twisting rigidity", "N m^2")] = 1.0e-3
+    damping: Annotated[float, Ge(0), About("viscous, per curvature rate", "N m^2 s")] = 5e-5
+    twist_damping: Annotated[float | None, Ge(0), About("of twists, where another", "N m^2 s")] = None
+    density: Annotated[float, Gt(0), About("mass per length; results are per unit of it", "kg/m")] = 0.05
+
+
+@dataclass(frozen=True, kw_only=True)
+class CableObject:
+    """A branched cable held at both ends by clamps that follow measured points; its edges come from the recordings."""
+
+    kind: Literal["cable"] = "cable"
+    parent: Annotated[tuple[str, ...], Len(5), About("points from clamp to clamp, two held at each end")]
+    children: Annotated[
+        Mapping[str, tuple[str, ...]], About("points of every branch, the first one the parent's at which it leaves")
+    ] = field(default_factory=dict)
+    undeformed: Annotated[FilePath, About("CSV table with the columns point, x, y, z", "m")]
+    branches: Annotated[Mapping[str, BranchSettings], About("by name, parent and children")] = field(
+        default_factory=dict
+    )
+    radius: Annotated[float, Gt(0), Le(1), About("of the links' cylinders", "m")] = 0.005
+    end: Annotated[Literal["axis", "weld"], About("whether the end clamp leaves the roll free or holds it")] = "axis"
+    rest_shape: Annotated[bool, About("whether branches rest in their undeformed shape, or straight")] = True
+    rigid_clamp: Annotated[bool, About("whether the first edge is rigid up to its second point")] = False
+    separate_lengths: Annotated[bool, About("whether every recording has edge lengths of its own")] = True
+    memory: Annotated[float | None, Ge(0), Le(1), About("how far a recording's start is its rest shape")] = None
+    rest_angles: Annotated[bool, About("whether every joint has a rest angle parameter")] = False
+
+
+@dataclass(frozen=True, kw_only=True)
 class GraspSettings:
     """A frame of the robot that holds a frame of the object."""
 
@@ -133,7 +167,7 @@ class ModelSettings:
 
     robot: Annotated[FilePath | None, About("URDF file, or package:NAME of example-robot-data")] = None
     arms: Annotated[ArmSettings, About("the robot's joints")] = field(default_factory=ArmSettings)
-    object: Annotated[YObject | SegmentedObject | None, About("the flexible object")] = None
+    object: Annotated[YObject | SegmentedObject | CableObject | None, About("the flexible object")] = None
     grasp: Annotated[Mapping[str, GraspSettings], About("by name: left, right, gripper")] = field(default_factory=dict)
     springs: Annotated[Mapping[str, SpringSettings], About("by joint of the robot")] = field(default_factory=dict)
     damping: Annotated[
@@ -191,7 +225,7 @@ class SolverSettings:
 
     name: Annotated[str, About("the method")] = "gauss_newton"
     time_step: Annotated[float, Gt(0), Le(0.1), About("of the integrator", "s")] = 0.01
-    force_split: Annotated[Literal["symmetric", "left"], About("rule for forces; left is the paper's")] = "symmetric"
+    force_split: Annotated[ForceSplit, About("rule for forces; left is the paper's")] = "symmetric"
     feedback: Annotated[Literal["none", "proportional", "lqr"], About("tracking filter of driven arms")] = "lqr"
     gains: Annotated[tuple[Annotated[float, Ge(0)], ...], Len(1), About("of the proportional filter", "N m/rad")] = (
         80.0,
@@ -206,11 +240,15 @@ class SolverSettings:
         Literal["equilibrium", "estimated", "given"], About("at rest; at rest plus a free deviation; fitted to points")
     ] = "equilibrium"
     start_window: Annotated[float, Gt(0), About("how long points that fix a given start may reach", "s")] = 0.02
+    start_std: Annotated[float | None, Gt(0), About("noise of the points that fix a given start", "m")] = None
+    start_parameters: Annotated[tuple[str, ...], About("fitted along with a given start in every recording")] = ()
     configuration_std: Annotated[float, Gt(0), About("prior of an estimated start", "rad")] = 0.05
     velocity_std: Annotated[float, Gt(0), About("prior of an estimated start", "rad/s")] = 0.2
     weighting: Annotated[Literal["whitened", "paper"], About("cost in deviations, or the paper's")] = "whitened"
     robust_scale: Annotated[float, Gt(0), About("Huber scale in deviations; .inf for squares")] = math.inf
-    tie_break: Annotated[float, Ge(0), About("prior of free parameters as a multiple of their start; 0 for none")] = 10.0
+    tie_break: Annotated[
+        float, Ge(0), About("factor within which parameters stay that nothing informs; 0 for none")
+    ] = 10.0
     path_cutoff: Annotated[float, Gt(0), About("low-pass cutoff of prescribed paths and efforts", "Hz")] = 10.0
     duration: Annotated[float | None, Gt(0), About("use only the first seconds of every recording", "s")] = None
     compiler: Annotated[bool, About("whether to compile the step where a C compiler is found")] = True

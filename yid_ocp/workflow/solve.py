@@ -12,14 +12,14 @@ import numpy as np
 
 from yid_ocp.errors import OutputError
 from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.cable import Cable
 from yid_ocp.problem.problem import Episode, EpisodeResult
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import Findings
-from yid_ocp.sensors import EffortSensor, PointSensor
 from yid_ocp.solvers import Solution, Status, solve
-from yid_ocp.solvers.base import Callback
-from yid_ocp.workflow.build import build_problem
-from yid_ocp.workflow.folder import Monitor, RunFolder, Silent, both, input_hashes, new_run_folder, versions
+from yid_ocp.workflow.build import build_cable, build_problem
+from yid_ocp.workflow.folder import Monitor, Silent, both, input_hashes, new_run_folder, versions
+from yid_ocp.workflow.held_out import held_out_entry
 from yid_ocp.workflow.settings import Run, dump_config
 
 FORMAT = "yid-solve/1"
@@ -87,7 +87,10 @@ def run_solve(run: Run, out: str | Path | None = None, monitor: Monitor | None =
         solution = solve(problem, run.solver.method, callback=both(note, watcher.iterate))
         watcher.stage("predicting the held-out recordings")
         held_out = problem.validate(solution.x)
-        result = solve_result(problem, solution, held_out) | {"inputs": inputs, "versions": versions()}
+        result = solve_result(problem, solution, held_out, build_cable(run)) | {
+            "inputs": inputs,
+            "versions": versions(),
+        }
         folder.log("end", status=solution.status.value, message=solution.message, seconds_solving=solution.seconds)
         write_trajectories(folder.path / "trajectories.h5", problem, solution, held_out)
         written = folder.write_json("result.json", result)
@@ -99,9 +102,12 @@ def run_solve(run: Run, out: str | Path | None = None, monitor: Monitor | None =
 
 
 def solve_result(
-    problem: EstimationProblem, solution: Solution, held_out: Sequence[tuple[Episode, EpisodeResult | str]]
+    problem: EstimationProblem,
+    solution: Solution,
+    held_out: Sequence[tuple[Episode, EpisodeResult | str]],
+    cable: Cable | None = None,
 ) -> dict[str, Any]:
-    """`yid-solve/1` without inputs and versions."""
+    """`yid-solve/1` without inputs and versions; a cable has baselines of its own."""
     residuals: Mapping[str, Any] = {}
     if solution.evaluation is not None:
         residuals = problem.channel_errors(solution.evaluation.episodes, problem.episodes)
@@ -115,38 +121,8 @@ def solve_result(
         "evaluations": solution.evaluations,
         "seconds": solution.seconds,
         "residuals": residuals,
-        "held_out": [_held_out(problem, episode, outcome) for episode, outcome in held_out],
+        "held_out": [held_out_entry(problem, episode, outcome, cable) for episode, outcome in held_out],
     }
-
-
-def _held_out(problem: EstimationProblem, episode: Episode, outcome: EpisodeResult | str) -> dict[str, Any]:
-    entry: dict[str, Any] = {"recording": episode.name}
-    if isinstance(outcome, str):
-        entry |= {"rmse": {}, "message": outcome}
-    else:
-        errors = problem.channel_errors([outcome], [episode])
-        entry["rmse"] = {channel: error["rmse"] for channel, error in errors.items()}
-    return entry | {"baselines": baselines(episode)}
-
-
-def baselines(episode: Episode) -> dict[str, dict[str, float]]:
-    """Errors of predictions that need no model, per channel: points that stay where first seen, efforts of zero."""
-    result: dict[str, dict[str, float]] = {}
-    for samples in episode.samples:
-        blocks = samples.value.reshape(len(samples.value), -1, samples.sensor.width)
-        for c, channel in enumerate(samples.sensor.channels):
-            seen = blocks[np.all(np.isfinite(blocks[:, c]), axis=1), c]
-            if not len(seen):
-                continue
-            if isinstance(samples.sensor, PointSensor):
-                name, reference = "stays", seen[0]
-            elif isinstance(samples.sensor, EffortSensor):
-                name, reference = "zero", np.zeros(samples.sensor.width)
-            else:
-                continue
-            error = float(np.sqrt(np.mean(np.sum((seen - reference) ** 2, axis=1))))
-            result.setdefault(name, {})[channel] = error
-    return result
 
 
 def write_trajectories(

@@ -1,0 +1,181 @@
+"""Fit the real branched cable and predict recordings that the fit has not seen, beside predictions without a model.
+
+    python benchmarks/cable.py [--folder FOLDER] [--json FILE] [--iterations N]
+
+Free vertices are all but the two held at each end. A prediction knows the held vertices throughout and the free ones in
+the first two frames; its error is the root mean square Euclidean distance over free vertices and later frames. All
+values are per unit weight: the linear density is nominal, no force was measured.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+import yid_ocp as yid
+from yid_ocp.data.recording import Recording, read_recording
+from yid_ocp.problem.baselines import linear_carry, move_with_clamps, positions, prediction_error, stay
+from yid_ocp.problem.cable import (
+    Cable,
+    CableOptions,
+    cable_problem_options,
+    cable_system,
+    free_parameters,
+    read_vertices,
+    vertex_errors,
+)
+from yid_ocp.problem.problem import EstimationProblem
+from yid_ocp.solvers import GaussNewton, solve
+
+FOLDER = Path(__file__).resolve().parents[2] / "shared" / "recordings" / "deft"
+ESTIMATE = ("000", "007", "021", "035", "049", "063")
+HELD_OUT = ("014", "028", "042", "056")
+TIME_STEP = 0.01  # [s]
+NOISE = 2e-4  # of motion capture, from the scatter of third differences (0.10 to 0.20 mm) [m]
+MODEL_ERROR = 0.1  # about 15 mm that last for some fifty frames [m]
+GRAVITY = 9.81  # [m/s^2]
+OPTIONS = CableOptions(memory=0.5, rest_angles=True)
+
+
+def branched_cable(folder: Path = FOLDER) -> Cable:
+    """The cable of the recordings: thirteen vertices of the parent, children leaving at the fifth and the ninth."""
+    return Cable(
+        tuple(f"p{i}" for i in range(13)),
+        {"a": ("p4", "a1", "a2", "a3", "a4"), "b": ("p8", "b1", "b2", "b3")},
+        read_vertices(folder / "bdlo1_undeformed.csv"),
+    )
+
+
+def baselines(recording: Recording, cable: Cable) -> dict[str, float]:
+    """Prediction errors without a model [m]."""
+    free, measured = cable.free, positions(recording, cable.free)
+    predictions = {
+        "stay": stay(recording, free),
+        "move_with_clamps": move_with_clamps(recording, free, cable.held),
+        "linear_carry": linear_carry(recording, free, cable.parent, cable.children, cable.held),
+    }
+    return {name: prediction_error(predicted, measured) for name, predicted in predictions.items()}
+
+
+def run(folder: Path = FOLDER, iterations: int = 15) -> dict[str, Any]:
+    """Fit, predict, compare; seconds are wall time."""
+    cable = branched_cable(folder)
+    recordings = {name: read_recording(folder / f"bdlo1_train_{name}.h5") for name in (*ESTIMATE, *HELD_OUT)}
+    estimate, held_out = [recordings[n] for n in ESTIMATE], [recordings[n] for n in HELD_OUT]
+    clock = time.perf_counter()
+    system = cable_system(estimate, cable, OPTIONS)
+    step = yid.compile_step(system, TIME_STEP, "left_damping")
+    seconds = {"build_and_compile": time.perf_counter() - clock}
+    options = cable_problem_options(cable, estimate + held_out, NOISE, MODEL_ERROR, options=OPTIONS)
+    problem = EstimationProblem(step, estimate, free_parameters(cable, OPTIONS), options, None, held_out)
+    clock = time.perf_counter()
+    nominal = vertex_errors(problem, cable, problem.start)
+    seconds["starts"] = time.perf_counter() - clock
+    episode, (theta, deviation) = problem.episodes[0], problem.split(problem.start, 0)
+    clock = time.perf_counter()
+    problem.run(episode, theta, deviation, derivatives=False)
+    seconds["rollout"] = time.perf_counter() - clock
+    clock = time.perf_counter()
+    solution = solve(problem, GaussNewton(iterations=iterations))
+    seconds["fit"] = time.perf_counter() - clock
+    fitted = vertex_errors(problem, cable, solution.x)
+    files = {}
+    for recording in (*estimate, *held_out):
+        errors = baselines(recording, cable)
+        model = fitted[recording.name]
+        files[recording.name] = {
+            "held_out": recording in held_out,
+            "error": model,
+            "nominal": nominal[recording.name],
+            "baselines": errors,
+            "ratio_to_linear_carry": errors["linear_carry"] / model,
+        }
+    return {
+        "format": "yid-cable/1",
+        "unit": "m",
+        "given": "held vertices throughout, free vertices in the first two frames",
+        "free_vertices": list(cable.free),
+        "files": files,
+        "held_out_median": medians([entry for entry in files.values() if entry["held_out"]]),
+        "parameters": parameters(cable, solution.x, solution.covariance, problem.names),
+        "status": solution.status.value,
+        "iterations": solution.iterations,
+        "seconds": seconds,
+    }
+
+
+def medians(files: list[dict[str, Any]]) -> dict[str, float]:
+    """Medians over files of every error, and the ratio of the strongest baseline's median to the model's."""
+    result = {key: statistics.median(entry[key] for entry in files) for key in ("error", "nominal")}
+    result |= {name: statistics.median(e["baselines"][name] for e in files) for name in files[0]["baselines"]}
+    result["ratio_to_linear_carry"] = result["linear_carry"] / result["error"]
+    return result
+
+
+def parameters(cable: Cable, x: Any, covariance: Any, names: tuple[str, ...]) -> dict[str, dict[str, Any]]:
+    """Values, deviations, and values per unit weight (density times gravity) of rigidities and dampings."""
+    units = {"bend": "m^3", "twist": "m^3", "damping": "m^3 s", "twist_damping": "m^3 s"}
+    result: dict[str, dict[str, Any]] = {}
+    for i, name in enumerate(names):
+        branch, _, quantity = name.partition(".")
+        result[name] = {"value": float(x[i]), "std": float(covariance[i, i]) ** 0.5}
+        if branch in cable.chains and quantity in units:
+            weight = OPTIONS.branches.get(branch, OPTIONS.default).density * GRAVITY
+            result[name] |= {"per_weight": float(x[i]) / weight, "per_weight_unit": units[quantity]}
+    return result
+
+
+def show(result: Mapping[str, Any], console: Console) -> None:
+    """The same as tables."""
+    table = Table(title="prediction error over free vertices and 5 s [mm]")
+    columns = ("file", "stays", "moves with clamps", "linear carry", "nominal", "fitted", "linear carry / fitted")
+    for column in columns:
+        table.add_column(column, justify="left" if column == "file" else "right")
+
+    def row(name: str, entry: Mapping[str, Any], plain: Mapping[str, float]) -> None:
+        errors = [plain["stay"], plain["move_with_clamps"], plain["linear_carry"], entry["nominal"], entry["error"]]
+        table.add_row(name, *(f"{1e3 * e:.1f}" for e in errors), f"{entry['ratio_to_linear_carry']:.2f}")
+
+    for name, entry in result["files"].items():
+        row(f"{name}{' (held out)' if entry['held_out'] else ''}", entry, entry["baselines"])
+    row("median of held-out", result["held_out_median"], result["held_out_median"])
+    console.print(table)
+    values = Table(title="per unit weight")
+    for column in ("parameter", "value", "relative deviation", "unit"):
+        values.add_column(column)
+    for name, entry in result["parameters"].items():
+        if "per_weight" in entry:
+            spread = entry["std"] / entry["value"] if entry["value"] else float("inf")
+            values.add_row(name, f"{entry['per_weight']:.3g}", f"{spread:.2g}", entry["per_weight_unit"])
+    console.print(values)
+    spent = ", ".join(f"{name} {value:.2f}" for name, value in result["seconds"].items())
+    console.print(f"{result['status']} after {result['iterations']} iterations; seconds: {spent}")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--folder", type=Path, default=FOLDER)
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--iterations", type=int, default=15)
+    arguments = parser.parse_args()
+    if not arguments.folder.is_dir():
+        print(f"the recordings are not there: {arguments.folder}", file=sys.stderr)
+        return 2
+    result = run(arguments.folder, arguments.iterations)
+    show(result, Console())
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

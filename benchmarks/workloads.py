@@ -1,0 +1,238 @@
+"""What is timed: each workload does its work once and says how many units (steps, calls, runs) that was.
+
+To add one, write a function of a `Bench` and enter it in `WORKLOADS`; `run.py` times it and shows it beside the others.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+import yid_ocp
+from yid_ocp.data.recording import read_recording
+from yid_ocp.data.synthetic import paper_system
+from yid_ocp.integrator.discrete import ForceSplit
+from yid_ocp.integrator.feedback import lqr_filter
+from yid_ocp.integrator.rollout import Statics
+from yid_ocp.integrator.step import Directions, Feedback, Step, Sweep, compile_step
+from yid_ocp.model import System
+
+Array = NDArray[np.float64]
+
+TIME_STEP = 0.01
+FORCE_SPLIT: ForceSplit = "left_damping"
+STIFFNESSES = ("T1.bend", "T1.twist", "T2.bend", "T2.twist", "T3.bend", "T3.twist")
+VALUES = dict(zip(STIFFNESSES, (22.0, 13.6, 10.7, 8.2, 11.5, 9.7), strict=True))
+# number of coordinates: arms and the shipped recording of that system
+SIZES = {43: (1, "single_arm_no_vision_estimate.h5"), 50: (2, "dual_arm_no_vision_estimate.h5")}
+
+
+@dataclass
+class Bench:
+    """One of the paper's systems, tracking its shipped recording of 500 steps, and the same tree in Pinocchio."""
+
+    size: int
+    system: System
+    step: Step
+    theta: Array
+    start: Array
+    torque: Array
+    path: Array
+    feedback: Feedback
+    swept: Sweep
+    model: Any
+    data: Any
+    points: list[tuple[Array, Array, Array]]
+    keep: dict[str, Any] = field(default_factory=dict)
+
+    @staticmethod
+    def of(size: int) -> Bench:
+        """Set up the system with 43 or 50 coordinates; nothing here is timed."""
+        arms, name = SIZES[size]
+        system = paper_system(arms)
+        assert system.size == size
+        recording = read_recording(Path(yid_ocp.__file__).parent / "data" / "defaults" / name)
+        joints = recording.joints
+        assert joints is not None
+        assert joints.effort is not None
+        assert joints.names == system.driven
+        angles, torque = joints.position, np.ascontiguousarray(joints.effort[:-1])
+        step = compile_step(system, TIME_STEP, FORCE_SPLIT)
+        theta = system.parameters.vector(VALUES)
+        rest = Statics(step).solve(angles[0], theta)
+        feedback = lqr_filter(step, angles, torque, theta)
+        path = np.zeros((len(torque) + 1, 0))
+        swept = step.kernel.sweep(theta, rest.state, torque, path, feedback, None)
+        assert swept.status.ok, swept.status.message
+        values = dict(zip(system.parameters.names, theta, strict=True))
+        tree = system.mechanism.to_urdf({name: values[name] for name in system.mechanism.parameters.names})
+        model = pin.buildModelFromXML(tree)
+        assert model.nv == size
+        rng = np.random.default_rng(1)
+        points = [
+            (pin.integrate(model, pin.neutral(model), 0.3 * rng.normal(size=size)), *rng.normal(size=(2, size)))
+            for _ in range(50)
+        ]
+        return Bench(
+            size, system, step, theta, rest.state, torque, path, feedback, swept, model, model.createData(), points
+        )
+
+    def directions(self, key: str, names: tuple[str, ...], everything: bool) -> Directions:
+        """Sensitivity directions, made once: the named parameters, or all of the state and the torque."""
+        if key not in self.keep:
+            sizes = self.step.sizes
+            nx, nu, d = sizes["nx"], sizes["nu"], len(names)
+            if not everything:
+                self.keep[key] = Directions(names, np.zeros((nx, d)))
+            else:
+                start = np.hstack([np.eye(nx), np.zeros((nx, nu))])
+                torque = np.zeros((len(self.torque), nu, nx + nu))
+                torque[:, :, nx:] = np.eye(nu)
+                self.keep[key] = Directions((), start, torque)
+        return self.keep[key]
+
+    def sweep(self, steps: int, directions: Directions | None = None) -> Sweep:
+        """Track the recording over the first steps."""
+        torque, path = self.torque[:steps], self.path[: steps + 1]
+        return self.step.kernel.sweep(self.theta, self.start, torque, path, self.feedback, directions)
+
+
+def step(bench: Bench) -> int:
+    """One step in compiled code: a rollout of 100 of them."""
+    bench.sweep(100)
+    return 100
+
+
+def step_with_a_and_b(bench: Bench) -> int:
+    """One step with its derivatives by the whole state and the torque, in compiled code."""
+    steps = 25
+    directions = bench.directions("everything", (), everything=True)
+    assert directions.torque is not None
+    bench.sweep(steps, Directions((), directions.start, directions.torque[:steps]))
+    return steps
+
+
+def step_called_from_python(bench: Bench) -> int:
+    """One call of the step from Python, as a user writes it; it starts without the rollout's extrapolation."""
+    n, calls = bench.size, 50
+    for k in range(100, 100 + calls):
+        x = bench.swept.state[k]
+        bench.step(x[:n], x[n : 2 * n], bench.swept.torque[k], bench.theta)
+    return calls
+
+
+def jacobians_called_from_python(bench: Bench) -> int:
+    """One call of `jacobians` from Python: A, B_u and B_theta of the six stiffnesses."""
+    n, calls = bench.size, 20
+    for k in range(100, 100 + calls):
+        x = bench.swept.state[k]
+        bench.step.jacobians(x[:n], x[n : 2 * n], bench.swept.torque[k], bench.theta, names=STIFFNESSES)
+    return calls
+
+
+def rollout_500(bench: Bench) -> int:
+    """A rollout of 500 steps that tracks a recording."""
+    bench.sweep(500)
+    return 1
+
+
+def sensitivities_500(bench: Bench) -> int:
+    """The same with forward sensitivities by six stiffnesses: what a Gauss-Newton iteration costs in the main."""
+    bench.sweep(500, bench.directions("six", STIFFNESSES, everything=False))
+    return 1
+
+
+def adjoint_500(bench: Bench) -> int:
+    """The gradient by six stiffnesses from the adjoint sweep back over 500 steps (the rollout not included)."""
+    bench.step.kernel.adjoint(bench.theta, bench.swept, bench.feedback, STIFFNESSES, bench.swept.state, None, None)
+    return 1
+
+
+def rnea_derivatives(bench: Bench) -> int:
+    """Pinocchio's derivatives of inverse dynamics on the same tree: the yardstick."""
+    model, data, derivatives = bench.model, bench.data, pin.computeRNEADerivatives
+    for q, v, a in bench.points:
+        derivatives(model, data, q, v, a)
+    return len(bench.points)
+
+
+def rnea(bench: Bench) -> int:
+    """Pinocchio's inverse dynamics on the same tree."""
+    model, data, inverse = bench.model, bench.data, pin.rnea
+    for q, v, a in bench.points:
+        inverse(model, data, q, v, a)
+    return len(bench.points)
+
+
+def trivial_call(bench: Bench) -> int:
+    """A call into Pinocchio that computes next to nothing: Python's share of the two above."""
+    model, neutral = bench.model, pin.neutral
+    for _ in bench.points:
+        neutral(model)
+    return len(bench.points)
+
+
+@dataclass(frozen=True)
+class Workload:
+    """A function to time and the unit that it counts."""
+
+    function: Callable[[Bench], int]
+    unit: str
+
+    @property
+    def name(self) -> str:
+        """Name in tables and keys."""
+        return self.function.__name__
+
+
+WORKLOADS: tuple[Workload, ...] = (
+    Workload(rnea_derivatives, "call"),
+    Workload(rnea, "call"),
+    Workload(trivial_call, "call"),
+    Workload(step, "step"),
+    Workload(step_with_a_and_b, "step"),
+    Workload(step_called_from_python, "call"),
+    Workload(jacobians_called_from_python, "call"),
+    Workload(rollout_500, "run"),
+    Workload(sensitivities_500, "run"),
+    Workload(adjoint_500, "run"),
+    # one iteration of a solver over 500 steps belongs here
+)
+
+# key in the results: (workload, what it is divided by), for every size
+RATIOS: dict[str, tuple[str, str]] = {
+    "step_{n}_over_rnea_derivatives": ("step", "rnea_derivatives"),
+    "step_ab_{n}_over_step": ("step_with_a_and_b", "step"),
+    "step_called_from_python_{n}_over_step": ("step_called_from_python", "step"),
+    "jacobians_called_from_python_{n}_over_step": ("jacobians_called_from_python", "step"),
+    "rollout_500_{n}_over_step": ("rollout_500", "step"),
+    "sensitivities_500_{n}_over_step": ("sensitivities_500", "step"),
+    "adjoint_{n}_over_step": ("adjoint_500", "step"),
+}
+
+
+def first_compile(bench: Bench) -> float:
+    """Seconds from a system to a step and its derivatives by six stiffnesses, with an empty cache."""
+    before = os.environ.get("YID_OCP_CACHE")
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["YID_OCP_CACHE"] = folder
+        try:
+            start = time.perf_counter()
+            made = compile_step(bench.system, TIME_STEP, FORCE_SPLIT)
+            x, n = bench.start, bench.size
+            made.jacobians(x[:n], x[n : 2 * n], bench.torque[0], bench.theta, names=STIFFNESSES)
+            return time.perf_counter() - start
+        finally:
+            if before is None:
+                del os.environ["YID_OCP_CACHE"]
+            else:
+                os.environ["YID_OCP_CACHE"] = before

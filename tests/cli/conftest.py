@@ -1,0 +1,104 @@
+"""A run small enough for seconds: a double pendulum moved as measured, its springs and dampers estimated from effort."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from yid_ocp.cli import main
+from yid_ocp.data import JointGroup, Recording, write_recording
+
+TRUTH = {"shoulder.stiffness": 4.0, "shoulder.damping": 0.3, "elbow.damping": 0.2}
+EFFORT_STD = 0.01
+
+CONFIG = """\
+description: A double pendulum, moved as measured.
+model:
+  robot: {urdf}
+  arms: {{mode: prescribed}}
+  springs:
+    shoulder: {{stiffness: 1.0, rest: 0.2}}
+recordings:
+  estimate: [{estimate}]
+  held_out: [{held_out}]
+parameters:
+  shoulder.stiffness: {{free: true, bounds: [0.0, 100.0]}}
+  shoulder.damping: {{free: true}}
+  elbow.damping: {{free: true}}
+solver:
+  path_cutoff: .inf
+  compiler: false
+"""
+
+
+def motion(seed: int, steps: int = 120) -> Recording:
+    """Two joints on smooth paths at 100 Hz, efforts still zero."""
+    rng = np.random.default_rng(seed)
+    t = 0.01 * np.arange(steps + 1)
+    waves = [
+        sum(rng.normal() * np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) / f for f in (0.4, 0.9, 1.7)) for _ in range(2)
+    ]
+    position = 0.5 * np.stack(waves, axis=1)
+    joints = JointGroup(
+        ("shoulder", "elbow"), t, position, effort=np.zeros_like(position), effort_std=EFFORT_STD, position_std=0.0
+    )
+    return Recording(joints, source="test", name=f"motion_{seed}")
+
+
+@pytest.fixture
+def cli(capsys):
+    """Run a command; returns exit code, standard output and standard error."""
+
+    def run(*arguments: object) -> SimpleNamespace:
+        capsys.readouterr()
+        code = main([str(argument) for argument in arguments])
+        captured = capsys.readouterr()
+        return SimpleNamespace(code=code, out=captured.out, err=captured.err)
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def pendulum_data(tmp_path_factory, urdf_folder):
+    """Folder with `estimate.h5` and `held_out.h5`, simulated with TRUTH, and the text of a configuration."""
+    folder = tmp_path_factory.mktemp("pendulum")
+    for seed, name in ((1, "estimate"), (2, "held_out")):
+        write_recording(motion(seed), folder / "motion.h5")
+        text = CONFIG.format(urdf=urdf_folder / "double_pendulum.urdf", estimate="motion.h5", held_out="motion.h5")
+        (folder / "simulate.yaml").write_text(text)
+        settings = ["--set", "recordings.held_out=[]"]
+        for parameter, value in TRUTH.items():
+            settings += ["--set", f"parameters.{parameter}.initial={value}"]
+        out = folder / f"simulate_{name}"
+        arguments = ["--out", str(out), "--noise", "--seed", str(seed), "--quiet"]
+        assert main(["simulate", str(folder / "simulate.yaml"), *arguments, *settings]) == 0
+        (out / "recording.h5").rename(folder / f"{name}.h5")
+    text = CONFIG.format(
+        urdf=urdf_folder / "double_pendulum.urdf", estimate=folder / "estimate.h5", held_out=folder / "held_out.h5"
+    )
+    return SimpleNamespace(folder=folder, text=text, truth=TRUTH)
+
+
+@pytest.fixture
+def pendulum(pendulum_data, tmp_path, monkeypatch) -> Path:
+    """A fresh working folder with the configuration `pendulum.yaml` in it."""
+    monkeypatch.chdir(tmp_path)
+    file = tmp_path / "pendulum.yaml"
+    file.write_text(pendulum_data.text)
+    return file
+
+
+@pytest.fixture
+def left_nothing(tmp_path):
+    """Check that a command left no run folder, not even an unfinished one."""
+    before = {path for path in tmp_path.rglob("*")}
+
+    def check(*also: Path) -> None:
+        found = {path for path in tmp_path.rglob("*")} - before - set(also)
+        left = [path for path in found if path.suffix not in (".yaml", ".h5")]
+        assert left == []
+
+    return check

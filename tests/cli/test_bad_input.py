@@ -1,0 +1,231 @@
+"""What a user gets wrong: exit code 2, a message that says what, where, what is allowed and what to do, nothing left."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+
+from yid_ocp.data import read_recording
+
+
+def assert_refused(done, *words):
+    assert done.code == 2, done.err
+    assert "Traceback" not in done.err
+    assert "error: " in done.err
+    assert "where: " in done.err
+    assert "allowed: " in done.err or "try: " in done.err
+    for word in words:
+        assert word in done.err, done.err
+
+
+def edited(file, old, new):
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new))
+    return next(i for i, line in enumerate(file.read_text().splitlines(), 1) if new.splitlines()[0].strip() in line)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("held_out:", "heldout:", ("there is no key 'heldout'", "recordings.heldout", "did you mean 'held_out'?")),
+        ("solver:", "sovler:", ("there is no key 'sovler'", "did you mean 'solver'?")),
+        ("path_cutoff: .inf", "path_cutof: 5", ("did you mean 'path_cutoff'?", "solver")),
+        ("{free: true}", "{fre: true}", ("did you mean 'free'?", "parameters.shoulder.damping.fre")),
+        ("path_cutoff: .inf", "path_cutoff: 5 Hz", ("path_cutoff", "[Hz]", "write the number alone, in Hz")),
+        ("path_cutoff: .inf", "time_step: 10 ms", ("time_step", "[s]", "convert it from ms")),
+        ("path_cutoff: .inf", "time_step: 10", ("time_step = 10", "up to 0.1 [s]")),
+        ("path_cutoff: .inf", "time_step: -0.01", ("above 0",)),
+        ("path_cutoff: .inf", "time_step: .nan", ("time_step",)),
+        ("path_cutoff: .inf", "iterations: many", ("solver.iterations", "a whole number")),
+        ("path_cutoff: .inf", "name: gaus_newton", ("there is no solver", "gauss_newton")),
+        ("path_cutoff: .inf", "feedback: lqg", ("none, proportional, lqr",)),
+        ("mode: prescribed", "mode: perscribed", ("driven, prescribed, free",)),
+        ("compiler: false", "compiler: no", ("true or false",)),
+        ("stiffness: 1.0", "stiffness: -1.0", ("from 0", "N m/rad")),
+        ("bounds: [0.0, 100.0]", "bounds: [0.0]", ("a list of 2",)),
+        ("bounds: [0.0, 100.0]", "bounds: [-5.0, 100.0]", ("bounds", "within 0 to inf N m/rad")),
+        ("bounds: [0.0, 100.0]", "bounds: [0.0, 0.5]", ("outside its bounds", "0 to 0.5 N m/rad")),
+        ("bounds: [0.0, 100.0]", "initial: 200, bounds: [0.0, 100.0]", ("outside its bounds", "0 to 100 N m/rad")),
+        ("shoulder.stiffness:", "sholder.stiffness:", ("no parameter", "did you mean 'shoulder.stiffness'?")),
+        ("    shoulder: {stiff", "    sholder: {stiff", ("there is no joint 'sholder'", "did you mean 'shoulder'?")),
+        ("mode: prescribed", "mode: prescribed, joints: [sholder]", ("sholder", "did you mean 'shoulder'?")),
+        ("mode: prescribed", "mode: prescribed, locked: {albow: 1}", ("albow", "did you mean 'elbow'?")),
+        ("double_pendulum.urdf", "doubel_pendulum.urdf", ("no such URDF file", "double_pendulum.urdf")),
+        ("estimate.h5", "estimat.h5", ("no such recording", "recordings.estimate", "did you mean 'estimate.h5'?")),
+        ("recordings:", "sensors: {points: {std: 1}}\nrecordings:", ("no recording has a group 'points'",)),
+        ("  held_out:", "  held_out: [nothing.h5]\n  held_out:", ("stands twice", "held_out")),
+        ("recordings:", "recordings: [", ("not valid YAML",)),
+        ("description: A", "description: [A", ("not valid YAML",)),
+    ],
+)  # fmt: skip
+def test_configuration(cli, pendulum, left_nothing, old, new, words):
+    line = edited(pendulum, old, new)
+    done = cli("solve", pendulum)
+    assert_refused(done, *words)
+    if "YAML" not in words[0] and "twice" not in words[0]:
+        assert f"pendulum.yaml, line {line}" in done.err
+    left_nothing()
+
+
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ("solver.time_stp=0.01", ("--set solver.time_stp", "did you mean 'time_step'?")),
+        ("solver.time_step=fast", ("--set solver.time_step", "a number")),
+        ("parameters.shoulder.stiffness.initail=3", ("did you mean 'initial'?",)),
+        ("solver.time_step", ("KEY=VALUE",)),
+        ("solver.time_step.deeper=1", ("no keys below 'deeper'",)),
+        ("solver.time_step=[1", ("not valid YAML",)),
+    ],
+)
+def test_settings_over_the_file(cli, pendulum, left_nothing, setting, words):
+    assert_refused(cli("solve", pendulum, "--set", setting), *words)
+    left_nothing()
+
+
+def test_no_such_configuration(cli, pendulum):
+    assert_refused(cli("solve", pendulum.parent / "pendolum.yaml"), "no such configuration", "did you mean 'pendulum.yaml'?")
+    assert_refused(cli("check", pendulum.parent), "cannot be read")
+    (pendulum.parent / "list.yaml").write_text("- 1\n")
+    assert_refused(cli("solve", pendulum.parent / "list.yaml"), "keys and values")
+    (pendulum.parent / "latin.yaml").write_bytes(b"description: \xe9\n")
+    assert_refused(cli("solve", pendulum.parent / "latin.yaml"), "UTF-8")
+
+
+def test_nothing_to_solve(cli, pendulum, left_nothing):
+    assert_refused(cli("solve", pendulum, "--set", "parameters={}"), "no parameter is free")
+    assert_refused(cli("solve", pendulum, "--set", "recordings.estimate=[]"), "no recording to estimate on")
+    assert_refused(cli("solve", pendulum, "--set", "model={}"), "neither a robot nor an object")
+    left_nothing()
+
+
+def test_a_recording_cannot_be_held_out_and_used(cli, pendulum, pendulum_data):
+    same = pendulum_data.folder / "estimate.h5"
+    assert_refused(cli("solve", pendulum, "--set", f"recordings.held_out=[{same}]"), "both estimated on and held out")
+
+
+def altered(pendulum_data, tmp_path, change):
+    """A copy of the recording, changed in the file where the package itself would refuse to write it."""
+    path = tmp_path / "changed.h5"
+    path.write_bytes((pendulum_data.folder / "estimate.h5").read_bytes())
+    with h5py.File(path, "r+") as file:
+        change(file["joints"])
+    return path
+
+
+def nan_effort(joints):
+    joints["effort"][5, 1] = np.nan
+
+
+def backwards(joints):
+    joints["t"][7] = joints["t"][5]
+
+
+def degrees(joints):
+    joints["position"].attrs["unit"] = "deg"
+
+
+def silent_degrees(joints):
+    joints["position"][...] = np.rad2deg(joints["position"][...]) + 90
+
+
+def other_joint(joints):
+    joints.attrs["names"] = np.array(["shoulder", "elbo"], dtype=h5py.string_dtype())
+
+
+def no_effort(joints):
+    del joints["effort"]
+
+
+def no_noise(joints):
+    del joints.attrs["effort_std"]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (nan_effort, ("'effort' of joint 'elbow' is not finite", "t = 0.05 s")),
+        (backwards, ("the clock does not advance", "index 6", "strictly increasing")),
+        (degrees, ("the unit is 'deg'", "rad", "convert")),
+        (silent_degrees, ("degrees", "rad")),
+        (other_joint, ("joint 'elbow' of the model is not recorded", "did you mean 'elbo'?")),
+        (no_effort, ("no measurement",)),
+        (no_noise, ("noise level", "sensors.joints.effort.std")),
+    ],
+)
+def test_recordings(cli, pendulum, pendulum_data, tmp_path, left_nothing, change, words):
+    path = altered(pendulum_data, tmp_path, change)
+    done = cli("solve", pendulum, "--set", f"recordings.estimate=[{path}]")
+    assert_refused(done, *words)
+    left_nothing()
+
+
+def test_a_truncated_recording(cli, pendulum, pendulum_data, tmp_path, left_nothing):
+    whole = (pendulum_data.folder / "estimate.h5").read_bytes()
+    for name, content in (("half.h5", whole[: len(whole) // 2]), ("text.h5", b"time,angle\n0,0\n"), ("empty.h5", b"")):
+        (tmp_path / name).write_bytes(content)
+        done = cli("solve", pendulum, "--set", f"recordings.estimate=[{name}]")
+        assert_refused(done, name)
+    left_nothing()
+
+
+def test_a_default_recording_that_does_not_exist(cli, pendulum):
+    done = cli("solve", pendulum, "--set", "recordings.estimate=[default:dual_arm_vison_estimate.h5]")
+    assert_refused(done, "no such recording", "did you mean 'dual_arm_vision_estimate.h5'?")
+
+
+def test_a_grasp_out_of_reach(cli, tmp_path, monkeypatch, repository, left_nothing):
+    monkeypatch.chdir(tmp_path)
+    done = cli(
+        "solve", repository / "configs" / "single_arm_no_vision.yaml",
+        "--set", "model.object={kind: y, links: 1, mount: {xyz: [2.5, 0, -0.93]}}",
+        "--set", "solver.compiler=false",
+    )  # fmt: skip
+    assert_refused(done, "grasp 'left' cannot be closed", "mm are missing", "model.grasp.left")
+    left_nothing()
+
+
+def test_a_grasp_of_an_unknown_frame(cli, tmp_path, monkeypatch, repository):
+    monkeypatch.chdir(tmp_path)
+    config = repository / "configs" / "single_arm_no_vision.yaml"
+    done = cli("solve", config, "--set", "model.grasp.left.holder=left_griper")
+    assert_refused(done, "there is no frame 'left_griper'", "did you mean 'left_gripper'?")
+    done = cli("solve", config, "--set", "model.object={kind: z}")
+    assert_refused(done, "there is no kind 'z'", "y, segments")
+
+
+@pytest.mark.parametrize("command", ["solve", "check", "inspect", "simulate"])
+def test_an_output_folder_that_cannot_be(cli, pendulum, tmp_path, monkeypatch, left_nothing, command):
+    # nothing may be built before the folder is known to be writable
+    monkeypatch.setattr(f"yid_ocp.workflow.{command}.build_step", lambda *a: pytest.fail("too late"), raising=False)
+    monkeypatch.setattr(f"yid_ocp.workflow.{command}.build_problem", lambda *a: pytest.fail("too late"), raising=False)
+    (tmp_path / "file.h5").write_text("not a folder")
+    assert_refused(cli(command, pendulum, "--out", tmp_path / "file.h5" / "run"), "cannot be made", "--out")
+    assert_refused(cli(command, pendulum, "--out", tmp_path / "file.h5"), "that of a file")
+    assert_refused(cli(command, pendulum, "--out", tmp_path), "exists and is not empty", "--out")
+    left_nothing()
+
+
+def test_output_of_import_and_export(cli, pendulum_data, tmp_path):
+    source = pendulum_data.folder / "estimate.h5"
+    assert_refused(cli("import", source, "--out", tmp_path / "no" / "x.h5"), "folder to write to does not exist")
+    (tmp_path / "file").write_text("")
+    done = cli("export", source, "--out", tmp_path / "file")
+    assert done.code == 2, done.err
+    done = cli("import", tmp_path / "nothing.csv", "--out", tmp_path / "x.h5")
+    assert done.code == 2, done.err
+    assert not (tmp_path / "x.h5").exists()
+
+
+def test_two_recordings_of_one_name_are_told_apart(cli, pendulum, pendulum_data, tmp_path):
+    other = tmp_path / "other"
+    other.mkdir()
+    copy = other / "estimate.h5"
+    copy.write_bytes((pendulum_data.folder / "estimate.h5").read_bytes())
+    both = f"recordings.estimate=[{pendulum_data.folder / 'estimate.h5'}, {copy}]"
+    assert cli("solve", pendulum, "--set", both, "--out", "two").code == 0
+    assert replace(read_recording(copy), name="x").name == "x"

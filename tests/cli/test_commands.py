@@ -1,0 +1,215 @@
+"""Every command on a small run: exit code, table for people, what stands in the run folder."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+
+import h5py
+import pytest
+
+from yid_ocp.config import load_config, schema
+from yid_ocp.data import read_recording
+
+SOLVE_KEYS = {
+    "format", "status", "message", "parameters", "cost", "iterations", "evaluations", "seconds", "residuals",
+    "held_out", "inputs", "versions", "notes",
+}  # fmt: skip
+PARAMETER_KEYS = {"value", "std", "unit", "initial", "lower", "upper", "free", "verdict"}
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["solve", "--help"], ["--version"]])
+def test_help_is_quick_and_imports_nothing_heavy(arguments):
+    code = (
+        "import sys, time; begun = time.perf_counter(); from yid_ocp.cli import main; code = main(sys.argv[1:]);"
+        "heavy = {'casadi', 'numpy', 'scipy', 'pydantic', 'rich'} & set(sys.modules);"
+        "print('HEAVY', sorted(heavy), 'SECONDS', time.perf_counter() - begun); sys.exit(code)"
+    )
+    begun = time.perf_counter()
+    done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "HEAVY []" in done.stdout
+    assert float(done.stdout.rsplit("SECONDS", 1)[1]) < 0.5
+    assert time.perf_counter() - begun < 1.5
+
+
+def test_as_a_module():
+    done = subprocess.run([sys.executable, "-m", "yid_ocp", "--version"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0
+    assert done.stdout.startswith("yid-ocp ")
+
+
+def test_no_command_and_unknown_command(cli):
+    assert cli().code == 2
+    assert cli("slove").code == 2
+
+
+def test_solve_finds_what_the_efforts_say(cli, pendulum, pendulum_data, tmp_path):
+    done = cli("solve", pendulum)
+    assert done.code == 0, done.err
+    folders = list((tmp_path / "runs").iterdir())
+    assert len(folders) == 1
+    folder = folders[0]
+    assert folder.name.startswith("pendulum-20")
+    assert {entry.name for entry in folder.iterdir()} >= {
+        "config.yaml", "result.json", "trajectories.h5", "report.html", "log.jsonl"
+    }  # fmt: skip
+
+    result = json.loads((folder / "result.json").read_text(), parse_constant=pytest.fail)
+    assert set(result) == SOLVE_KEYS
+    assert result["format"] == "yid-solve/1"
+    assert result["status"] == "converged"
+    assert all(set(entry) == PARAMETER_KEYS for entry in result["parameters"].values())
+    for name, value in pendulum_data.truth.items():
+        entry = result["parameters"][name]
+        assert entry["free"]
+        assert abs(entry["value"] - value) < 4 * entry["std"] < 0.2 * value
+        assert entry["verdict"] == "identifiable"
+    assert result["parameters"]["shoulder.rest"]["verdict"] == "fixed"
+    channel = result["residuals"]["joints.effort.shoulder"]
+    assert set(channel) == {"rmse", "unit", "n"}
+    assert channel["unit"] == "N m"
+    assert 0.005 < channel["rmse"] < 0.02
+    held_out = result["held_out"][0]
+    assert set(held_out) == {"recording", "rmse", "baselines"}
+    assert held_out["rmse"]["joints.effort.shoulder"] < 0.1 * held_out["baselines"]["zero"]["joints.effort.shoulder"]
+    assert len(result["inputs"]) == 4
+    assert all(len(digest) == 64 for digest in result["inputs"].values())
+    assert {"python", "yid-ocp", "casadi", "numpy"} <= set(result["versions"])
+
+    lines = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+    events = [line["event"] for line in lines]
+    assert events[0] == "start"
+    assert events[-1] == "end"
+    assert events.count("iterate") >= 2
+
+    assert load_config(folder / "config.yaml").solver == load_config(pendulum).solver
+    with h5py.File(folder / "trajectories.h5") as file:
+        assert file.attrs["format"] == "yid-trajectories/1"
+        group = file["recordings/estimate"]
+        assert group["q"].shape == (121, 2)
+        assert group["joints.effort/predicted"].shape == group["joints.effort/measured"].shape
+        assert list(file["unknowns"].attrs["names"]) == list(pendulum_data.truth)
+    for words in ("shoulder.stiffness", "N m/rad", "held-out recording", "run folder: runs", "converged"):
+        assert words in done.out
+    assert "iteration 1" in done.err
+
+
+def test_a_resolved_configuration_runs_again(cli, pendulum, tmp_path):
+    assert cli("solve", pendulum, "--out", "first", "--set", "output.report=false").code == 0
+    assert not (tmp_path / "first" / "report.html").exists()
+    assert cli("solve", "first/config.yaml", "--out", "second").code == 0
+    first, second = (json.loads((tmp_path / name / "result.json").read_text()) for name in ("first", "second"))
+    assert first["parameters"] == second["parameters"]
+
+
+def test_quiet_prints_the_folder_alone(cli, pendulum, tmp_path):
+    done = cli("solve", pendulum, "--quiet", "--out", tmp_path / "here")
+    assert done.code == 0
+    assert done.out.strip() == str(tmp_path / "here")
+    assert done.err == ""
+
+
+def test_set_changes_the_run(cli, pendulum, tmp_path):
+    done = cli("solve", pendulum, "--out", "a", "--set", "parameters.elbow.damping.free=false", "--set", "solver.duration=0.5")
+    assert done.code == 0
+    result = json.loads((tmp_path / "a" / "result.json").read_text())
+    assert not result["parameters"]["elbow.damping"]["free"]
+    assert result["residuals"]["joints.effort.shoulder"]["n"] < 60
+
+
+def test_a_named_empty_folder_may_be_used(cli, pendulum, tmp_path):
+    (tmp_path / "empty").mkdir()
+    assert cli("solve", pendulum, "--out", "empty").code == 0
+    assert (tmp_path / "empty" / "result.json").is_file()
+
+
+def test_check(cli, pendulum, tmp_path):
+    done = cli("check", pendulum, "--out", "c")
+    assert done.code == 0, done.err
+    result = json.loads((tmp_path / "c" / "result.json").read_text())
+    assert result["format"] == "yid-check/1"
+    assert result["model"]["n"] == 2
+    assert [entry["role"] for entry in result["recordings"]] == ["estimate", "held_out"]
+    assert "100 Hz" in done.out
+    assert "run folder: c" in done.out
+
+
+def test_check_refines_links_and_time_step(cli, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "beam.yaml").write_text(
+        "model:\n"
+        "  object:\n"
+        "    kind: segments\n"
+        "    segments:\n"
+        "      beam: {length: 0.5, mass: 0.3, radius: 0.01, links: 4, bend: 0.5, twist: 0.5, rigidity: true, clamped: true}\n"
+        "  damping: 0.001\n"
+        "  gravity: [0, 0, 0]\n"
+    )
+    done = cli("check", "beam.yaml", "--out", "c")
+    assert done.code == 0, done.err
+    convergence = json.loads((tmp_path / "c" / "result.json").read_text())["convergence"]
+    assert [row["value"] for row in convergence["links"]] == [2, 4, 8]
+    assert [row["value"] for row in convergence["time_step"]] == [0.01, 0.005, 0.0025]
+    # a clamped uniform beam: f1 = 1.8751^2/(2 pi) sqrt(EI/(rho A L^4))
+    exact = 1.8751**2 / 6.2832 * (0.5 / (0.3 / 0.5 * 0.5**4)) ** 0.5
+    finest = convergence["links"][-1]["hertz"][0]
+    coarsest = convergence["links"][0]["hertz"][0]
+    assert abs(finest - exact) < 0.05 * exact
+    assert abs(finest - exact) < abs(coarsest - exact)
+    assert "warning: frequency" in done.out
+
+
+def test_inspect(cli, pendulum, tmp_path):
+    done = cli("inspect", pendulum, "--out", "i")
+    assert done.code == 0, done.err
+    folder = tmp_path / "i"
+    result = json.loads((folder / "result.json").read_text())
+    assert result["format"] == "yid-inspect/1"
+    assert [entry["role"] for entry in result["variables"]] == ["prescribed", "prescribed"]
+    assert result["parameters"]["shoulder.stiffness"]["free"]
+    assert (folder / "sparsity.png").read_bytes().startswith(b"\x89PNG")
+    with h5py.File(folder / "linearisation.h5") as file:
+        assert file["A"].shape == (4, 4)
+        assert file["B_theta"].shape == (4, len(result["parameters"]))
+
+
+def test_inspect_agrees_with_finite_differences(cli, tmp_path, monkeypatch, urdf_folder):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "free.yaml").write_text(
+        f"model:\n  robot: {urdf_folder / 'double_pendulum.urdf'}\n  arms: {{mode: driven}}\nsolver: {{compiler: false}}\n"
+    )
+    done = cli("inspect", "free.yaml", "--out", "i")
+    assert done.code == 0, done.err
+    result = json.loads((tmp_path / "i" / "result.json").read_text())
+    assert all(error < 1e-6 for error in result["linearisation"]["finite_difference_errors"].values())
+    assert result["equations"]["unknowns"] == 2
+    assert result["equations"]["jacobian_nonzeros"] == 4
+
+
+def test_simulate_is_a_recording_that_solve_reads(pendulum_data):
+    recording = read_recording(pendulum_data.folder / "estimate.h5")
+    assert recording.joint_names == ("shoulder", "elbow")
+    assert abs(recording.joints.effort).max() > 0.5
+    assert recording.truth["shoulder.stiffness"] == pendulum_data.truth["shoulder.stiffness"]
+
+
+def test_import_and_export(cli, pendulum_data, tmp_path):
+    exported = cli("export", pendulum_data.folder / "estimate.h5", "--out", tmp_path / "csv")
+    assert exported.code == 0, exported.err
+    files = list((tmp_path / "csv").glob("*.csv"))
+    assert files
+    done = cli("import", files[0], "--out", tmp_path / "back.h5")
+    assert done.code == 0, done.err
+    back = read_recording(tmp_path / "back.h5", allow_nan_effort=True)
+    assert back.joint_names == ("shoulder", "elbow")
+    assert "back.h5" in done.out
+
+
+def test_schema_is_the_one_beside_the_configurations(cli, repository, tmp_path):
+    assert cli("schema", "--out", tmp_path / "schema.json").code == 0
+    made, kept = (path.read_text() for path in (tmp_path / "schema.json", repository / "configs" / "schema.json"))
+    assert made == kept, "regenerate it with  yid-ocp schema --out configs/schema.json"
+    assert json.loads(kept) == schema()

@@ -1,0 +1,67 @@
+"""Every file in configs/ runs, on a shortened horizon and with coarse objects so that this stays quick."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from yid_ocp.config import load_config
+from yid_ocp.workflow.build import recording_file
+
+PAPER = ("single_arm_no_vision", "single_arm_vision", "dual_arm_no_vision", "dual_arm_vision")
+# settings that make each run quick: fewer links, a short horizon, interpreted where that is faster than compiling
+QUICK = {
+    **{
+        name: (
+            "model.object.links=2", "solver.duration=0.3", "solver.iterations=3", "solver.compiler=false",
+            "parameters={T*.bend: {free: true, initial: 15}, T*.twist: {initial: 10}}",
+        )
+        for name in PAPER
+    },
+    "baxter_arm": ("solver.duration=1.0",),
+}  # fmt: skip
+
+
+def configurations(repository):
+    return {path.stem: path for path in (repository / "configs").glob("*.yaml")}
+
+
+def test_every_configuration_has_its_row(repository):
+    assert set(configurations(repository)) == set(QUICK), "a new configuration needs a row in QUICK"
+
+
+@pytest.mark.parametrize("name", sorted(QUICK))
+def test_configuration_runs(cli, repository, tmp_path, name):
+    file = configurations(repository)[name]
+    run = load_config(file)
+    missing = [
+        path for path in (*run.recordings.estimate, *run.recordings.held_out) if not recording_file(path).is_file()
+    ]
+    if missing:
+        pytest.skip(f"its recordings are not here: {missing[0]}")
+    settings = [part for setting in QUICK[name] for part in ("--set", setting)]
+    done = cli("solve", file, "--out", tmp_path / "run", *settings, "--set", "output.report=false")
+    assert done.code in (0, 1), done.err
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert result["status"] in ("converged", "iteration_limit"), result["message"]
+    assert result["residuals"]
+    assert all(entry["rmse"] for entry in result["held_out"])
+    if name == "baxter_arm":
+        assert [channel for channel in result["residuals"] if channel.startswith("joints.effort.left_")]
+        assert len(result["residuals"]) == 7
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PAPER)
+def test_the_papers_experiments_in_full(cli, repository, tmp_path, name):
+    done = cli("solve", configurations(repository)[name], "--out", tmp_path / "run")
+    assert done.code == 0, done.err
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    truth = {"T1.bend": 22.0, "T1.twist": 13.6, "T2.bend": 10.7, "T2.twist": 8.2, "T3.bend": 11.5, "T3.twist": 9.7}
+    found = {n: e for n, e in result["parameters"].items() if e["verdict"] == "identifiable"}
+    assert {"T1.bend", "T2.bend"} <= set(found)
+    for parameter, entry in found.items():
+        assert abs(entry["value"] - truth[parameter]) < max(0.05 * truth[parameter], 2 * entry["std"])
+    assert "T2.twist" not in found
+    assert "T3.twist" not in found

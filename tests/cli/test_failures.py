@@ -1,0 +1,131 @@
+"""Solves that fail, interruptions and bugs: exit codes 1, 130 and 3, and what they leave behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from yid_ocp.workflow import solve as solve_module
+
+
+def test_a_solve_that_does_not_converge(cli, pendulum, tmp_path):
+    done = cli("solve", pendulum, "--out", "limit", "--set", "solver.iterations=1", "--set", "solver.name=steepest_descent")
+    assert done.code == 1
+    result = json.loads((tmp_path / "limit" / "result.json").read_text())
+    assert result["status"] == "iteration_limit"
+    assert "iterations" in result["message"]
+    assert result["parameters"]["shoulder.stiffness"]["value"] > 0
+    assert (tmp_path / "limit" / "report.html").is_file()
+    assert "run folder: limit" in done.out
+
+
+def test_a_rollout_that_fails_leaves_reason_and_best_point(cli, pendulum, tmp_path, monkeypatch):
+    original = solve_module.build_problem
+
+    def broken(run):
+        problem = original(run)
+        monkeypatch.setattr(type(problem), "run", lambda self, *a, **k: "estimate: step 3: Newton did not converge")
+        return problem
+
+    monkeypatch.setattr(solve_module, "build_problem", broken)
+    done = cli("solve", pendulum, "--out", "failed")
+    assert done.code == 1
+    result = json.loads((tmp_path / "failed" / "result.json").read_text(), parse_constant=pytest.fail)
+    assert result["status"] == "failed"
+    assert "step 3" in result["message"]
+    assert result["parameters"]["shoulder.stiffness"]["std"] is None
+    assert any("std" in note for note in result["notes"])
+    assert "could not be predicted" in done.out
+    assert "found" not in done.out.split("held-out")[0]
+    assert (tmp_path / "failed" / "report.html").is_file()
+
+
+def test_a_bug_is_told_from_wrong_input(cli, pendulum, left_nothing, monkeypatch):
+    def broken(*arguments, **named):
+        raise ZeroDivisionError("a mistake of ours")
+
+    monkeypatch.setattr(solve_module, "solve", broken)
+    done = cli("solve", pendulum)
+    assert done.code == 3
+    assert "Traceback" not in done.err
+    assert "a mistake of ours" in done.err
+    log = Path(done.err.rsplit(maxsplit=1)[1])
+    assert "ZeroDivisionError" in log.read_text()
+    log.unlink()
+    left_nothing()
+
+
+def test_an_interruption_leaves_nothing(cli, pendulum, left_nothing, monkeypatch):
+    def interrupted(*arguments, **named):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(solve_module, "solve", interrupted)
+    done = cli("solve", pendulum)
+    assert done.code == 130
+    assert "interrupted" in done.err
+    left_nothing()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals as on POSIX")
+def test_a_real_interruption(pendulum, tmp_path):
+    code = (
+        "import sys, time, yid_ocp.workflow.solve as s\n"
+        "def wait(*a, **k):\n"
+        "    print('SOLVING', flush=True)\n"
+        "    time.sleep(60)\n"
+        "s.solve = wait\n"
+        "from yid_ocp.cli import main\n"
+        "sys.exit(main(sys.argv[1:]))\n"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, "solve", str(pendulum)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout.readline().strip() == "SOLVING"
+    assert list((tmp_path / "runs").glob(".*.partial"))
+    assert not list((tmp_path / "runs").glob("pendulum*"))
+    process.send_signal(signal.SIGINT)
+    _, error = process.communicate(timeout=20)
+    assert process.returncode == 130
+    assert "interrupted" in error
+    assert "Traceback" not in error
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals as on POSIX")
+def test_a_killed_run_does_not_look_finished(pendulum, tmp_path):
+    code = (
+        "import sys, time, yid_ocp.workflow.solve as s\n"
+        "def wait(*a, **k):\n"
+        "    print('SOLVING', flush=True)\n"
+        "    time.sleep(60)\n"
+        "s.solve = wait\n"
+        "from yid_ocp.cli import main\n"
+        "sys.exit(main(sys.argv[1:]))\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code, "solve", str(pendulum)], stdout=subprocess.PIPE, text=True)
+    process.stdout.readline()
+    process.kill()
+    process.wait(timeout=20)
+    process.stdout.close()
+    time.sleep(0.05)
+    names = [path.name for path in (tmp_path / "runs").iterdir()]
+    assert all(name.startswith(".") and name.endswith(".partial") for name in names)
+    assert not list((tmp_path / "runs").rglob("result.json"))
+
+
+def test_a_full_disk_is_the_users_business(cli, pendulum, left_nothing, monkeypatch):
+    def full(*arguments):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("yid_ocp.workflow.folder.os.replace", full)
+    done = cli("solve", pendulum)
+    assert done.code == 2
+    assert "No space left on device" in done.err
+    left_nothing()

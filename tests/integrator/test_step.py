@@ -1,0 +1,382 @@
+"""What a step does: prescribed coordinates and their effort, internal and compliant coordinates, grasps, failures."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from yid_ocp.errors import ConfigError, ModelError
+from yid_ocp.integrator.step import StepCode, compile_step
+from yid_ocp.model import Grasp, Mechanism, Parameters, Segment, System, Terms, flexible_object, forward_kinematics
+from yid_ocp.model.mechanism import robot_description_file
+
+ARM = [f"left_{joint}" for joint in ("s0", "s1", "e0", "e1", "w0", "w1", "w2")]
+BENT = np.array([0.3, -0.2, 0.1, 0.4, 0.2, -0.1, 0.2, 0.3, 0.15])
+
+
+def numbers(expression) -> np.ndarray:
+    return np.array(ca.DM(ca.densify(expression)))
+
+
+def pose(system, frame, q) -> np.ndarray:
+    mechanism = system.mechanism.numeric()
+    return numbers(forward_kinematics(mechanism, ca.SX(ca.DM(q))).pose(frame).matrix())
+
+
+# ---------------------------------------------------------------------------------------------- prescribed coordinates
+
+
+def smooth(time):
+    """Angles, rates and accelerations of seven joints."""
+    amplitude, rate = np.linspace(0.2, 0.6, 7), np.linspace(1.0, 4.0, 7)
+    phase = np.outer(np.atleast_1d(time), rate) + np.arange(7)
+    return amplitude * np.sin(phase), amplitude * rate * np.cos(phase), -amplitude * rate**2 * np.sin(phase)
+
+
+def test_effort_of_prescribed_joints_is_inverse_dynamics_to_second_order(roll, momentum):
+    pin = pytest.importorskip("pinocchio", reason="the reference needs Pinocchio: pip install pin")
+    system = System.build(Mechanism.from_urdf("package:baxter", joints=ARM), prescribed=ARM)
+    theta = system.parameters.vector()
+    full = pin.buildModelFromUrdf(str(robot_description_file("baxter")))
+    rest = [i for i in range(1, full.njoints) if full.names[i] not in ARM]
+    model = pin.buildReducedModel(full, rest, pin.neutral(full))
+    assert list(model.names[1:]) == ARM
+    data = model.createData()
+    errors, counts = [], (20, 40, 80, 160)
+    for count in counts:
+        step = compile_step(system, 0.5 / count)
+        times = np.arange(count + 1) * step.time_step
+        q, v, a = smooth(times)
+        swept = roll(step, theta, q[0], momentum(step, q[0], v[0], theta), count, path=q)
+        assert swept.status.ok, swept.status.message
+        needed = np.array([pin.rnea(model, data, *row) for row in zip(q, v, a, strict=True)])
+        errors.append(np.max(np.abs(swept.effort[1:] - needed[1:-1])))
+        # a start with its true momentum has felt only half a step of its effort
+        assert np.max(np.abs(2 * swept.effort[0] - needed[0])) < 60 * step.time_step
+    slope = np.polyfit(np.log(1 / np.array(counts)), np.log(errors), 1)[0]
+    assert slope == pytest.approx(2.0, abs=0.1)
+
+
+def test_prescribed_joints_move_what_hangs_on_them(parts, roll):
+    system, q = parts.clamped_cable("weld")
+    step = compile_step(system, 1e-3)
+    path = np.tile(q[:6], (41, 1))
+    path[:, 0] += 0.02 * (1 - np.cos(np.linspace(0, np.pi, 41)))
+    swept = roll(step, system.parameters.vector(), q, np.zeros(system.size), 40, path=path)
+    assert swept.status.ok, swept.status.message
+    np.testing.assert_array_equal(swept.state[:, :6], path)
+    end = pose(system, "w_C", swept.state[-1, : system.size])
+    np.testing.assert_allclose(end[:3, 3], path[-1, :3], atol=1e-9)
+    assert np.max(np.abs(swept.effort)) > 0.1
+
+
+def test_the_effort_of_a_clamp_is_the_pull_of_its_grasp(parts, roll):
+    """The clamp has no mass, so its translational effort is the multipliers over the time step."""
+    system, q = parts.clamped_cable("point")
+    step = compile_step(system, 1e-3)
+    swept = roll(step, system.parameters.vector(), q, np.zeros(system.size), 20)
+    assert swept.status.ok, swept.status.message
+    np.testing.assert_allclose(swept.effort[:, :3], swept.multipliers / step.time_step, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(swept.effort[:, 3:], 0.0, atol=1e-9)
+
+
+# ------------------------------------------------------------------------------------------------ internal coordinates
+
+
+@pytest.fixture(scope="module")
+def hinge():
+    """One rod on a three-axis joint at the ground."""
+
+    def build(effects=(), **options):
+        rod = flexible_object([Segment("R", 0.4, 0.2, 0.05, links=1, bend=2.0, twist=1.0, damping=0.0)])
+        return System.build(objects=[(rod, None, None)], effects=effects, **options)
+
+    return build
+
+
+def test_a_maxwell_branch_relaxes_with_its_time_constant(parts, hinge, roll):
+    tau, k1, angle = 0.05, 3.0, 0.2
+    system = hinge([parts.maxwell_branch("R_0_x", k1, tau)], prescribed=["R_0_x"], gravity=(0, 0, 0))
+    theta, q = system.parameters.vector(), np.array([angle, 0.0, 0.0])
+    errors = []
+    for count in (50, 100):
+        step = compile_step(system, 0.2 / count)
+        assert step.sizes["nz"] == 1
+        swept = roll(step, theta, q, np.zeros(3), count)
+        assert swept.status.ok, swept.status.message
+        z = swept.state[:, -1]
+        time = np.arange(count + 1) * step.time_step
+        expected = angle * (1 - np.exp(-time / tau))
+        errors.append(np.max(np.abs(z - expected)))
+        assert swept.status.internal == pytest.approx([z[-1]])
+        # torque on the held joint: the spring beside, and what is left of the branch's
+        stretch = angle - expected[1:-1]
+        np.testing.assert_allclose(swept.effort[1:, 0], 2.0 * angle + k1 * stretch, rtol=5e-3)
+    assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.05)
+
+
+def test_a_neutral_maxwell_branch_changes_nothing(parts, hinge, roll):
+    q, plain, added = np.array([0.4, -0.3, 0.2]), hinge(), hinge([parts.maxwell_branch("R_0_x", 0.0, 0.1)])
+    sweeps = [
+        roll(compile_step(system, 2e-3), system.parameters.vector(), q, np.zeros(3), 100) for system in (plain, added)
+    ]
+    np.testing.assert_allclose(sweeps[0].state, sweeps[1].state[:, :6], rtol=0, atol=1e-9)
+
+
+def test_an_internal_coordinate_needs_an_equation(parts, hinge):
+    orphan = parts.Added("orphan", "R", Parameters(), {"orphan@R.z": ca.SX.sym("z")}, add=lambda effect, state: Terms())
+    with pytest.raises(ModelError, match=r"orphan@R\.z"):
+        compile_step(hinge([orphan]), 0.01)
+
+
+# ----------------------------------------------------------------------------------------------- compliant coordinates
+
+
+def test_a_compliance_equals_a_spring(parts, roll):
+    """Spring 2 N m/rad against compliance 1/2; the momentum of a compliant coordinate carries the compliance."""
+    plain, soft = parts.cable(), parts.cable(effects=[parts.soft_joint("C_1_y", 0.5)])
+    index = plain.mechanism.joint_index("C_1_y")
+    states = []
+    for system in (plain, soft):
+        theta = system.parameters.vector({"C.damping": 0.0})
+        swept = roll(compile_step(system, 1e-3), theta, BENT, np.zeros(9), 200)
+        assert swept.status.ok, swept.status.message
+        states.append(swept.state.copy())
+    states[1][:, 9 + index] /= 0.5
+    np.testing.assert_allclose(states[1], states[0], rtol=0, atol=1e-8)
+
+
+def test_without_compliance_a_coordinate_stays_at_zero(parts, roll):
+    q = BENT.copy()
+    index = 4
+    q[index] = 0.0
+    system = parts.cable(effects=[parts.soft_joint("C_1_y", 0.0)])
+    assert system.mechanism.joint_index("C_1_y") == index
+    step = compile_step(system, 1e-3)
+    theta = system.parameters.vector()
+    swept = roll(step, theta, q, np.zeros(9), 200)
+    assert swept.status.ok, swept.status.message
+    # exactly in compiled code, whose elimination does not pivot
+    assert np.max(np.abs(swept.state[:, [index, 9 + index]])) <= (0.0 if step.compiled else 1e-18)
+    assert np.ptp(swept.state[:, 3]) > 0.01
+    # the neighbours move as if there were no joint
+    rigid = replace(parts.cable(prescribed=["C_1_y"]))
+    other = roll(compile_step(rigid, 1e-3), rigid.parameters.vector(), q, np.zeros(9), 200)
+    np.testing.assert_allclose(swept.state[:, :9], other.state[:, :9], rtol=0, atol=1e-9)
+
+
+def test_the_step_is_differentiable_where_the_compliance_is_zero(parts):
+    system = parts.cable(effects=[parts.soft_joint("C_1_y", 0.0)])
+    step = compile_step(system, 1e-3)
+    q = BENT.copy()
+    q[4] = 0.0
+    theta = system.parameters.vector()
+    _, _, B = step.jacobians(q, np.zeros(9), [], theta, names=["soft@C_1_y.compliance"])
+    small = 1e-7
+    moved = step(q, np.zeros(9), [], system.parameters.vector({"soft@C_1_y.compliance": small}))
+    still = step(q, np.zeros(9), [], theta)
+    expected = np.concatenate([(a - b) / small for a, b in zip(moved[:2], still[:2], strict=True)])
+    assert abs(B[4, 0]) > 1e-3
+    np.testing.assert_allclose(B[:, 0], expected, rtol=1e-3, atol=1e-4 * np.max(np.abs(expected)))
+
+
+def test_a_soft_grasp_gives_way_in_proportion(parts, roll, violation):
+    compliance = 2e-4
+    system, q = parts.clamped_cable("point", [parts.soft_grasp("clamp", compliance)])
+    step, theta = compile_step(system, 1e-3), system.parameters.vector()
+    swept = roll(step, theta, q, np.zeros(system.size), 30)
+    assert swept.status.ok, swept.status.message
+    for k in (0, 10, 29):
+        gap = violation(step, swept.state[k + 1, : system.size], theta)
+        np.testing.assert_allclose(gap, compliance * swept.multipliers[k] / step.time_step, rtol=1e-9, atol=1e-12)
+        assert np.linalg.norm(gap) > 1e-5
+    stiff = system.parameters.vector({"soft_grasp@clamp.compliance": 0.0})
+    rigid, _ = parts.clamped_cable("point")
+    one = roll(step, stiff, q, np.zeros(system.size), 30)
+    two = roll(compile_step(rigid, 1e-3), rigid.parameters.vector(), q, np.zeros(system.size), 30)
+    np.testing.assert_allclose(one.state, two.state, rtol=0, atol=1e-9)
+
+
+def test_a_soft_grasp_relaxes_with_its_time_constant(parts, roll, violation):
+    """phi + T dphi/dt = C lam / h, backward in time: damping beside the grasp's stiffness."""
+    compliance, relaxation = 2e-4, 5e-3
+    system, q = parts.clamped_cable("point", [parts.soft_grasp("clamp", compliance, relaxation)])
+    step, theta = compile_step(system, 1e-3), system.parameters.vector()
+    swept = roll(step, theta, q, np.zeros(system.size), 30)
+    assert swept.status.ok, swept.status.message
+    rigid, _ = parts.clamped_cable("point")
+    plain = compile_step(rigid, 1e-3)
+    nominal = rigid.parameters.vector()
+    gaps = [violation(plain, x[: system.size], nominal) for x in swept.state]
+    for k in (0, 10, 29):
+        rate = (gaps[k + 1] - gaps[k]) / step.time_step
+        load = swept.multipliers[k] / step.time_step
+        np.testing.assert_allclose(gaps[k + 1] + relaxation * rate, compliance * load, rtol=1e-8, atol=1e-12)
+
+
+# --------------------------------------------------------------------------------------------------------- grasp kinds
+
+
+@pytest.mark.parametrize("kind", ["point", "axis", "weld"])
+def test_grasps_hold_what_they_should(parts, roll, violation, kind):
+    system, q = parts.clamped_cable(kind)
+    step, theta = compile_step(system, 5e-4), system.parameters.vector()
+    path = np.tile(q[:6], (101, 1))
+    # the clamp turns about its own axes
+    path[:, 3:] += np.outer(1 - np.cos(np.linspace(0, np.pi, 101)), [0.05, -0.04, 0.08])
+    swept = roll(step, theta, q, np.zeros(system.size), 100, path=path)
+    assert swept.status.ok, swept.status.message
+    end = swept.state[-1, : system.size]
+    assert np.max(np.abs(violation(step, end, theta))) < 1e-10
+    grasp = system.grasps[0]
+    holder = pose(system, "clamp", end)
+    wanted = holder[:3, :3] @ numbers(grasp.rotation)
+    held = pose(system, "w_C", end)
+    np.testing.assert_allclose(held[:3, 3], holder[:3, 3], atol=1e-9)
+    aligned = np.allclose(held[:3, 2], wanted[:, 2], atol=1e-9)
+    same = np.allclose(held[:3, :3], wanted, atol=1e-9)
+    assert (aligned, same) == {"point": (False, False), "axis": (True, False), "weld": (True, True)}[kind]
+
+
+def test_a_creeping_grasp_slides_along_the_object(parts, roll, violation):
+    system, q = parts.clamped_cable("point", [parts.creeping_grasp("clamp", 0.05)])
+    step, theta = compile_step(system, 5e-4), system.parameters.vector()
+    swept = roll(step, theta, q, np.zeros(system.size), 100)
+    assert swept.status.ok, swept.status.message
+    slip, end = swept.state[-1, -1], swept.state[-1, : system.size]
+    held, holder = pose(system, "w_C", end), pose(system, "clamp", end)
+    assert abs(slip) > 1e-4
+    np.testing.assert_allclose(held[:3, 3] - slip * held[:3, 2], holder[:3, 3], atol=1e-9)
+    assert system.parameters.vector()[-1] == 0.05
+
+
+# ------------------------------------------------------------------------------------------------------------ failures
+
+
+@pytest.mark.parametrize("use_compiler", [True, False], ids=["compiled", "interpreted"])
+class TestFailures:
+    def test_a_torque_that_is_not_a_number(self, urdf_folder, roll, use_compiler):
+        system = System.build(Mechanism.from_urdf(urdf_folder / "double_pendulum.urdf"), driven=["elbow"])
+        step = compile_step(system, 0.01, use_compiler=use_compiler)
+        theta = system.parameters.vector()
+        _, _, _, status = step([0.1, 0.2], [0.0, 0.0], [math.nan], theta)
+        assert (status.ok, status.code, status.step) == (False, StepCode.NOT_FINITE, 0)
+        torque = np.zeros((12, 1))
+        torque[7] = math.nan
+        swept = roll(step, theta, [0.1, 0.2], [0.0, 0.0], 12, torque=torque)
+        assert (swept.status.code, swept.status.step) == (StepCode.NOT_FINITE, 7)
+        assert swept.status.message.startswith("step 7: the state is no longer finite")
+        assert np.all(np.isfinite(swept.state[:8]))
+        assert np.all(np.isnan(swept.state[9:]))
+        assert np.all(np.isnan(swept.multipliers[7:]))
+
+    def test_a_grasp_out_of_reach(self, urdf_folder, use_compiler):
+        robot = Mechanism.from_urdf(urdf_folder / "double_pendulum.urdf")
+        far = Grasp("far", "ceiling", "tip", offset=ca.SX(ca.DM([0.0, 3.0, 0.0])))
+        # the pendulum is planar: without the third joint the equations would be redundant
+        turn = Mechanism.from_urdf(urdf_folder / "turntable.urdf", joints=["turn"])
+        renamed = replace(turn, frames={"disc": turn.frames["disc"]})
+        system = System.build(renamed.joined(robot, "disc"), grasps=[far])
+        step = compile_step(system, 0.01, use_compiler=use_compiler)
+        q, _, _, status = step([0.1, 0.3, 0.4], np.zeros(3), [], system.parameters.vector())
+        assert status.code in (StepCode.NOT_CONVERGED, StepCode.SINGULAR)
+        assert status.message.startswith("step 0: ")
+        assert q.shape == (3,)
+
+    def test_redundant_grasps(self, urdf_folder, use_compiler):
+        robot = Mechanism.from_urdf(urdf_folder / "turntable.urdf")
+        system = System.build(robot, grasps=[Grasp("one", "floor", "disc"), Grasp("two", "floor", "disc")])
+        step = compile_step(system, 0.01, use_compiler=use_compiler)
+        _, _, _, status = step([0.1, 0.2, 0.3], np.zeros(3), [], system.parameters.vector())
+        assert not status.ok
+        assert status.code != StepCode.OK
+
+    def test_derivatives_of_a_step_that_failed_are_not_numbers(self, urdf_folder, use_compiler):
+        system = System.build(Mechanism.from_urdf(urdf_folder / "double_pendulum.urdf"), driven=["elbow"])
+        step = compile_step(system, 0.01, use_compiler=use_compiler)
+        for matrix in step.jacobians([0.1, 0.2], [0.0, 0.0], [math.nan], system.parameters.vector()):
+            assert np.all(np.isnan(matrix))
+
+    def test_a_system_without_unknowns(self, urdf_folder, use_compiler):
+        """Everything prescribed: a step is an evaluation."""
+        robot = Mechanism.from_urdf(urdf_folder / "double_pendulum.urdf")
+        system = System.build(robot, prescribed=["shoulder", "elbow"])
+        step = compile_step(system, 0.01, use_compiler=use_compiler)
+        pair = ([0.1, 0.2], [0.11, 0.19])
+        q1, p1, lam, status = step(pair[0], [0.0, 0.0], [], system.parameters.vector(), prescribed=pair)
+        assert status.ok
+        np.testing.assert_array_equal(q1, pair[1])
+        assert np.all(np.isfinite([*p1, *status.effort]))
+        assert lam.shape == (0,)
+
+
+def test_a_status_says_what_to_try(single_step, golden, theta_golden):
+    trep, theta = golden("single"), theta_golden("single")
+    *_, status = single_step(trep.q[0], trep.p[0], 1e6 * trep.u[0] + 1e7, theta)
+    assert not status.ok
+    assert "step 0: Newton did not converge; try a smaller time step" in status.message
+    *_, status = single_step(trep.q[0], trep.p[0], trep.u[0], theta)
+    assert (status.ok, status.message, status.step) == (True, "converged", 1)
+    assert status.iterations >= 1
+    assert status.error < single_step.tolerance
+
+
+# -------------------------------------------------------------------------------------------------------------- inputs
+
+
+@pytest.mark.parametrize("time_step", [0.0, -0.01, math.nan, math.inf])
+def test_a_time_step_is_positive(single_arm, time_step):
+    with pytest.raises(ModelError, match=f"time_step = {time_step}"):
+        compile_step(single_arm, time_step)
+
+
+def test_an_unknown_force_split(hinge):
+    with pytest.raises(ModelError) as caught:
+        compile_step(hinge(), 0.01, "right")
+    assert "force_split = 'right'" in str(caught.value)
+    assert "symmetric, left" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"q0": np.zeros(5)}, ["q0", "(5,)", "(6,)"]),
+        ({"p0": np.zeros((6, 1))}, ["p0", "(6, 1)", "(6,)"]),
+        ({"u": np.zeros(3)}, ["u has shape (3,)", "(2,)"]),
+        ({"theta": np.zeros(4)}, ["theta", "(4,)"]),
+        ({"prescribed": None}, ["1 coordinates are prescribed", "prescribed=(s0, s1)"]),
+        ({"prescribed": ([0.3],)}, ["prescribed has 1 entries"]),
+        ({"prescribed": ([0.3], [0.3, 0.1])}, ["prescribed has shape (2,)", "(1,)"]),
+        ({"internal": [1.0]}, ["internal has shape (1,)", "(0,)"]),
+    ],
+)
+def test_wrong_shapes_name_the_array(parts, urdf_folder, change, words):
+    system, q = parts.closed_loop(urdf_folder)
+    step = compile_step(system, 0.01, use_compiler=False)
+    s = system.mechanism.joint_index("swing")
+    arguments = {"q0": q, "p0": np.zeros(6), "u": np.zeros(2), "theta": system.parameters.vector()}
+    arguments |= {"prescribed": (q[[s]], q[[s]])}
+    assert step(**arguments)[3].ok
+    with pytest.raises(ModelError) as caught:
+        step(**{**arguments, **change})
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_an_unknown_parameter_to_differentiate_by(hinge):
+    step = compile_step(hinge(), 0.01)
+    with pytest.raises(ConfigError, match=r"did you mean 'R\.bend'"):
+        step.jacobians(np.zeros(3), np.zeros(3), [], step.system.parameters.vector(), names=["R.bent"])
+
+
+def test_inputs_are_left_as_they_were(single_step, golden, theta_golden):
+    trep, theta = golden("single"), theta_golden("single")
+    arguments = [trep.q[3].copy(), trep.p[3].copy(), trep.u[3].copy(), theta.copy()]
+    single_step(*arguments)
+    single_step.jacobians(*arguments, names=["T1.bend"])
+    for actual, expected in zip(arguments, (trep.q[3], trep.p[3], trep.u[3], theta), strict=True):
+        np.testing.assert_array_equal(actual, expected)

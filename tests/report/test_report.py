@@ -1,0 +1,143 @@
+"""The report: sections from results alone and from solved problems, self-contained, and its absence."""
+
+from __future__ import annotations
+
+import logging
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from yid_ocp.errors import OutputError
+from yid_ocp.report import figures
+from yid_ocp.report.html import number, write_report
+from yid_ocp.report.sections import SECTIONS, Findings
+from yid_ocp.workflow.solve import solve_result
+
+
+class Balanced(HTMLParser):
+    """Fails on tags that are not closed in order."""
+
+    VOID = ("meta", "br", "img", "link", "input", "hr")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+
+    def handle_starttag(self, tag, attrs):
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open
+        assert self.open.pop() == tag
+
+
+@pytest.fixture(scope="module")
+def solved(tmp_path_factory, urdf_folder):
+    """A pendulum's problem and solution."""
+    from yid_ocp.config import load_problem
+    from yid_ocp.data import JointGroup, Recording, write_recording
+    from yid_ocp.solvers import GaussNewton, solve
+
+    folder = tmp_path_factory.mktemp("report")
+    t = 0.01 * np.arange(101)
+    position = np.stack([np.sin(3 * t), 0.4 * np.cos(5 * t)], axis=1)
+    joints = JointGroup(("shoulder", "elbow"), t, position, effort=0.1 * position, effort_std=0.1)
+    write_recording(Recording(joints, name="a"), folder / "a.h5")
+    (folder / "p.yaml").write_text(
+        f"model: {{robot: {urdf_folder / 'double_pendulum.urdf'}, arms: {{mode: prescribed}}}}\n"
+        "recordings: {estimate: [a.h5]}\n"
+        "parameters: {elbow.damping: {free: true}}\n"
+        "solver: {path_cutoff: .inf, compiler: false}\n"
+    )
+    problem = load_problem(folder / "p.yaml")
+    return problem, solve(problem, GaussNewton())
+
+
+def findings(solved, **changes) -> Findings:
+    problem, solution = solved
+    result = solve_result(problem, solution, []) | {"inputs": {"a": "0" * 64}, "versions": {"python": "3"}}
+    return Findings("run <one>", "A & B.", result | changes, problem, solution)
+
+
+def test_a_whole_report_is_one_self_contained_page(solved, tmp_path):
+    assert write_report(tmp_path / "r.html", findings(solved))
+    page = (tmp_path / "r.html").read_text(encoding="utf-8")
+    body = page[page.index("<body>") :]
+    assert page.count("plotly.js v") == 1
+    assert not re.search(r"<(script|link|img)[^>]+(src|href)=", page[: page.index("<script>")] + body)
+    assert "<title>run &lt;one&gt;</title>" in page
+    assert "A &amp; B." in body
+    for name in ("summary", "fit", "search", "inputs"):
+        assert f'<section id="{name}">' in body
+    assert body.index('id="summary"') < body.index('id="fit"') < body.index('id="search"') < body.index('id="inputs"')
+    assert "elbow.damping" in body
+    assert "joints.effort.shoulder" in body
+    checker = Balanced()
+    checker.feed(re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL))
+    assert checker.open == []
+
+
+def test_words_follow_the_verdicts(solved, tmp_path):
+    problem, solution = solved
+    for verdict, words in (
+        ("identifiable", "1 of 1"),
+        ("weak", "Only weakly determined: elbow.damping"),
+        ("not_identifiable", "These recordings cannot tell"),
+    ):
+        entry = replace(solution.parameters["elbow.damping"], verdict=verdict)
+        other = replace(solution, parameters=solution.parameters | {"elbow.damping": entry})
+        write_report(tmp_path / "r.html", findings((problem, other)))
+        assert words in re.sub(r"</?strong>", "", (tmp_path / "r.html").read_text(encoding="utf-8"))
+
+
+def test_a_failed_solve_gets_no_verdicts(solved, tmp_path):
+    problem, solution = solved
+    failed = replace(solution, evaluation=None, cost=float("nan"))
+    write_report(tmp_path / "r.html", findings((problem, failed), status="failed", message="step 3 did not converge"))
+    body = (tmp_path / "r.html").read_text(encoding="utf-8").split("<body>")[1]
+    assert "The search failed: step 3 did not converge" in body
+    assert 'class="verdict' not in body
+    assert '<section id="fit">' not in body
+
+
+def test_sections_may_have_nothing_to_say():
+    empty = Findings("x", "", {"format": "other/1"})
+    assert all(SECTIONS[name].prepare(empty) is None for name in SECTIONS)
+
+
+def test_without_the_extra_there_is_a_notice_and_no_report(solved, tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr("yid_ocp.report.html.util.find_spec", lambda name: None)
+    with caplog.at_level(logging.WARNING):
+        assert not write_report(tmp_path / "r.html", findings(solved))
+    assert "yid-ocp[report]" in caplog.text
+    assert not (tmp_path / "r.html").exists()
+
+
+def test_a_report_that_cannot_be_written(solved, tmp_path):
+    with pytest.raises(OutputError, match="report cannot be written"):
+        write_report(tmp_path / "no" / "r.html", findings(solved))
+
+
+def test_numbers_for_people():
+    assert number(None) == "–"
+    assert number(3.14159265) == "3.142"
+    assert number(7) == "7"
+
+
+def test_long_curves_are_thinned_and_gaps_stay():
+    t = np.linspace(0.0, 10.0, 50_000)
+    measured = np.sin(t)
+    measured[:10_000] = np.nan
+    figure = figures.measured_and_predicted({"x": (t, measured, t, np.sin(t))}, "m")
+    assert max(len(trace.x) for trace in figure.data) <= figures.LONGEST
+    assert figure.data[0].y[0] is None or np.isnan(figure.data[0].y[0])
+
+
+def test_cost_history_has_a_curve_for_each_horizon():
+    figure = figures.cost_history([5.0, 3.0, 9.0, 2.0], ["first 1 s", "first 1 s", "", ""])
+    assert [trace.name for trace in figure.data] == ["first 1 s", "whole recordings"]
+    assert [list(trace.x) for trace in figure.data] == [[0, 1], [2, 3]]

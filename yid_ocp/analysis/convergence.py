@@ -1,0 +1,141 @@
+"""How far a model is from its limit of many links and short steps: the lowest frequencies about a rest posture."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+import scipy.optimize
+from numpy.typing import NDArray
+
+from yid_ocp.integrator.discrete import ForceSplit
+from yid_ocp.integrator.rollout import Rest, Statics
+from yid_ocp.integrator.step import Step, compile_step
+from yid_ocp.model.kinematics import forward_kinematics
+from yid_ocp.model.system import System
+
+Array = NDArray[np.float64]
+
+DAMPINGS = ("damping", "twist_damping")
+
+
+@dataclass(frozen=True)
+class Frequencies:
+    """Natural frequencies of one step map about rest, its robot held still.
+
+    Attributes
+    ----------
+    hertz : ndarray, shape (k,)
+        Undamped, ascending [Hz].
+    growing : int
+        Modes that grow from step to step although the damping acts: the object would leave the posture, or the time
+        step is too long for the tension that the grasps put on it.
+    message : str
+        Why there are none, empty otherwise.
+    """
+
+    hertz: Array
+    growing: int = 0
+    message: str = ""
+
+
+def held_still(system: System) -> System:
+    """The same system with its driven joints prescribed."""
+    return replace(system, driven=(), prescribed=(*system.driven, *system.prescribed))
+
+
+def natural_frequencies(
+    system: System, posture: Mapping[str, float], theta: Array, time_step: float, force_split: ForceSplit = "symmetric"
+) -> Frequencies:
+    """Frequencies of the step map of a system about rest, from the eigenvalues of A_k without damping.
+
+    Parameters
+    ----------
+    system : System
+        Driven joints are held still.
+    posture : mapping of str to float
+        Driven and prescribed coordinates [rad or m].
+    theta : ndarray, shape (ntheta,)
+    time_step : float
+        h [s]; the midpoint rule lowers a frequency f to atan(pi f h)/(pi h).
+    force_split : str
+        See `compile_step`; matters for growth, not for the undamped frequencies.
+    """
+    still = held_still(system)
+    if not still.free_indices:
+        return Frequencies(np.zeros(0), message="every coordinate is prescribed, nothing can swing")
+    step = compile_step(still, time_step, force_split, use_compiler=False)
+    known = np.array([posture[name] for name in still.prescribed])
+    rest = Statics(step).solve(known, theta)
+    if not rest.converged:
+        return Frequencies(np.zeros(0), message=rest.message)
+    undamped = theta.copy()
+    for i, name in enumerate(system.parameters.names):
+        if name.rpartition(".")[2] in DAMPINGS:
+            undamped[i] = 0.0
+    angles = np.sort(np.angle(_eigenvalues(step, rest, known, undamped)))
+    turning = angles[(angles > 1e-7) & (angles < math.pi - 1e-7)]
+    growing = int(np.sum(np.abs(_eigenvalues(step, rest, known, theta)) > 1 + 1e-6))
+    return Frequencies(turning / (2 * math.pi * time_step), growing)
+
+
+def _eigenvalues(step: Step, rest: Rest, known: Array, theta: Array) -> Array:
+    """Eigenvalues of A at rest that belong to motion, not to what the constraints take away."""
+    n = step.system.size
+    q, p, z = rest.state[:n], rest.state[n : 2 * n], rest.state[2 * n :]
+    a, _, _ = step.jacobians(q, p, np.zeros(0), theta, (known, known), z, names=())
+    free = np.array(step.system.free_indices)
+    rows = np.concatenate([free, n + free])
+    values: Array = np.linalg.eigvals(a[np.ix_(rows, rows)])
+    return values[np.abs(values) > 0.2]
+
+
+def grasp_gaps(system: System, posture: Mapping[str, float], theta: Array) -> dict[str, float]:
+    """Smallest distance to which each grasp can be closed at a posture of the robot, by bending the object [m].
+
+    Parameters
+    ----------
+    system : System
+    posture : mapping of str to float
+        Driven and prescribed coordinates [rad or m].
+    theta : ndarray, shape (ntheta,)
+        Lengths are taken from it.
+    """
+    if not system.grasps:
+        return {}
+    q = ca.SX.sym("q", system.size)
+    kinematics = forward_kinematics(system.mechanism, q)
+    symbols = ca.vertcat(system.parameters.symbols, *system.internal.values())
+    numbers = np.concatenate([theta, np.zeros(len(system.internal))])
+    ends = [grasp.residual(kinematics)[:3] for grasp in system.grasps]
+    phi = ca.substitute(ca.vertcat(*ends), symbols, ca.SX(ca.DM(numbers)))
+    known = [system.mechanism.joint_index(name) for name in posture]
+    free = [i for i in range(system.size) if i not in known]
+    full = np.zeros(system.size)
+    full[known] = list(posture.values())
+    function = ca.Function("phi", [q], [phi, ca.jacobian(phi, q)[:, free]])
+
+    def at(x: Array) -> Array:
+        full[free] = x
+        return full
+
+    best: Array | None = None
+    for seed in range(4):
+        start = np.random.default_rng(seed).normal(scale=0.1, size=len(free))
+        # a little stiffness keeps the search from winding the object up
+        found = scipy.optimize.least_squares(
+            lambda x: np.concatenate([np.array(function(at(x))[0]).ravel(), 1e-4 * x]),
+            start,
+            lambda x: np.vstack([np.array(ca.densify(function(at(x))[1])), 1e-4 * np.eye(len(free))]),
+            max_nfev=100,
+        )
+        gap = np.array(function(at(found.x))[0]).ravel()
+        if best is None or np.linalg.norm(gap) < np.linalg.norm(best):
+            best = gap
+        if np.linalg.norm(best) < 1e-3:
+            break
+    assert best is not None
+    return {grasp.name: float(np.linalg.norm(part)) for grasp, part in zip(system.grasps, best.reshape(-1, 3), strict=True)}

@@ -1,0 +1,104 @@
+"""The library of unmodelled effects: kinds, where each can sit, and `make_effect`; add one file with one registration.
+
+A kind's equation, quantities, units, bounds and expected ranges stand at its class; `docs/extending.md` shows a new one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from importlib import import_module
+
+from yid_ocp.effects import base
+from yid_ocp.effects.base import EFFECTS as EFFECTS
+from yid_ocp.effects.base import EffectBase as EffectBase
+from yid_ocp.effects.base import Quantity as Quantity
+from yid_ocp.effects.base import Reported as Reported
+from yid_ocp.errors import ModelError, nearest
+from yid_ocp.model.system import System
+
+FAMILIES = ("elasticity", "damping", "friction", "inertia", "actuator", "grasp", "environment", "sensing")
+SENSORS = ("joints.position", "joints.effort", "camera", "nominal_clock")
+"""What `candidates` may be told of a recording: measured joint angles, joint efforts, points seen by a camera, and a
+clock that is a sample index times a nominal period."""
+
+for _family in FAMILIES:
+    import_module(f"yid_ocp.effects.{_family}")
+
+
+def make_effect(kind: str, location: str, system: System, values: Mapping[str, float] | None = None) -> EffectBase:
+    """An effect, to be added with `System.with_effects`.
+
+    Parameters
+    ----------
+    kind : str
+        A registered kind, `kelvin_voigt` for example.
+    location : str
+        Where it sits: a segment, point, arm joint, grasp or arm, `base`, `object`, `world`, `camera` or `clock`.
+    system : System
+        The system that it will be added to.
+    values : mapping of quantity to value, optional
+        Where they are not neutral; a compliance may be given as its `stiffness`.
+
+    Returns
+    -------
+    EffectBase
+        Its parameters are named `kind@location.quantity`.
+
+    Raises
+    ------
+    ConfigError
+        No such kind or quantity, or a value outside its bounds.
+    ModelError
+        The system has no such place for it.
+    """
+    cls = EFFECTS[kind]
+    places = cls.locations(system)
+    if location not in places:
+        known = ", ".join(places[:20]) + (", ..." if len(places) > 20 else "")
+        raise ModelError(
+            f"{kind} does not fit '{location}'",
+            where=f"{kind}@{location}",
+            allowed=known or "nothing in this system",
+            hint=nearest(location, places) if places else "leave it out",
+        )
+    return base.build(kind, location, system, values)
+
+
+def candidates(system: System, sensors_present: Collection[str]) -> list[tuple[str, str]]:
+    """Every (kind, location) that could be at work in a system and show in a recording.
+
+    Parameters
+    ----------
+    system : System
+        Without the effects in question.
+    sensors_present : collection of str
+        What was recorded, among `SENSORS`.
+
+    Returns
+    -------
+    list of (str, str)
+        By kind, then in the order of the system. What works only on prescribed joints is left out where no effort was
+        recorded, for there nothing would show it.
+
+    Raises
+    ------
+    ModelError
+        An entry that is not in `SENSORS`.
+    """
+    present = set(sensors_present)
+    for name in sorted(present - set(SENSORS)):
+        raise ModelError(
+            f"there is no kind of sensor '{name}'", allowed=", ".join(SENSORS), hint=nearest(name, SENSORS)
+        )
+    unseen = set() if "joints.effort" in present else set(system.prescribed)
+    found = []
+    for kind in EFFECTS:
+        cls = EFFECTS[kind]
+        if cls.needs <= present:
+            found += [(kind, place) for place in cls.likely(system) if place not in unseen]
+    return found
+
+
+def vocabulary() -> list[tuple[str, str, str]]:
+    """Every kind with the equation that it adds and the sensors without which it cannot be seen."""
+    return [(kind, EFFECTS[kind].equation, ", ".join(sorted(EFFECTS[kind].needs))) for kind in EFFECTS]

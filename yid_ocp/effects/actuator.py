@@ -1,0 +1,178 @@
+"""What lies between a motor and what is recorded of it: elastic gears, play, effort sensing, late torque.
+
+Recorded torques drive the model and recorded angles prescribe or guide it, so that these effects reach a driven joint,
+or the angle of a prescribed one, through `correct`; the effort that a prescribed joint needs is compared with the
+recorded one through `measure`.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import casadi as ca
+
+from yid_ocp.effects.base import EFFECTS, EffectBase, Quantity, arms, robot_joints
+from yid_ocp.model.system import NodeState, System
+
+PLAY_TORQUE = 0.2
+"""Torque by which the play of a gear is taken up to three quarters [N m]."""
+
+
+@EFFECTS.register("series_elasticity")
+class SeriesElasticity(EffectBase):
+    """An elastic gear with the encoder on the motor's side: measured angle = q + effort/stiffness.
+
+    The effort is the joint's own where the model knows it, else the recorded one.
+    """
+
+    equation = "measured angle = q + effort/stiffness"
+    needs: ClassVar[frozenset[str]] = frozenset({"joints.position", "joints.effort"})
+
+    @classmethod
+    def locations(cls, system: System) -> tuple[str, ...]:
+        """Arm joints that are driven or prescribed."""
+        return _recorded(system)
+
+    @classmethod
+    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
+        """Compliance [rad/(N m)], reported as stiffness [N m/rad]."""
+        text, reported = "compliance of the gear", "stiffness N m/rad"
+        return (Quantity("compliance", "rad/(N m)", 0.0, 0.0, 0.02, (1 / 2000, 1 / 100), text, reciprocal=reported),)
+
+    def measure(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
+        """See the class."""
+        return output + self._give(channel, _effort(state, self.location))
+
+    def correct(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
+        """See the class."""
+        return reading - self._give(channel, effort)
+
+    def _give(self, channel: str, effort: ca.SX) -> ca.SX:
+        return self["compliance"] * effort if channel == f"joints.position.{self.location}" else ca.SX(0)
+
+
+@EFFECTS.register("backlash")
+class Backlash(EffectBase):
+    """A gear with play, the encoder on the motor's side: measured angle = q + width/2 tanh(effort/`PLAY_TORQUE`)."""
+
+    equation = "measured angle = q + width/2 tanh(effort/0.2 N m)"
+    needs: ClassVar[frozenset[str]] = frozenset({"joints.position", "joints.effort"})
+
+    @classmethod
+    def locations(cls, system: System) -> tuple[str, ...]:
+        """Arm joints that are driven or prescribed."""
+        return _recorded(system)
+
+    @classmethod
+    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
+        """Width [rad]."""
+        return (Quantity("width", "rad", 0.0, 0.0, 0.1, (0.0, 0.01), "play of the gear"),)
+
+    def measure(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
+        """See the class."""
+        return output + self._give(channel, _effort(state, self.location))
+
+    def correct(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
+        """See the class."""
+        return reading - self._give(channel, effort)
+
+    def _give(self, channel: str, effort: ca.SX) -> ca.SX:
+        if channel != f"joints.position.{self.location}":
+            return ca.SX(0)
+        return self["width"] / 2 * ca.tanh(effort / PLAY_TORQUE)
+
+
+@EFFECTS.register("effort_gain")
+class EffortGain(EffectBase):
+    """Measured effort = scale x true effort."""
+
+    equation = "measured effort = scale x true"
+    needs: ClassVar[frozenset[str]] = frozenset({"joints.effort"})
+
+    @classmethod
+    def locations(cls, system: System) -> tuple[str, ...]:
+        """Arm joints that are driven or prescribed."""
+        return _recorded(system)
+
+    @classmethod
+    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
+        """Scale [1]."""
+        return (Quantity("scale", "1", 1.0, 0.3, 3.0, (0.8, 1.2), "measured over true effort"),)
+
+    def measure(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
+        """See the class."""
+        return output * self["scale"] if channel == f"joints.effort.{self.location}" else output
+
+    def correct(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
+        """See the class."""
+        return reading / self["scale"] if channel == f"joints.effort.{self.location}" else reading
+
+
+@EFFECTS.register("effort_offset")
+class EffortOffset(EffectBase):
+    """Measured effort = true effort + offset."""
+
+    equation = "measured effort = true + offset"
+    needs: ClassVar[frozenset[str]] = frozenset({"joints.effort"})
+
+    @classmethod
+    def locations(cls, system: System) -> tuple[str, ...]:
+        """Arm joints that are driven or prescribed."""
+        return _recorded(system)
+
+    @classmethod
+    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
+        """Offset [N m]."""
+        return (Quantity("offset", "N m", 0.0, -10.0, 10.0, (-1.5, 1.5), "measured less true effort"),)
+
+    def measure(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
+        """See the class."""
+        return output + self["offset"] if channel == f"joints.effort.{self.location}" else output
+
+    def correct(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
+        """See the class."""
+        return reading - self["offset"] if channel == f"joints.effort.{self.location}" else reading
+
+
+@EFFECTS.register("effort_delay")
+class EffortDelay(EffectBase):
+    """Torque acts late: what acts at t was recorded at t - delay, interpolated between samples.
+
+    For a prescribed arm the recorded effort at t is what the motion needs at t + delay; a negative delay means that the
+    effort is recorded late.
+    """
+
+    equation = "the torque that acts at t was recorded at t - delay"
+    needs: ClassVar[frozenset[str]] = frozenset({"joints.effort"})
+
+    @classmethod
+    def locations(cls, system: System) -> tuple[str, ...]:
+        """Arms of which a joint is driven or prescribed."""
+        known = set(_recorded(system))
+        return tuple(name for name, joints in arms(system).items() if known & set(joints))
+
+    @classmethod
+    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
+        """Delay [s]."""
+        return (Quantity("delay", "s", 0.0, -0.2, 0.2, (0.0, 0.1), "how late recorded torque acts"),)
+
+    @classmethod
+    def joints_at(cls, location: str, system: System) -> tuple[str, ...]:
+        """Joints of the arm."""
+        return arms(system)[location]
+
+    def delay(self, channel: str, camera: bool) -> ca.SX:
+        """See the class."""
+        quantity, _, joint = channel.partition(".") if channel.startswith("torque.") else channel.rpartition(".")
+        if joint not in self.joints:
+            return ca.SX(0)
+        return {"torque": self["delay"], "joints.effort": -self["delay"]}.get(quantity, ca.SX(0))
+
+
+def _recorded(system: System) -> tuple[str, ...]:
+    known = {*system.driven, *system.prescribed}
+    return tuple(name for name in robot_joints(system) if name in known)
+
+
+def _effort(state: NodeState, joint: str) -> ca.SX:
+    return state.effort[state.system.mechanism.joint_index(joint)]

@@ -1,0 +1,130 @@
+"""Losses inside the object: material damping, relaxation, hysteresis."""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from yid_ocp.effects.base import EFFECTS, EffectBase, Quantity, segment_names, segment_springs, typical_stiffness
+from yid_ocp.model.system import MidpointState, System, Terms
+
+SLOW = 1e-3
+"""Rate below which Dahl's absolute value is rounded off [rad/s]."""
+
+
+@EFFECTS.register("kelvin_voigt")
+class KelvinVoigt(EffectBase):
+    """Damping in proportion to stiffness: F = -tau kappa v on all joints of a segment, beside the model's damping."""
+
+    equation = "F = -tau kappa v"
+
+    @classmethod
+    def locations(cls, system: System) -> tuple[str, ...]:
+        """Segments."""
+        return segment_names(system)
+
+    @classmethod
+    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
+        """tau [s]."""
+        return (Quantity("tau", "s", 0.0, 0.0, 1.0, (0.005, 0.2), "damping over stiffness"),)
+
+    def terms(self, state: MidpointState) -> Terms:
+        """See the class."""
+        force = ca.SX(state.system.size, 1)
+        for spring in segment_springs(state.system, self.location):
+            index = state.system.mechanism.joint_index(spring.joint)
+            force[index] = -self["tau"] * spring.stiffness * state.v[index]
+        return Terms(viscous=force)
+
+
+@EFFECTS.register("standard_linear_solid")
+class StandardLinearSolid(EffectBase):
+    """A spring and a damper in series beside every bending spring of a segment.
+
+    V += 1/2 ratio kappa (q - z)^2 with the massless z creeping after q: (q - z) = relaxation_time dz/dt. Twists are left
+    elastic: their relaxation shows in no measured point of a slender branch, and they would cost half as much again.
+    """
+
+    equation = "V += 1/2 ratio kappa (q - z)^2, q - z = relaxation_time dz/dt"
+
+    @classmethod
+    def locations(cls, system: System) -> tuple[str, ...]:
+        """Segments."""
+        return segment_names(system)
+
+    @classmethod
+    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
+        """Ratio [1] and relaxation_time [s]."""
+        return (
+            Quantity("ratio", "1", 0.0, 0.0, 5.0, (0.05, 1.0), "stiffness of the branch over that of the spring"),
+            Quantity("relaxation_time", "s", 0.5, 1e-3, 100.0, (0.05, 10.0), "of the branch", shape=True),
+        )
+
+    @classmethod
+    def internal_names(cls, location: str, system: System) -> tuple[str, ...]:
+        """Bending joints of the segment."""
+        return bending_joints(system, location)
+
+    def terms(self, state: MidpointState) -> Terms:
+        """See the class."""
+        energy, equations = ca.SX(0), {}
+        for spring in segment_springs(state.system, self.location):
+            name = f"{self.label}.{spring.joint}"
+            if name not in state.internal:
+                continue
+            row = state.internal[name]
+            stretch = state.q[state.system.mechanism.joint_index(spring.joint)] - state.z[row]
+            energy += self["ratio"] * spring.stiffness * stretch**2 / 2
+            equations[name] = stretch - self["relaxation_time"] * state.z_rate[row]
+        return Terms(lagrangian=-energy, internal=equations)
+
+
+@EFFECTS.register("hysteresis")
+class Hysteresis(EffectBase):
+    """A Dahl element beside every bending spring of a segment: F = -stiffness z, dz/dt = v - |v| z / yield_angle.
+
+    |v| is rounded off below `SLOW`. At the start of a recording z = 0: what came before is not known.
+
+    References
+    ----------
+    Dahl (1968), A solid friction model, Aerospace Corporation TOR-158(3107-18).
+    """
+
+    equation = "F = -stiffness z, dz/dt = v - |v| z / yield_angle"
+
+    @classmethod
+    def locations(cls, system: System) -> tuple[str, ...]:
+        """Segments."""
+        return segment_names(system)
+
+    @classmethod
+    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
+        """Stiffness [N m/rad], 0.05 to 1 times that of the bends, and yield_angle [rad]."""
+        kappa = typical_stiffness(system, location)
+        text = "stiffness of the element before it yields"
+        return (
+            Quantity("stiffness", "N m/rad", 0.0, 0.0, 5 * kappa, (0.05 * kappa, kappa), text),
+            Quantity("yield_angle", "rad", 0.15, 5e-3, 5.0, (0.05, 0.5), "angle over which it yields", shape=True),
+        )
+
+    @classmethod
+    def internal_names(cls, location: str, system: System) -> tuple[str, ...]:
+        """Bending joints of the segment."""
+        return bending_joints(system, location)
+
+    def terms(self, state: MidpointState) -> Terms:
+        """See the class."""
+        force, equations, start = ca.SX(state.system.size, 1), {}, {}
+        for joint in bending_joints(state.system, self.location):
+            name = f"{self.label}.{joint}"
+            row, index = state.internal[name], state.system.mechanism.joint_index(joint)
+            v, z = state.v[index], state.z[row]
+            speed = ca.sqrt(v**2 + SLOW**2) - SLOW
+            force[index] = -self["stiffness"] * z
+            equations[name] = state.z_rate[row] - v + speed * z / self["yield_angle"]
+            start[name] = z
+        return Terms(force=force, internal=equations, at_rest=start)
+
+
+def bending_joints(system: System, segment: str) -> tuple[str, ...]:
+    """Joints about which a segment bends."""
+    return tuple(spring.joint for spring in segment_springs(system, segment) if spring.kind == "bend")

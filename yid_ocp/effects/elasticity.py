@@ -1,0 +1,219 @@
+"""Springs that differ from the nominal ones, and springs where the nominal model is rigid."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import casadi as ca
+
+from yid_ocp.effects.base import (
+    EFFECTS,
+    EffectBase,
+    Quantity,
+    inverse,
+    junctions,
+    robot_joints,
+    roots,
+    segment_names,
+    segment_springs,
+    typical_stiffness,
+    with_springs,
+)
+from yid_ocp.model.mechanism import Joint, Placement
+from yid_ocp.model.system import MidpointState, System, Terms
+from yid_ocp.model.y_object import AXES
+
+REFERENCE_ANGLE = 0.5
+"""Stands for the largest angle in the data where a range depends on it [rad]."""
+
+_SPRING = Quantity(
+    "compliance",
+    "rad/(N m)",
+    0.0,
+    0.0,
+    1.0,
+    (1 / 500, 1 / 5),
+    "compliance of the two-axis spring",
+    reciprocal="stiffness N m/rad",
+)
+
+
+@EFFECTS.register("cubic_stiffness")
+class CubicStiffness(EffectBase):
+    """Springs of a segment that stiffen (k3 > 0) or soften with the angle: V += 1/4 k3 q^4 on every joint."""
+
+    equation = "V += 1/4 k3 q^4"
+
+    @classmethod
+    def locations(cls, system: System) -> tuple[str, ...]:
+        """Segments."""
+        return segment_names(system)
+
+    @classmethod
+    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
+        """k3 [N m/rad^3]; its range is -0.5 to 1 times stiffness over `REFERENCE_ANGLE` squared."""
+        unit = typical_stiffness(system, location) / REFERENCE_ANGLE**2
+        text = "cubic stiffness of every joint"
+        return (Quantity("k3", "N m/rad^3", 0.0, -unit, 5 * unit, (-0.5 * unit, unit), text),)
+
+    def terms(self, state: MidpointState) -> Terms:
+        """See the class."""
+        index = state.system.mechanism.joint_index
+        angles = [state.q[index(spring.joint)] for spring in segment_springs(state.system, self.location)]
+        return Terms(lagrangian=-self["k3"] / 4 * sum((q**4 for q in angles), ca.SX(0)))
+
+
+@EFFECTS.register("rest_curvature")
+class RestCurvature(EffectBase):
+    """A segment that is bent at rest: V = 1/2 kappa (q - q_rest)^2, the same rest angles at every joint."""
+
+    equation = "V = 1/2 kappa (q - q_rest)^2"
+
+    @classmethod
+    def locations(cls, system: System) -> tuple[str, ...]:
+        """Segments."""
+        return segment_names(system)
+
+    @classmethod
+    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
+        """qx and qy [rad] per joint, beside the rest angles that the model has."""
+        return tuple(
+            Quantity(f"q{axis}", "rad", 0.0, -1.0, 1.0, (-0.3, 0.3), f"rest angle of every joint about {axis}")
+            for axis in "xy"
+        )
+
+    def modify(self, system: System) -> System:
+        """See the class."""
+        changed = {
+            spring.joint: replace(spring, rest=spring.rest + self[f"q{spring.axis}"])
+            for spring in segment_springs(system, self.location)
+            if spring.kind == "bend"
+        }
+        return with_springs(system, changed)
+
+
+@EFFECTS.register("bend_anisotropy")
+class BendAnisotropy(EffectBase):
+    """A segment that bends more easily one way than the other: kappa_y = kappa_x (1 + ratio)."""
+
+    equation = "kappa_y = kappa_x (1 + ratio)"
+
+    @classmethod
+    def locations(cls, system: System) -> tuple[str, ...]:
+        """Segments that bend about y."""
+        bent = {spring.segment for spring in system.elastic if spring.axis == "y"}
+        return tuple(name for name in segment_names(system) if name in bent)
+
+    @classmethod
+    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
+        """ratio [1]."""
+        return (Quantity("ratio", "1", 0.0, -0.9, 3.0, (-0.3, 0.3), "excess of the bending stiffness about y"),)
+
+    def modify(self, system: System) -> System:
+        """See the class."""
+        changed = {
+            spring.joint: replace(spring, stiffness=spring.stiffness * (1 + self["ratio"]))
+            for spring in segment_springs(system, self.location)
+            if spring.axis == "y"
+        }
+        return with_springs(system, changed)
+
+
+@EFFECTS.register("joint_spring")
+class JointSpring(EffectBase):
+    """A spring across an arm joint: V += 1/2 stiffness (q - rest_angle)^2."""
+
+    equation = "V += 1/2 stiffness (q - rest_angle)^2"
+
+    @classmethod
+    def locations(cls, system: System) -> tuple[str, ...]:
+        """Arm joints."""
+        return robot_joints(system)
+
+    @classmethod
+    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
+        """Stiffness [N m/rad] and rest_angle [rad]."""
+        return (
+            Quantity("stiffness", "N m/rad", 0.0, 0.0, 300.0, (0.0, 60.0), "stiffness of the spring"),
+            Quantity("rest_angle", "rad", 0.0, -math.pi, math.pi, (-2.0, 2.0), "where it is relaxed", shape=True),
+        )
+
+    def terms(self, state: MidpointState) -> Terms:
+        """See the class."""
+        stretch = state.q[state.system.mechanism.joint_index(self.location)] - self["rest_angle"]
+        return Terms(lagrangian=-self["stiffness"] / 2 * stretch**2)
+
+
+@EFFECTS.register("mount_compliance")
+class MountCompliance(EffectBase):
+    """A two-axis rotational spring under the object's foot, massless: it turns about x and y of the first link."""
+
+    equation = "two joints with V = 1/2 stiffness q^2 before the first link"
+
+    @classmethod
+    def locations(cls, system: System) -> tuple[str, ...]:
+        """`base`, or the clamp in which the object stands."""
+        return tuple(roots(system))
+
+    @classmethod
+    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
+        """Compliance [rad/(N m)], reported as stiffness [N m/rad]."""
+        return (_SPRING,)
+
+    def modify(self, system: System) -> System:
+        """See the class."""
+        for number, first in enumerate(roots(system)[self.location]):
+            suffix = "" if number == 0 else f"_{number}"
+            system = _sprung(system, (first,), None, f"{self.label}{suffix}", self["compliance"])
+        return system
+
+
+@EFFECTS.register("junction_compliance")
+class JunctionCompliance(EffectBase):
+    """A two-axis rotational spring, massless, between a segment and the branches that leave it at one place.
+
+    At `w_PARENT` all branches turn together about x and y of the parent's last link, at `junction_BRANCH` one turns
+    about its own.
+    """
+
+    equation = "two joints with V = 1/2 stiffness q^2 before the branches"
+
+    @classmethod
+    def locations(cls, system: System) -> tuple[str, ...]:
+        """Junctions."""
+        return tuple(junctions(system))
+
+    @classmethod
+    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
+        """Compliance [rad/(N m)], reported as stiffness [N m/rad]."""
+        return (_SPRING,)
+
+    def modify(self, system: System) -> System:
+        """See the class."""
+        branches = junctions(system)[self.location]
+        at = system.mechanism.frame(self.location).placement if self.location.startswith("w_") else None
+        return _sprung(system, branches, at, self.label, self["compliance"])
+
+
+def _sprung(system: System, hung: tuple[str, ...], at: Placement | None, label: str, compliance: ca.SX) -> System:
+    """Two massless joints `LABEL_x`, `LABEL_y` between some joints and what they hang on.
+
+    They sit at the placement `at` of the carrier, at that of the only joint hung where there is none.
+    """
+    tree = system.mechanism
+    first = min(tree.joint_index(joint) for joint in hung)
+    carrier = tree.joints[first].parent
+    place = tree.joints[first].placement if at is None else at
+    chain = [
+        Joint(f"{label}_{axis}", "revolute", carrier, place if axis == "x" else Placement.identity(), AXES[axis])
+        for axis in "xy"
+    ]
+    tree = tree.inserted(first, chain)
+    joints = list(tree.joints)
+    for name in hung:
+        index = tree.joint_index(name)
+        rest = Placement.identity() if at is None else inverse(place) @ joints[index].placement
+        joints[index] = replace(joints[index], parent=first + 1, placement=rest)
+    compliant = {**system.compliant, **{joint.name: compliance for joint in chain}}
+    return replace(system, mechanism=replace(tree, joints=tuple(joints)), compliant=compliant)

@@ -1,0 +1,193 @@
+"""What the model's effects say about recorded inputs: true torques, angles and times behind what was recorded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.integrator.codegen import Mapped
+from yid_ocp.integrator.step import Feedback
+from yid_ocp.model.system import RecordedEffect, System
+from yid_ocp.sensors import Sensor
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What drives a rollout, with derivatives by d parameters; a derivative is None where it is zero throughout.
+
+    Attributes
+    ----------
+    torque : ndarray, shape (N, nu)
+        [N m]
+    first_torque : ndarray, shape (nu,)
+        That which holds the first posture [N m].
+    path : ndarray, shape (N + 1, nc)
+    arm : ndarray, shape (N + 1, nu)
+        Angles of the driven joints [rad].
+    by_torque, by_first_torque, by_path, by_arm : ndarray, shape (..., d), or None
+    """
+
+    torque: Array
+    first_torque: Array
+    path: Array
+    arm: Array
+    by_torque: Array | None = None
+    by_first_torque: Array | None = None
+    by_path: Array | None = None
+    by_arm: Array | None = None
+
+    @property
+    def posture(self) -> Array:
+        """Known coordinates (driven, then prescribed) at node 0, shape (nk,)."""
+        return np.concatenate([self.arm[0], self.path[0]])
+
+    def by_posture(self, width: int) -> Array:
+        """Derivative of `posture`, shape (nk, d)."""
+        parts = ((self.by_arm, self.arm), (self.by_path, self.path))
+        return np.vstack([np.zeros((x.shape[1], width)) if by is None else by[0] for by, x in parts])
+
+    def guided(self, feedback: Feedback | None, driven: tuple[int, ...], measured: Array) -> Feedback | None:
+        """The tracking filter with the true angles in place of the measured ones."""
+        if feedback is None or self.by_arm is None:
+            return feedback
+        reference = feedback.reference.copy()
+        for column, row in enumerate(feedback.index):
+            if int(row) in driven:
+                at = driven.index(int(row))
+                reference[:, column] += (self.arm - measured)[: len(reference), at]
+        return Feedback(feedback.index, feedback.gain, reference)
+
+    def torque_directions(self, feedback: Feedback | None, driven: tuple[int, ...]) -> Array | None:
+        """Derivative of the nominal torque, that of the filter's reference included, shape (N, nu, d)."""
+        total = self.by_torque
+        if feedback is not None and self.by_arm is not None:
+            total = np.zeros((*self.torque.shape, self.by_arm.shape[2])) if total is None else total.copy()
+            for column, row in enumerate(feedback.index):
+                if int(row) in driven:
+                    moved = self.by_arm[: len(total), driven.index(int(row))]
+                    total += feedback.gain[:, :, column, None] * moved[:, None, :]
+        return total
+
+
+class Readings:
+    """Maps from recorded to true inputs and times, from `RecordedEffect.correct` and `.delay` of a system's effects.
+
+    Parameters
+    ----------
+    system : System
+    use_compiler : bool
+    """
+
+    def __init__(self, system: System, use_compiler: bool) -> None:
+        self.system = system
+        self._compiled = use_compiler
+        self._effects = tuple(e for e in system.effects if isinstance(e, RecordedEffect))
+        self.joints = (*system.driven, *system.prescribed)
+        count = len(self.joints)
+        self._angle, self._effort = ca.SX.sym("angle", count), ca.SX.sym("effort", count)
+        angles, efforts = [], []
+        for i, joint in enumerate(self.joints):
+            effort, angle = self._effort[i], self._angle[i]
+            # the last effect is the nearest to the reading
+            for effect in reversed(self._effects):
+                effort = effect.correct(f"joints.effort.{joint}", effort, effort)
+            for effect in reversed(self._effects):
+                angle = effect.correct(f"joints.position.{joint}", angle, effort)
+            efforts.append(effort)
+            angles.append(angle)
+        self._true_angle = ca.vertcat(ca.SX(0, 1), *angles)
+        self._true_effort = ca.vertcat(ca.SX(0, 1), *efforts)
+        theta = system.parameters.symbols
+        self.corrects_angles = self._depends(self._true_angle, theta)
+        self.corrects_efforts = self._depends(self._true_effort, theta)
+        self.angles_need_effort = self._depends(self._true_angle, self._effort)
+        self._late = ca.vertcat(ca.SX(0, 1), *(self._delay(f"torque.{joint}", False) for joint in system.driven))
+        self.delays_torque = self._depends(self._late, theta)
+        self._maps: dict[tuple[str, ...], Mapped] = {}
+        self._delays: dict[tuple[Sensor | None, tuple[str, ...]], ca.Function] = {}
+
+    @property
+    def active(self) -> bool:
+        """Whether true inputs may differ from recorded ones."""
+        return self.corrects_angles or self.delays_torque or (self.corrects_efforts and bool(self.system.driven))
+
+    @staticmethod
+    def _depends(expression: ca.SX, symbols: ca.SX) -> bool:
+        return expression.numel() > 0 and symbols.numel() > 0 and bool(ca.depends_on(expression, symbols))
+
+    def _delay(self, channel: str, camera: bool) -> ca.SX:
+        total = sum((effect.delay(channel, camera) for effect in self._effects), ca.SX(0))
+        # a delay is in true time, a recording in its own
+        return total / self.system.time_scale
+
+    def true(
+        self, angle: Array, effort: Array, theta: Array, names: tuple[str, ...]
+    ) -> tuple[Array, Array, Array, Array, Array]:
+        """True angles and efforts of `joints` behind readings.
+
+        Parameters
+        ----------
+        angle, effort : ndarray, shape (K, nj)
+        theta : ndarray, shape (ntheta,)
+        names : tuple of str
+            Parameters by which to differentiate, d of them.
+
+        Returns
+        -------
+        angle, effort : ndarray, shape (K, nj)
+        angle_by_theta, effort_by_theta : ndarray, shape (K, nj, d)
+        effort_by_reading : ndarray, shape (K, nj)
+        """
+        if names not in self._maps:
+            chosen = self._chosen(names)
+            slope = ca.vertcat(
+                ca.SX(0, 1), *(ca.jacobian(self._true_effort[i], self._effort[i]) for i in range(len(self.joints)))
+            )
+            outputs = [
+                self._true_angle,
+                self._true_effort,
+                ca.jacobian(self._true_angle, chosen),
+                ca.jacobian(self._true_effort, chosen),
+                ca.densify(slope),
+            ]
+            function = ca.Function("true", [self._angle, self._effort, self.system.parameters.symbols], outputs)
+            self._maps[names] = Mapped(function, shared=(2,), use_compiler=self._compiled)
+        a, e, a_theta, e_theta, e_reading = self._maps[names](angle, effort, theta)
+        return a[:, :, 0], e[:, :, 0], a_theta, e_theta, e_reading[:, :, 0]
+
+    def torque_delay(self, theta: Array, names: tuple[str, ...]) -> tuple[Array, Array]:
+        """How long after it was recorded each driven joint's torque acts, shape (nu,) [s], and its derivative."""
+        return self._evaluate(None, self._late, theta, names)
+
+    def sensor_delay(self, sensor: Sensor, theta: Array, names: tuple[str, ...]) -> tuple[Array, Array] | None:
+        """How long before its recorded time each output was true, shape (k,) [s], and its derivative; None for never."""
+        if sensor not in self._late_sensors:
+            camera = sensor.camera is not None
+            late = [self._delay(channel, camera) for channel in sensor.channels for _ in range(sensor.width)]
+            expression = ca.vertcat(ca.SX(0, 1), *late)
+            moved = self._depends(expression, self.system.parameters.symbols)
+            self._late_sensors[sensor] = expression if moved else None
+        found = self._late_sensors[sensor]
+        return None if found is None else self._evaluate(sensor, found, theta, names)
+
+    @cached_property
+    def _late_sensors(self) -> dict[Sensor, ca.SX | None]:
+        return {}
+
+    def _evaluate(
+        self, key: Sensor | None, expression: ca.SX, theta: Array, names: tuple[str, ...]
+    ) -> tuple[Array, Array]:
+        if (key, names) not in self._delays:
+            outputs = [expression, ca.jacobian(expression, self._chosen(names))]
+            self._delays[key, names] = ca.Function("delay", [self.system.parameters.symbols], outputs)
+        value, slope = self._delays[key, names](theta)
+        return np.array(ca.densify(value)).ravel(), np.array(ca.densify(slope)).reshape(expression.numel(), len(names))
+
+    def _chosen(self, names: tuple[str, ...]) -> ca.SX:
+        return ca.vertcat(ca.SX(0, 1), *(self.system.parameters[name].symbol for name in names))

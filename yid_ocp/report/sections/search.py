@@ -1,0 +1,22 @@
+"""How the solver got there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from markupsafe import Markup
+
+from yid_ocp.report import figures
+from yid_ocp.report.sections import Findings, section
+
+
+@section("search", 40, "How it was found")
+def prepare(findings: Findings) -> Mapping[str, Any] | None:
+    """Cost history of the solver."""
+    solution = findings.solution
+    if solution is None or len(solution.history) < 2:
+        return None
+    picture = figures.cost_history([h.cost for h in solution.history], [h.note for h in solution.history])
+    return {"solution": solution, "finite": math.isfinite(solution.cost), "picture": Markup(figures.html(picture))}

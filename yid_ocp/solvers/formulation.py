@@ -1,0 +1,548 @@
+"""Transcription of an estimation problem with node states as unknowns: packing, defects, objective, initial guess.
+
+The unknown vector of the NLP is, in this order,
+
+    (theta_free | recording 1: x_0, [x_j, (lam of the step before)] for every later node | recording 2: ... )
+
+with x = (q, p, z). With a node at every step the DEL equations and constraints are the equality constraints themselves
+and the multipliers are unknowns; with one every n steps the steps between are eliminated by the compiled rollout and
+the equality constraints are the defects F^n(x_j) - x_{j+1}.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+from yid_ocp.errors import SolverError
+from yid_ocp.integrator.feedback import lqr_filter
+from yid_ocp.integrator.rollout import momentum_of, simulate
+from yid_ocp.integrator.step import Directions, Feedback, Sweep
+from yid_ocp.problem.inputs import Smoother
+from yid_ocp.problem.problem import Episode, EstimationProblem
+from yid_ocp.problem.residuals import huber
+
+Array = NDArray[np.float64]
+Sparse = scipy.sparse.csc_matrix
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where one recording's unknowns stand in the NLP's vector.
+
+    Attributes
+    ----------
+    nodes : ndarray of int, shape (K + 1,)
+        Steps at which there is a node state.
+    state : ndarray of int, shape (K + 1, nx)
+        Positions of the node states.
+    multipliers : ndarray of int, shape (K, m)
+        Positions of the multipliers, of width zero where steps are eliminated.
+    """
+
+    nodes: NDArray[np.int64]
+    state: NDArray[np.int64]
+    multipliers: NDArray[np.int64]
+
+
+class Transcription:
+    """Node states of an estimation problem as unknowns.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+        Its recordings' start states are those of the problem (equilibrium or given).
+    interval : int
+        Steps between nodes.
+    multipliers : bool
+        Whether, with a node at every step, the DEL equations are constraints and their multipliers unknowns.
+
+    Raises
+    ------
+    SolverError
+        Effort channels, an interval below one, a recording shorter than one interval, or local parameters where there
+        are multipliers.
+    """
+
+    def __init__(self, problem: EstimationProblem, interval: int, multipliers: bool = True) -> None:
+        if interval < 1:
+            raise SolverError(f"node_interval = {interval}", where="solver", allowed="a whole number from 1")
+        if problem.local and multipliers:
+            raise SolverError(
+                f"{problem.local[0]} has a value of its own in every recording",
+                where="multiple shooting",
+                hint="use gauss_newton for problems with local parameters",
+            )
+        self.problem = problem
+        self.step = problem.step
+        self.interval = interval
+        self.free_start = problem.options.initial_state == "estimated"
+        sizes = problem.step.sizes
+        self.nx, self.n, self.nz, self.m = sizes["nx"], sizes["n"], sizes["nz"], sizes["m"]
+        self.has_multipliers = interval == 1 and multipliers
+        at = len(problem.shared)
+        layouts = []
+        for episode in problem.episodes:
+            steps = episode.grid.steps
+            if steps < interval:
+                raise SolverError(
+                    f"the recording has {steps} steps, fewer than one node interval of {interval}",
+                    where=episode.name,
+                    allowed=f"solver.node_interval from 1 to {steps}",
+                )
+            if any(s.sensor.group == "joints.effort" for s in episode.samples):
+                raise SolverError(
+                    "effort channels depend on whole steps, which node states do not carry",
+                    where=episode.name,
+                    hint="use gauss_newton",
+                )
+            nodes = np.unique(np.append(np.arange(0, steps + 1, interval), steps))
+            width = self.m if self.has_multipliers else 0
+            state, places = [], []
+            for j in range(len(nodes)):
+                state.append(np.arange(at, at + self.nx))
+                at += self.nx
+                if j < len(nodes) - 1:
+                    places.append(np.arange(at, at + width))
+                    at += width
+            layouts.append(Layout(nodes, np.array(state), np.array(places, dtype=np.int64).reshape(len(nodes) - 1, width)))
+        self.layouts = tuple(layouts)
+        self.size = at
+
+    # -- initial guess ------------------------------------------------------------------------------------------------
+
+    def guess(self, x: Array) -> Array:
+        """Unknowns near a solution at the parameters `x`: the rollout under the tracking filter.
+
+        Where that fails, every node is at rest at the posture that the arms had then (or, without arms, at the start).
+        """
+        w = np.zeros(self.size)
+        count = len(self.problem.shared)
+        w[:count] = x[:count]
+        problem = self.problem
+        for i, (episode, layout) in enumerate(zip(problem.episodes, self.layouts, strict=True)):
+            theta = self._theta(w, i)
+            start, _, message = problem.start_state(episode, theta)
+            sweep = None
+            if not message:
+                feedback = self._tracking(episode, theta)
+                sweep = simulate(
+                    self.step, theta, start, episode.grid.steps, episode.torque, episode.path, feedback
+                )
+            if sweep is not None and sweep.status.ok:
+                state, multipliers = sweep.state[layout.nodes], sweep.multipliers
+            else:
+                state, multipliers = self._resting(episode, layout, theta, start)
+            w[layout.state.ravel()] = state.ravel()
+            if self.has_multipliers:
+                w[layout.multipliers.ravel()] = multipliers.ravel()
+        return w
+
+    def _resting(self, episode: Episode, layout: Layout, theta: Array, start: Array) -> tuple[Array, Array]:
+        """Node states at rest at the measured postures, with the momentum of moving from one to the next."""
+        problem, n = self.problem, self.n
+        statics, h = problem.statics(), self.step.time_step
+        state = np.tile(start, (len(layout.nodes), 1))
+        pull = np.zeros((len(layout.nodes), self.m))
+        shape: Array | None = None
+        # shapes change slowly: a tenth of a second between them is enough
+        every = max(1, round(0.1 / (h * self.interval)))
+        chosen = np.unique(np.append(np.arange(0, len(layout.nodes), every), len(layout.nodes) - 1))
+        for j in chosen:
+            node = layout.nodes[j]
+            posture = np.concatenate([episode.measured_arm[node], episode.path[node]])
+            torque = episode.torque[min(node, len(episode.torque) - 1)] if problem.system.driven else None
+            rest = statics.solve(posture, theta, torque, shape)
+            if rest.error < 1e-3:
+                shape = rest.state[:n]
+                state[j], pull[j] = rest.state, rest.constraint_force
+            else:
+                state[j], pull[j] = state[max(j - 1, 0)], pull[max(j - 1, 0)]
+        times = layout.nodes * h
+        for column in range(self.nx):
+            state[:, column] = np.interp(times, times[chosen], state[chosen, column])
+        force = np.stack([np.interp(times, times[chosen], pull[chosen, c]) for c in range(self.m)], axis=1)
+        driven = list(problem.system.driven_indices)
+        state[:, driven] = episode.measured_arm[layout.nodes]
+        velocity = np.gradient(state[:, :n], times, axis=0)
+        state[:, n : 2 * n] += momentum_of(self.step, state[:, :n], velocity, theta)
+        return state, force[:-1] * h
+
+    def _tracking(self, episode: Episode, theta: Array) -> Feedback | None:
+        feedback = self.problem.feedback(episode)
+        if feedback is None and self.problem.system.driven:
+            smooth = Smoother(self.problem.options.path_cutoff)(episode.grid.times, episode.measured_arm)
+            return lqr_filter(self.step, smooth, episode.torque, theta)
+        return feedback
+
+    def _unknowns(self, theta_free: Array) -> Array:
+        """The problem's unknown vector with the starts' deviations at zero."""
+        x = self.problem.start.copy()
+        x[: len(theta_free)] = theta_free
+        return x
+
+    def local_columns(self, i: int) -> NDArray[np.int64]:
+        """Places of one recording's (shared, local, start) unknowns in the problem's vector."""
+        shared = len(self.problem.shared)
+        own = len(self.problem.local) + len(self.problem.start_rows)
+        return np.concatenate([np.arange(shared), shared + i * own + np.arange(own)])
+
+    # -- bounds -------------------------------------------------------------------------------------------------------
+
+    def bounds(self) -> tuple[Array, Array]:
+        """Bounds of all unknowns; prescribed coordinates are fixed."""
+        lower, upper = np.full(self.size, -np.inf), np.full(self.size, np.inf)
+        count = len(self.problem.shared)
+        low, high = self.problem.bounds
+        lower[:count], upper[:count] = low[:count], high[:count]
+        for episode, layout in zip(self.problem.episodes, self.layouts, strict=True):
+            for column, index in enumerate(self.problem.system.prescribed_indices):
+                positions = layout.state[:, index]
+                lower[positions] = upper[positions] = episode.path[layout.nodes, column]
+        return lower, upper
+
+    # -- equality constraints -----------------------------------------------------------------------------------------
+
+    def constraints(self, w: Array, derivatives: bool) -> tuple[Array, Sparse | None]:
+        """Defects of all recordings, scaled to order one, and their Jacobian.
+
+        Rows of a recording: its start state, then for every interval the DEL rows over h, internal and constraint rows
+        and p_{k+1} (a node at every step), or F^n(x_j) - x_{j+1} (fewer nodes).
+        """
+        values, blocks = [], []
+        for i in range(len(self.problem.episodes)):
+            for part, jacobian in (self._start_rows(w, i, derivatives), self._motion_rows(w, i, derivatives)):
+                values.append(part)
+                blocks.append(jacobian)
+        matrix = scipy.sparse.vstack(blocks, format="csc") if derivatives else None
+        return np.concatenate(values), matrix
+
+    def _theta(self, w: Array, episode: int) -> Array:
+        theta = self.problem.split(self._unknowns(w[: len(self.problem.shared)]), episode)[0]
+        return self.problem.own_theta(self.problem.episodes[episode], theta)
+
+    def _start_rows(self, w: Array, i: int, derivatives: bool) -> tuple[Array, Sparse | None]:
+        episode, layout = self.problem.episodes[i], self.layouts[i]
+        loose = self.problem.start_rows if self.free_start else ()
+        keep = np.setdiff1d(np.arange(self.nx), [*self.problem.system.prescribed_indices, *loose])
+        theta = self._theta(w, i)
+        start, by_theta, _ = self.problem.start_state(episode, theta)
+        value = (w[layout.state[0]] - start)[keep]
+        if not derivatives:
+            return value, None
+        rows = np.arange(len(keep))
+        matrix = scipy.sparse.lil_matrix((len(keep), self.size))
+        matrix[rows, layout.state[0][keep]] = 1.0
+        count = len(self.problem.shared)
+        if count:
+            matrix[:, :count] = -by_theta[keep][:, :count]
+        return value, matrix.tocsc()
+
+    def _start_prior(self, w: Array, i: int, derivatives: bool) -> tuple[Array, Sparse | None]:
+        """Deviation of an estimated start from rest, over its prior's deviation."""
+        layout, rows = self.layouts[i], np.array(self.problem.start_rows)
+        start, by_theta, _ = self.problem.start_state(self.problem.episodes[i], self._theta(w, i))
+        weight = 1.0 / self.problem.start_deviations
+        value = weight * (w[layout.state[0]] - start)[rows]
+        if not derivatives:
+            return value, None
+        matrix = scipy.sparse.lil_matrix((len(rows), self.size))
+        matrix[np.arange(len(rows)), layout.state[0][rows]] = weight
+        count = len(self.problem.shared)
+        matrix[:, :count] = -(weight[:, None] * by_theta[rows][:, :count])
+        return value, matrix.tocsc()
+
+    def unknowns(self, w: Array) -> Array:
+        """The problem's unknown vector that belongs to a point of the NLP."""
+        x = self._unknowns(w[: len(self.problem.shared)])
+        if self.free_start:
+            at, size = len(self.problem.shared), len(self.problem.start_rows)
+            for i, (episode, layout) in enumerate(zip(self.problem.episodes, self.layouts, strict=True)):
+                start, _, _ = self.problem.start_state(episode, self._theta(w, i))
+                x[at : at + size] = (w[layout.state[0]] - start)[list(self.problem.start_rows)]
+                at += size
+        return x
+
+    def _motion_rows(self, w: Array, i: int, derivatives: bool) -> tuple[Array, Sparse | None]:
+        if self.has_multipliers:
+            return self._step_rows(w, i, derivatives)
+        return self._interval_rows(w, i, derivatives)
+
+    def _step_rows(self, w: Array, i: int, derivatives: bool) -> tuple[Array, Sparse | None]:
+        """DEL rows of every step, of which the multipliers are unknowns too."""
+        layout = self.layouts[i]
+        state, steps = w[layout.state], len(layout.nodes) - 1
+        value, block = self._stage_block(i, state[:-1], state[1:], w[layout.multipliers], self._theta(w, i), derivatives)
+        if not derivatives:
+            return value.ravel(), None
+        return value.ravel(), self._assembled(block, self._stage_columns(i, steps), value.shape[1])
+
+    def _stage_columns(self, i: int, steps: int) -> NDArray[np.int64]:
+        layout, count = self.layouts[i], len(self.problem.shared)
+        shared = np.broadcast_to(np.arange(count), (steps, count))
+        return np.concatenate([shared, layout.state[:-1], layout.state[1:], layout.multipliers], axis=1)
+
+    def _stage_block(
+        self, i: int, before: Array, after: Array, multipliers: Array, theta: Array, derivatives: bool
+    ) -> tuple[Array, Array]:
+        """Rows of all steps, (N, height), and their derivatives by (theta, x_k, x_{k+1}, lam_k), (N, height, width)."""
+        problem, episode = self.problem, self.problem.episodes[i]
+        n, nz, m, nx, h = self.n, self.nz, self.m, self.nx, self.step.time_step
+        steps = len(before)
+        feedback = problem.feedback(episode)
+        torque = episode.torque
+        if feedback is not None:
+            deviation = before[:, feedback.index] - feedback.reference
+            torque = torque - np.einsum("kuj,kj->ku", feedback.gain, deviation)
+        if np.array_equal(before[1:], after[:-1]):
+            chained, used, lam, held = np.vstack([before, after[-1:]]), slice(None), multipliers, torque
+        else:
+            # the kernel takes one trajectory: lay the pairs end to end and skip the steps in between
+            chained = np.stack([before, after], axis=1).reshape(2 * steps, nx)
+            used, lam, held = slice(0, None, 2), np.repeat(multipliers, 2, axis=0)[:-1], np.repeat(torque, 2, axis=0)[:-1]
+        stages = self.step.kernel.stages(theta, chained, lam, held, problem.shared, derivatives)
+        free = np.array(problem.system.free_indices)
+        kept = np.concatenate([free, np.arange(n, n + nz + m)])
+        scale = np.concatenate([np.full(len(free), 1.0 / h), np.ones(nz + m)])
+        value = np.hstack([stages.rows[used][:, kept] * scale, (after[:, n : 2 * n] - stages.p1[used]) / h])
+        if not derivatives:
+            return value, np.zeros(0)
+        count, height = len(problem.shared), len(kept) + n
+        top, bottom = slice(0, len(kept)), slice(len(kept), height)
+        block = np.zeros((steps, height, count + 2 * nx + m))
+        old, new, last = count, count + nx, count + 2 * nx
+        block[:, top, :count], block[:, bottom, :count] = stages.rows_theta[used][:, kept], -stages.p1_theta[used]
+        for rows, matrix, sign in ((top, stages.rows_old[used][:, kept], 1.0), (bottom, stages.p1_old[used], -1.0)):
+            block[:, rows, old : old + n] = sign * matrix[:, :, :n]
+            block[:, rows, old + 2 * n : old + nx] = sign * matrix[:, :, n:]
+        for rows, matrix, sign in ((top, stages.rows_new[used][:, kept], 1.0), (bottom, stages.p1_new[used], -1.0)):
+            block[:, rows, new : new + n] = sign * matrix[:, :, :n]
+            block[:, rows, new + 2 * n : new + nx] = sign * matrix[:, :, n : n + nz]
+            block[:, rows, last:] = sign * matrix[:, :, n + nz :]
+        block[:, np.arange(len(free)), old + n + free] += 1.0
+        block[:, len(kept) + np.arange(n), new + n + np.arange(n)] += 1.0
+        if feedback is not None:
+            at = old + feedback.index
+            block[:, top, at] -= stages.rows_input[used][:, kept] @ feedback.gain
+            block[:, bottom, at] += stages.p1_input[used] @ feedback.gain
+        block[:, top] *= scale[None, :, None]
+        block[:, bottom] /= h
+        return value, block
+
+    def curvature(self, w: Array, weights: Array) -> Sparse:
+        """Hessian of weights . g(w) of the DEL equations, from differences of their compiled Jacobian.
+
+        One difference for each local coordinate of a step (parameters, q_k, q_{k+1}, lam_k; momenta enter linearly)
+        serves all steps at once.
+        """
+        if not self.has_multipliers:
+            raise SolverError(
+                "an exact Hessian needs a node at every step",
+                where="solver.hessian",
+                allowed="node_interval: 1, or hessian: gauss_newton",
+            )
+        n, nx, count = self.n, self.nx, len(self.problem.shared)
+        total: Sparse = scipy.sparse.csc_matrix((self.size, self.size))
+        at = 0
+        for i, layout in enumerate(self.layouts):
+            state, lam, theta = w[layout.state], w[layout.multipliers], self._theta(w, i)
+            at += len(self._start_rows(w, i, False)[0])
+            value, block = self._stage_block(i, state[:-1], state[1:], lam, theta, True)
+            weight = weights[at : at + value.size].reshape(value.shape)
+            at += value.size
+            base = np.einsum("kr,krc->kc", weight, block)
+            steps, width = base.shape
+            hessian = np.zeros((steps, width, width))
+            coordinates = [*range(n), *range(2 * n, nx)]
+            local = [*range(count)]
+            local += [count + c for c in coordinates] + [count + nx + c for c in coordinates]
+            local += [*range(count + 2 * nx, width)]
+            for c in local:
+                before, after, moved, own = state[:-1].copy(), state[1:].copy(), lam.copy(), theta.copy()
+                if c < count:
+                    index = self.problem.system.parameters.index(self.problem.shared[c])
+                    size = 1e-6 * max(abs(own[index]), 1.0)
+                    own[index] += size
+                else:
+                    size = 1e-6
+                    target = before if c < count + nx else after if c < count + 2 * nx else moved
+                    target[:, (c - count) % nx if c < count + 2 * nx else c - count - 2 * nx] += size
+                changed = self._stage_block(i, before, after, moved, own, True)[1]
+                hessian[:, :, c] = (np.einsum("kr,krc->kc", weight, changed) - base) / size
+            hessian = 0.5 * (hessian + hessian.transpose(0, 2, 1))
+            column = self._stage_columns(i, steps)
+            rows = np.broadcast_to(column[:, :, None], hessian.shape).ravel()
+            columns = np.broadcast_to(column[:, None, :], hessian.shape).ravel()
+            total = total + scipy.sparse.csc_matrix((hessian.ravel(), (rows, columns)), shape=total.shape)
+        return total
+
+    def _interval_rows(self, w: Array, i: int, derivatives: bool) -> tuple[Array, Sparse | None]:
+        """Defects over intervals whose inner steps the rollout eliminates."""
+        problem, layout = self.problem, self.layouts[i]
+        keep = np.setdiff1d(np.arange(self.nx), problem.system.prescribed_indices)
+        count, nx = len(problem.shared), self.nx
+        theta = self._theta(w, i)
+        values, blocks = [], []
+        for j in range(len(layout.nodes) - 1):
+            directions = None
+            if derivatives:
+                start = np.zeros((nx, count + nx))
+                start[:, count:] = np.eye(nx)
+                directions = Directions(problem.shared, start)
+            sweep = self.interval_sweep(i, j, w[layout.state[j]], theta, directions)
+            values.append((sweep.state[-1] - w[layout.state[j + 1]])[keep])
+            if derivatives:
+                assert sweep.by_state is not None
+                minus = np.zeros((len(keep), nx))
+                minus[np.arange(len(keep)), keep] = -1.0
+                blocks.append(np.hstack([sweep.by_state[-1][keep], minus]))
+        value = np.concatenate(values)
+        if not derivatives:
+            return value, None
+        steps = len(blocks)
+        column = np.hstack([np.broadcast_to(np.arange(count), (steps, count)), layout.state[:-1], layout.state[1:]])
+        return value, self._assembled(np.array(blocks), column, len(keep))
+
+    def interval_sweep(self, i: int, j: int, start: Array, theta: Array, directions: Directions | None) -> Sweep:
+        """Rollout over one interval of a recording, with the problem's own feedback."""
+        episode, nodes = self.problem.episodes[i], self.layouts[i].nodes
+        first, last = int(nodes[j]), int(nodes[j + 1])
+        feedback = self.problem.feedback(episode)
+        if feedback is not None:
+            feedback = replace(
+                feedback, gain=feedback.gain[first:last], reference=feedback.reference[first:last]
+            )
+        return simulate(
+            self.step,
+            theta,
+            start,
+            last - first,
+            episode.torque[first:last],
+            episode.path[first : last + 1],
+            feedback,
+            directions,
+        )
+
+    def _assembled(self, block: Array, column: NDArray[np.int64], height: int) -> Sparse:
+        steps, _, width = block.shape
+        row = np.arange(steps * height).reshape(steps, height, 1)
+        rows = np.broadcast_to(row, block.shape)
+        columns = np.broadcast_to(column[:, None, :width], block.shape)
+        used = np.any(block != 0.0, axis=0)
+        chosen = np.broadcast_to(used, block.shape)
+        shape = (steps * height, self.size)
+        return scipy.sparse.csc_matrix((block[chosen], (rows[chosen], columns[chosen])), shape=shape)
+
+    # -- objective ----------------------------------------------------------------------------------------------------
+
+    def residual(self, w: Array, derivatives: bool) -> tuple[Array, Sparse | None, float]:
+        """Whitened residual of all samples and priors, its Jacobian, and the (robust) cost."""
+        problem = self.problem
+        count = len(problem.shared)
+        values, blocks, cost = [], [], 0.0
+        for i, (episode, layout) in enumerate(zip(problem.episodes, self.layouts, strict=True)):
+            theta = self._theta(w, i)
+            for samples in episode.samples:
+                nodes = samples.nodes
+                position = np.searchsorted(layout.nodes, nodes)
+                if not np.all(layout.nodes[np.minimum(position, len(layout.nodes) - 1)] == nodes):
+                    part = self._between_nodes(w, i, samples, theta, derivatives)
+                else:
+                    state = w[layout.state[position]]
+                    effort = np.zeros((len(nodes), self.n))
+                    outputs = problem.sensor(samples.sensor, problem.shared)(
+                        state[:, : self.n], state[:, 2 * self.n :], effort, theta
+                    )
+                    part = self._at_nodes(samples, outputs, layout.state[position], derivatives)
+                predicted, jacobian = part
+                seen = samples.weight > 0
+                raw = samples.weight * np.where(seen, predicted - samples.value, 0.0)
+                loss, factor = huber(raw, problem.options.robust_scale)
+                cost += loss
+                keep = seen.ravel()
+                values.append((factor * raw).ravel()[keep])
+                if derivatives:
+                    assert jacobian is not None
+                    weight = scipy.sparse.diags((factor * samples.weight).ravel())
+                    blocks.append((weight @ jacobian).tocsr()[keep])
+            if self.free_start:
+                part, jacobian = self._start_prior(w, i, derivatives)
+                cost += 0.5 * float(part @ part)
+                values.append(part)
+                blocks.append(jacobian)
+        prior, by_theta = problem.prior(self._unknowns(w[:count]))
+        own = np.any(by_theta[:, :count] != 0, axis=1)
+        values.append(prior[own])
+        cost += 0.5 * float(prior[own] @ prior[own])
+        if not derivatives:
+            return np.concatenate(values), None, cost
+        wide = scipy.sparse.lil_matrix((int(own.sum()), self.size))
+        wide[:, :count] = by_theta[own][:, :count]
+        return np.concatenate(values), scipy.sparse.vstack([*blocks, wide.tocsr()], format="csc"), cost
+
+    def _at_nodes(
+        self, samples, outputs: Sequence[Array], columns: NDArray[np.int64], derivatives: bool  # type: ignore[no-untyped-def]
+    ) -> tuple[Array, Sparse | None]:
+        y, by_q, by_z, _, by_theta = outputs
+        predicted = samples.interpolate(y[:, :, 0])
+        if not derivatives:
+            return predicted, None
+        count, width = len(self.problem.shared), y.shape[1]
+        nodes = samples.nodes
+        before = np.searchsorted(nodes, samples.node)
+        after = np.minimum(np.searchsorted(nodes, samples.node + 1), len(nodes) - 1)
+        total: Sparse | None = None
+        for place, share in ((before, 1.0 - samples.fraction), (after, samples.fraction)):
+            block = np.concatenate([by_theta[place], by_q[place], by_z[place]], axis=2) * share[:, None, None]
+            at = np.hstack(
+                [
+                    np.broadcast_to(np.arange(count), (len(place), count)),
+                    columns[place][:, : self.n],
+                    columns[place][:, 2 * self.n :],
+                ]
+            )
+            part = self._assembled(block, at, width)
+            total = part if total is None else total + part
+        return predicted, total
+
+    def _between_nodes(self, w: Array, i: int, samples, theta: Array, derivatives: bool) -> tuple[Array, Sparse | None]:  # type: ignore[no-untyped-def]
+        """Predictions at steps that the rollout eliminates, by the chain rule through the interval before them."""
+        problem, layout, n = self.problem, self.layouts[i], self.n
+        count, nx = len(problem.shared), self.nx
+        nodes = samples.nodes
+        state = np.zeros((len(nodes), nx))
+        slope = np.zeros((len(nodes), nx, count + nx))
+        owner = np.clip(np.searchsorted(layout.nodes, nodes, side="right") - 1, 0, len(layout.nodes) - 2)
+        for j in np.unique(owner):
+            start = np.zeros((nx, count + nx))
+            start[:, count:] = np.eye(nx)
+            directions = Directions(problem.shared, start) if derivatives else None
+            sweep = self.interval_sweep(i, int(j), w[layout.state[j]], theta, directions)
+            here = owner == j
+            offset = nodes[here] - layout.nodes[j]
+            state[here] = sweep.state[offset]
+            if sweep.by_state is not None:
+                slope[here] = sweep.by_state[offset]
+        effort = np.zeros((len(nodes), n))
+        y, by_q, by_z, _, by_theta = problem.sensor(samples.sensor, problem.shared)(
+            state[:, :n], state[:, 2 * n :], effort, theta
+        )
+        predicted = samples.interpolate(y[:, :, 0])
+        if not derivatives:
+            return predicted, None
+        total = by_q @ slope[:, :n] + (by_z @ slope[:, 2 * n :] if self.nz else 0.0)
+        total[:, :, :count] += by_theta
+        before = np.searchsorted(nodes, samples.node)
+        after = np.minimum(np.searchsorted(nodes, samples.node + 1), len(nodes) - 1)
+        matrix: Sparse | None = None
+        for place, share in ((before, 1.0 - samples.fraction), (after, samples.fraction)):
+            at = np.hstack(
+                [np.broadcast_to(np.arange(count), (len(place), count)), layout.state[owner[place]]]
+            )
+            part = self._assembled(total[place] * share[:, None, None], at, y.shape[1])
+            matrix = part if matrix is None else matrix + part
+        return predicted, matrix

@@ -1,0 +1,200 @@
+"""Gauss-Newton on the lifted problem: node states as unknowns, condensed onto the parameters in every iteration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.integrator.step import Directions
+from yid_ocp.problem.problem import EstimationProblem
+from yid_ocp.problem.residuals import huber
+from yid_ocp.solvers.base import SOLVERS, Callback, Outcome, Recorder, Status, projected_gradient
+from yid_ocp.solvers.formulation import Transcription
+from yid_ocp.solvers.gauss_newton import bounded_step
+
+Array = NDArray[np.float64]
+
+# Largest factor by which one iteration changes an unknown that is positive by nature.
+REACH = 3.0
+
+
+@dataclass(frozen=True)
+class _Linearised:
+    """Whitened residual, its derivative by the unknowns and its change by closing the defects; sizes of the defects."""
+
+    cost: float
+    defect: float
+    residual: Array
+    jacobian: Array
+    by_defect: Array
+    states: tuple[tuple[Array, Array, Array], ...]
+
+
+@SOLVERS.register("lifted")
+@dataclass(frozen=True)
+class Lifted:
+    """Iterate on node states s_j and parameters x with the defects d_j = F^n(s_j, x) - s_{j+1} free to be non-zero.
+
+    A linear step closes every defect; the recursion  S_{j+1} = A_j S_j + B_j,  c_{j+1} = A_j c_j + d_j  expresses all
+    node steps by the parameters' step (condensing), so that an iteration costs one rollout with one direction more
+    than single shooting's. The merit of a step is the cost plus a penalty on the defects.
+
+    Attributes
+    ----------
+    node_interval : int
+        Steps between nodes.
+    iterations : int
+    step_tolerance, cost_tolerance : float
+        As in `GaussNewton`.
+    defect_tolerance : float
+        Largest defect [rad, m or N m s] that counts as closed.
+
+    References
+    ----------
+    Albersmeyer and Diehl (2010), SIAM J. Optim. 20(3):1655, doi:10.1137/080724885.
+    """
+
+    node_interval: int = 10
+    iterations: int = 80
+    step_tolerance: float = 1e-5
+    cost_tolerance: float = 1e-5
+    defect_tolerance: float = 1e-7
+    name: str = "lifted"
+    needs_rollout: bool = False
+
+    def run(self, problem: EstimationProblem, start: Array, callback: Callback | None) -> Outcome:
+        """See `Solver.run`."""
+        # the inner steps are eliminated, so there are no multipliers among the unknowns, whatever the interval
+        transcription = Transcription(problem, self.node_interval, multipliers=False)
+        recorder = Recorder(callback)
+        guess = transcription.guess(start[: len(problem.shared)])
+        nodes = [guess[layout.state] for layout in transcription.layouts]
+        x = start.copy()
+        lower, upper = problem.bounds
+        now = self._linearise(transcription, x, nodes)
+        recorder.evaluations += 1
+        if isinstance(now, str):
+            return Outcome(Status.FAILED, now, x, (), recorder.evaluations)
+        mu, weight = 1e-4, 0.0
+        for _ in range(self.iterations):
+            size = np.maximum(np.abs(x), problem.scales)
+            closed = now.residual + now.by_defect
+            recorder.accept(now.cost, x, projected_gradient(x, now.jacobian.T @ now.residual, lower, upper, size))
+            # far from the solution the linear model is good for a factor, not for a jump to a bound
+            low = np.where(problem.positive, np.maximum(lower, x / REACH), lower)
+            high = np.where(problem.positive, np.minimum(upper, np.maximum(x, 1e-3 * problem.scales) * REACH), upper)
+            step = bounded_step(now.jacobian * size, closed, mu, (low - x) / size, (high - x) / size) * size
+            change = now.by_defect + now.jacobian @ step
+            promised = now.cost - 0.5 * float(np.sum((now.residual + change) ** 2))
+            slope = float(now.residual @ change)
+            # exact penalty: large enough that the step descends on cost + weight * defect
+            weight = max(weight, 2.0 * max(slope, 0.0) / max(now.defect, 1e-300)) if now.defect > 0 else weight
+            moved = float(np.max(np.abs(step) / size, initial=0.0))
+            done = now.defect < self.defect_tolerance
+            if done and (moved < self.step_tolerance or abs(promised) <= self.cost_tolerance * max(now.cost, 1e-300)):
+                return self._end(Status.CONVERGED, f"closed to {now.defect:.1e}", x, recorder)
+            factor = 1.0
+            while True:
+                trial_x = np.clip(x + factor * step, lower, upper)
+                trial_nodes = self._moved(transcription, nodes, now, step, factor)
+                trial = self._linearise(transcription, trial_x, trial_nodes)
+                recorder.evaluations += 1
+                if not isinstance(trial, str):
+                    merit, target = trial.cost + weight * trial.defect, now.cost + weight * now.defect
+                    if merit <= target * (1 + 1e-9) or (done and moved < 1e-3):
+                        break
+                factor *= 0.5
+                if factor < 1e-3:
+                    message = trial if isinstance(trial, str) else "no step lowers cost and defects together"
+                    if mu < 1e2:
+                        break
+                    return self._end(Status.STALLED, f"{message}; try more nodes, or gauss_newton", x, recorder)
+            if factor < 1e-3:
+                mu = max(mu * 30.0, 1e-4)
+                continue
+            mu = mu * 0.2 if factor == 1.0 else mu * 5.0
+            assert not isinstance(trial, str)
+            x, nodes, now = trial_x, trial_nodes, trial
+        message = f"no convergence in {self.iterations} iterations; largest defect {now.defect:.1e}"
+        return self._end(Status.ITERATION_LIMIT, message, x, recorder)
+
+    def _end(self, status: Status, message: str, x: Array, recorder: Recorder) -> Outcome:
+        return Outcome(status, message, x, tuple(recorder.history), recorder.evaluations)
+
+    def _moved(
+        self, transcription: Transcription, nodes: list[Array], now: _Linearised, step: Array, factor: float
+    ) -> list[Array]:
+        moved = []
+        for i, (state, (by_x, by_defect, _)) in enumerate(zip(nodes, now.states, strict=True)):
+            local = transcription.local_columns(i)
+            moved.append(state + factor * (by_x @ step[local] + by_defect))
+        return moved
+
+    def _linearise(self, transcription: Transcription, x: Array, nodes: list[Array]) -> _Linearised | str:
+        problem = transcription.problem
+        cost, defect, residuals, jacobians, changes, states = 0.0, 0.0, [], [], [], []
+        for i, episode in enumerate(problem.episodes):
+            theta, deviation = problem.split(x, i)
+            theta = problem.own_theta(episode, theta)
+            start, by_start, message = problem.start_state(episode, theta, deviation)
+            if message:
+                return message
+            swept = self._condensed(transcription, i, theta, start, by_start, nodes[i])
+            if isinstance(swept, str):
+                return swept
+            trajectory, slopes, by_x, by_defect, gaps = swept
+            defect = max(defect, float(np.max(np.abs(gaps), initial=0.0)))
+            states.append((by_x, by_defect, gaps))
+            local = transcription.local_columns(i)
+            for samples in episode.samples:
+                predicted, sensitivity = problem.predict_along(samples, trajectory, slopes, theta)
+                seen = samples.weight > 0
+                raw = samples.weight * np.where(seen, predicted - samples.value, 0.0)
+                loss, robust = huber(raw, problem.options.robust_scale)
+                cost += loss
+                keep = seen.ravel()
+                scaled = ((robust * samples.weight)[:, :, None] * sensitivity).reshape(raw.size, -1)[keep]
+                residuals.append((robust * raw).ravel()[keep])
+                wide = np.zeros((len(scaled), len(x)))
+                wide[:, local] = scaled[:, :-1]
+                jacobians.append(wide)
+                changes.append(scaled[:, -1])
+        prior, by_x_prior = problem.prior(x)
+        cost += 0.5 * float(prior @ prior)
+        return _Linearised(
+            cost,
+            defect,
+            np.concatenate([*residuals, prior]),
+            np.vstack([*jacobians, by_x_prior]),
+            np.concatenate([*changes, np.zeros(len(prior))]),
+            tuple(states),
+        )
+
+    def _condensed(
+        self, transcription: Transcription, i: int, theta: Array, start: Array, by_start: Array, nodes: Array
+    ) -> tuple[Array, Array, Array, Array, Array] | str:
+        """Trajectory through the nodes with derivatives by (free parameters and start, closing of the defects)."""
+        problem, layout = transcription.problem, transcription.layouts[i]
+        nx, width = transcription.nx, by_start.shape[1]
+        steps = problem.episodes[i].grid.steps
+        trajectory, slopes = np.zeros((steps + 1, nx)), np.zeros((steps + 1, nx, width + 1))
+        by_x, by_defect = np.zeros((len(nodes), nx, width)), np.zeros((len(nodes), nx))
+        gaps = np.zeros((len(nodes), nx))
+        gaps[0] = start - nodes[0]
+        by_x[0], by_defect[0] = by_start, gaps[0]
+        for j in range(len(nodes) - 1):
+            first, last = int(layout.nodes[j]), int(layout.nodes[j + 1])
+            column = np.concatenate([by_x[j], by_defect[j][:, None]], axis=1)
+            wanted = (*problem.shared, *problem.local)
+            sweep = transcription.interval_sweep(i, j, nodes[j], theta, Directions(wanted, column))
+            if not sweep.status.ok or sweep.by_state is None:
+                return f"{problem.episodes[i].name}: interval {j}: {sweep.status.message}"
+            trajectory[first:last], slopes[first:last] = sweep.state[:-1], sweep.by_state[:-1]
+            gaps[j + 1] = sweep.state[-1] - nodes[j + 1]
+            by_x[j + 1] = sweep.by_state[-1][:, :width]
+            by_defect[j + 1] = sweep.by_state[-1][:, width] + gaps[j + 1]
+            trajectory[last] = nodes[j + 1]
+            slopes[last, :, :width], slopes[last, :, width] = by_x[j + 1], by_defect[j + 1]
+        return trajectory, slopes, by_x, by_defect, gaps

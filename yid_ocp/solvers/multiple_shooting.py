@@ -1,0 +1,275 @@
+"""Multiple shooting: the transcription solved by IPOPT, with compiled stage derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import casadi as ca
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+from yid_ocp.errors import SolverError
+from yid_ocp.problem.problem import EstimationProblem
+from yid_ocp.solvers.base import SOLVERS, Callback, Outcome, Recorder, Status, check_positive
+from yid_ocp.solvers.formulation import Transcription
+
+Array = NDArray[np.float64]
+Hessian = Literal["gauss_newton", "exact"]
+
+SUCCESS = {"Solve_Succeeded", "Solved_To_Acceptable_Level"}
+
+
+@SOLVERS.register("multiple_shooting")
+@dataclass(frozen=True)
+class MultipleShooting:
+    """Solve  min 1/2 |r(w)|^2  subject to the DEL equations of every step (or of every interval) and bounds.
+
+    The start is a rollout under the tracking filter; defects are scaled to order one, the cost by its initial value, and
+    IPOPT's own scaling is off.
+
+    Attributes
+    ----------
+    node_interval : int
+        Steps between nodes; 1 makes every DEL equation and multiplier part of the NLP.
+    hessian : "gauss_newton" or "exact"
+        Of the Lagrangian. Exact adds the curvature of the constraints, by differences of their compiled Jacobian.
+    iterations : int
+    tolerance : float
+        IPOPT's `tol`.
+    mu_init : float
+        Initial barrier parameter; small because the start nearly satisfies the equations.
+    ipopt : mapping
+        Further IPOPT options, which win.
+
+    References
+    ----------
+    Bock and Plitt (1984), IFAC Proc. 17(2):1603, doi:10.1016/S1474-6670(17)61205-9.
+    Waechter and Biegler (2006), Math. Programming 106:25, doi:10.1007/s10107-004-0559-y.
+    """
+
+    node_interval: int = 1
+    hessian: Hessian = "gauss_newton"
+    iterations: int = 200
+    tolerance: float = 1e-6
+    mu_init: float = 1e-5
+    ipopt: dict[str, Any] = field(default_factory=dict)
+    name: str = "multiple_shooting"
+    needs_rollout: bool = False
+
+    def run(self, problem: EstimationProblem, start: Array, callback: Callback | None) -> Outcome:
+        """See `Solver.run`."""
+        check_positive("tolerance", self.tolerance)
+        check_positive("mu_init", self.mu_init)
+        if self.hessian not in ("gauss_newton", "exact"):
+            raise SolverError(
+                f"hessian = '{self.hessian}'",
+                where="solver.hessian",
+                allowed="gauss_newton, exact",
+                hint="limited-memory updates cannot learn thousands of node states in a few dozen iterations",
+            )
+        if str(self.ipopt.get("hessian_approximation", "exact")) != "exact":
+            raise SolverError(
+                "limited-memory Hessians are refused",
+                where="solver.ipopt.hessian_approximation",
+                allowed="exact",
+                hint="the node states number in the thousands; use hessian: gauss_newton",
+            )
+        transcription = Transcription(problem, self.node_interval)
+        nlp = _Nlp(transcription, self.hessian, Recorder(callback))
+        w0 = transcription.guess(start)
+        lower, upper = transcription.bounds()
+        nlp.prepare(w0)
+        options = {
+            "print_time": False,
+            "no_nlp_grad": True,
+            "error_on_fail": False,
+            "ipopt": {
+                "print_level": 0,
+                "sb": "yes",
+                "max_iter": self.iterations,
+                "tol": self.tolerance,
+                "mu_init": self.mu_init,
+                "nlp_scaling_method": "none",
+                "bound_relax_factor": 0.0,
+                "acceptable_tol": 1e-3,
+                "acceptable_iter": 4,
+                "acceptable_constr_viol_tol": 1e-6,
+                "acceptable_obj_change_tol": 1e-5,
+                "fixed_variable_treatment": "make_parameter",
+                **self.ipopt,
+            },
+        }
+        functions = nlp.functions()
+        solver = ca.nlpsol("multiple_shooting", "ipopt", functions.pop("nlp"), {**options, **functions})
+        result = solver(x0=w0, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
+        stats = solver.stats()
+        w = np.array(result["x"]).ravel()
+        defect = float(np.max(np.abs(transcription.constraints(w, False)[0]), initial=0.0))
+        best = w if np.all(np.isfinite(w)) else nlp.best
+        if stats["return_status"] in SUCCESS:
+            status, message = Status.CONVERGED, f"IPOPT: {stats['return_status']}, largest defect {defect:.1e}"
+        elif stats["return_status"] == "Maximum_Iterations_Exceeded":
+            status = Status.ITERATION_LIMIT
+            message = f"IPOPT stopped after {self.iterations} iterations, largest defect {defect:.1e}; raise solver.iterations"
+        else:
+            status = Status.STALLED
+            message = (
+                f"IPOPT: {stats['return_status']}, largest defect {defect:.1e}; "
+                "start nearer, use more nodes, or use gauss_newton"
+            )
+        return Outcome(
+            status, message, transcription.unknowns(best), tuple(nlp.recorder.history), nlp.recorder.evaluations
+        )
+
+
+class _Function(ca.Callback):
+    """A CasADi function computed in Python."""
+
+    def __init__(
+        self, name: str, inputs: Sequence[str], outputs: Sequence[str], sparsity: dict[str, ca.Sparsity],
+        compute: Callable[..., list],
+    ) -> None:
+        ca.Callback.__init__(self)
+        self._inputs, self._outputs, self._sparsity, self._compute = list(inputs), list(outputs), sparsity, compute
+        self.construct(name, {})
+
+    def get_n_in(self) -> int:
+        return len(self._inputs)
+
+    def get_n_out(self) -> int:
+        return len(self._outputs)
+
+    def get_name_in(self, i: int) -> str:
+        return self._inputs[i]
+
+    def get_name_out(self, i: int) -> str:
+        return self._outputs[i]
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        return self._sparsity[self._inputs[i]]
+
+    def get_sparsity_out(self, i: int) -> ca.Sparsity:
+        return self._sparsity[self._outputs[i]]
+
+    def eval(self, arguments: list[ca.DM]) -> list:
+        return self._compute(*(np.array(a).ravel() for a in arguments))
+
+
+class _Nlp:
+    """Objective, constraints and their derivatives in the form that CasADi's IPOPT interface takes."""
+
+    def __init__(self, transcription: Transcription, hessian: Hessian, recorder: Recorder) -> None:
+        self.transcription = transcription
+        self.hessian = hessian
+        self.recorder = recorder
+        self.best = np.zeros(transcription.size)
+        self._keep: list[_Function] = []
+
+    def prepare(self, w0: Array) -> None:
+        """Fix scaling and sparsity from the start and from random points about it."""
+        t = self.transcription
+        rng = np.random.default_rng(0)
+        pattern_g = pattern_r = None
+        for trial in range(3):
+            w = w0 + (rng.normal(scale=1e-2, size=len(w0)) * np.maximum(np.abs(w0), 1e-2) if trial else 0.0)
+            _, jacobian = t.constraints(w, True)
+            _, slope, _ = t.residual(w, True)
+            assert jacobian is not None
+            assert slope is not None
+            pattern_g = abs(jacobian).sign() if pattern_g is None else pattern_g + abs(jacobian).sign()
+            pattern_r = abs(slope).sign() if pattern_r is None else pattern_r + abs(slope).sign()
+        self._g = _Pattern(pattern_g)
+        curvature = pattern_r.T @ pattern_r
+        if self.hessian == "exact":
+            curvature = curvature + pattern_g.T @ pattern_g
+        curvature = curvature + scipy.sparse.identity(t.size, format="csc")
+        self._h = _Pattern(scipy.sparse.triu(curvature, format="csc"))
+        cost = t.residual(w0, False)[2]
+        self._unit = max(cost, 1.0)
+        self.best = w0
+        self.recorder.evaluations += 1
+        self.recorder.accept(cost, w0[: len(t.problem.shared)], np.nan, "start")
+
+    def functions(self) -> dict[str, ca.Function]:
+        """The functions `nlp`, `grad_f`, `jac_g` and `hess_lag`."""
+        t = self.transcription
+        count = self._g.shape[0]
+        sparsity = {
+            "x": ca.Sparsity.dense(t.size, 1),
+            "p": ca.Sparsity.dense(0, 1),
+            "f": ca.Sparsity.dense(1, 1),
+            "g": ca.Sparsity.dense(count, 1),
+            "lam_f": ca.Sparsity.dense(1, 1),
+            "lam_g": ca.Sparsity.dense(count, 1),
+            "grad_f": ca.Sparsity.dense(t.size, 1),
+            "jac_g": self._g.sparsity,
+            "hess_lag": self._h.sparsity,
+        }
+
+        def make(name: str, inputs: Sequence[str], outputs: Sequence[str], compute: Callable[..., list]) -> _Function:
+            self._keep.append(_Function(name, inputs, outputs, sparsity, compute))
+            return self._keep[-1]
+
+        return {
+            "nlp": make("nlp", ("x", "p"), ("f", "g"), self._values),
+            "grad_f": make("grad_f", ("x", "p"), ("f", "grad_f"), self._gradient),
+            "jac_g": make("jac_g", ("x", "p"), ("g", "jac_g"), self._jacobian),
+            "hess_lag": make("hess_lag", ("x", "p", "lam_f", "lam_g"), ("hess_lag",), self._curvature),
+        }
+
+    def _values(self, w: Array, _: Array) -> list:
+        self.recorder.evaluations += 1
+        return [self.transcription.residual(w, False)[2] / self._unit, self.transcription.constraints(w, False)[0]]
+
+    def _gradient(self, w: Array, _: Array) -> list:
+        residual, slope, cost = self.transcription.residual(w, True)
+        assert slope is not None
+        gradient = slope.T @ residual
+        self.best = w
+        self.recorder.accept(cost, self.transcription.unknowns(w), float(np.max(np.abs(gradient))) / self._unit)
+        return [cost / self._unit, gradient / self._unit]
+
+    def _jacobian(self, w: Array, _: Array) -> list:
+        value, jacobian = self.transcription.constraints(w, True)
+        assert jacobian is not None
+        return [value, self._g.filled(jacobian)]
+
+    def _curvature(self, w: Array, _: Array, lam_f: Array, lam_g: Array) -> list:
+        _, slope, _ = self.transcription.residual(w, True)
+        assert slope is not None
+        problem = self.transcription.problem
+        count = len(problem.shared)
+        # weakly informed parameters would swing to and fro: a curvature of one per size squared holds them
+        ridge = np.zeros(len(w))
+        ridge[:count] = 1.0 / np.maximum(np.abs(w[:count]), problem.scales[:count]) ** 2
+        matrix = (slope.T @ slope + scipy.sparse.diags(ridge)) * (float(lam_f[0]) / self._unit)
+        if self.hessian == "exact":
+            matrix = matrix + self.transcription.curvature(w, lam_g)
+        return [self._h.filled(scipy.sparse.triu(matrix, format="csc"))]
+
+
+class _Pattern:
+    """A fixed sparsity into which matrices of fewer entries are filled."""
+
+    def __init__(self, matrix: Any) -> None:
+        matrix = scipy.sparse.csc_matrix(matrix)
+        matrix.sort_indices()
+        self.shape = matrix.shape
+        self._start, self._row = matrix.indptr.astype(np.int64), matrix.indices.astype(np.int64)
+        self.sparsity = ca.Sparsity(matrix.shape[0], matrix.shape[1], self._start.tolist(), self._row.tolist())
+        columns = np.repeat(np.arange(self.shape[1]), np.diff(self._start))
+        self._keys = columns * self.shape[0] + self._row
+
+    def filled(self, matrix: Any) -> ca.DM:
+        """The matrix's entries in this pattern; entries outside it (a derivative that vanished by chance) are lost."""
+        matrix = scipy.sparse.csc_matrix(matrix)
+        columns = np.repeat(np.arange(self.shape[1]), np.diff(matrix.indptr))
+        keys = columns * self.shape[0] + matrix.indices
+        place = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
+        values = np.zeros(len(self._keys))
+        inside = self._keys[place] == keys
+        np.add.at(values, place[inside], matrix.data[inside])
+        return ca.DM(self.sparsity, values)

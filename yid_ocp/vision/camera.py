@@ -1,0 +1,310 @@
+"""A virtual depth camera: clouds of a robot and its object as a structured-light sensor would see them.
+
+The pattern's shift is a disparity d = f b / z [pixels]. Its noise and its steps are even in d, so that in depth both
+grow with the square of the distance: dz = z^2/(f b) dd. Pixels are lost where the surface is seen at a grazing angle,
+at edges, and where the projector's light does not reach; some at edges mix front and back.
+
+References
+----------
+Khoshelham & Elberink (2012), Sensors 12:1437, doi:10.3390/s120201437, equations (5) and (10).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
+
+from yid_ocp.errors import ConfigError
+from yid_ocp.model.system import System
+from yid_ocp.vision.frames import XTION, Film, Pinhole, checked_pose
+from yid_ocp.vision.meshes import Mesh, Surfaces, numeric_mechanism, robot_meshes, tube_meshes
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class DepthCamera:
+    """Geometry and errors of a structured-light depth camera; the defaults are an Asus Xtion Pro Live.
+
+    Attributes
+    ----------
+    pinhole : Pinhole
+    baseline : float
+        Between projector and camera, along x [m].
+    nearest, furthest : float
+        Range of depths that it measures [m].
+    disparity_std : float
+        Deviation of the disparity [pixels]; 1/16 gives 6 mm at 2 m.
+    disparity_step : float
+        Step of the disparity [pixels]; 1/8 gives 12 mm at 2 m.
+    correlation : float
+        Over how many pixels neighbouring errors are alike [pixels].
+    grazing : float
+        Cosine of ray and normal below which nothing comes back; up to twice as much it comes back sometimes.
+    edge_jump : float
+        Difference in depth of neighbouring pixels that makes an edge, relative to depth.
+    edge_loss, edge_mix : float
+        Probability that a pixel at an edge is lost, or lies anywhere between front and back.
+    loss : float
+        Probability that any pixel is lost.
+    outliers : float
+        Probability that a pixel's pattern is matched wrongly: its depth is then anywhere within `outlier_span`.
+    outlier_span : float
+        [m], to either side of the true depth.
+    """
+
+    pinhole: Pinhole = XTION
+    baseline: float = 0.075
+    nearest: float = 0.8
+    furthest: float = 3.5
+    disparity_std: float = 1 / 16
+    disparity_step: float = 1 / 8
+    correlation: float = 0.7
+    grazing: float = 0.12
+    edge_jump: float = 0.02
+    edge_loss: float = 0.6
+    edge_mix: float = 0.05
+    loss: float = 0.01
+    outliers: float = 0.0
+    outlier_span: float = 0.4
+
+    def depth_std(self, depth: ArrayLike) -> Array:
+        """Deviation of a measured depth, noise and steps together [m]:  z^2/(f b) sqrt(std^2 + step^2/12)."""
+        z = np.asarray(depth, float)
+        spread = math.hypot(self.disparity_std, self.disparity_step / math.sqrt(12.0))
+        return np.asarray(z**2 / (self.pinhole.fx * self.baseline) * spread)
+
+    def measure(self, depth: Array, cosine: Array, rng: np.random.Generator) -> Array:
+        """Measured depth image.
+
+        Parameters
+        ----------
+        depth, cosine : ndarray, shape (height, width)
+            True depth [m], infinite where there is nothing; cosine of ray and normal.
+        rng : Generator
+
+        Returns
+        -------
+        ndarray, shape (height, width)
+            [m]; NaN where nothing was measured.
+        """
+        scale = self.pinhole.fx * self.baseline
+        shape = depth.shape
+        white = rng.standard_normal(shape)
+        if self.correlation > 0:
+            white = gaussian_filter(white, self.correlation, mode="wrap")
+            white /= white.std()
+        chance = rng.random((4, *shape))
+        far = np.where(np.isfinite(depth), depth, 1e3)
+        front, back = minimum_filter(far, size=3), maximum_filter(far, size=3)
+        edge = back - front > self.edge_jump * front
+        mixed = edge & (chance[0] < self.edge_mix) & (back < self.furthest)
+        true = np.where(mixed, front + rng.random(shape) * (back - front), far)
+        wrong = chance[1] < self.outliers
+        true = np.where(wrong, true + self.outlier_span * rng.uniform(-1.0, 1.0, shape), true)
+        disparity = scale / np.maximum(true, 1e-3) + self.disparity_std * white
+        if self.disparity_step > 0:
+            disparity = np.rint(disparity / self.disparity_step) * self.disparity_step
+        measured = scale / np.maximum(disparity, 1e-6)
+        lost = (far < self.nearest) | (far > self.furthest) | (measured < self.nearest) | (measured > self.furthest)
+        lost |= cosine < self.grazing * (1.0 + chance[2])
+        lost |= edge & ~mixed & (chance[0] > 1.0 - self.edge_loss)
+        lost |= chance[3] < self.loss
+        lost |= self._shadow(far)
+        return np.where(lost, np.nan, measured)
+
+    def _shadow(self, depth: Array) -> NDArray[np.bool_]:
+        """Pixels that the projector, on the camera's left, does not reach: another one of its line is nearer."""
+        if self.baseline <= 0:
+            return np.zeros(depth.shape, bool)
+        disparity = self.pinhole.fx * self.baseline / depth
+        height, width = depth.shape
+        margin = math.ceil(float(disparity.max())) + 1
+        # the projector stands at x = -baseline, so that its image of a pixel lies to the right by the disparity
+        column = np.rint(np.arange(width) + disparity).astype(np.int64)
+        flat = np.arange(height)[:, None] * (width + margin + 1) + np.minimum(column, width + margin)
+        nearest = np.zeros(height * (width + margin + 1))
+        np.maximum.at(nearest, flat.ravel(), disparity.ravel())
+        return np.asarray(disparity < nearest[flat] - 1.0)
+
+
+@dataclass(frozen=True)
+class Shutter:
+    """When a camera takes frames, and what happens to them and to their time stamps.
+
+    Attributes
+    ----------
+    rate : float
+        Mean rate [Hz].
+    spread : float
+        Periods vary by this share either way.
+    dropped : float
+        Share of frames that never arrive.
+    latency : float
+        By how much every stamp is later than the picture, and the camera's clock ahead, taken together [s].
+    latency_std : float
+        Deviation of the latency from frame to frame [s].
+    late : float
+        Share of frames that are stamped `late_by` [s] too late.
+    late_by : float
+    """
+
+    rate: float = 3.0
+    spread: float = 0.25
+    dropped: float = 0.0
+    latency: float = 0.0
+    latency_std: float = 0.0
+    late: float = 0.0
+    late_by: float = 0.15
+
+    def times(self, start: float, stop: float, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Times of the pictures that arrive and their stamps, both shape (M,) [s]."""
+        if not (self.rate > 0 and 0 <= self.spread < 1):
+            raise ConfigError(f"rate = {self.rate}, spread = {self.spread}", allowed="rate > 0, 0 <= spread < 1")
+        count = math.ceil((stop - start) * self.rate / (1 - self.spread)) + 2
+        taken = start + np.cumsum(rng.uniform(1 - self.spread, 1 + self.spread, count) / self.rate)
+        taken = taken[taken < stop]
+        taken = taken[rng.random(len(taken)) >= self.dropped]
+        stamps = taken + self.latency + self.latency_std * rng.standard_normal(len(taken))
+        return taken, stamps + np.where(rng.random(len(taken)) < self.late, self.late_by, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class VirtualFilm:
+    """A virtual camera's film with what really was.
+
+    Attributes
+    ----------
+    film : Film
+    taken : ndarray, shape (M,)
+        Time of every picture on the simulator's clock [s].
+    q : ndarray, shape (M, n)
+        Configuration in every picture.
+    depth : sequence of ndarray
+        `depth[i]` is the measured depth image of frame i, made when asked for [m].
+    """
+
+    film: Film
+    taken: Array
+    q: Array
+    depth: Sequence[Array]
+
+
+@dataclass(frozen=True)
+class Room:
+    """What stands around the robot: a floor at z and a wall at x [m], None for neither."""
+
+    floor: float | None = -0.93
+    wall: float | None = -0.6
+
+    def mesh(self) -> Mesh | None:
+        """Thin boxes."""
+        parts = []
+        if self.floor is not None:
+            at = np.eye(4)
+            at[:3, 3] = [1.0, 0.0, self.floor - 0.01]
+            parts.append(Mesh.box([8.0, 8.0, 0.02]).moved(at))
+        if self.wall is not None:
+            at = np.eye(4)
+            at[:3, 3] = [self.wall - 0.01, 0.0, 0.5]
+            parts.append(Mesh.box([0.02, 8.0, 3.0]).moved(at))
+        return Mesh.joined(parts) if parts else None
+
+
+@dataclass(eq=False)
+class _Images(Sequence[Array]):
+    """Depth images, each rendered from its own seed when it is asked for; the last one is kept."""
+
+    surfaces: Surfaces
+    camera: DepthCamera
+    pose: Array
+    q: Array
+    seed: int
+    _kept: dict[int, Array] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    def __getitem__(self, index):  # type: ignore[no-untyped-def]
+        number = int(index)
+        if number not in self._kept:
+            self._kept.clear()
+            depth, cosine = self.surfaces.cast(self.camera.pinhole, self.pose, self.q[number])
+            rng = np.random.default_rng([self.seed, number])
+            self._kept[number] = self.camera.measure(depth, cosine, rng)
+        return self._kept[number]
+
+
+def film(
+    system: System,
+    t: ArrayLike,
+    q: ArrayLike,
+    pose: ArrayLike,
+    *,
+    urdf: str | None = "package:baxter",
+    camera: DepthCamera | None = None,
+    shutter: Shutter | None = None,
+    room: Room | None = None,
+    values: Mapping[str, float] | None = None,
+    seed: int = 0,
+) -> VirtualFilm:
+    """Let a virtual camera look at a motion.
+
+    Parameters
+    ----------
+    system : System
+    t : array_like, shape (N,)
+        [s]
+    q : array_like, shape (N, n)
+        Configurations at these times, from whatever simulator; interpolated by a cubic spline in between.
+    pose : array_like, shape (4, 4)
+        Camera in the world (x right, y down, z ahead) [m].
+    urdf : str, optional
+        File of the robot whose meshes are seen; None to see the object alone.
+    camera : DepthCamera, optional
+        An Asus Xtion Pro Live where absent.
+    shutter : Shutter, optional
+    room : Room, optional
+        A floor under the paper's Y and a wall behind Baxter where absent.
+    values : mapping of str to float, optional
+        Parameter values (lengths, radii); nominal where absent.
+    seed : int
+        Of all that is drawn at random.
+
+    Returns
+    -------
+    VirtualFilm
+        Frames are rendered when they are loaded, the same every time.
+
+    Raises
+    ------
+    DataError, ModelError
+        No Open3D, no object, a mesh that cannot be read, or a pose that is none.
+    """
+    sensor, when = camera or DepthCamera(), shutter or Shutter()
+    matrix = checked_pose(pose, "film")
+    times, path = np.asarray(t, float), np.asarray(q, float)
+    rng = np.random.default_rng(seed)
+    taken, stamps = when.times(float(times[0]), float(times[-1]), rng)
+    configuration = np.asarray(CubicSpline(times, path, axis=0)(taken))
+    tree = numeric_mechanism(system, values)
+    meshes = tube_meshes(system, values)
+    fixed = [] if room is None and urdf is None else [(room or Room()).mesh()]
+    for joint, mesh in (robot_meshes(urdf, tree) if urdf is not None else {}).items():
+        if joint < 0:
+            fixed.append(mesh)
+        else:
+            meshes[joint] = mesh
+    still = [mesh for mesh in fixed if mesh is not None]
+    if still:
+        meshes[-1] = Mesh.joined(still)
+    images = _Images(Surfaces(tree, meshes), sensor, matrix, configuration, seed)
+    names = tuple(f"frame {i}" for i in range(len(taken)))
+    made = Film(stamps, names, matrix, lambda i: sensor.pinhole.cloud(images[i]), sensor.pinhole, "virtual camera")
+    return VirtualFilm(made, taken, configuration, images)

@@ -1,0 +1,254 @@
+"""From a camera's cloud to the points of the object: pass-through, voxels, robot self-filter, statistical outliers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from yid_ocp.errors import ConfigError
+from yid_ocp.model.kinematics import forward_kinematics
+from yid_ocp.model.system import System
+from yid_ocp.vision.meshes import Surfaces, numeric_mechanism
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_TO_SIGMA = 1.4826  # from the median absolute deviation of a normal distribution to its deviation
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """Points with weights.
+
+    Attributes
+    ----------
+    points : ndarray, shape (N, 3)
+        In the world [m].
+    weight : ndarray, shape (N,)
+        How many of the camera's points each one stands for.
+    """
+
+    points: Array
+    weight: Array
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def keep(self, mask: NDArray[np.bool_] | NDArray[np.int64]) -> Cloud:
+        """The points that a mask or a list of indices selects."""
+        return Cloud(self.points[mask], self.weight[mask])
+
+
+@dataclass(frozen=True)
+class FilterOptions:
+    """What counts as the object.
+
+    Attributes
+    ----------
+    voxel : float
+        Edge of the cubes in which points are averaged [m].
+    padding : float
+        Points this near to the robot's surface belong to it [m]; about five deviations of the depth.
+    lower, upper : (float, float, float), optional
+        Corners of a box in the world outside of which points are left out [m].
+    floor : float, optional
+        Points below this height are left out [m]; where absent, `floor_margin` above the foot of an object that stands
+        on one, else nothing.
+    floor_margin : float
+        [m]
+    reach_margin : float
+        Points further from the object's root than its longest branch reaches, plus this, are left out [m].
+    behind : float, optional
+        Points that are further from the camera than the robot's base by more than this, seen in the horizontal, are
+        behind the robot and left out [m]; None to keep them.
+    neighbours : int
+        Of every point, whose mean distance tells whether it is alone.
+    outlier_ratio : float
+        A point is an outlier where that distance exceeds the median by so many (robust) deviations.
+    least : int
+        A frame with fewer points left is of no use.
+    most : int
+        Of more points left, so many are drawn at random, to bound the time that a frame takes.
+    """
+
+    voxel: float = 0.008
+    padding: float = 0.03
+    lower: tuple[float, float, float] | None = None
+    upper: tuple[float, float, float] | None = None
+    floor: float | None = None
+    floor_margin: float = 0.05
+    reach_margin: float = 0.1
+    behind: float | None = 0.0
+    neighbours: int = 12
+    outlier_ratio: float = 4.0
+    least: int = 150
+    most: int = 6000
+
+    def __post_init__(self) -> None:
+        for name in ("voxel", "padding", "reach_margin", "outlier_ratio"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"{name} = {getattr(self, name)}", where="filter options", allowed="a positive number")
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """Where the object can be at all.
+
+    Attributes
+    ----------
+    lower, upper : ndarray, shape (3,)
+        Box in the world [m].
+    centre : ndarray, shape (3,)
+        The object's root [m].
+    radius : float
+        How far it reaches from there [m].
+    ahead : ndarray, shape (3,)
+        Horizontal direction from the camera to the robot, zero where nothing is behind it.
+    limit : float
+        Points with  ahead . p > limit  are behind the robot [m].
+    """
+
+    lower: Array
+    upper: Array
+    centre: Array
+    radius: float
+    ahead: Array
+    limit: float
+
+    def contains(self, points: Array) -> Mask:
+        """Which points, shape (N, 3), lie inside, shape (N,)."""
+        inside = np.ones(len(points), bool)
+        for axis in range(3):  # column by column, which is quicker than whole rows on large clouds
+            inside &= (points[:, axis] >= self.lower[axis]) & (points[:, axis] <= self.upper[axis])
+        rest = np.flatnonzero(inside)
+        inside[rest] = points[rest] @ self.ahead <= self.limit
+        rest = np.flatnonzero(inside)
+        away = points[rest] - self.centre
+        inside[rest] = np.einsum("ij,ij->i", away, away) <= self.radius**2
+        return inside
+
+
+class ObjectRegion:
+    """Works out where the object can be, from how far its branches reach and what it stands on.
+
+    Parameters
+    ----------
+    system : System
+    options : FilterOptions
+    values : mapping of str to float, optional
+        Parameter values; nominal where absent.
+    """
+
+    def __init__(self, system: System, options: FilterOptions, values: Mapping[str, float] | None = None) -> None:
+        tree = numeric_mechanism(system, values)
+        symbols, theta = system.parameters.symbols, system.parameters.vector(values)
+        lengths = {
+            s.name: float(sum(float(ca.Function("l", [symbols], [length])(theta)) for length in s.lengths))
+            for s in system.segments
+        }
+        radius = max(float(ca.Function("r", [symbols], [s.radius])(theta)) for s in system.segments)
+        reach: dict[str, float] = {}
+        for segment in system.segments:
+            reach[segment.name] = lengths[segment.name] + (reach[segment.parent] if segment.parent else 0.0)
+        first = next(s for s in system.segments if s.parent is None)
+        self._radius = max(reach.values()) + radius + options.reach_margin
+        base = tree.joint_index(first.links[0][0])
+        q = ca.SX.sym("q", system.size)
+        kinematics = forward_kinematics(tree, q)
+        self._root = ca.Function("root", [q], [kinematics.origins[base]])
+        tips = [kinematics.position(f"w_{name}") for name in lengths if f"w_{name}" in tree.frames]
+        low = -np.inf if options.floor is None else options.floor
+        if options.floor is None and tree.joints[base].parent < 0 and tips:
+            rest = np.zeros(system.size)
+            root = float(np.array(self._root(rest))[2, 0])
+            heights = np.array(ca.Function("tips", [q], [ca.horzcat(*tips)])(rest))[2]
+            if heights.min() > root:
+                low = root + options.floor_margin
+        self._lower = np.full(3, -np.inf) if options.lower is None else np.asarray(options.lower, float)
+        self._upper = np.full(3, np.inf) if options.upper is None else np.asarray(options.upper, float)
+        self._lower = self._lower.copy()
+        self._lower[2] = max(self._lower[2], low)
+        self._behind = options.behind
+        elastic = {entry.joint for entry in system.elastic}
+        roots = [j for j in tree.joints if j.parent < 0 and j.name not in elastic]
+        bases = [np.array(ca.DM(joint.placement.translation)).ravel() for joint in roots]
+        self._base = np.mean(bases, axis=0) if bases else None
+
+    def at(self, q: ArrayLike, camera: ArrayLike) -> Region:
+        """The region with the robot at a configuration, shape (n,), seen from a camera's position, shape (3,) [m]."""
+        centre = np.array(self._root(np.asarray(q, float))).ravel()
+        ahead, limit = np.zeros(3), 0.0
+        if self._behind is not None and self._base is not None:
+            ahead = (self._base - np.asarray(camera, float)) * [1.0, 1.0, 0.0]
+            length = float(np.linalg.norm(ahead))
+            ahead = ahead / length if length > 0 else np.zeros(3)
+            limit = float(ahead @ self._base) + self._behind
+        return Region(self._lower, self._upper, centre, self._radius, ahead, limit)
+
+
+def voxel_grid(points: Array, size: float) -> Cloud:
+    """Mean of the points in every cube of a grid.
+
+    Parameters
+    ----------
+    points : ndarray, shape (N, 3)
+        [m]
+    size : float
+        Edge of the cubes [m].
+
+    Returns
+    -------
+    Cloud
+        One point for every cube that is not empty, weighted by how many were in it.
+    """
+    if not len(points):
+        return Cloud(np.empty((0, 3)), np.empty(0))
+    cell = np.floor((points - points.min(0)) / size).astype(np.int64)
+    extent = cell.max(0) + 1
+    key = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
+    _, index, count = np.unique(key, return_inverse=True, return_counts=True)
+    total = np.stack([np.bincount(index, points[:, axis]) for axis in range(3)], axis=1)
+    return Cloud(total / count[:, None], count.astype(np.float64))
+
+
+def without_robot(cloud: Cloud, robot: Surfaces, q: ArrayLike, padding: float) -> Mask:
+    """Which points are not the robot's: further than `padding` [m] from its surface at a configuration, shape (N,)."""
+    return ~np.isfinite(robot.distance(cloud.points, q, padding))
+
+
+def without_outliers(cloud: Cloud, neighbours: int, ratio: float) -> Mask:
+    """Which points have company: statistical outlier removal.
+
+    A point stays where the mean distance d to its nearest neighbours satisfies  d <= median(d) + ratio s,  with s the
+    median absolute deviation turned into a standard one. Median and deviation are weighted, so that wrong points, each
+    alone in its voxel, count for little; unlike mean and standard deviation they hardly move with the outliers.
+
+    Parameters
+    ----------
+    cloud : Cloud
+    neighbours : int
+        Of every point.
+    ratio : float
+
+    Returns
+    -------
+    ndarray, shape (N,)
+        True for points that stay.
+    """
+    if len(cloud) <= neighbours:
+        return np.zeros(len(cloud), bool)
+    distance = cKDTree(cloud.points).query(cloud.points, k=neighbours + 1)[0][:, 1:].mean(1)
+    middle = _weighted_median(distance, cloud.weight)
+    spread = _TO_SIGMA * _weighted_median(np.abs(distance - middle), cloud.weight)
+    return np.asarray(distance <= middle + ratio * spread)
+
+
+def _weighted_median(values: Array, weight: Array) -> float:
+    order = np.argsort(values)
+    total = np.cumsum(weight[order])
+    return float(values[order[np.searchsorted(total, 0.5 * total[-1])]])

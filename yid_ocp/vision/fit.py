@@ -1,0 +1,374 @@
+"""The object's shape from a cloud: equation (3) of the source paper, robust and with derivatives.
+
+    q_o = argmin sum_i w_i rho(e_i) + |g(q)/s_g|^2 + |b(q)|^2,      e_i = |p_i - c_i(q)| - f r_i
+
+p_i: point of the cloud, or node of its skeleton; c_i: nearest point of the model's line segments, with r_i the radius of
+its tube. A camera sees surfaces: points lie at the radius (f = 1) from the centre line, on the camera's side; a node, the
+mean of the visible half of a tube, lies at f = pi/4. rho is Geman and McClure's loss. g: distance of held frames from the
+grippers, known from the joint angles. b: bends, in proportion to the square root of their stiffness, so that of all shapes
+through the points it is the one of least elastic energy. Twists about the tubes' axes move no centre line (the two
+bends at the next joint reach every direction) and stay at rest.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from yid_ocp.errors import ConfigError, DataError
+from yid_ocp.model.kinematics import forward_kinematics
+from yid_ocp.model.system import System
+from yid_ocp.vision.meshes import numeric_mechanism
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+NODE_FACTOR = math.pi / 4
+"""Where the mean of a tube's visible half lies, as a share of its radius."""
+
+_AWAY = -0.5  # cosine of normal and sight beyond which a point cannot be on the side that the camera sees
+_STATIONS = 6  # per link, where it is asked whether points are near
+_LEAST_STIFFNESS = 1e-2  # of the mean; softer bends are still held this much
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """How a shape is fitted.
+
+    Attributes
+    ----------
+    scales : tuple of float
+        Scale of the robust loss on the nodes, one pass after the other [m]: wide first, so that a start some
+        decimetres off is caught.
+    surface_scales : tuple of float
+        The same on the points of the cloud; empty for a fit to the nodes alone, as in the source paper [m].
+    noise : float
+        Deviation of one averaged point from the surface [m].
+    noise_correlation : float
+        Of how many points the errors are alike; divides the weight of all points together.
+    grasp_std : float
+        Deviation between a gripper, by its joint angles, and what it holds [m].
+    direction_std : float
+        The same of the axes that grasps of kind `axis` and `weld` make coincide [rad].
+    bend_std : float
+        Bend of a joint of mean stiffness that costs as much as one deviation [rad].
+    rate_std : float
+        Change of a bend since the previous frame that costs as much, per time between them [rad/s].
+    iterations : int
+        At most so many in a pass.
+    weight_cap : float
+        A point counts at most for so many of the camera's.
+    """
+
+    scales: tuple[float, ...] = (0.15, 0.05)
+    surface_scales: tuple[float, ...] = (0.03, 0.015)
+    noise: float = 0.006
+    noise_correlation: float = 8.0
+    grasp_std: float = 0.004
+    direction_std: float = 0.05
+    bend_std: float = 0.3
+    rate_std: float = 3.0
+    iterations: int = 25
+    weight_cap: float = 6.0
+
+    def __post_init__(self) -> None:
+        for name in ("noise", "noise_correlation", "grasp_std", "direction_std", "bend_std", "rate_std", "weight_cap"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"{name} = {getattr(self, name)}", where="fit options", allowed="a positive number")
+        if not self.scales and not self.surface_scales:
+            raise ConfigError("there is no pass to fit in", where="fit options: scales", allowed="one scale or more")
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A shape and how good it is.
+
+    Attributes
+    ----------
+    q : ndarray, shape (n,)
+        Configuration, twists at rest.
+    points : ndarray, shape (np, 3)
+        The system's points there [m].
+    std : ndarray, shape (np, 3)
+        Deviation of each coordinate by the curvature of the cost [m].
+    distance : float
+        Mean of |e_i| over all processed points, each counted for 0.1 m at most: the value of equation (3) [m].
+    inliers : float
+        Share of the points nearer than three times the last scale.
+    coverage : mapping of segment to float
+        Share of each segment's length along which there are points.
+    iterations : int
+    centre_line : ndarray, shape (K, 2, 3)
+        Start and end of every link [m].
+    """
+
+    q: Array
+    points: Array
+    std: Array
+    distance: float
+    inliers: float
+    coverage: Mapping[str, float]
+    iterations: int
+    centre_line: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What one frame knows: processed points and where they were seen from.
+
+    Attributes
+    ----------
+    points : ndarray, shape (N, 3)
+        Surface points in the world [m].
+    weight : ndarray, shape (N,)
+    nodes : ndarray, shape (K, 3)
+        Of their skeleton [m].
+    camera : ndarray, shape (3,)
+        The camera's position [m].
+    """
+
+    points: Array
+    weight: Array
+    nodes: Array
+    camera: Array
+
+
+class ShapeFit:
+    """Fits the shape of a system's object to what a camera saw.
+
+    Parameters
+    ----------
+    system : System
+    options : FitOptions, optional
+    values : mapping of str to float, optional
+        Parameter values (lengths, radii, stiffnesses for the prior); nominal where absent.
+
+    Raises
+    ------
+    DataError
+        The system has no object with bends.
+    """
+
+    def __init__(
+        self, system: System, options: FitOptions | None = None, values: Mapping[str, float] | None = None
+    ) -> None:
+        self.system = system
+        self.options = options or FitOptions()
+        if not system.segments:
+            raise DataError("the model has no object whose shape could be fitted", hint="give it segments")
+        tree = numeric_mechanism(system, values)
+        symbols, theta = system.parameters.symbols, system.parameters.vector(values)
+
+        def number(expression: ca.SX) -> Array:
+            return np.array(ca.densify(ca.Function("number", [symbols], [expression])(theta))).ravel()
+
+        bends = [entry for entry in system.elastic if entry.kind == "bend" and entry.axis]
+        self.free = tuple(tree.joint_index(entry.joint) for entry in bends)
+        self.rest = np.zeros(system.size)
+        for entry in system.elastic:
+            self.rest[tree.joint_index(entry.joint)] = number(entry.rest)[0]
+        stiffness = np.array([number(entry.stiffness)[0] for entry in bends])
+        typical = stiffness.mean() if stiffness.max() > 0 else 1.0
+        self._prior = np.sqrt(np.maximum(stiffness / typical, _LEAST_STIFFNESS)) / self.options.bend_std
+        elastic = {entry.joint for entry in system.elastic}
+        self.known = tuple(name for name in tree.joint_names if name not in elastic)
+
+        q = ca.SX.sym("q", system.size)
+        kinematics = forward_kinematics(tree, q)
+        columns = list(self.free)
+        starts, ends, radii, owners = [], [], [], []
+        for segment in system.segments:
+            for i, names in enumerate(segment.links):
+                starts.append(kinematics.origins[tree.joint_index(names[0])])
+                ends.append(kinematics.position(f"{segment.name}_{i}_tip"))
+                radii.append(number(segment.radius)[0])
+                owners.append(segment.name)
+        self.radius, self.owner = np.array(radii), tuple(owners)
+        corners = ca.vertcat(*(ca.vertcat(a, b) for a, b in zip(starts, ends, strict=True)))
+        self._corners = ca.Function("corners", [q], ca.cse([corners, ca.densify(ca.jacobian(corners, q)[:, columns])]))
+        seen = ca.vertcat(*(kinematics.position(name) for name in system.points))
+        self._seen = ca.Function("seen", [q], ca.cse([seen, ca.densify(ca.jacobian(seen, q)[:, columns])]))
+        rows = [ca.SX(0, 1)]
+        for grasp in system.grasps:
+            residual, alignment = grasp.residual(kinematics), grasp.alignment(kinematics)
+            rows.append(residual[:3] / self.options.grasp_std)
+            if grasp.kind != "point":  # the first column of a weld is a roll, which stays unknown
+                rows.append(alignment[-3:] / self.options.direction_std)
+        held = ca.substitute(ca.vertcat(*rows), symbols, ca.SX(ca.DM(theta)))
+        self._held = ca.Function("held", [q], ca.cse([held, ca.densify(ca.jacobian(held, q)[:, columns])]))
+
+    def solve(
+        self,
+        sight: Sight,
+        q_known: Array,
+        start: Array | None = None,
+        previous: tuple[Array, float] | None = None,
+    ) -> Fit:
+        """Fit the shape in one frame.
+
+        Parameters
+        ----------
+        sight : Sight
+        q_known : ndarray, shape (n,)
+            Configuration whose robot part is right; the object's part is not used.
+        start : ndarray, shape (n,), optional
+            Where the search for the object's part begins; at rest where absent.
+        previous : (ndarray of shape (n,), float), optional
+            Configuration in the frame before and the time since then [s]: a prior.
+
+        Returns
+        -------
+        Fit
+
+        Raises
+        ------
+        DataError
+            There is no point.
+        """
+        options, free = self.options, list(self.free)
+        if not len(sight.points) or not len(sight.nodes):
+            raise DataError("there is no point to fit to", where="fit")
+        q = self.rest.copy()
+        known = [self.system.mechanism.joint_index(name) for name in self.known]
+        q[known] = q_known[known]
+        q[free] = (self.rest if start is None else start)[free]
+        weight = np.minimum(sight.weight, options.weight_cap)
+        # nodes weigh together as much as the points, which share their errors
+        node_weight = np.full(len(sight.nodes), weight.sum() / len(sight.nodes))
+        factor = 1.0 / (options.noise_correlation * options.noise**2)
+        iterations, hessian = 0, np.eye(len(free))
+        passes = [(sight.nodes, node_weight, NODE_FACTOR, scale) for scale in options.scales]
+        passes += [(sight.points, weight, 1.0, scale) for scale in options.surface_scales]
+        for points, heft, share, scale in passes:
+            task = _Task(points, heft * factor, share, scale, sight.camera, previous)
+            q, hessian, used = self._minimise(q, task)
+            iterations += used
+        last = passes[-1]
+        error, link, along = self._errors(q, last[0], last[2], sight.camera)
+        size = np.abs(error)
+        share_in = size < 3 * last[3]
+        points, jacobian = self._seen(q)
+        spread = np.array(jacobian) @ np.linalg.solve(hessian, np.array(jacobian).T)
+        corners = np.array(self._corners(q)[0]).reshape(-1, 2, 3)
+        return Fit(
+            q,
+            np.array(points).reshape(-1, 3),
+            np.sqrt(np.maximum(np.diag(spread), 0.0)).reshape(-1, 3),
+            float(np.average(np.minimum(size, 0.1), weights=last[1])),
+            float(np.average(share_in, weights=last[1])),
+            self._coverage(link[share_in], along[share_in]),
+            iterations,
+            corners,
+        )
+
+    def _minimise(self, q: Array, task: _Task) -> tuple[Array, Array, int]:
+        """Levenberg and Marquardt's method; the configuration, the Hessian there, and the number of iterations."""
+        free = list(self.free)
+        cost, gradient, hessian = self._system(q, task)
+        damping = 1e-3
+        used = 0
+        for used in range(1, self.options.iterations + 1):
+            step = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), gradient)
+            size = float(np.abs(step).max())
+            trial = q.copy()
+            trial[free] += step * min(1.0, 0.5 / max(size, 1e-12))
+            new_cost, new_gradient, new_hessian = self._system(trial, task)
+            if new_cost < cost:
+                done = size < 1e-4 or cost - new_cost < 1e-4 * cost
+                q, cost, gradient, hessian = trial, new_cost, new_gradient, new_hessian
+                damping = max(damping / 10, 1e-9)
+                if done:
+                    break
+            else:
+                damping *= 10
+                if size < 1e-5 or damping > 1e6:
+                    break
+        return q, hessian, used
+
+    def _errors(self, q: Array, points: Array, share: float, camera: Array) -> tuple[Array, Integers, Array]:
+        """e_i, the link that each point belongs to, and where along it (0 to 1)."""
+        corners = np.array(self._corners(q)[0]).reshape(-1, 2, 3)
+        link, along, normal, distance = self._nearest(corners, points, share)
+        away = np.einsum("ij,ij->i", normal, points - camera) > -_AWAY * np.linalg.norm(points - camera, axis=1)
+        return np.where(away, -distance, distance) - share * self.radius[link], link, along
+
+    def _nearest(self, corners: Array, points: Array, share: float) -> tuple[Integers, Array, Array, Array]:
+        start, edge = corners[:, 0], corners[:, 1] - corners[:, 0]
+        square = np.einsum("ij,ij->i", edge, edge)
+        # (p - a).d for all points and links at once, by one product of matrices
+        t = np.clip((points @ edge.T - np.einsum("ij,ij->i", start, edge)) / square, 0.0, 1.0)
+        apart = np.zeros(t.shape)
+        for axis in range(3):
+            apart += (points[:, axis, None] - start[:, axis] - t * edge[:, axis]) ** 2
+        link = np.argmin(np.sqrt(apart) - share * self.radius, axis=1)
+        rows = np.arange(len(points))
+        along = t[rows, link]
+        normal = points - start[link] - along[:, None] * edge[link]
+        distance = np.sqrt(apart[rows, link])
+        return link, along, normal / np.maximum(distance, 1e-9)[:, None], distance
+
+    def _system(self, q: Array, task: _Task) -> tuple[float, Array, Array]:
+        """Cost, gradient and Gauss-Newton Hessian by the free bends."""
+        out, jacobian = self._corners(q)
+        corners, by_q = np.array(out).reshape(-1, 2, 3), np.array(jacobian)
+        link, along, normal, distance = self._nearest(corners, task.points, task.share)
+        sight = task.points - task.camera
+        away = np.einsum("ij,ij->i", normal, sight) > -_AWAY * np.linalg.norm(sight, axis=1)
+        sign = np.where(away, -1.0, 1.0)
+        error = sign * distance - task.share * self.radius[link]
+        square = (error / task.scale) ** 2
+        cost = 0.5 * task.scale**2 * float(np.sum(task.weight * square / (1 + square)))
+        weight = task.weight / (1 + square) ** 2
+        # e falls as the centre line moves along the normal: de = -n'((1 - t) da + t db)
+        direction = -sign[:, None] * normal
+        rows = np.concatenate([direction * (1 - along)[:, None], direction * along[:, None]], axis=1)
+        count = len(self.radius)
+        gradient, hessian = np.zeros(by_q.shape[1]), np.zeros((by_q.shape[1],) * 2)
+        for k in range(count):
+            mine = np.flatnonzero(link == k)
+            if len(mine):
+                block, chain = rows[mine], by_q[6 * k : 6 * k + 6]
+                weighted = block * weight[mine, None]
+                gradient += chain.T @ (weighted.T @ error[mine])
+                hessian += chain.T @ (block.T @ weighted) @ chain
+        held, by_held = (np.array(x) for x in self._held(q))
+        held = held.ravel()
+        bend = (q - self.rest)[list(self.free)] * self._prior
+        cost += 0.5 * float(held @ held + bend @ bend)
+        gradient += by_held.T @ held + bend * self._prior
+        hessian += by_held.T @ by_held + np.diag(self._prior**2)
+        if task.previous is not None:
+            before, since = task.previous
+            slow = 1.0 / (self.options.rate_std * max(since, 1e-3))
+            change = (q - before)[list(self.free)] * slow
+            cost += 0.5 * float(change @ change)
+            gradient += change * slow
+            hessian += slow**2 * np.eye(len(change))
+        return cost, gradient, hessian
+
+    def _coverage(self, link: Integers, along: Array) -> dict[str, float]:
+        stations = link * _STATIONS + np.minimum((along * _STATIONS).astype(np.int64), _STATIONS - 1)
+        filled = np.bincount(stations, minlength=len(self.radius) * _STATIONS).reshape(-1, _STATIONS) > 0
+        owners = np.array(self.owner)
+        return {s.name: float(filled[owners == s.name].mean()) for s in self.system.segments}
+
+    def place(self, q: ArrayLike) -> Array:
+        """The system's points at a configuration, shape (np, 3) [m]."""
+        return np.array(self._seen(np.asarray(q, float))[0]).reshape(-1, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """One pass: points, their weights, where they lie on the tubes, the scale of the loss, the camera, the prior."""
+
+    points: Array
+    weight: Array
+    share: float
+    scale: float
+    camera: Array
+    previous: tuple[Array, float] | None

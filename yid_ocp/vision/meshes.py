@@ -1,0 +1,398 @@
+"""Surfaces of the robot and of the tubes, each fixed to a joint's moving frame, and queries against them.
+
+Every joint keeps one scene in its own frame: rays and points are brought there, so that nothing is rebuilt as the robot
+moves.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from yid_ocp.errors import DataError, ModelError
+from yid_ocp.model.kinematics import forward_kinematics
+from yid_ocp.model.mechanism import Mechanism, robot_description_file
+from yid_ocp.model.system import System
+from yid_ocp.vision.frames import Pinhole, open3d_module
+
+Array = NDArray[np.float64]
+MeshKind = Literal["visual", "collision"]
+
+_FACETS = 48  # of a tube: the surface is then within 0.2 % of the radius
+_TOUCHING = 5e-4  # [m]
+_NEAR = 0.05  # [m]; closer than this a box is not projected but taken to fill the image
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles: `vertices` (V, 3) [m], `faces` (F, 3) indices."""
+
+    vertices: Array
+    faces: NDArray[np.int64]
+
+    def moved(self, pose: ArrayLike) -> Mesh:
+        """The mesh seen from the frame in which its own has this pose, shape (4, 4)."""
+        matrix = np.asarray(pose, float)
+        return Mesh(self.vertices @ matrix[:3, :3].T + matrix[:3, 3], self.faces)
+
+    @staticmethod
+    def joined(parts: Sequence[Mesh]) -> Mesh:
+        """Several meshes as one."""
+        shifts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+        faces = [part.faces + shift for part, shift in zip(parts, shifts, strict=True)]
+        return Mesh(np.concatenate([part.vertices for part in parts]), np.concatenate(faces))
+
+    @staticmethod
+    def box(size: ArrayLike) -> Mesh:
+        """A box about the origin; `size` (3,) [m]."""
+        corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+        sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+        faces = [triangle for a, b, c, d in sides for triangle in ((a, b, c), (a, c, d))]
+        return Mesh(corners * np.asarray(size, float), np.array(faces))
+
+    @staticmethod
+    def cylinder(radius: float, low: float, high: float) -> Mesh:
+        """A closed cylinder about z from `low` to `high` [m]."""
+        angle = 2 * np.pi * np.arange(_FACETS) / _FACETS
+        ring = np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
+        levels = [np.column_stack([ring, np.full(_FACETS, z)]) for z in (low, high)]
+        vertices = np.concatenate([*levels, [[0, 0, low], [0, 0, high]]])
+        i, j = np.arange(_FACETS), (np.arange(_FACETS) + 1) % _FACETS
+        sides = [np.column_stack([i, j, j + _FACETS]), np.column_stack([i, j + _FACETS, i + _FACETS])]
+        caps = [np.column_stack([j, i, np.full(_FACETS, 2 * _FACETS)])]
+        caps += [np.column_stack([i + _FACETS, j + _FACETS, np.full(_FACETS, 2 * _FACETS + 1)])]
+        return Mesh(vertices, np.concatenate([*sides, *caps]))
+
+    @staticmethod
+    def sphere(radius: float) -> Mesh:
+        """A sphere about the origin."""
+        rings = _FACETS // 2
+        polar = np.pi * np.arange(1, rings) / rings
+        angle = 2 * np.pi * np.arange(_FACETS) / _FACETS
+        around = np.column_stack([np.cos(angle), np.sin(angle)])
+        shell = [np.column_stack([np.sin(p) * around, np.full(_FACETS, np.cos(p))]) for p in polar]
+        vertices = radius * np.concatenate([*shell, [[0, 0, 1.0], [0, 0, -1.0]]])
+        top, bottom = len(vertices) - 2, len(vertices) - 1
+        i, j = np.arange(_FACETS), (np.arange(_FACETS) + 1) % _FACETS
+        faces = [np.column_stack([i, j, np.full(_FACETS, top)])]
+        for k in range(rings - 2):
+            a, b = k * _FACETS, (k + 1) * _FACETS
+            faces += [np.column_stack([i + a, i + b, j + b]), np.column_stack([i + a, j + b, j + a])]
+        last = (rings - 2) * _FACETS
+        faces.append(np.column_stack([j + last, i + last, np.full(_FACETS, bottom)]))
+        return Mesh(vertices, np.concatenate(faces))
+
+
+class Surfaces:
+    """Meshes on the joints of a mechanism, and what rays and points find of them.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+        With numbers in place of its parameters (`Mechanism.numeric`).
+    meshes : mapping of int to Mesh
+        By joint index (-1: fixed to the world), in the joint's moving frame.
+    """
+
+    def __init__(self, mechanism: Mechanism, meshes: Mapping[int, Mesh]) -> None:
+        o3d = open3d_module()
+        self.mechanism = mechanism
+        self.joints = tuple(sorted(meshes))
+        self._scenes: list[Any] = []
+        self._low, self._high = [], []
+        for joint in self.joints:
+            mesh = meshes[joint]
+            scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+            vertices = o3d.core.Tensor(np.ascontiguousarray(mesh.vertices, dtype=np.float32))
+            scene.add_triangles(vertices, o3d.core.Tensor(np.ascontiguousarray(mesh.faces, dtype=np.uint32)))
+            self._scenes.append(scene)
+            self._low.append(mesh.vertices.min(0))
+            self._high.append(mesh.vertices.max(0))
+        q = ca.SX.sym("q", len(mechanism.joints))
+        kinematics = forward_kinematics(mechanism, q)
+        poses = [
+            ca.SX.eye(4)
+            if joint < 0
+            else ca.vertcat(
+                ca.horzcat(kinematics.rotations[joint], kinematics.origins[joint]), ca.SX(ca.DM([[0.0, 0.0, 0.0, 1.0]]))
+            )
+            for joint in self.joints
+        ]
+        self._poses = ca.Function("poses", [q], [ca.densify(ca.horzcat(*poses))])
+
+    def poses(self, q: ArrayLike) -> Array:
+        """Pose of every part in the world at a configuration, shape (len(joints), 4, 4)."""
+        stacked = np.array(self._poses(np.asarray(q, float)))
+        return np.asarray(stacked.reshape(4, len(self.joints), 4).transpose(1, 0, 2))
+
+    def distance(self, points: Array, q: ArrayLike, within: float, *, moving_only: bool = False) -> Array:
+        """Distance of points to the nearest surface.
+
+        Parameters
+        ----------
+        points : ndarray, shape (N, 3)
+            In the world [m].
+        q : array_like, shape (n,)
+            Configuration of the mechanism.
+        within : float
+            Distances beyond this one are not worked out [m].
+        moving_only : bool
+            Whether what is fixed to the world is left out.
+
+        Returns
+        -------
+        ndarray, shape (N,)
+            Unsigned [m]; infinite beyond `within`.
+        """
+        o3d = open3d_module()
+        result = np.full(len(points), np.inf)
+        for part, pose in enumerate(self.poses(q)):
+            if moving_only and self.joints[part] < 0:
+                continue
+            local = (points - pose[:3, 3]) @ pose[:3, :3]
+            near = np.flatnonzero(((local > self._low[part] - within) & (local < self._high[part] + within)).all(1))
+            if not len(near):
+                continue
+            query = o3d.core.Tensor(np.ascontiguousarray(local[near], dtype=np.float32))
+            found = self._scenes[part].compute_distance(query, nthreads=1).numpy().astype(np.float64)
+            result[near] = np.minimum(result[near], found)
+        return np.where(result <= within, result, np.inf)
+
+    def closest(self, points: Array, q: ArrayLike, within: float) -> tuple[Array, Array, NDArray[np.int64]]:
+        """Nearest moving surface of points, and the way there.
+
+        Parameters
+        ----------
+        points : ndarray, shape (N, 3)
+            In the world [m].
+        q : array_like, shape (n,)
+        within : float
+            Surfaces further away are not looked for [m].
+
+        Returns
+        -------
+        distance : ndarray, shape (N,)
+            Infinite beyond `within` [m].
+        normal : ndarray, shape (N, 3)
+            Unit vector from the surface to the point; zero beyond `within`.
+        part : ndarray of int, shape (N,)
+            Index into `joints`, -1 beyond `within`.
+        """
+        o3d = open3d_module()
+        distance, normal = np.full(len(points), np.inf), np.zeros((len(points), 3))
+        owner = np.full(len(points), -1)
+        for part, pose in enumerate(self.poses(q)):
+            if self.joints[part] < 0:
+                continue
+            local = (points - pose[:3, 3]) @ pose[:3, :3]
+            near = np.flatnonzero(((local > self._low[part] - within) & (local < self._high[part] + within)).all(1))
+            if not len(near):
+                continue
+            query = np.ascontiguousarray(local[near], dtype=np.float32)
+            answer = self._scenes[part].compute_closest_points(o3d.core.Tensor(query), nthreads=1)
+            away = query - answer["points"].numpy()
+            length = np.linalg.norm(away, axis=1).astype(np.float64)
+            # the way to a surface that is all but touched is rounding: its own normal is better
+            flat = answer["primitive_normals"].numpy()
+            flat = flat * np.where((flat * away).sum(1) < 0, -1.0, 1.0)[:, None]
+            unit = np.where(length[:, None] > _TOUCHING, away / np.maximum(length, 1e-12)[:, None], flat)
+            better = (length < distance[near]) & (length <= within)
+            chosen = near[better]
+            distance[chosen], owner[chosen] = length[better], part
+            normal[chosen] = unit[better] @ pose[:3, :3].T
+        return distance, normal, owner
+
+    def cast(self, pinhole: Pinhole, pose: ArrayLike, q: ArrayLike) -> tuple[Array, Array]:
+        """Depth image without noise, and how squarely each pixel's ray meets the surface.
+
+        Parameters
+        ----------
+        pinhole : Pinhole
+        pose : array_like, shape (4, 4)
+            Camera in the world.
+        q : array_like, shape (n,)
+
+        Returns
+        -------
+        depth : ndarray, shape (height, width)
+            Along the optical axis [m]; infinite where there is nothing.
+        cosine : ndarray, shape (height, width)
+            Of the angle between ray and surface normal.
+        """
+        o3d = open3d_module()
+        rays = pinhole.rays
+        camera = np.asarray(pose, float)
+        depth = np.full(rays.shape[:2], np.inf)
+        cosine = np.zeros(rays.shape[:2])
+        for part, placed in enumerate(self.poses(q)):
+            rotation = placed[:3, :3].T @ camera[:3, :3]
+            origin = placed[:3, :3].T @ (camera[:3, 3] - placed[:3, 3])
+            window = self._window(pinhole, rotation, origin, part)
+            if window is None:
+                continue
+            rows, columns = window
+            directions = rays[rows, columns] @ rotation.T
+            packed = np.concatenate([np.broadcast_to(origin, directions.shape), directions], axis=-1)
+            answer = self._scenes[part].cast_rays(
+                o3d.core.Tensor(np.ascontiguousarray(packed, dtype=np.float32)), nthreads=1
+            )
+            hit = answer["t_hit"].numpy().astype(np.float64)
+            normals = answer["primitive_normals"].numpy()
+            square = np.abs((normals * directions).sum(-1)) / np.linalg.norm(directions, axis=-1)
+            nearer = hit < depth[rows, columns]
+            depth[rows, columns] = np.where(nearer, hit, depth[rows, columns])
+            cosine[rows, columns] = np.where(nearer, square, cosine[rows, columns])
+        return depth, cosine
+
+    def _window(
+        self, pinhole: Pinhole, rotation: Array, origin: Array, part: int
+    ) -> tuple[slice, slice] | None:
+        low, high = self._low[part], self._high[part]
+        corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+        seen = (corners - origin) @ rotation
+        if (seen[:, 2] < _NEAR).all():
+            return None
+        if (seen[:, 2] < _NEAR).any():
+            return slice(0, pinhole.height), slice(0, pinhole.width)
+        u = pinhole.fx * seen[:, 0] / seen[:, 2] + pinhole.cx
+        v = pinhole.fy * seen[:, 1] / seen[:, 2] + pinhole.cy
+        left, right = max(0, math.floor(u.min())), min(pinhole.width, math.ceil(u.max()) + 1)
+        top, bottom = max(0, math.floor(v.min())), min(pinhole.height, math.ceil(v.max()) + 1)
+        return (slice(top, bottom), slice(left, right)) if left < right and top < bottom else None
+
+
+def robot_meshes(urdf: str | Path, mechanism: Mechanism, kind: MeshKind = "visual") -> dict[int, Mesh]:
+    """Meshes of a robot's links by the joint that carries them.
+
+    Parameters
+    ----------
+    urdf : str or Path
+        The URDF file, or `package:baxter`.
+    mechanism : Mechanism
+        That was read from it, alone or joined with others; numeric.
+    kind : "visual" or "collision"
+
+    Returns
+    -------
+    dict of int to Mesh
+        In the frame of the joint, -1 for what does not move.
+
+    Raises
+    ------
+    ModelError
+        No such file, a mesh that is missing or cannot be read, or no mesh at all.
+    """
+    import trimesh
+    import yourdfpy
+
+    text = str(urdf)
+    path = robot_description_file(text.removeprefix("package:")) if text.startswith("package:") else Path(text)
+    if not path.is_file():
+        raise ModelError(f"there is no URDF file '{path}'", hint="give a path, or package:NAME")
+    try:
+        robot = yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False, load_collision_meshes=False)
+    except Exception as error:  # yourdfpy and lxml raise many kinds for a malformed file
+        raise ModelError(f"the URDF cannot be read: {error}", where=str(path)) from error
+    parts: dict[int, list[Mesh]] = {}
+    cache: dict[Path, Mesh] = {}
+    for link in robot.robot.links:
+        if link.name not in mechanism.frames:
+            continue
+        frame = mechanism.frames[link.name]
+        placement = np.array(ca.DM(frame.placement.matrix()))
+        for shape in link.visuals if kind == "visual" else link.collisions:
+            origin = np.eye(4) if shape.origin is None else np.asarray(shape.origin, float)
+            geometry = shape.geometry
+            if geometry.box is not None:
+                mesh = Mesh.box(geometry.box.size)
+            elif geometry.cylinder is not None:
+                half = 0.5 * geometry.cylinder.length
+                mesh = Mesh.cylinder(geometry.cylinder.radius, -half, half)
+            elif geometry.sphere is not None:
+                mesh = Mesh.sphere(geometry.sphere.radius)
+            elif geometry.mesh is not None:
+                file = mesh_file(geometry.mesh.filename, path)
+                if file not in cache:
+                    try:
+                        loaded = trimesh.load(file, force="mesh")
+                        cache[file] = Mesh(np.asarray(loaded.vertices, float), np.asarray(loaded.faces, np.int64))
+                    except Exception as error:  # trimesh's readers raise many kinds
+                        raise ModelError(f"the mesh cannot be read: {error}", where=str(file)) from error
+                scale = np.ones(3) if geometry.mesh.scale is None else np.asarray(geometry.mesh.scale, float)
+                mesh = replace(cache[file], vertices=cache[file].vertices * scale)
+            else:
+                continue
+            parts.setdefault(frame.joint, []).append(mesh.moved(placement @ origin))
+    if not parts:
+        raise ModelError(f"the URDF has no {kind} meshes", where=str(path), hint="choose the other kind")
+    return {joint: Mesh.joined(entries) for joint, entries in parts.items()}
+
+
+def mesh_file(name: str, urdf: Path) -> Path:
+    """File that a URDF means by a mesh's name: `package://`, `file://`, absolute or beside the URDF.
+
+    Raises
+    ------
+    ModelError
+        There is no such file.
+    """
+    bare = name.removeprefix("file://")
+    package = bare.removeprefix("package://")
+    candidates = [Path(bare), urdf.parent / bare]
+    if package != bare:
+        # the package's folder is the URDF's own or one above it, whether or not it still has its name
+        parts = Path(package).parts
+        candidates = [above / Path(*rest) for above in urdf.parents for rest in (parts, parts[1:]) if rest]
+    for candidate in candidates:
+        if candidate.is_file():
+            return candidate
+    raise ModelError(f"the mesh '{name}' is not there", where=str(urdf), hint="keep meshes beside the URDF's package")
+
+
+def tube_meshes(system: System, values: Mapping[str, float] | None = None) -> dict[int, Mesh]:
+    """Cylinders along the links of the object's tubes, with balls at the joints between them.
+
+    Parameters
+    ----------
+    system : System
+    values : mapping of str to float, optional
+        Parameter values (lengths, radii); nominal where absent.
+
+    Returns
+    -------
+    dict of int to Mesh
+        By joint index, in the joint's frame.
+
+    Raises
+    ------
+    DataError
+        The system has no tubes.
+    """
+    if not system.segments:
+        raise DataError("the model has no object to see", hint="give it segments")
+    symbols, theta = system.parameters.symbols, system.parameters.vector(values)
+
+    def number(expression: ca.SX) -> float:
+        return float(ca.Function("number", [symbols], [expression])(theta))
+
+    meshes: dict[int, Mesh] = {}
+    for segment in system.segments:
+        radius = number(segment.radius)
+        for i, (names, length) in enumerate(zip(segment.links, segment.lengths, strict=True)):
+            parts = [Mesh.cylinder(radius, 0.0, number(length))]
+            if i or segment.parent is not None:
+                parts.append(Mesh.sphere(radius))
+            meshes[system.mechanism.joint_index(names[-1])] = Mesh.joined(parts)
+    return meshes
+
+
+def numeric_mechanism(system: System, values: Mapping[str, float] | None = None) -> Mechanism:
+    """A system's mechanism with numbers in place of all of the system's parameters."""
+    return replace(system.mechanism, parameters=system.parameters).numeric(values)

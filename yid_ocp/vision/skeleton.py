@@ -1,0 +1,219 @@
+"""The walk that thins a cloud to nodes along the tubes, and the graph that joins them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
+from scipy.spatial import cKDTree
+
+from yid_ocp.errors import ConfigError
+from yid_ocp.vision.filters import Cloud
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class WalkOptions:
+    """How a cloud is thinned.
+
+    Attributes
+    ----------
+    neighbours : int
+        k1: points of a segment.
+    radius : float
+        Points further away are no neighbours [m]; somewhat more than the thickest tube's diameter.
+    least : int
+        A segment of fewer points gives no node.
+    links : int
+        Neighbours of a node in the graph.
+    link_length : float
+        Nodes further apart are not joined [m].
+    least_share : float
+        A connected part of the graph that holds a smaller share of the points is not the object.
+    """
+
+    neighbours: int = 50
+    radius: float = 0.07
+    least: int = 15
+    links: int = 4
+    link_length: float = 0.15
+    least_share: float = 0.04
+
+    def __post_init__(self) -> None:
+        if self.neighbours < 2 or self.least < 1 or self.links < 1:
+            raise ConfigError(
+                f"neighbours = {self.neighbours}, least = {self.least}, links = {self.links}",
+                where="walk options",
+                allowed="neighbours from 2, least and links from 1",
+            )
+        if not (self.radius > 0 and self.link_length > 0):
+            raise ConfigError(f"radius = {self.radius}, link_length = {self.link_length}", allowed="positive metres")
+
+
+@dataclass(frozen=True, eq=False)
+class Skeleton:
+    """Nodes of a cloud and the graph between them.
+
+    Attributes
+    ----------
+    nodes : ndarray, shape (K, 3)
+        Centroids of the kept segments, in the order of the walk [m].
+    size : ndarray, shape (K,)
+        Points (weights) of each segment.
+    label : ndarray of int, shape (N,)
+        Node to which each point of the cloud belongs, -1 for none.
+    edges : ndarray of int, shape (E, 2)
+        Minimum spanning forest of the graph of nearest neighbours.
+    part : ndarray of int, shape (K,)
+        Connected part of each node, the one with most points first.
+    """
+
+    nodes: Array
+    size: Array
+    label: Integers
+    edges: Integers
+    part: Integers
+
+    @property
+    def connected(self) -> NDArray[np.bool_]:
+        """Which points of the cloud belong to a node, shape (N,)."""
+        return self.label >= 0
+
+
+def walk(
+    cloud: Cloud, rng: np.random.Generator, options: WalkOptions | None = None, down: ArrayLike = (0.0, 0.0, -1.0)
+) -> tuple[Array, Array, Integers]:
+    """Thin a cloud to nodes, segment by segment.
+
+    The seed is the lowest point. Its k1 nearest neighbours have a centroid; the k1 nearest neighbours of that centroid
+    are the centred segment, whose centroid becomes a node where the segment has points enough. The segment is removed.
+    The remaining point that is nearest to it is the next seed; where none is within the radius, a point drawn at random.
+    It ends when no point is left.
+
+    Parameters
+    ----------
+    cloud : Cloud
+    rng : Generator
+        For the points drawn at random.
+    options : WalkOptions, optional
+    down : array_like, shape (3,)
+        Direction of gravity in the frame of the points.
+
+    Returns
+    -------
+    nodes : ndarray, shape (K, 3)
+        [m]
+    size : ndarray, shape (K,)
+        Weight of each node's points.
+    label : ndarray of int, shape (N,)
+        Node of every point, -1 where its segment gave none.
+    """
+    chosen = options or WalkOptions()
+    label = np.full(len(cloud), -1)
+    alive = np.arange(len(cloud))
+    points, weight = cloud.points, cloud.weight
+    reach = chosen.radius**2
+    nodes: list[Array] = []
+    size: list[float] = []
+    seed = points[int(np.argmax(points @ np.asarray(down, float)))] if len(points) else np.zeros(3)
+
+    def near(centre: Array) -> Integers:
+        away = points - centre
+        square = np.einsum("ij,ij->i", away, away)
+        if len(square) > chosen.neighbours:
+            found = np.argpartition(square, chosen.neighbours - 1)[: chosen.neighbours]
+            return np.asarray(found[square[found] <= reach])
+        return np.flatnonzero(square <= reach)
+
+    while len(alive):
+        first = near(seed)
+        centred = near(np.average(points[first], axis=0, weights=weight[first]))
+        if not len(centred):  # a ring about its own centre: take the segment itself, or the walk would stand still
+            centred = first
+        centre = np.average(points[centred], axis=0, weights=weight[centred])
+        if len(centred) >= chosen.least:
+            label[alive[centred]] = len(nodes)
+            nodes.append(centre)
+            size.append(float(weight[centred].sum()))
+        stays = np.ones(len(alive), bool)
+        stays[centred] = False
+        alive, points, weight = alive[stays], points[stays], weight[stays]
+        if not len(alive):
+            break
+        away = points - centre
+        square = np.einsum("ij,ij->i", away, away)
+        following = int(np.argmin(square))
+        if square[following] > reach:
+            following = int(rng.integers(len(alive)))
+        seed = points[following]
+    return np.array(nodes).reshape(-1, 3), np.array(size), label
+
+
+def connect(nodes: Array, options: WalkOptions | None = None) -> tuple[Integers, Integers]:
+    """Join nodes to their nearest neighbours and keep the shortest edges that connect them.
+
+    Parameters
+    ----------
+    nodes : ndarray, shape (K, 3)
+        [m]
+    options : WalkOptions, optional
+
+    Returns
+    -------
+    edges : ndarray of int, shape (E, 2)
+        Minimum spanning forest.
+    part : ndarray of int, shape (K,)
+        Connected part of each node.
+    """
+    chosen = options or WalkOptions()
+    count = len(nodes)
+    if count < 2:
+        return np.empty((0, 2), dtype=np.int64), np.zeros(count, dtype=np.int64)
+    k = min(chosen.links + 1, count)
+    distance, index = cKDTree(nodes).query(nodes, k=k, distance_upper_bound=chosen.link_length)
+    rows = np.repeat(np.arange(count), k)
+    columns, lengths = index.ravel(), distance.ravel()
+    good = np.isfinite(lengths) & (columns != rows)
+    # a length of zero would be no edge to scipy
+    entries = (np.maximum(lengths[good], 1e-9), (rows[good], columns[good]))
+    forest = minimum_spanning_tree(coo_matrix(entries, shape=(count, count)).tocsr()).tocoo()
+    part = connected_components(forest, directed=False)[1]
+    return np.column_stack([forest.row, forest.col]).astype(np.int64), part.astype(np.int64)
+
+
+def skeleton(
+    cloud: Cloud, rng: np.random.Generator, options: WalkOptions | None = None, down: ArrayLike = (0.0, 0.0, -1.0)
+) -> Skeleton:
+    """Walk, connect, and leave out connected parts that hold too few points.
+
+    Parameters
+    ----------
+    cloud : Cloud
+    rng : Generator
+    options : WalkOptions, optional
+    down : array_like, shape (3,)
+
+    Returns
+    -------
+    Skeleton
+        Without nodes where the cloud has nowhere enough points.
+    """
+    chosen = options or WalkOptions()
+    nodes, size, label = walk(cloud, rng, chosen, down)
+    _, part = connect(nodes, chosen)
+    if not len(nodes):
+        return Skeleton(nodes, size, label, np.empty((0, 2), dtype=np.int64), part)
+    held = np.bincount(part, size)
+    order = np.argsort(-held, kind="stable")
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order))
+    keep = held[part] >= chosen.least_share * size.sum()
+    renamed = np.full(len(nodes) + 1, -1)
+    renamed[:-1][keep] = np.arange(int(keep.sum()))
+    edges, _ = connect(nodes[keep], chosen)
+    return Skeleton(nodes[keep], size[keep], renamed[label], edges, rank[part[keep]])

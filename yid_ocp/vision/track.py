@@ -1,0 +1,510 @@
+"""From a film and the joints' recording to measured points: filter, thin, fit, judge, and write them down.
+
+Every frame ends as a fitted shape or with the reason why it was dropped; nothing in one frame stops the sequence.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from yid_ocp.data.recording import PointGroup, Recording, validate
+from yid_ocp.errors import ConfigError, DataError, ModelError, nearest
+from yid_ocp.model.system import System
+from yid_ocp.vision.clock import Clock, ClockOptions, estimate_clock
+from yid_ocp.vision.filters import Cloud, FilterOptions, ObjectRegion, voxel_grid, without_outliers, without_robot
+from yid_ocp.vision.fit import Fit, FitOptions, ShapeFit, Sight
+from yid_ocp.vision.frames import Film
+from yid_ocp.vision.meshes import MeshKind, Surfaces, numeric_mechanism, robot_meshes
+from yid_ocp.vision.skeleton import Skeleton, WalkOptions, skeleton
+
+Array = NDArray[np.float64]
+Progress = Callable[[int, int, str], None]
+
+GROUP = "points_camera"
+_LARGEST = 50.0  # [m]; a depth camera sees no further, a cloud in millimetres always does
+_SAME_TIME = 1e-6  # [s]
+
+
+@dataclass(frozen=True)
+class TrackOptions:
+    """How a film is turned into measured points.
+
+    Attributes
+    ----------
+    filters : FilterOptions
+    walk : WalkOptions
+    fit : FitOptions
+    clock : ClockOptions
+    d_max : float
+        A frame whose points are further from the fitted shape than this on average is dropped [m].
+    least_inliers : float
+        As is one of which a smaller share of the points lies on the shape.
+    point_std_max : float
+        A point that is known less well than this in a frame counts as not seen there [m].
+    std_floor : float
+        Deviation that no fit is better than: of the camera's calibration and of the model's straight links [m].
+    stamp_std : float
+        Deviation of a frame's time stamp, beyond the common offset [s].
+    points : tuple of str, optional
+        Points to write down; those of the system that no arm holds where absent, as the arms know theirs better.
+    mesh : "visual" or "collision"
+        Meshes of the robot's self-filter.
+    seed : int
+        Of the walk's random points and of all subsampling.
+    """
+
+    filters: FilterOptions = field(default_factory=FilterOptions)
+    walk: WalkOptions = field(default_factory=WalkOptions)
+    fit: FitOptions = field(default_factory=FitOptions)
+    clock: ClockOptions = field(default_factory=ClockOptions)
+    d_max: float = 0.012
+    least_inliers: float = 0.6
+    point_std_max: float = 0.02
+    std_floor: float = 0.003
+    stamp_std: float = 0.003
+    points: tuple[str, ...] | None = None
+    mesh: MeshKind = "visual"
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("d_max", "point_std_max", "std_floor"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"{name} = {getattr(self, name)}", where="track options", allowed="a positive number")
+
+
+@dataclass(frozen=True, eq=False)
+class FrameReport:
+    """What became of one frame.
+
+    Attributes
+    ----------
+    index : int
+        Of the film.
+    name : str
+    stamp : float
+        As the camera gave it [s].
+    t : float
+        On the joints' clock [s].
+    reason : str
+        Why it was dropped; empty for a good one.
+    raw, filtered, nodes : int
+        Points of the cloud, points left by the filters, nodes of the skeleton.
+    delay : float
+        Of its stamp beyond the common offset, NaN where it cannot be told [s].
+    fit : Fit or None
+    """
+
+    index: int
+    name: str
+    stamp: float
+    t: float
+    reason: str
+    raw: int
+    filtered: int
+    nodes: int
+    delay: float
+    fit: Fit | None
+
+    @property
+    def good(self) -> bool:
+        """Whether it was used."""
+        return not self.reason
+
+
+@dataclass(frozen=True, eq=False)
+class Stages:
+    """One frame on its way, for pictures.
+
+    Attributes
+    ----------
+    name : str
+    cloud, filtered : ndarray, shape (N, 3)
+        In the world [m].
+    skeleton : Skeleton
+    fit : Fit
+    camera : ndarray, shape (3,)
+        [m]
+    """
+
+    name: str
+    cloud: Array
+    filtered: Array
+    skeleton: Skeleton
+    fit: Fit
+    camera: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Shapes and points of the good frames.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Points written down.
+    t : ndarray, shape (M,)
+        Times of the good frames on the joints' clock [s].
+    q : ndarray, shape (M, n)
+        Configurations, twists at rest.
+    position, std : ndarray, shape (M, np, 3)
+        [m]; NaN where a point was not seen well enough.
+    frames : tuple of FrameReport
+        All of them, by time stamp.
+    clock : Clock
+    stages : tuple of Stages
+        Of the frames that were asked for and turned out well.
+    """
+
+    names: tuple[str, ...]
+    t: Array
+    q: Array
+    position: Array
+    std: Array
+    frames: tuple[FrameReport, ...]
+    clock: Clock
+    stages: tuple[Stages, ...]
+    _system_points: tuple[str, ...]
+    _place: Callable[[Array], Array]
+    _pose: Array
+
+    def shape(self, t: float) -> Array:
+        """Configuration at any time between the good frames, by a cubic spline through theirs, shape (n,).
+
+        Beyond the first and the last frame it stays as it was there.
+        """
+        at = float(np.clip(t, self.t[0], self.t[-1]))
+        return self.q[0].copy() if len(self.t) < 2 else np.asarray(CubicSpline(self.t, self.q, axis=0)(at))
+
+    def points(self, t: float) -> Array:
+        """The written points at any time, by the kinematics of `shape`, shape (np, 3) [m]."""
+        return self._place(self.shape(t))[[self._system_points.index(name) for name in self.names]]
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """How often each reason dropped a frame; numbers in the reasons are left out."""
+        reasons = (frame.reason.partition(":")[0] for frame in self.frames if not frame.good)
+        return dict(Counter(reasons).most_common())
+
+    def group(self) -> PointGroup:
+        """The points as a group of a recording, called `points_camera`."""
+        return PointGroup(
+            GROUP, self.names, self.t, self.position, self.std, "depth camera, fitted shape", pose=self._pose
+        )
+
+    def recording(self, recording: Recording) -> Recording:
+        """A recording with these points in place of any `points_camera` that it had; `DataError` as `validate`."""
+        others = tuple(group for group in recording.points if group.name != GROUP)
+        text = f"{recording.description} Points of {len(self.t)} of {len(self.frames)} frames; {self.clock.message}."
+        return validate(replace(recording, points=(*others, self.group()), description=text.strip(), sha256=None))
+
+
+def track(
+    system: System,
+    recording: Recording,
+    film: Film,
+    *,
+    urdf: str | Path | None = None,
+    options: TrackOptions | None = None,
+    values: Mapping[str, float] | None = None,
+    stages: Sequence[int] = (),
+    progress: Progress | None = None,
+) -> Track:
+    """Measure the object's points in a film.
+
+    Parameters
+    ----------
+    system : System
+        Robot and object. Its joints that are not elastic must be in the recording.
+    recording : Recording
+        Joint angles, for the self-filter, the grasps and the clock.
+    film : Film
+    urdf : str or Path, optional
+        File of the robot, for its meshes (`package:baxter`); without it there is no self-filter and no clock offset.
+    options : TrackOptions, optional
+    values : mapping of str to float, optional
+        Parameter values (lengths, radii, relative stiffnesses); nominal where absent.
+    stages : sequence of int
+        Frames of the film of which all stages are kept for pictures.
+    progress : callable, optional
+        Called with frames done, frames in all and what is being done.
+
+    Returns
+    -------
+    Track
+
+    Raises
+    ------
+    DataError
+        No joint angles, time stamps of another clock, or not one good frame; the error lists the reasons.
+    ConfigError
+        A point that the system does not have.
+    ModelError
+        Meshes that cannot be read.
+    """
+    return _Tracker(system, recording, film, urdf, options or TrackOptions(), values, stages, progress).run()
+
+
+class _Tracker:
+    """The state of one call of `track`."""
+
+    def __init__(
+        self,
+        system: System,
+        recording: Recording,
+        film: Film,
+        urdf: str | Path | None,
+        options: TrackOptions,
+        values: Mapping[str, float] | None,
+        stages: Sequence[int],
+        progress: Progress | None,
+    ) -> None:
+        self.system, self.film, self.options = system, film, options
+        self.wanted = frozenset(stages)
+        self.tell = progress or (lambda done, total, text: None)
+        self.shape = ShapeFit(system, options.fit, values)
+        self.names = _chosen_points(system, options.points)
+        self.region = ObjectRegion(system, options.filters, values)
+        self.camera = film.pose[:3, 3]
+        self.span, self.angles = _joint_angles(system, recording, self.shape.known)
+        tree = numeric_mechanism(system, values)
+        self.robot: Surfaces | None = None
+        if urdf is not None:
+            meshes = robot_meshes(urdf, tree, options.mesh)
+            if all(joint < 0 for joint in meshes):
+                raise ModelError("no link of the robot moves with the model's joints", where=str(urdf))
+            self.robot = Surfaces(tree, meshes)
+        self.rng = np.random.default_rng(options.seed)
+
+    def posture(self, t: float) -> Array:
+        """Configuration at a time on the joints' clock, the object at rest; the ends of the recording hold beyond it."""
+        q = self.shape.rest.copy()
+        if self.angles is not None:
+            q[[self.system.mechanism.joint_index(name) for name in self.shape.known]] = self.angles(t)
+        return q
+
+    def run(self) -> Track:
+        """Both passes over the film."""
+        film, total = self.film, len(self.film)
+        order, reasons = _sorted_frames(film.t)
+        self._check_clock([i for i in order if i not in reasons])
+        clouds: list[Cloud | None] = []
+        raw: dict[int, int] = {}
+        for done, i in enumerate(order):
+            self.tell(done, 2 * total, f"reading {film.names[i]}")
+            cloud = None
+            if i not in reasons:
+                try:
+                    cloud, raw[i] = self._read(i)
+                except DataError as error:
+                    reasons[i] = error.what
+            clouds.append(cloud)
+        stamps = film.t[order]
+        self.tell(total, 2 * total, "comparing the clocks")
+        clock = self._clock(clouds, stamps)
+        frames: list[FrameReport] = []
+        kept: list[Stages] = []
+        last: tuple[Array, float] | None = None
+        for k, i in enumerate(order):
+            self.tell(total + k, 2 * total, f"fitting {film.names[i]}")
+            report, stage = self._frame(i, clouds[k], clock, k, reasons.get(i, ""), raw.get(i, 0), last)
+            clouds[k] = None
+            frames.append(report)
+            if report.good and report.fit is not None:
+                last = report.fit.q, report.t
+            if stage is not None and report.good:
+                kept.append(stage)
+        self.tell(2 * total, 2 * total, "done")
+        return self._track(frames, clock, kept)
+
+    def _check_clock(self, usable: Sequence[int]) -> None:
+        if self.span is None or not usable:
+            return
+        options, stamps = self.options.clock, self.film.t[list(usable)]
+        first, last = float(stamps.min()) - options.offset, float(stamps.max()) - options.offset
+        if first > self.span[1] + options.search or last < self.span[0] - options.search:
+            raise DataError(
+                f"the frames run from {first:.3f} s to {last:.3f} s, the joints from {self.span[0]:.3f} s to"
+                f" {self.span[1]:.3f} s: their clocks are not the same",
+                where=self.film.source,
+                hint=f"give the clock offset (stamp minus joint time): {first + options.offset - self.span[0]:.3f} s if"
+                " both started together",
+            )
+
+    def _read(self, index: int) -> tuple[Cloud, int]:
+        points = self.film.world(index)
+        count = len(points)
+        points = points[np.isfinite(points).all(axis=1)]
+        if not len(points):
+            raise DataError("the cloud is empty")
+        far = float(np.median(np.abs(points).max(axis=1)))
+        if far > _LARGEST:
+            raise DataError(f"the cloud is not in metres: half of its points are {far:.0f} m away (millimetres?)")
+        filters = self.options.filters
+        q = self.posture(float(self.film.t[index]) - self.options.clock.offset)
+        inside = self.region.at(q, self.camera).contains(points)
+        if not inside.any():
+            raise DataError("no point lies where the object can be: check the camera's pose")
+        cloud = voxel_grid(points[inside], filters.voxel)
+        # before the robot is taken out: among all surfaces, wrong points are few
+        return cloud.keep(without_outliers(cloud, filters.neighbours, filters.outlier_ratio)), count
+
+    def _clock(self, clouds: Sequence[Cloud | None], stamps: Array) -> Clock:
+        options = self.options.clock
+        if self.robot is None or self.span is None:
+            nothing = np.full(len(stamps), np.nan)
+            text = f"clock offset {1e3 * options.offset:.0f} ms as given: no robot to compare"
+            return Clock(options.offset, math.inf, False, nothing, nothing, text)
+        return estimate_clock(self.robot, clouds, stamps, self.posture, self.rng, options)
+
+    def _frame(
+        self,
+        index: int,
+        cloud: Cloud | None,
+        clock: Clock,
+        row: int,
+        reason: str,
+        raw: int,
+        last: tuple[Array, float] | None,
+    ) -> tuple[FrameReport, Stages | None]:
+        options = self.options
+        stamp = float(self.film.t[index])
+        t, delay = stamp - clock.offset, float(clock.delay[row])
+        report = FrameReport(index, self.film.names[index], stamp, t, reason, raw, 0, 0, delay, None)
+        if reason or cloud is None:
+            return report, None
+        if self.span is not None and not self.span[0] <= t <= self.span[1]:
+            return replace(report, reason="there are no joint angles at its time"), None
+        if abs(delay) > max(options.clock.late, 4 * float(clock.delay_std[row])):
+            return replace(report, reason=f"its stamp is late: by {1e3 * delay:.0f} ms"), None
+        q = self.posture(t)
+        if self.robot is not None:
+            cloud = cloud.keep(without_robot(cloud, self.robot, q, options.filters.padding))
+        if len(cloud) < options.filters.least:
+            return replace(report, filtered=len(cloud), reason=f"too few points of the object: {len(cloud)} left"), None
+        if len(cloud) > options.filters.most:
+            cloud = cloud.keep(np.sort(self.rng.choice(len(cloud), options.filters.most, replace=False)))
+        found = skeleton(cloud, self.rng, options.walk)
+        report = replace(report, filtered=len(cloud), nodes=len(found.nodes))
+        if not len(found.nodes):
+            return replace(report, reason="no part of the cloud is dense enough for a skeleton"), None
+        rest = cloud.keep(found.connected)
+        fit = self._best_fit(Sight(rest.points, rest.weight, found.nodes, self.camera), q, t, last)
+        report = replace(report, fit=fit, reason=self._judge(fit))
+        stage = None
+        if index in self.wanted:
+            stage = Stages(self.film.names[index], self.film.world(index), rest.points, found, fit, self.camera)
+        return report, stage
+
+    def _best_fit(self, sight: Sight, q: Array, t: float, last: tuple[Array, float] | None) -> Fit:
+        if last is not None:
+            fit = self.shape.solve(sight, q, last[0], (last[0], t - last[1]))
+            if not self._judge(fit):
+                return fit
+        fresh = self.shape.solve(sight, q)
+        return fresh if last is None or fresh.distance <= fit.distance else fit
+
+    def _judge(self, fit: Fit) -> str:
+        options = self.options
+        if not np.isfinite(fit.q).all():
+            return "the fit failed"
+        if fit.distance > options.d_max:
+            limit = 1e3 * options.d_max
+            return f"the shape does not fit: {1e3 * fit.distance:.1f} mm off on average, d_max is {limit:g} mm"
+        if fit.inliers < options.least_inliers:
+            return f"the shape does not fit: only {100 * fit.inliers:.0f} % of the points lie on it"
+        return ""
+
+    def _track(self, frames: Sequence[FrameReport], clock: Clock, kept: Sequence[Stages]) -> Track:
+        good = [frame for frame in frames if frame.good]
+        if not good:
+            count = Counter(frame.reason for frame in frames).most_common(3)
+            listed = "; ".join(f"{reason} ({number} of {len(frames)})" for reason, number in count)
+            hint = "check the camera's pose, the unit of the clouds and the filters, and look at the pictures of a frame"
+            if "metres" in listed:
+                hint = "say in camera.json that the unit is mm"
+            raise DataError(f"not one frame could be used: {listed}", where=self.film.source, hint=hint)
+        fits = [frame.fit for frame in good if frame.fit is not None]
+        t = np.array([frame.t for frame in good])
+        columns = [self.system.points.index(name) for name in self.names]
+        position = np.array([fit.points[columns] for fit in fits])
+        std = np.hypot(np.array([fit.std[columns] for fit in fits]), self.options.std_floor)
+        uncertain = math.hypot(self.options.stamp_std, clock.std if clock.estimated else 0.0)
+        if len(t) > 1:
+            velocity = np.asarray(CubicSpline(t, position, axis=0)(t, 1))
+            std = np.hypot(std, np.abs(velocity) * uncertain)
+        unseen = np.linalg.norm(std, axis=2) > math.sqrt(3.0) * self.options.point_std_max
+        return Track(
+            self.names,
+            t,
+            np.array([fit.q for fit in fits]),
+            np.where(unseen[..., None], np.nan, position),
+            np.where(unseen[..., None], np.nan, std),
+            tuple(frames),
+            clock,
+            tuple(kept),
+            self.system.points,
+            self.shape.place,
+            self.film.pose,
+        )
+
+
+def _chosen_points(system: System, wanted: tuple[str, ...] | None) -> tuple[str, ...]:
+    if wanted is None:
+        held = {grasp.held for grasp in system.grasps}
+        return tuple(name for name in system.points if name not in held) or system.points
+    for name in wanted:
+        if name not in system.points:
+            hint = nearest(name, system.points)
+            raise ConfigError(f"there is no point '{name}'", where="track options: points", hint=hint)
+    return wanted
+
+
+def _joint_angles(
+    system: System, recording: Recording, known: Sequence[str]
+) -> tuple[tuple[float, float] | None, Callable[[float], Array] | None]:
+    """Time span of the joints and their angles in the order of `known`, None without a robot."""
+    if not known:
+        return None, None
+    joints = recording.joints
+    if joints is None:
+        raise DataError(
+            "the recording has no joint angles, which the self-filter and the grasps need", where=recording.name
+        )
+    for name in known:
+        if name not in joints.names:
+            raise DataError(
+                f"joint '{name}' of the model is not recorded", where=f"{recording.name}: joints", hint=nearest(name, joints.names)
+            )
+    columns = [joints.names.index(name) for name in known]
+    t, position = joints.t, joints.position[:, columns]
+
+    def angles(at: float) -> Array:
+        after = int(np.clip(np.searchsorted(t, at), 1, len(t) - 1)) if len(t) > 1 else 0
+        if len(t) == 1:
+            return np.array(position[0])
+        share = float(np.clip((at - t[after - 1]) / (t[after] - t[after - 1]), 0.0, 1.0))
+        return np.asarray((1 - share) * position[after - 1] + share * position[after])
+
+    return (float(t[0]), float(t[-1])), angles
+
+
+def _sorted_frames(stamps: Array) -> tuple[list[int], dict[int, str]]:
+    """Frames by time stamp, and why some of them cannot be used: no time, or the time of the one before."""
+    reasons = {int(i): "its time stamp is not a number" for i in np.flatnonzero(~np.isfinite(stamps))}
+    order = sorted(range(len(stamps)), key=lambda i: (math.inf if i in reasons else float(stamps[i]), i))
+    before = -math.inf
+    for i in order:
+        if i not in reasons:
+            if stamps[i] - before < _SAME_TIME:
+                reasons[i] = "its time stamp is that of the frame before: a duplicate"
+            else:
+                before = float(stamps[i])
+    return order, reasons

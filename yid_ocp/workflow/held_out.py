@@ -1,0 +1,96 @@
+"""How well held-out recordings are predicted, beside predictions that need no model."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.baselines import linear_carry, move_with_clamps, stay
+from yid_ocp.problem.cable import Cable
+from yid_ocp.problem.problem import Episode, EpisodeResult
+from yid_ocp.problem.residuals import Samples
+from yid_ocp.sensors import EffortSensor, PointSensor
+
+Array = NDArray[np.float64]
+
+GIVEN = 2  # frames from which the baselines of a cable start, as its own start state does
+
+
+def held_out_entry(
+    problem: EstimationProblem, episode: Episode, outcome: EpisodeResult | str, cable: Cable | None = None
+) -> dict[str, Any]:
+    """One entry of `held_out` in a result: recording, rmse per channel, the same for every baseline.
+
+    A group of several points has an entry of its own beside its channels: the square root of the mean squared distance
+    over all its points and frames but those that fixed the start.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    episode : Episode
+    outcome : EpisodeResult or str
+        Prediction, or why there is none.
+    cable : Cable, optional
+        For the baselines that only a cable held by clamps has.
+    """
+    entry: dict[str, Any] = {"recording": episode.name, "rmse": {}, "baselines": {}}
+    fixed = _start_end(problem, episode)
+    if isinstance(outcome, str):
+        entry["message"] = outcome
+    else:
+        for samples, predicted in zip(episode.samples, outcome.predicted, strict=True):
+            entry["rmse"] |= _errors(samples, predicted, fixed)
+    for samples in episode.samples:
+        for name, predicted in _baselines(episode, samples, cable).items():
+            errors = _errors(samples, predicted, fixed)
+            if errors:
+                entry["baselines"].setdefault(name, {}).update(errors)
+    return entry
+
+
+def _start_end(problem: EstimationProblem, episode: Episode) -> float:
+    """Node up to which measured points were used to fix the start, -1 where none were."""
+    options = problem.options
+    return options.start_window / problem.step.time_step if options.initial_state == "given" else -1.0
+
+
+def _errors(samples: Samples, predicted: Array, fixed: float) -> dict[str, float]:
+    sensor = samples.sensor
+    shape = (len(predicted), len(sensor.channels), sensor.width)
+    square = np.sum((predicted - samples.value).reshape(shape) ** 2, axis=2)
+    result = {}
+    for c, channel in enumerate(sensor.channels):
+        seen = square[np.isfinite(square[:, c]), c]
+        if len(seen):
+            result[channel] = float(np.sqrt(np.mean(seen)))
+    if isinstance(sensor, PointSensor) and len(sensor.channels) > 1:
+        later = square[samples.node + samples.fraction > fixed + 1e-6]
+        if np.any(np.isfinite(later)):
+            result[sensor.group] = float(np.sqrt(np.nanmean(later)))
+    return result
+
+
+def _baselines(episode: Episode, samples: Samples, cable: Cable | None) -> dict[str, Array]:
+    sensor = samples.sensor
+    if isinstance(sensor, EffortSensor):
+        return {"zero": np.zeros_like(samples.value)}
+    if not isinstance(sensor, PointSensor):
+        return {}
+    if cable is not None and set(sensor.points) <= set(cable.vertices):
+        recording, held, points = episode.recording, cable.held, sensor.points
+        group = next(group for group in recording.points if group.name == sensor.group)
+        inside = (group.t >= episode.grid.start - 1e-9) & (group.t <= episode.grid.times[-1] + 1e-9)
+        arrays = {
+            "stays": stay(recording, points, GIVEN),
+            "moves_with_clamps": move_with_clamps(recording, points, held, GIVEN),
+            "linear_carry": linear_carry(recording, points, cable.parent, cable.children, given=GIVEN),
+        }
+        return {name: array[inside].reshape(len(samples.value), -1) for name, array in arrays.items()}
+    first = np.full(samples.value.shape[1], np.nan)
+    for column in range(len(first)):
+        seen = samples.value[np.isfinite(samples.value[:, column]), column]
+        first[column] = seen[0] if len(seen) else np.nan
+    return {"stays": np.broadcast_to(first, samples.value.shape)}

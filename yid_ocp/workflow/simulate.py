@@ -1,0 +1,188 @@
+"""The command `simulate`: what the model says a robot and its sensors would record, written as a recording."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate, write_recording
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.problem import Episode, EpisodeResult
+from yid_ocp.sensors import PointSensor
+from yid_ocp.workflow.build import build_step, build_system, problem_options, read_recordings
+from yid_ocp.workflow.folder import Monitor, Silent, input_hashes, new_run_folder, versions
+from yid_ocp.workflow.settings import Run, dump_config
+
+FORMAT = "yid-simulate/1"
+DURATION = 5.0  # of a virtual experiment whose configuration does not say [s]
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SimulateOutcome:
+    """What `run_simulate` leaves.
+
+    Attributes
+    ----------
+    folder : Path
+    result : dict
+        Contents of result.json.
+    recording : Recording or None
+        None where the rollout failed.
+    """
+
+    folder: Path
+    result: dict[str, Any]
+    recording: Recording | None
+
+    @property
+    def ok(self) -> bool:
+        """Whether a recording was made."""
+        return self.recording is not None
+
+
+def run_simulate(
+    run: Run, out: str | Path | None = None, monitor: Monitor | None = None, seed: int = 0, noise: bool = False
+) -> SimulateOutcome:
+    """Write `recording.h5`: the model moved by the inputs of the first recording, or a virtual experiment without one.
+
+    With a recording under `recordings.estimate`, its torques or prescribed motion drive the model with the parameters'
+    initial values, and every sensor is predicted at the times at which it measured. Without one, MuJoCo simulates a
+    random motion of the driven arms.
+
+    Parameters
+    ----------
+    run : Run
+    out : str or Path, optional
+    monitor : Monitor, optional
+    seed : int
+        Of the motion and the noise.
+    noise : bool
+        Whether noise of the recorded deviations is added to what the model predicts (a virtual experiment always has
+        noise).
+
+    Raises
+    ------
+    ConfigError, DataError, ModelError, OutputError
+    """
+    watcher = monitor or Silent()
+    with new_run_folder(run, out, "simulate") as folder:
+        folder.write("config.yaml", dump_config(run))
+        inputs = input_hashes(run)
+        folder.log("start", command="simulate", versions=versions(), inputs=inputs)
+        if run.recordings.estimate:
+            made = _predicted(run, watcher, seed if noise else None)
+        else:
+            made = _virtual(run, watcher, seed)
+        result: dict[str, Any] = {"format": FORMAT, "status": "done", "message": "", "seed": seed}
+        if isinstance(made, str):
+            result |= {"status": "failed", "message": made}
+            recording = None
+        else:
+            recording = made
+            write_recording(recording, folder.path / "recording.h5")
+            result |= {
+                "duration": recording.duration,
+                "groups": {getattr(g, "name", "joints"): {"samples": len(g.t)} for g in recording.groups},
+                "truth": dict(recording.truth),
+            }
+        written = folder.write_json("result.json", result | {"inputs": inputs, "versions": versions()})
+    return SimulateOutcome(folder.path, written, recording)
+
+
+def _virtual(run: Run, watcher: Monitor, seed: int) -> Recording:
+    from yid_ocp.data.synthetic import virtual_experiment
+
+    system = build_system(run)
+    watcher.stage("simulating a virtual experiment in MuJoCo")
+    duration = run.solver.duration or DURATION
+    return virtual_experiment(system, None, duration=duration, seed=seed, name=run.name, description=run.description)
+
+
+def _predicted(run: Run, watcher: Monitor, seed: int | None) -> Recording | str:
+    watcher.stage("building the model and its compiled step")
+    step = build_step(run)
+    first = replace(run, recordings=replace(run.recordings, estimate=run.recordings.estimate[:1]))
+    recordings = read_recordings(first, "estimate")
+    options = replace(problem_options(run, step.system.parameters, recordings), local=(), priors={})
+    problem = EstimationProblem(step, recordings, (), options)
+    episode = problem.episodes[0]
+    watcher.stage(f"rolling out {episode.grid.steps} steps")
+    outcome = problem.run(episode, problem.theta, np.zeros(len(problem.start)), derivatives=False)
+    if isinstance(outcome, str):
+        return outcome
+    return validate(as_recording(run, problem, episode, outcome, seed))
+
+
+def as_recording(
+    run: Run, problem: EstimationProblem, episode: Episode, outcome: EpisodeResult, seed: int | None = None
+) -> Recording:
+    """The rollout of an episode as a recording with its sensors' clocks and noise levels.
+
+    Parameters
+    ----------
+    run : Run
+    problem : EstimationProblem
+    episode : Episode
+    outcome : EpisodeResult
+    seed : int, optional
+        Of noise with the recorded deviations; none when absent.
+    """
+    rng = None if seed is None else np.random.default_rng(seed)
+    system, source = problem.system, episode.recording
+    groups = []
+    for samples, predicted in zip(episode.samples, outcome.predicted, strict=True):
+        if isinstance(samples.sensor, PointSensor):
+            t = episode.grid.start + problem.step.time_step * (samples.node + samples.fraction)
+            shape = (len(t), len(samples.sensor.points), 3)
+            std = np.where(np.isfinite(samples.std), samples.std, np.nanmedian(samples.std)).reshape(shape)
+            position = np.where(samples.weight > 0, predicted, np.nan).reshape(shape)
+            original = next(group for group in source.points if group.name == samples.sensor.group)
+            groups.append(
+                PointGroup(
+                    original.name, samples.sensor.points, t, _noisy(position, std, rng), std,
+                    original.sensor, original.frame, original.pose,
+                )
+            )  # fmt: skip
+    theta = problem.own_theta(episode, problem.theta)
+    truth = dict(zip(system.parameters.names, map(float, theta), strict=True))
+    text = f"{run.description} Simulated with the inputs of {episode.name}.".strip()
+    joints = _joints(problem, episode, outcome, rng)
+    return Recording(joints, tuple(groups), text, "yid_ocp simulate", "recording", truth=truth)
+
+
+def _joints(
+    problem: EstimationProblem, episode: Episode, outcome: EpisodeResult, rng: np.random.Generator | None
+) -> JointGroup | None:
+    system, source = problem.system, episode.recording.joints
+    if source is None or not (system.driven or system.prescribed):
+        return None
+    names = tuple(name for name in (*system.driven, *system.prescribed) if name in source.names)
+    at = [system.mechanism.joint_index(name) for name in names]
+    position = outcome.sweep.state[:, at]
+    held = {name: outcome.sweep.torque[:, i] for i, name in enumerate(system.driven)}
+    held |= {name: outcome.sweep.effort[:, i] for i, name in enumerate(system.prescribed)}
+    effort = np.stack([np.append(held[name], held[name][-1]) for name in names], axis=1)
+    position_std = source.position_std
+    effort_std = source.effort_std
+    columns = [source.names.index(name) for name in names]
+
+    def own(std: Any) -> Any:
+        return std if std is None or np.ndim(std) == 0 else np.asarray(std)[columns]
+
+    return JointGroup(
+        names,
+        episode.grid.times,
+        _noisy(position, np.broadcast_to(0.0 if position_std is None else own(position_std), position.shape), rng),
+        effort=_noisy(effort, np.broadcast_to(0.0 if effort_std is None else own(effort_std), effort.shape), rng),
+        position_std=own(position_std),
+        effort_std=own(effort_std),
+    )
+
+
+def _noisy(values: Array, std: Array, rng: np.random.Generator | None) -> Array:
+    return values if rng is None else values + np.where(np.isfinite(std), std, 0.0) * rng.standard_normal(values.shape)
