@@ -91,7 +91,10 @@ def test_paths_are_relative_to_the_file(written, tmp_path):
         ("model.damping=0.1", ("model", "damping", 0.1)),
         ("model.springs.left_s1={stiffness: 20}", ("model", "springs", "left_s1", "stiffness", 20.0)),
         ("parameters.T1.bend={initial: 5, free: false}", ("parameters", "T1.bend", "free", False)),
-        ("diagnosis.candidates=[density, kelvin_voigt@T3]", ("diagnosis", "candidates", ("density", "kelvin_voigt@T3"))),
+        (
+            "diagnosis.candidates=[density, kelvin_voigt@T3]",
+            ("diagnosis", "candidates", ("density", "kelvin_voigt@T3")),
+        ),
     ],
 )
 def test_settings_over_the_file(setting, value):
@@ -259,7 +262,9 @@ def test_a_problem_from_a_file(repository):
     assert problem.free == tuple(f"T{i}.{kind}" for i in (1, 2, 3) for kind in ("bend", "twist"))
     assert [s.sensor.group for s in problem.episodes[0].samples] == ["points_arm"]
     assert len(problem.held_out) == 1
-    assert build_problem(load_config(repository / "configs" / "single_arm_vision.yaml"), problem.step).free == problem.free
+    assert (
+        build_problem(load_config(repository / "configs" / "single_arm_vision.yaml"), problem.step).free == problem.free
+    )
 
 
 def test_the_public_names_exist():

@@ -202,6 +202,8 @@ COMMANDS: tuple[Command, ...] = (
 
 def solve_summary(result: dict[str, Any]) -> list[str]:
     """Lines that tell a person what a `yid-solve/1` result says."""
+    from yid_ocp.report.tables import held_out_rows, medians
+
     free = {name: entry for name, entry in result["parameters"].items() if entry["free"]}
     failed = result["status"] == "failed"
     words = {"identifiable": "found", "weak": "weakly determined", "not_identifiable": "cannot be found"}
@@ -215,18 +217,15 @@ def solve_summary(result: dict[str, Any]) -> list[str]:
     rows += [(c, f"{e['rmse']:.3g}", e["unit"], str(e["n"])) for c, e in result["residuals"].items()]
     if len(rows) > 1:
         lines += [*table(rows), ""]
-    units = {channel: entry["unit"] for channel, entry in result["residuals"].items()}
-    rows = [("held-out recording", "channel", "error (rms)", "unit", "without a model")]
     for entry in result["held_out"]:
         if "message" in entry:
             lines += [f"held-out recording {entry['recording']} could not be predicted: {entry['message']}", ""]
-        for channel, rmse in entry["rmse"].items():
-            without = [
-                f"{errors[channel]:.3g} ({name})" for name, errors in entry["baselines"].items() if channel in errors
-            ]
-            rows.append((entry["recording"], channel, f"{rmse:.3g}", units.get(channel, ""), ", ".join(without)))
-    if len(rows) > 1:
-        lines += [*table(rows), ""]
+    rows = [("held-out recording", "channel", "error (rms)", "unit", "without a model")]
+    predicted = held_out_rows(result)
+    for row in [*predicted, *medians(predicted)]:
+        without = ", ".join(f"{error:.3g} ({name})" for name, error in row.baselines.items())
+        rows.append((row.recording, row.channel, f"{row.rmse:.3g}", row.unit, without))
+    lines += [*table(rows), ""] if len(rows) > 1 else []
     lost = [name for name, entry in free.items() if entry["verdict"] == "not_identifiable"]
     weak = [name for name, entry in free.items() if entry["verdict"] == "weak"]
     if failed:

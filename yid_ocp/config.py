@@ -153,7 +153,7 @@ def _override(data: dict[str, Any], places: dict[KeyPath, str], text: str) -> No
         value = YAML(typ="rt").load(value_text) if value_text.strip() else None
     except YAMLError as error:
         raise ConfigError(
-            f"the value '{value_text}' is not valid YAML", where=origin, allowed="a number, text, [list] or {key: value}"
+            f"the value '{value_text}' is not valid YAML", where=origin, allowed="a number, text, [list], {key: value}"
         ) from error
     parent = data
     for part in path[:-1]:

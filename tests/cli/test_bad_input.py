@@ -88,7 +88,9 @@ def test_settings_over_the_file(cli, pendulum, left_nothing, setting, words):
 
 
 def test_no_such_configuration(cli, pendulum):
-    assert_refused(cli("solve", pendulum.parent / "pendolum.yaml"), "no such configuration", "did you mean 'pendulum.yaml'?")
+    assert_refused(
+        cli("solve", pendulum.parent / "pendolum.yaml"), "no such configuration", "did you mean 'pendulum.yaml'?"
+    )
     assert_refused(cli("check", pendulum.parent), "cannot be read")
     (pendulum.parent / "list.yaml").write_text("- 1\n")
     assert_refused(cli("solve", pendulum.parent / "list.yaml"), "keys and values")

@@ -113,7 +113,9 @@ def test_quiet_prints_the_folder_alone(cli, pendulum, tmp_path):
 
 
 def test_set_changes_the_run(cli, pendulum, tmp_path):
-    done = cli("solve", pendulum, "--out", "a", "--set", "parameters.elbow.damping.free=false", "--set", "solver.duration=0.5")
+    done = cli(
+        "solve", pendulum, "--out", "a", "--set", "parameters.elbow.damping.free=false", "--set", "solver.duration=0.5"
+    )
     assert done.code == 0
     result = json.loads((tmp_path / "a" / "result.json").read_text())
     assert not result["parameters"]["elbow.damping"]["free"]

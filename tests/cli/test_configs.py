@@ -12,14 +12,12 @@ from yid_ocp.workflow.build import recording_file
 PAPER = ("single_arm_no_vision", "single_arm_vision", "dual_arm_no_vision", "dual_arm_vision")
 # settings that make each run quick: fewer links, a short horizon, interpreted where that is faster than compiling
 QUICK = {
-    **{
-        name: (
-            "model.object.links=2", "solver.duration=0.3", "solver.iterations=3", "solver.compiler=false",
-            "parameters={T*.bend: {free: true, initial: 15}, T*.twist: {initial: 10}}",
-        )
-        for name in PAPER
-    },
+    **dict.fromkeys(PAPER, ("model.object.links=2", "solver.duration=0.3", "solver.iterations=3", "solver.compiler=false", "parameters={T*.bend: {free: true, initial: 15}, T*.twist: {initial: 10}}")),
     "baxter_arm": ("solver.duration=1.0",),
+    "deft_bdlo1": (
+        "solver.duration=0.2", "solver.iterations=2", "recordings.estimate=[../../shared/recordings/deft/bdlo1_train_007.h5]",
+        "recordings.held_out=[../../shared/recordings/deft/bdlo1_train_014.h5]",
+    ),
 }  # fmt: skip
 
 

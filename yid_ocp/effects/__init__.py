@@ -1,6 +1,6 @@
 """The library of unmodelled effects: kinds, where each can sit, and `make_effect`; add one file with one registration.
 
-A kind's equation, quantities, units, bounds and expected ranges stand at its class; `docs/extending.md` shows a new one.
+A kind's equation, quantities, units, bounds and ranges stand at its class; `docs/extending.md` shows a new one.
 """
 
 from __future__ import annotations

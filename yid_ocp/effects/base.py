@@ -1,4 +1,4 @@
-"""What all effects share: their quantities, the neutral behaviour that each overrides in part, and where they can sit."""
+"""What all effects share: their quantities, the neutral behaviour that each overrides in part, where they can sit."""
 
 from __future__ import annotations
 

@@ -38,10 +38,9 @@ class KelvinVoigt(EffectBase):
 
 @EFFECTS.register("standard_linear_solid")
 class StandardLinearSolid(EffectBase):
-    """A spring and a damper in series beside every bending spring of a segment.
+    """A spring and a damper in series beside every spring of a segment, bends and twists.
 
-    V += 1/2 ratio kappa (q - z)^2 with the massless z creeping after q: (q - z) = relaxation_time dz/dt. Twists are left
-    elastic: their relaxation shows in no measured point of a slender branch, and they would cost half as much again.
+    V += 1/2 ratio kappa (q - z)^2 with the massless z creeping after q: (q - z) = relaxation_time dz/dt.
     """
 
     equation = "V += 1/2 ratio kappa (q - z)^2, q - z = relaxation_time dz/dt"
@@ -61,16 +60,14 @@ class StandardLinearSolid(EffectBase):
 
     @classmethod
     def internal_names(cls, location: str, system: System) -> tuple[str, ...]:
-        """Bending joints of the segment."""
-        return bending_joints(system, location)
+        """Joints of the segment."""
+        return sprung_joints(system, location)
 
     def terms(self, state: MidpointState) -> Terms:
         """See the class."""
         energy, equations = ca.SX(0), {}
         for spring in segment_springs(state.system, self.location):
             name = f"{self.label}.{spring.joint}"
-            if name not in state.internal:
-                continue
             row = state.internal[name]
             stretch = state.q[state.system.mechanism.joint_index(spring.joint)] - state.z[row]
             energy += self["ratio"] * spring.stiffness * stretch**2 / 2
@@ -80,7 +77,7 @@ class StandardLinearSolid(EffectBase):
 
 @EFFECTS.register("hysteresis")
 class Hysteresis(EffectBase):
-    """A Dahl element beside every bending spring of a segment: F = -stiffness z, dz/dt = v - |v| z / yield_angle.
+    """A Dahl element beside every spring of a segment, bends and twists: F = -stiffness z, dz/dt = v - |v| z / yield_angle.
 
     |v| is rounded off below `SLOW`. At the start of a recording z = 0: what came before is not known.
 
@@ -108,13 +105,13 @@ class Hysteresis(EffectBase):
 
     @classmethod
     def internal_names(cls, location: str, system: System) -> tuple[str, ...]:
-        """Bending joints of the segment."""
-        return bending_joints(system, location)
+        """Joints of the segment."""
+        return sprung_joints(system, location)
 
     def terms(self, state: MidpointState) -> Terms:
         """See the class."""
         force, equations, start = ca.SX(state.system.size, 1), {}, {}
-        for joint in bending_joints(state.system, self.location):
+        for joint in sprung_joints(state.system, self.location):
             name = f"{self.label}.{joint}"
             row, index = state.internal[name], state.system.mechanism.joint_index(joint)
             v, z = state.v[index], state.z[row]
@@ -125,6 +122,6 @@ class Hysteresis(EffectBase):
         return Terms(force=force, internal=equations, at_rest=start)
 
 
-def bending_joints(system: System, segment: str) -> tuple[str, ...]:
-    """Joints about which a segment bends."""
-    return tuple(spring.joint for spring in segment_springs(system, segment) if spring.kind == "bend")
+def sprung_joints(system: System, segment: str) -> tuple[str, ...]:
+    """Joints of a segment that have a spring."""
+    return tuple(spring.joint for spring in segment_springs(system, segment))

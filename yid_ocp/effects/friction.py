@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import casadi as ca
 
-from yid_ocp.effects.base import SMOOTHING, EFFECTS, EffectBase, Quantity, on_joint, robot_joints
+from yid_ocp.effects.base import EFFECTS, SMOOTHING, EffectBase, Quantity, on_joint, robot_joints
 from yid_ocp.model.system import MidpointState, System, Terms
 
 

@@ -41,8 +41,8 @@ class GraspCompliance(EffectBase):
     """A spring and a damper in place of the constraint: f = phi/C + damping dphi/dt, phi = gripper - object.
 
     In a step: phi(q_{k+1}) + C damping (phi(q_{k+1}) - phi(q_k))/h = C lam_k/h, regular at C = 0, where it is the rigid
-    grasp. The stretch is taken at the end of the step, which by itself damps motions that are fast against it. Every row
-    of the grasp has the same C; in rows of orientation it counts in rad/(N m).
+    grasp. The stretch is taken at the end of the step, which by itself damps what is fast against it. Every row of the
+    grasp has the same C; in rows of orientation it counts in rad/(N m).
     """
 
     equation = "phi + C damping dphi/dt = C force"

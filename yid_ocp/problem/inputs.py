@@ -130,7 +130,7 @@ def held_torque(
 
 
 def held_torque_slope(joints: JointGroup, driven: tuple[str, ...], grid: Grid, where: str, delay: Array) -> Array:
-    """Derivative of `held_torque` by each joint's delay, shape (steps, nu) [N m/s]; at a jump the mean of both sides."""
+    """Derivative of `held_torque` by each joint's delay, shape (steps, nu) [N m/s]; at a jump the mean of two sides."""
     assert joints.effort is not None
     effort = joints.effort[:, columns(joints, driven, where)]
 

@@ -16,7 +16,7 @@ from yid_ocp.errors import ConfigError, DataError, nearest
 from yid_ocp.integrator.codegen import Mapped
 from yid_ocp.integrator.feedback import lqr_filter, proportional_filter
 from yid_ocp.integrator.rollout import Rest, Statics, adjoint_gradient, simulate
-from yid_ocp.integrator.step import Directions, Feedback, Step, Sweep
+from yid_ocp.integrator.step import Directions, Feedback, Step, Sweep, check_shape
 from yid_ocp.problem.initial import FittedStart, StartFit
 from yid_ocp.problem.inputs import (
     ClampPath,
@@ -106,6 +106,8 @@ class ProblemOptions:
         first points alone; none of them may be free.
     recording_values : mapping of recording to mapping of parameter to value
         Known values of parameters that differ from recording to recording, such as where markers sit.
+    known_start : mapping of recording to array_like, shape (nx,)
+        State (q, p, z) in which a recording starts, in place of rest or of the fit; an `estimated` start deviates from it.
     """
 
     initial_state: InitialState = "equilibrium"
@@ -126,6 +128,7 @@ class ProblemOptions:
     start_std: float | None = None
     start_parameters: tuple[str, ...] = ()
     recording_values: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    known_start: Mapping[str, ArrayLike] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -485,7 +488,7 @@ class EstimationProblem:
         own = theta.copy()
         for name, value in known.items():
             own[self.system.parameters.index(name)] = value
-        if self.options.initial_state == "given":
+        if self.options.initial_state == "given" and episode.name not in self.options.known_start:
             for name, value in self.fitted_start(episode, own).values.items():
                 own[self.system.parameters.index(name)] = value
         return own
@@ -501,7 +504,10 @@ class EstimationProblem:
         by_deviation[chosen, np.arange(len(chosen))] = 1.0
         key = id(episode)
         rest: Rest | None = None
-        if self.options.initial_state == "given":
+        known = self.options.known_start.get(episode.name)
+        if known is not None:
+            state, by_theta = check_shape("known_start", known, (nx,)).copy(), np.zeros((nx, len(wanted)))
+        elif self.options.initial_state == "given":
             state, by_theta = self.fitted_start(episode, theta).state.copy(), np.zeros((nx, len(wanted)))
         else:
             guess = self._starts.get(key)

@@ -166,7 +166,7 @@ class Readings:
         return self._evaluate(None, self._late, theta, names)
 
     def sensor_delay(self, sensor: Sensor, theta: Array, names: tuple[str, ...]) -> tuple[Array, Array] | None:
-        """How long before its recorded time each output was true, shape (k,) [s], and its derivative; None for never."""
+        """How long before its recorded time each output was true, shape (k,) [s], and its derivative; None if never."""
         if sensor not in self._late_sensors:
             camera = sensor.camera is not None
             late = [self._delay(channel, camera) for channel in sensor.channels for _ in range(sensor.width)]

@@ -29,6 +29,9 @@ from yid_ocp.problem.residuals import huber
 Array = NDArray[np.float64]
 Sparse = scipy.sparse.csc_matrix
 
+# Mean square whitened residual above which a rollout is not the best guess of the node states.
+POOR_GUESS = 100.0
+
 
 @dataclass(frozen=True)
 class Layout:
@@ -116,31 +119,57 @@ class Transcription:
     # -- initial guess ------------------------------------------------------------------------------------------------
 
     def guess(self, x: Array) -> Array:
-        """Unknowns near a solution at the parameters `x`: the rollout under the tracking filter.
+        """Unknowns near a solution at the parameters `x`.
 
-        Where that fails, every node is at rest at the posture that the arms had then (or, without arms, at the start).
+        Either the rollout under the tracking filter, which has no defects, or, where that fails or strays far from what
+        was measured, every node at rest at the posture that the arms had then, which has defects but follows the data.
         """
         w = np.zeros(self.size)
         count = len(self.problem.shared)
         w[:count] = x[:count]
-        problem = self.problem
-        for i, (episode, layout) in enumerate(zip(problem.episodes, self.layouts, strict=True)):
+        for i, (episode, layout) in enumerate(zip(self.problem.episodes, self.layouts, strict=True)):
             theta = self._theta(w, i)
-            start, _, message = problem.start_state(episode, theta)
-            sweep = None
-            if not message:
-                feedback = self._tracking(episode, theta)
-                sweep = simulate(
-                    self.step, theta, start, episode.grid.steps, episode.torque, episode.path, feedback
-                )
+            start, _, message = self.problem.start_state(episode, theta)
+            sweep = None if message else self._tracked(episode, theta, start)
+            candidates = []
             if sweep is not None and sweep.status.ok:
-                state, multipliers = sweep.state[layout.nodes], sweep.multipliers
-            else:
-                state, multipliers = self._resting(episode, layout, theta, start)
-            w[layout.state.ravel()] = state.ravel()
-            if self.has_multipliers:
-                w[layout.multipliers.ravel()] = multipliers.ravel()
+                candidates.append((sweep.state[layout.nodes], sweep.multipliers))
+            if not candidates or self._misfit(w, i, *candidates[0]) > POOR_GUESS:
+                candidates.append(self._resting(episode, layout, theta, start))
+            state, multipliers = min(candidates, key=lambda pair: self._misfit(w, i, *pair))
+            self._place(w, i, state, multipliers)
         return w
+
+    def _place(self, w: Array, i: int, state: Array, multipliers: Array) -> None:
+        layout = self.layouts[i]
+        w[layout.state.ravel()] = state.ravel()
+        if self.has_multipliers:
+            w[layout.multipliers.ravel()] = multipliers.ravel()
+
+    def _misfit(self, w: Array, i: int, state: Array, multipliers: Array) -> float:
+        """Mean square of one recording's whitened residuals at given node states."""
+        trial = w.copy()
+        self._place(trial, i, state, multipliers)
+        values = [value for value, _, _ in self._sample_rows(trial, i, False)]
+        return float(np.mean(np.concatenate(values) ** 2))
+
+    def _tracked(self, episode: Episode, theta: Array, start: Array) -> Sweep:
+        return simulate(
+            self.step,
+            theta,
+            start,
+            episode.grid.steps,
+            episode.torque,
+            episode.path,
+            self._tracking(episode, theta),
+        )
+
+    def _tracking(self, episode: Episode, theta: Array) -> Feedback | None:
+        feedback = self.problem.feedback(episode)
+        if feedback is None and self.problem.system.driven:
+            smooth = Smoother(self.problem.options.path_cutoff)(episode.grid.times, episode.measured_arm)
+            return lqr_filter(self.step, smooth, episode.torque, theta)
+        return feedback
 
     def _resting(self, episode: Episode, layout: Layout, theta: Array, start: Array) -> tuple[Array, Array]:
         """Node states at rest at the measured postures, with the momentum of moving from one to the next."""
@@ -171,13 +200,6 @@ class Transcription:
         velocity = np.gradient(state[:, :n], times, axis=0)
         state[:, n : 2 * n] += momentum_of(self.step, state[:, :n], velocity, theta)
         return state, force[:-1] * h
-
-    def _tracking(self, episode: Episode, theta: Array) -> Feedback | None:
-        feedback = self.problem.feedback(episode)
-        if feedback is None and self.problem.system.driven:
-            smooth = Smoother(self.problem.options.path_cutoff)(episode.grid.times, episode.measured_arm)
-            return lqr_filter(self.step, smooth, episode.torque, theta)
-        return feedback
 
     def _unknowns(self, theta_free: Array) -> Array:
         """The problem's unknown vector with the starts' deviations at zero."""
@@ -444,31 +466,11 @@ class Transcription:
         problem = self.problem
         count = len(problem.shared)
         values, blocks, cost = [], [], 0.0
-        for i, (episode, layout) in enumerate(zip(problem.episodes, self.layouts, strict=True)):
-            theta = self._theta(w, i)
-            for samples in episode.samples:
-                nodes = samples.nodes
-                position = np.searchsorted(layout.nodes, nodes)
-                if not np.all(layout.nodes[np.minimum(position, len(layout.nodes) - 1)] == nodes):
-                    part = self._between_nodes(w, i, samples, theta, derivatives)
-                else:
-                    state = w[layout.state[position]]
-                    effort = np.zeros((len(nodes), self.n))
-                    outputs = problem.sensor(samples.sensor, problem.shared)(
-                        state[:, : self.n], state[:, 2 * self.n :], effort, theta
-                    )
-                    part = self._at_nodes(samples, outputs, layout.state[position], derivatives)
-                predicted, jacobian = part
-                seen = samples.weight > 0
-                raw = samples.weight * np.where(seen, predicted - samples.value, 0.0)
-                loss, factor = huber(raw, problem.options.robust_scale)
+        for i in range(len(problem.episodes)):
+            for value, jacobian, loss in self._sample_rows(w, i, derivatives):
+                values.append(value)
+                blocks.append(jacobian)
                 cost += loss
-                keep = seen.ravel()
-                values.append((factor * raw).ravel()[keep])
-                if derivatives:
-                    assert jacobian is not None
-                    weight = scipy.sparse.diags((factor * samples.weight).ravel())
-                    blocks.append((weight @ jacobian).tocsr()[keep])
             if self.free_start:
                 part, jacobian = self._start_prior(w, i, derivatives)
                 cost += 0.5 * float(part @ part)
@@ -483,6 +485,33 @@ class Transcription:
         wide = scipy.sparse.lil_matrix((int(own.sum()), self.size))
         wide[:, :count] = by_theta[own][:, :count]
         return np.concatenate(values), scipy.sparse.vstack([*blocks, wide.tocsr()], format="csc"), cost
+
+    def _sample_rows(self, w: Array, i: int, derivatives: bool) -> list[tuple[Array, Sparse | None, float]]:
+        """Residual, Jacobian and loss of every group of samples of one recording."""
+        problem, layout = self.problem, self.layouts[i]
+        theta = self._theta(w, i)
+        result = []
+        for samples in problem.episodes[i].samples:
+            nodes = samples.nodes
+            position = np.searchsorted(layout.nodes, nodes)
+            if np.all(layout.nodes[np.minimum(position, len(layout.nodes) - 1)] == nodes):
+                state = w[layout.state[position]]
+                effort = np.zeros((len(nodes), self.n))
+                outputs = problem.sensor(samples.sensor, problem.shared)(
+                    state[:, : self.n], state[:, 2 * self.n :], effort, theta
+                )
+                predicted, jacobian = self._at_nodes(samples, outputs, layout.state[position], derivatives)
+            else:
+                predicted, jacobian = self._between_nodes(w, i, samples, theta, derivatives)
+            seen = samples.weight > 0
+            raw = samples.weight * np.where(seen, predicted - samples.value, 0.0)
+            loss, factor = huber(raw, problem.options.robust_scale)
+            keep = seen.ravel()
+            placed: Sparse | None = None
+            if jacobian is not None:
+                placed = (scipy.sparse.diags((factor * samples.weight).ravel()) @ jacobian).tocsr()[keep]
+            result.append(((factor * raw).ravel()[keep], placed, loss))
+        return result
 
     def _at_nodes(
         self, samples, outputs: Sequence[Array], columns: NDArray[np.int64], derivatives: bool  # type: ignore[no-untyped-def]

@@ -20,17 +20,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.errors import ConfigError
-from yid_ocp.vision.filters import Cloud
+from yid_ocp.vision.filters import Cloud, weighted_median
 from yid_ocp.vision.meshes import Surfaces
 
 Array = NDArray[np.float64]
 
-_POINTS, _FEW = 1500, 150  # of every frame: for the result, for the first search
+_POINTS, _FEW = 1000, 150  # of every frame: for the result, for the first search
 _COARSE = 0.02  # [s]
 _FEWEST = 40  # points that tell anything of a frame
 _CONTRAST = 0.05  # by which a minimum must be lower than the highest sum, of that
 _NARROWING = (1.0, 0.7, 0.5, 0.35, 0.35)  # of the reach, from iteration to iteration
-_OWN_NARROWING = (0.7, 0.5, 0.35)
+_CLEARLY = 0.8  # of the misfit at the common offset, below which a frame's own minimum elsewhere is believed
 _LEAST_LATE = 0.02  # [s]; a stamp that is off by less is like the others
 _SHIFT = 1e-2  # weight, against that of the points, that keeps a shift that they do not tell small
 _MEDIAN_SQUARE = 0.4549  # of a normal variable
@@ -156,7 +156,7 @@ def estimate_clock(
     offset, shift = float(coarse[best]), np.zeros(3)
     usual = sorted(samples)
     own, information = nothing.copy(), np.zeros(count)
-    for narrowing in (_NARROWING, _NARROWING[-2:]):
+    for narrowing in (_NARROWING, _NARROWING[-2:], _NARROWING[-2:]):
         for share in narrowing:
             rows = [_rows(robot, samples[i], float(stamps[i]) - offset, posture, share * chosen.reach) for i in usual]
             stacked = np.concatenate(rows)
@@ -164,10 +164,14 @@ def estimate_clock(
             change = np.linalg.solve(normal, -stacked[:, :4].T @ stacked[:, 4])
             offset, shift = offset + float(np.clip(change[0], -0.05, 0.05)), change[1:]
         for i, points in samples.items():
-            starts = {offset, float(coarse[int(np.argmin(curves[i]))])}
-            trials = [_own(robot, points + shift, float(stamps[i]), start, posture, chosen.reach) for start in starts]
-            _, own[i], information[i] = min(trials)
+            trial = _own(robot, points + shift, float(stamps[i]), offset, posture, chosen.reach, _NARROWING[-3:])
+            lowest = float(coarse[int(np.argmin(curves[i]))])
+            if abs(lowest - offset) > _LEAST_LATE:
+                other = _own(robot, points + shift, float(stamps[i]), lowest, posture, chosen.reach, _NARROWING[1:])
+                trial = other if other[0] < _CLEARLY * trial[0] else trial
+            _, own[i], information[i] = trial
         # frames that were stamped late must not pull the others
+        offset = weighted_median(own[usual], information[usual])
         deviation = own - offset
         variance = float(np.median((information * deviation**2)[usual])) / _MEDIAN_SQUARE
         limit = np.maximum(_LEAST_LATE, 4 * np.sqrt(variance / np.maximum(information, 1e-12)))
@@ -229,11 +233,17 @@ def _movement(robot: Surfaces, posture: Callable[[float], Array], t: float) -> A
 
 
 def _own(
-    robot: Surfaces, points: Array, stamp: float, start: float, posture: Callable[[float], Array], reach: float
+    robot: Surfaces,
+    points: Array,
+    stamp: float,
+    start: float,
+    posture: Callable[[float], Array],
+    reach: float,
+    narrowing: Sequence[float],
 ) -> tuple[float, float, float]:
     """One frame's misfit, its own offset (not far from a start), and how much it tells of it."""
     offset, information = start, 0.0
-    for share in _OWN_NARROWING:
+    for share in narrowing:
         rows = _rows(robot, points, stamp - offset, posture, share * reach)
         information = float(rows[:, 0] @ rows[:, 0])
         if information > 0:

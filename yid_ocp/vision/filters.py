@@ -243,12 +243,13 @@ def without_outliers(cloud: Cloud, neighbours: int, ratio: float) -> Mask:
     if len(cloud) <= neighbours:
         return np.zeros(len(cloud), bool)
     distance = cKDTree(cloud.points).query(cloud.points, k=neighbours + 1)[0][:, 1:].mean(1)
-    middle = _weighted_median(distance, cloud.weight)
-    spread = _TO_SIGMA * _weighted_median(np.abs(distance - middle), cloud.weight)
+    middle = weighted_median(distance, cloud.weight)
+    spread = _TO_SIGMA * weighted_median(np.abs(distance - middle), cloud.weight)
     return np.asarray(distance <= middle + ratio * spread)
 
 
-def _weighted_median(values: Array, weight: Array) -> float:
+def weighted_median(values: Array, weight: Array) -> float:
+    """Value below and above which lies half of the weight."""
     order = np.argsort(values)
     total = np.cumsum(weight[order])
     return float(values[order[np.searchsorted(total, 0.5 * total[-1])]])

@@ -11,10 +11,16 @@ from markupsafe import Markup
 from yid_ocp.problem.problem import Episode, EpisodeResult
 from yid_ocp.report import figures
 from yid_ocp.report.sections import Findings, section
+from yid_ocp.report.tables import held_out_rows, medians
 from yid_ocp.sensors import Sensor
 
 MOST_PICTURES = 24  # a page with more is too heavy to open; result.json and trajectories.h5 have them all
-WORDS = {"stays": "every point stays where it was first seen", "zero": "an effort of zero"}
+WORDS = {
+    "stays": "points stay where they were first seen",
+    "zero": "an effort of zero",
+    "moves_with_clamps": "points move with the mean of the clamps",
+    "linear_carry": "the clamps' motion carried along the cable",
+}
 
 
 @section("fit", 20, "How well it fits")
@@ -33,10 +39,12 @@ def prepare(findings: Findings) -> Mapping[str, Any] | None:
             else:
                 left += 1
     residuals = _whitened(findings)
+    rows = held_out_rows(result)
     return {
         "residuals": result.get("residuals", {}),
-        "held_out": result.get("held_out", []),
-        "units": {channel: entry["unit"] for channel, entry in result.get("residuals", {}).items()},
+        "held_out": rows,
+        "medians": medians(rows),
+        "unpredicted": [entry for entry in result.get("held_out", []) if "message" in entry],
         "words": WORDS,
         "pictures": pictures,
         "left": left,

@@ -1,0 +1,152 @@
+"""Pictures of a frame's stages and of a whole track, drawn without a display."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from yid_ocp.data.recording import new_file
+from yid_ocp.errors import OutputError
+from yid_ocp.vision.track import Stages, Track
+
+Array = NDArray[np.float64]
+
+_MOST = 12000  # points in one picture: more hide each other
+_GREY, _BLUE, _ORANGE, _GREEN = "#9a9a9a", "#1f5fa8", "#e07a1f", "#2a8f4f"
+STAGES = ("cloud", "filtered", "skeleton", "graph", "fit")
+"""The pictures of one frame, in order."""
+
+
+def draw_stages(stages: Stages, folder: str | os.PathLike[str]) -> list[Path]:
+    """Write one picture for every stage of a frame: cloud, filtered, skeleton, graph, fit.
+
+    Parameters
+    ----------
+    stages : Stages
+    folder : path-like
+        Made where it does not exist.
+
+    Returns
+    -------
+    list of Path
+        `NAME_1_cloud.png` to `NAME_5_fit.png`.
+
+    Raises
+    ------
+    OutputError
+        The folder or a file cannot be written.
+    """
+    path = Path(folder)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"the folder cannot be made: {error.strerror}", where=str(path)) from error
+    rng = np.random.default_rng(0)
+    skeleton, fit = stages.skeleton, stages.fit
+    near = stages.filtered
+
+    def cloud(axes: Any) -> None:
+        _scatter(axes, _some(stages.cloud, rng), _GREY, 0.4)
+
+    def filtered(axes: Any) -> None:
+        _scatter(axes, _some(near, rng), _BLUE, 1.5)
+
+    def nodes(axes: Any) -> None:
+        _scatter(axes, _some(near, rng), _GREY, 0.4)
+        _scatter(axes, skeleton.nodes, _ORANGE, 14)
+
+    def graph(axes: Any) -> None:
+        _scatter(axes, skeleton.nodes, _ORANGE, 14)
+        for a, b in skeleton.edges:
+            axes.plot(*skeleton.nodes[[a, b]].T, color=_BLUE, linewidth=1.2)
+
+    def shape(axes: Any) -> None:
+        _scatter(axes, _some(near, rng), _GREY, 0.4)
+        for link in fit.centre_line:
+            axes.plot(*link.T, color=_GREEN, linewidth=2.5)
+        _scatter(axes, fit.centre_line.reshape(-1, 3), _GREEN, 18)
+        _scatter(axes, fit.points, _ORANGE, 40)
+
+    counts = {
+        "cloud": f"{len(stages.cloud)} points of the camera",
+        "filtered": f"{len(near)} points of the object",
+        "skeleton": f"{len(skeleton.nodes)} nodes of the walk",
+        "graph": f"{len(skeleton.edges)} edges, {len(set(skeleton.part.tolist()))} connected parts",
+        "fit": f"fitted shape, {1e3 * fit.distance:.1f} mm off on average",
+    }
+    stem = "".join(letter if letter.isalnum() else "_" for letter in Path(stages.name).stem)
+    written = []
+    drawings = (cloud, filtered, nodes, graph, shape)
+    for number, (name, draw) in enumerate(zip(STAGES, drawings, strict=True), start=1):
+        target = path / f"{stem}_{number}_{name}.png"
+        frame = stages.cloud if name == "cloud" else np.concatenate([near, fit.centre_line.reshape(-1, 3)])
+        _write(target, f"{stages.name}: {counts[name]}", frame, stages.camera, draw)
+        written.append(target)
+    return written
+
+
+def draw_track(track: Track, file: str | os.PathLike[str]) -> None:
+    """Write a picture of the points over time: the good frames with two deviations, and the spline between them.
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
+    figure = Figure(figsize=(9, 2.2 * len(track.names) + 0.8), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(len(track.names), 1, sharex=True, squeeze=False)[:, 0]
+    fine = np.linspace(track.t[0], track.t[-1], 400)
+    course = np.array([track.points(t) for t in fine])
+    lost = [frame.t for frame in track.frames if not frame.good and np.isfinite(frame.t)]
+    for row, (panel, name) in enumerate(zip(axes, track.names, strict=True)):
+        for axis, colour in enumerate((_BLUE, _ORANGE, _GREEN)):
+            centre = np.nanmean(track.position[:, row, axis]) if np.isfinite(track.position[:, row, axis]).any() else 0.0
+            panel.plot(fine, 1e3 * (course[:, row, axis] - centre), color=colour, linewidth=1)
+            seen = 1e3 * (track.position[:, row, axis] - centre)
+            panel.errorbar(track.t, seen, 2e3 * track.std[:, row, axis], fmt=".", color=colour, label="xyz"[axis])
+        for t in lost:
+            panel.axvline(t, color=_GREY, linewidth=0.6, linestyle=":")
+        panel.set_ylabel(f"{name} [mm]")
+    axes[0].legend(loc="upper right", ncols=3, frameon=False)
+    axes[0].set_title(f"about the mean, two deviations; dotted: dropped frames\n{track.clock.message}", fontsize=9)
+    axes[-1].set_xlabel("t [s]")
+    with new_file(Path(file)) as temporary:
+        figure.savefig(temporary, format="png", dpi=110)
+
+
+def _some(points: Array, rng: np.random.Generator) -> Array:
+    return points if len(points) <= _MOST else points[rng.choice(len(points), _MOST, replace=False)]
+
+
+def _scatter(axes: Any, points: Array, colour: str, size: float) -> None:
+    axes.scatter(*points.T, s=size, c=colour, linewidths=0, depthshade=False)
+
+
+def _write(path: Path, title: str, frame: Array, camera: Array, draw: Callable[[Any], None]) -> None:
+    figure = Figure(figsize=(6.4, 6.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot(projection="3d")
+    draw(axes)
+    low, high = np.percentile(frame, 0.5, axis=0) - 0.02, np.percentile(frame, 99.5, axis=0) + 0.02
+    middle, half = 0.5 * (low + high), 0.5 * float((high - low).max())
+    axes.set_xlim(middle[0] - half, middle[0] + half)
+    axes.set_ylim(middle[1] - half, middle[1] + half)
+    axes.set_zlim(middle[2] - half, middle[2] + half)
+    axes.set_box_aspect((1, 1, 1))
+    away = camera - middle
+    # beside the camera's own view, where depth shows
+    axes.view_init(elev=18, azim=float(np.degrees(np.arctan2(away[1], away[0]))) + 35)
+    axes.set_xlabel("x [m]")
+    axes.set_ylabel("y [m]")
+    axes.set_zlabel("z [m]")
+    axes.set_title(title, fontsize=10)
+    with new_file(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=110)
