@@ -195,14 +195,14 @@ def test_an_object_of_segments_on_a_robots_hand(written):
             "model:\n"
             "  robot: package:panda\n"
             "  arms:\n"
-            "    joints: [panda_joint1, panda_joint2, panda_joint3, panda_joint4, panda_joint5, panda_joint6, panda_joint7]\n"
+            f"    joints: [{', '.join(f'panda_joint{i}' for i in range(1, 8))}]\n"
             "    mode: prescribed\n"
             "  object:\n"
             "    kind: segments\n"
             "    mount: {frame: panda_hand, xyz: [0, 0, 0.1], rpy: [0, 1.5708, 0]}\n"
             "    segments:\n"
-            "      beam: {length: 0.52, mass: 0.33, radius: 0.01, links: 5, bend: 1.3, twist: 2.0, rigidity: true, clamped: true}\n"
-            "      tip: {link_lengths: [0.1, 0.05], mass: 0.01, radius: 0.01, parent: beam, at_link: 4, damping: 0.001}\n"
+            "      beam: {length: 0.5, mass: 0.3, radius: 0.01, links: 5, bend: 1.3, rigidity: true, clamped: true}\n"
+            "      tip: {link_lengths: [0.1, 0.05], mass: 0.01, radius: 0.01, parent: beam, damping: 0.001}\n"
         )
     )
     assert isinstance(run.model.object, SegmentedObject)

@@ -83,6 +83,18 @@ def _solve(arguments: argparse.Namespace) -> int:
     return DONE if outcome.ok else FAILED
 
 
+def _compare(arguments: argparse.Namespace) -> int:
+    from yid_ocp.workflow.compare import run_compare
+
+    run = _load(arguments)
+    with _progress(arguments.quiet) as monitor:
+        outcome = run_compare(run, arguments.out, monitor)
+    if not arguments.quiet:
+        _print(compare_summary(outcome.result))
+    _say_folder(outcome.folder, arguments.quiet)
+    return DONE if outcome.ok else FAILED
+
+
 def _simulate(arguments: argparse.Namespace) -> int:
     from yid_ocp.workflow.simulate import run_simulate
 
@@ -188,6 +200,7 @@ def _schema_arguments(parser: argparse.ArgumentParser) -> None:
 
 COMMANDS: tuple[Command, ...] = (
     Command("solve", "estimate the free parameters from recordings", _solve, configured(optional=True)),
+    Command("compare", "run several methods on one problem and say whether they agree", _compare, configured()),
     Command("simulate", "write what the model says would be recorded", _simulate, _simulate_arguments),
     Command("check", "validate a configuration, its recordings and the model before a long run", _check, configured()),
     Command("inspect", "show the model's equations in numbers", _inspect, configured()),
@@ -237,6 +250,46 @@ def solve_summary(result: dict[str, Any]) -> list[str]:
     lines.append(
         f"{result['status']}: {result['message']} ({result['iterations']} iterations, {result['seconds']:.1f} s)"
     )
+    return lines
+
+
+def compare_summary(result: dict[str, Any]) -> list[str]:
+    """Lines that tell a person what a `yid-compare/1` result says."""
+    methods: dict[str, Any] = result["methods"]
+    free = [name for name, entry in methods[result["reference"]]["parameters"].items() if entry["free"]]
+    beside = [key for key in ("published", "truth") if result[key]]
+    rows: Rows = [("parameter", *methods, *beside, "verdict")]
+    for name in free:
+        cells = []
+        for entry in methods.values():
+            found = entry["parameters"][name]
+            cells.append(f"{found['value']:.4g}" + ("" if found["std"] is None else f" ± {found['std']:.2g}"))
+        known = [f"{result[key][name]:.4g}" if name in result[key] else "" for key in beside]
+        verdict = methods[result["reference"]]["parameters"][name]["verdict"].replace("_", " ")
+        rows.append((name, *cells, *known, verdict))
+    lines = [*table(rows), ""]
+
+    def row(title: str, *cells: str) -> None:
+        prices.append((title, *cells))
+
+    prices: Rows = [("", *methods)]
+    row("status", *(entry["status"] for entry in methods.values()))
+    costs = [entry["whitened_cost"] for entry in methods.values()]
+    row("cost (whitened)", *("failed" if cost is None else f"{cost:.6g}" for cost in costs))
+    for channel in sorted({c for e in methods.values() for h in e["held_out"] for c in h.get("rmse", {})}):
+        cells = [[h["rmse"][channel] for h in e["held_out"] if channel in h.get("rmse", {})] for e in methods.values()]
+        row(f"held out: {channel}", *(f"{sum(c) / len(c):.3g}" if c else "failed" for c in cells))
+    row("iterations", *(str(entry["iterations"]) for entry in methods.values()))
+    row("evaluations", *(str(entry["evaluations"]) for entry in methods.values()))
+    row("wall time [s]", *(f"{entry['wall_seconds']:.2f}" for entry in methods.values()))
+    row("CPU time [s]", *(f"{entry['cpu_seconds']:.2f}" for entry in methods.values()))
+    row("peak memory [MiB]", *(f"{entry['peak_memory_mib']:.0f}" for entry in methods.values()))
+    lines += [*table(prices), ""]
+    for name, entry in methods.items():
+        lines += [f"{name} differs: {sentence}" for sentence in entry["disagreements"]]
+    lines += result["explained"]
+    if result["agree"]:
+        lines.append("all methods agree on the identifiable parameters within their uncertainty")
     return lines
 
 
@@ -370,7 +423,7 @@ class _BarProgress:
     def close(self) -> None:
         """Mark the running stage as done."""
         if self._task is not None:
-            self._bars.update(self._task, total=1, completed=1)
+            self._bars.update(self._task, description=self._text, total=1, completed=1)
 
 
 def _iterate_words(entry: Iterate) -> str:

@@ -1,4 +1,4 @@
-"""A run small enough for seconds: a double pendulum moved as measured, its springs and dampers estimated from effort."""
+"""A run small enough for seconds: a double pendulum moved as measured, springs and dampers estimated from effort."""
 
 from __future__ import annotations
 
@@ -94,10 +94,10 @@ def pendulum(pendulum_data, tmp_path, monkeypatch) -> Path:
 @pytest.fixture
 def left_nothing(tmp_path):
     """Check that a command left no run folder, not even an unfinished one."""
-    before = {path for path in tmp_path.rglob("*")}
+    before = set(tmp_path.rglob("*"))
 
     def check(*also: Path) -> None:
-        found = {path for path in tmp_path.rglob("*")} - before - set(also)
+        found = set(tmp_path.rglob("*")) - before - set(also)
         left = [path for path in found if path.suffix not in (".yaml", ".h5")]
         assert left == []
 

@@ -1,4 +1,4 @@
-"""What a user gets wrong: exit code 2, a message that says what, where, what is allowed and what to do, nothing left."""
+"""What a user gets wrong: exit code 2, a message that says what, where, what is allowed, what to do; nothing left."""
 
 from __future__ import annotations
 

@@ -146,7 +146,8 @@ def test_check_refines_links_and_time_step(cli, tmp_path, monkeypatch):
         "  object:\n"
         "    kind: segments\n"
         "    segments:\n"
-        "      beam: {length: 0.5, mass: 0.3, radius: 0.01, links: 4, bend: 0.5, twist: 0.5, rigidity: true, clamped: true}\n"
+        "      beam:\n"
+        "        {length: 0.5, mass: 0.3, radius: 0.01, bend: 0.5, twist: 0.5, rigidity: true, clamped: true}\n"
         "  damping: 0.001\n"
         "  gravity: [0, 0, 0]\n"
     )
@@ -181,7 +182,8 @@ def test_inspect(cli, pendulum, tmp_path):
 def test_inspect_agrees_with_finite_differences(cli, tmp_path, monkeypatch, urdf_folder):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "free.yaml").write_text(
-        f"model:\n  robot: {urdf_folder / 'double_pendulum.urdf'}\n  arms: {{mode: driven}}\nsolver: {{compiler: false}}\n"
+        f"model:\n  robot: {urdf_folder / 'double_pendulum.urdf'}\n  arms: {{mode: driven}}\n"
+        "solver: {compiler: false}\n"
     )
     done = cli("inspect", "free.yaml", "--out", "i")
     assert done.code == 0, done.err

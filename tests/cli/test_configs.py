@@ -11,14 +11,26 @@ from yid_ocp.workflow.build import recording_file
 
 PAPER = ("single_arm_no_vision", "single_arm_vision", "dual_arm_no_vision", "dual_arm_vision")
 # settings that make each run quick: fewer links, a short horizon, interpreted where that is faster than compiling
+COARSE = (
+    "model.object.links=2",
+    "solver.duration=0.3",
+    "solver.iterations=3",
+    "solver.compiler=false",
+    "parameters={T*.bend: {free: true, initial: 15}, T*.twist: {initial: 10}}",
+)
+DEFT = "../../shared/recordings/deft/bdlo1_train_{}.h5"
 QUICK = {
-    **dict.fromkeys(PAPER, ("model.object.links=2", "solver.duration=0.3", "solver.iterations=3", "solver.compiler=false", "parameters={T*.bend: {free: true, initial: 15}, T*.twist: {initial: 10}}")),
+    **dict.fromkeys(PAPER, COARSE),
     "baxter_arm": ("solver.duration=1.0",),
     "deft_bdlo1": (
-        "solver.duration=0.2", "solver.iterations=2", "recordings.estimate=[../../shared/recordings/deft/bdlo1_train_007.h5]",
-        "recordings.held_out=[../../shared/recordings/deft/bdlo1_train_014.h5]",
+        "solver.duration=0.1",
+        "solver.iterations=2",
+        "solver.compiler=false",
+        "solver.start_parameters=[]",
+        f"recordings.estimate=[{DEFT.format('007')}]",
+        f"recordings.held_out=[{DEFT.format('014')}]",
     ),
-}  # fmt: skip
+}
 
 
 def configurations(repository):
@@ -45,6 +57,9 @@ def test_configuration_runs(cli, repository, tmp_path, name):
     assert result["status"] in ("converged", "iteration_limit"), result["message"]
     assert result["residuals"]
     assert all(entry["rmse"] for entry in result["held_out"])
+    if name == "deft_bdlo1":
+        assert set(result["held_out"][0]["baselines"]) == {"stays", "moves_with_clamps", "linear_carry"}
+        assert result["held_out"][0]["rmse"]["points"] < 0.05
     if name == "baxter_arm":
         assert [channel for channel in result["residuals"] if channel.startswith("joints.effort.left_")]
         assert len(result["residuals"]) == 7

@@ -138,4 +138,5 @@ def grasp_gaps(system: System, posture: Mapping[str, float], theta: Array) -> di
         if np.linalg.norm(best) < 1e-3:
             break
     assert best is not None
-    return {grasp.name: float(np.linalg.norm(part)) for grasp, part in zip(system.grasps, best.reshape(-1, 3), strict=True)}
+    distances = np.linalg.norm(best.reshape(-1, 3), axis=1)
+    return {grasp.name: float(distance) for grasp, distance in zip(system.grasps, distances, strict=True)}

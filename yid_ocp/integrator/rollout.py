@@ -53,9 +53,9 @@ class Rest:
     message: str
 
 
-# Driven joints are held at their measured posture by a spring [N m/rad], so that an equilibrium exists also where encoder
-# noise stretches the object by a hair beyond its reach. With a measured torque the spring is as soft as the ratio of
-# torque error to encoder error; without one it is stiff enough to give less than an encoder's noise.
+# Driven joints are held at their measured posture by a spring [N m/rad], so that an equilibrium exists also where
+# encoder noise stretches the object by a hair beyond its reach. With a measured torque the spring is as soft as the
+# ratio of torque error to encoder error; without one it is stiff enough to give less than an encoder's noise.
 HOLD_STIFFNESS = 1e5
 HOLD_STIFFNESS_WITH_TORQUE = 1e3
 # A holding spring that gives by more than this means that the posture does not fit the grasp [rad].
@@ -98,7 +98,8 @@ class Statics:
         w = ca.vertcat(sought, z, force)
         residual = ca.vertcat(balance[list(self.unknown)], internal, constraint)
         inputs = [w, given, held, stiffness, e.theta, e.time_step]
-        potential = system.elastic_energy(q) + ca.substitute(e.rigid.potential, ca.vertcat(e.q0, e.q1), ca.vertcat(q, q))
+        weight = ca.substitute(e.rigid.potential, ca.vertcat(e.q0, e.q1), ca.vertcat(q, q))
+        potential = system.elastic_energy(q) + weight
         potential += stiffness / 2 * ca.sumsqr(give) + ca.dot(held, give) if nu else 0
         state = ca.densify(ca.vertcat(q, p_rest, z))
         self._residual = ca.Function("rest", inputs, [residual, ca.jacobian(residual, w)])

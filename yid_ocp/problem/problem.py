@@ -937,6 +937,17 @@ class EstimationProblem:
         none = np.zeros(self._start_size)
         return [(episode, self.run(episode, theta, none, derivatives=False)) for episode in self.held_out]
 
+    def with_options(self, options: ProblemOptions) -> EstimationProblem:
+        """The same problem with other options; recordings, step and free parameters are shared."""
+        return EstimationProblem(
+            self.step,
+            [episode.recording for episode in self.episodes],
+            self.free,
+            options,
+            dict(zip(self.system.parameters.names, self.theta, strict=True)),
+            [episode.recording for episode in self.held_out],
+        )
+
     def with_free(self, free: Sequence[str], values: Mapping[str, float] | None = None) -> EstimationProblem:
         """The same problem with other free parameters; recordings, step and options are shared."""
         merged = dict(zip(self.system.parameters.names, self.theta, strict=True)) | dict(values or {})

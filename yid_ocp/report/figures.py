@@ -98,26 +98,35 @@ def residual_histogram(residuals: Mapping[str, Array]) -> plotly.graph_objects.F
     return _styled(figure, 340, "residual in standard deviations", "density")
 
 
-def estimates(values: Mapping[str, tuple[float, float | None, float]], unit: str) -> plotly.graph_objects.Figure:
-    """Values with two standard deviations, and the start, one row for each parameter: (value, std, initial)."""
+def estimates(values: Mapping[str, tuple[float, float | None, float, bool]], unit: str) -> plotly.graph_objects.Figure:
+    """Values with two standard deviations, and the start, one row for each parameter: (value, std, initial, found)."""
     import plotly.graph_objects as go
 
     names = list(values)
-    known = [name for name in names if values[name][1] is not None]
     figure = go.Figure()
     figure.add_scatter(
-        x=[values[name][2] for name in names], y=names, mode="markers", name="start",
+        x=[values[name][2] for name in names],
+        y=names,
+        mode="markers",
+        name="start",
         marker={"color": PALE, "size": 10, "symbol": "diamond", "line": {"color": INK, "width": 1}},
-    )  # fmt: skip
-    figure.add_scatter(
-        x=[values[name][0] for name in names], y=names, mode="markers", name="estimate",
-        marker={"color": [COLORS[0] if name in known else COLORS[1] for name in names], "size": 10},
-        error_x={"type": "data", "array": [2 * (values[name][1] or 0.0) for name in names], "color": COLORS[0]},
-    )  # fmt: skip
-    largest = max([abs(v) for value, _, initial in values.values() for v in (value, initial)] or [1.0])
+    )
+    for found, word, color in ((True, "estimate", COLORS[0]), (False, "estimate that cannot be trusted", COLORS[1])):
+        chosen = [name for name in names if values[name][3] == found]
+        figure.add_scatter(
+            x=[values[name][0] for name in chosen],
+            y=chosen,
+            mode="markers",
+            name=word,
+            marker={"color": color, "size": 10},
+            error_x={"type": "data", "array": [2 * (values[name][1] or 0.0) for name in chosen], "color": color},
+            showlegend=bool(chosen),
+        )
+    largest = max([abs(number) for value, _, initial, _ in values.values() for number in (value, initial)] or [1.0])
     figure = _styled(figure, 110 + 34 * len(names), unit, "")
-    figure.update_xaxes(range=[min(0.0, *(v[0] for v in values.values())) - 0.05 * largest, 1.6 * largest])
-    figure.update_yaxes(autorange="reversed")
+    lowest = min(0.0, *(value for value, *_ in values.values()))
+    figure.update_xaxes(range=[lowest - 0.05 * largest, 1.6 * largest])
+    figure.update_yaxes(autorange="reversed", categoryorder="array", categoryarray=names)
     return figure
 
 

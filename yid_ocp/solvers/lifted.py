@@ -93,7 +93,9 @@ class Lifted:
             weight = max(weight, 2.0 * max(slope, 0.0) / max(now.defect, 1e-300)) if now.defect > 0 else weight
             moved = float(np.max(np.abs(step) / size, initial=0.0))
             done = now.defect < self.defect_tolerance
-            if done and (moved < self.step_tolerance or abs(promised) <= self.cost_tolerance * max(now.cost, 1e-300)):
+            recent = [entry.cost for entry in recorder.history[-4:]]
+            still = len(recent) == 4 and max(recent) - min(recent) <= self.cost_tolerance * max(now.cost, 1e-300)
+            if done and (still or moved < self.step_tolerance or abs(promised) <= self.cost_tolerance * max(now.cost, 1e-300)):
                 return self._end(Status.CONVERGED, f"closed to {now.defect:.1e}", x, recorder)
             factor = 1.0
             while True:

@@ -267,6 +267,22 @@ class DiagnosisSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class CompareSettings:
+    """Which methods are compared, each with settings of its own."""
+
+    methods: Annotated[Mapping[str, Mapping[str, Any]], About("settings of each method, by name")] = field(
+        default_factory=lambda: {
+            "steepest_descent": {"trial": "spectral", "iterations": 400},
+            "single_shooting": {},
+            "gauss_newton": {},
+            "multiple_shooting": {"node_interval": 10},
+            "lifted": {},
+        }
+    )
+    published: Annotated[str | None, About("experiment of the source paper whose answer stands beside")] = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class OutputSettings:
     """Where results go."""
 
@@ -294,6 +310,7 @@ class Run:
     sensors: Annotated[Mapping[str, SensorSettings], About("by group of the recordings")] = field(default_factory=dict)
     parameters: Annotated[Mapping[str, ParameterSettings], About("by name or pattern")] = field(default_factory=dict)
     solver: Annotated[SolverSettings, About("how the cost is lowered")] = field(default_factory=SolverSettings)
+    compare: Annotated[CompareSettings, About("which methods are compared")] = field(default_factory=CompareSettings)
     diagnosis: Annotated[DiagnosisSettings, About("how a gap is diagnosed")] = field(default_factory=DiagnosisSettings)
     output: Annotated[OutputSettings, About("where results go")] = field(default_factory=OutputSettings)
     name: str = field(default="run", metadata={"internal": True})

@@ -20,9 +20,10 @@ def prepare(findings: Findings) -> Mapping[str, Any] | None:
     if "parameters" not in result:
         return None
     free = {name: entry for name, entry in result["parameters"].items() if entry.get("free")}
-    by_unit: dict[str, dict[str, tuple[float, float | None, float]]] = {}
+    by_unit: dict[str, dict[str, tuple[float, float | None, float, bool]]] = {}
     for name, entry in free.items():
-        by_unit.setdefault(entry["unit"], {})[name] = (entry["value"], entry["std"], entry["initial"])
+        found = entry["verdict"] != "not_identifiable" and result["status"] != "failed"
+        by_unit.setdefault(entry["unit"], {})[name] = (entry["value"], entry["std"], entry["initial"], found)
     by_verdict = {word: [n for n, e in free.items() if e["verdict"] == key] for key, word in WORDS.items()}
     return {
         "result": result,

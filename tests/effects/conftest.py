@@ -1,0 +1,181 @@
+"""A small robot with a small Y, driven or prescribed, and what every test of effects does with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from yid_ocp.effects import SENSORS, EffectBase, candidates, make_effect
+from yid_ocp.integrator.rollout import Statics, simulate
+from yid_ocp.integrator.step import Directions, Step, Sweep, compile_step
+from yid_ocp.model import Grasp, Mechanism, Segment, System, flexible_object, forward_kinematics
+from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, roll_pitch_yaw, transform
+from yid_ocp.sensors import EffortSensor, PointSensor, Sensor, sensor_function
+
+POSTURE = np.array([0.3, 0.8, 0.9])
+H = 0.01
+POSE = ((0.0, 0.0, -1.0, 2.0), (1.0, 0.0, 0.0, 0.3), (0.0, -1.0, 0.0, 0.5), (0.0, 0.0, 0.0, 1.0))
+
+
+def arm() -> Mechanism:
+    """Three joints, 0.3 m links of 1 kg, each turned from the one before."""
+    along = Placement.of(transform(np.eye(3), [0.0, 0.0, 0.3]))
+    axes = ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0))
+    joints = tuple(
+        Joint(
+            f"left_{name}",
+            "revolute",
+            i - 1,
+            along if i else Placement.identity(),
+            axes[i],
+            (Inertia.of(1.0, [0.01, 0.02, 0.15], np.diag([8e-3, 7e-3, 2e-3])),),
+        )
+        for i, name in enumerate("abc")
+    )
+    return Mechanism("arm", joints, {"left_gripper": Frame(2, along)})
+
+
+def small_y(foot: np.ndarray):
+    """T1 of two links, T2 and T3 of one."""
+    turn = [roll_pitch_yaw(lean, 0.2, 0.0) for lean in (-0.8, 0.8)]
+    segments = (
+        Segment("T1", 0.4, 0.08, 0.03, 2, damping=0.02),
+        Segment("T2", 0.25, 0.04, 0.02, 1, parent="T1", rotation=turn[0], damping=0.02),
+        Segment("T3", 0.3, 0.05, 0.02, 1, parent="T1", rotation=turn[1], damping=0.02),
+    )
+    return flexible_object(segments, foot)
+
+
+def position(mechanism: Mechanism, frame: str, q: np.ndarray) -> np.ndarray:
+    """Origin of a frame at nominal parameters."""
+    return np.array(ca.DM(forward_kinematics(mechanism.numeric(), ca.SX(ca.DM(q))).position(frame))).ravel()
+
+
+def build(prescribed: bool = False, grasped: bool = True) -> System:
+    """The arm at `POSTURE` holding the tip of T2 of the undeformed object, 2 cm beside it."""
+    robot, item = arm(), small_y(np.eye(4))
+    gap = position(robot, "left_gripper", POSTURE) - position(item.mechanism, "w_T2", np.zeros(12))
+    foot = transform(np.eye(3), gap + [0.01, -0.02, -0.015])
+    names = robot.joint_names
+    return System.build(
+        robot,
+        objects=[(small_y(foot), None, None)],
+        grasps=[Grasp("left", "left_gripper", "w_T2")] if grasped else [],
+        driven=() if prescribed else names,
+        prescribed=names if prescribed else (),
+        damping=0.05,
+    )
+
+
+@dataclass(frozen=True)
+class Run:
+    """A rollout from rest under the bench's motion."""
+
+    step: Step
+    theta: np.ndarray
+    start: np.ndarray
+    sweep: Sweep
+
+
+class Bench:
+    """A system's short, lively rollouts by the interpreter."""
+
+    posture, pose = POSTURE, POSE
+
+    def __init__(self, system: System, steps: int = 8) -> None:
+        self.system = system
+        self.steps = steps
+        self.plain = compile_step(system, H, use_compiler=False)
+        self.rest = Statics(self.plain).solve(POSTURE, system.parameters.vector())
+        assert self.rest.converged, self.rest.message
+        t = H * np.arange(steps + 1)[:, None]
+        self.torque = self.rest.torque + np.array([1.0, -2.0, 0.7][: len(system.driven)]) * np.sin(30 * t[:-1] + 1)
+        self.path = POSTURE + 0.03 * np.sin(25 * t + np.arange(3)) - 0.03 * np.sin(np.arange(3))
+        self.path = self.path[:, : len(system.prescribed)]
+        rng = np.random.default_rng(3)
+        self.kick = 1e-3 * rng.normal(size=system.size)
+
+    def effect(self, kind: str, location: str, **values: float) -> EffectBase:
+        return make_effect(kind, location, self.system, values)
+
+    def step(self, *effects: EffectBase) -> Step:
+        return compile_step(self.system.with_effects(effects), H, use_compiler=False)
+
+    def start(self, step: Step) -> np.ndarray:
+        """The nominal rest in a system that may have more coordinates, internal ones relaxed at zero stretch."""
+        names, sizes = step.system.mechanism.joint_names, step.sizes
+        at = [names.index(name) for name in self.system.mechanism.joint_names]
+        state, n = np.zeros(sizes["nx"]), sizes["n"]
+        state[at] = self.rest.state[: self.system.size]
+        state[[n + i for i in at]] = self.rest.state[self.system.size : 2 * self.system.size] + self.kick
+        for row, name in enumerate(step.system.internal):
+            joint = name.rpartition(".")[2]
+            if joint in names and not name.startswith("hysteresis"):
+                state[2 * n + row] = state[names.index(joint)]
+        return state
+
+    def run(self, step: Step, values: Mapping[str, float] | None = None, names=(), start=None, steps=None) -> Run:
+        theta = step.system.parameters.vector(values)
+        begin = self.start(step) if start is None else start
+        directions = Directions(tuple(names), np.zeros((len(begin), len(names)))) if names else None
+        count = steps or self.steps
+        sweep = simulate(
+            step, theta, begin, count, self.torque[:count], self.path[: count + 1], directions=directions
+        )
+        return Run(step, theta, begin, sweep)
+
+    def nominal_part(self, run: Run) -> np.ndarray:
+        """Coordinates and momenta of the joints that the nominal model has."""
+        names, n = run.step.system.mechanism.joint_names, run.step.sizes["n"]
+        at = [names.index(name) for name in self.system.mechanism.joint_names]
+        return np.hstack([run.sweep.state[:, at], run.sweep.state[:, [n + i for i in at]]])
+
+    def reading(self, run: Run, sensor: Sensor) -> np.ndarray:
+        """What a sensor reads at every node but the last."""
+        n, sweep, system = run.step.sizes["n"], run.sweep, run.step.system
+        function = sensor_function(system, sensor, ())
+        effort = np.zeros((len(sweep.state) - 1, n))
+        effort[:, list(system.prescribed_indices)] = sweep.effort
+        effort[:, list(system.driven_indices)] = sweep.torque
+        rows = zip(sweep.state[:-1], effort, strict=True)
+        return np.array([np.array(function(x[:n], x[2 * n :], e, run.theta)[0]).ravel() for x, e in rows])
+
+
+CAMERA = PointSensor("points_camera", ("w_T1", "w_T3"), ("w_T1", "w_T3"), POSE)
+
+
+@pytest.fixture(scope="session")
+def driven() -> Bench:
+    return Bench(build())
+
+
+@pytest.fixture(scope="session")
+def prescribed() -> Bench:
+    return Bench(build(prescribed=True))
+
+
+@pytest.fixture(scope="session")
+def benches(driven, prescribed) -> dict[str, Bench]:
+    return {"driven": driven, "prescribed": prescribed}
+
+
+@pytest.fixture(scope="session")
+def all_effects() -> Callable[[System], list[EffectBase]]:
+    def every(system: System) -> list[EffectBase]:
+        return [make_effect(kind, place, system) for kind, place in candidates(system, SENSORS)]
+
+    return every
+
+
+@pytest.fixture(scope="session")
+def sensors() -> SimpleNamespace:
+    return SimpleNamespace(
+        camera=CAMERA,
+        arm=PointSensor("points_arm", ("w_T2",), ("w_T2",)),
+        effort=EffortSensor(("left_a", "left_b", "left_c")),
+    )

@@ -1,0 +1,406 @@
+"""Each effect does what its equation says, on systems small enough to be worked out by hand."""
+
+from __future__ import annotations
+
+import math
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from yid_ocp.effects import EFFECTS, make_effect
+from yid_ocp.integrator.rollout import Statics, simulate
+from yid_ocp.integrator.step import compile_step
+from yid_ocp.model import Grasp, Mechanism, Segment, System, flexible_object, forward_kinematics
+from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, roll_pitch_yaw, transform
+from yid_ocp.sensors import AngleSensor, EffortSensor, PointSensor, sensor_function
+
+LENGTH, MASS, RADIUS, KAPPA = 0.5, 0.2, 0.02, 3.0
+INERTIA = MASS * (LENGTH**2 / 3 + RADIUS**2 / 4)
+G = 9.81
+H = 0.005
+
+
+JOINTS = ("T1_0_y", "T1_0_x", "T1_0_z")
+
+
+def link(gravity=(0.0, 0.0, 0.0), prescribed=JOINTS, links=1) -> System:
+    """A tube of equal links on the ground, without damping."""
+    segment = Segment("T1", LENGTH, MASS, RADIUS, links, bend=KAPPA, damping=0.0)
+    return System.build(objects=[(flexible_object([segment]), None, None)], prescribed=prescribed, gravity=gravity)
+
+
+def hinge(mode: str = "prescribed", gravity=(0.0, 0.0, 0.0)) -> System:
+    """One arm joint about y that carries a link along z."""
+    body = Inertia.of(MASS, [0.0, 0.0, LENGTH / 2], np.diag([1e-3, 1e-3, 1e-4]))
+    joint = Joint("left_a", "revolute", -1, Placement.identity(), (0.0, 1.0, 0.0), (body,))
+    tip = Frame(0, Placement.of(transform(np.eye(3), [0, 0, LENGTH])))
+    return System.build(Mechanism("arm", (joint,), {"left_gripper": tip}), gravity=gravity, **{mode: ["left_a"]})
+
+
+def follow(system, effects, path, values=None, z0=None):
+    """Effort of the first prescribed joint along its path, the others held, started in steady motion; and the sweep."""
+    step = compile_step(system.with_effects(effects), H, use_compiler=False)
+    theta = step.system.parameters.vector(values)
+    sizes = step.sizes
+    lead = np.vstack([2 * path[:1] - path[1:2], path])
+    lead = np.pad(lead, ((0, 0), (0, sizes["nc"] - lead.shape[1])))
+    start = np.zeros(sizes["nx"])
+    if z0 is not None:
+        start[2 * sizes["n"] :] = z0
+    sweep = simulate(step, theta, start, len(lead) - 1, path=lead)
+    assert sweep.status.ok
+    return sweep.effort[1:, 0], sweep
+
+
+def still(angle: float, steps: int = 4) -> np.ndarray:
+    return np.full((steps, 1), angle)
+
+
+def turning(rate: float, steps: int = 8, angle: float = 0.0) -> np.ndarray:
+    return angle + rate * H * np.arange(steps)[:, None]
+
+
+def swing(system, effects, angle: float, steps: int):
+    """Free motion of an undriven system from a bent start: the bent joint's angle, shape (steps + 1,)."""
+    step = compile_step(system.with_effects(effects), H, use_compiler=False)
+    sizes = step.sizes
+    start = np.zeros(sizes["nx"])
+    index = step.system.mechanism.joint_index("T1_0_y")
+    start[index] = angle
+    sweep = simulate(step, step.system.parameters.vector(), start, steps)
+    assert sweep.status.ok
+    return sweep.state[:, index]
+
+
+# -- the object's material --------------------------------------------------------------------------------------------
+
+
+def test_kelvin_voigt_takes_energy_out_at_its_damping_ratio() -> None:
+    system, tau, steps = link(prescribed=()), 0.01, 320
+    q = swing(system, [make_effect("kelvin_voigt", "T1", system, {"tau": tau})], 0.1, steps)
+    omega = math.sqrt(KAPPA / INERTIA)
+    free = swing(system, [], 0.1, steps)
+    assert np.max(np.abs(free[-50:])) > 0.0999
+    peaks = [k for k in range(1, steps) if q[k - 1] < q[k] > q[k + 1]]
+    decrement = math.log(q[peaks[0]] / q[peaks[2]]) / 2
+    ratio = tau * omega / 2
+    assert decrement == pytest.approx(2 * math.pi * ratio / math.sqrt(1 - ratio**2), rel=0.03)
+
+
+def test_a_standard_linear_solid_relaxes_with_its_time_constant() -> None:
+    system, time, ratio = link(), 0.08, 0.6
+    effect = make_effect("standard_linear_solid", "T1", system, {"ratio": ratio, "relaxation_time": time})
+    effort, _ = follow(system, [effect], still(0.2, 60))
+    t = H * np.arange(len(effort))
+    # the first steady step has begun to creep already
+    expected = KAPPA * 0.2 * (1 + ratio * np.exp(-(t + H) / time))
+    assert effort == pytest.approx(expected, rel=0.02)
+    assert effort[-1] == pytest.approx(KAPPA * 0.2, rel=0.02)
+
+
+def test_hysteresis_loses_energy_and_saturates() -> None:
+    system, stiffness, angle = link(), 1.5, 0.1
+    effect = make_effect("hysteresis", "T1", system, {"stiffness": stiffness, "yield_angle": angle})
+    t = H * np.arange(801)
+    path = 0.6 * np.sin(2 * np.pi * 0.5 * t)[:, None]
+    values = dict(zip(effect.parameters.names, (stiffness, angle), strict=True))
+    effort, _ = follow(system, [effect], path, values)
+    nominal, _ = follow(system, [], path)
+    friction = effort - nominal
+    assert np.max(np.abs(friction)) == pytest.approx(stiffness * angle, rel=0.05)
+    second = slice(401, 800)
+    # work of one cycle, against that of a dry friction of the saturated torque
+    work = np.sum(friction[second] * np.gradient(path[:, 0])[second])
+    assert 0.7 < work / (4 * 0.6 * stiffness * angle) < 1.0
+
+
+def test_cubic_stiffness_stiffens() -> None:
+    system, k3, angle = link(), 5.0, 0.4
+    effort, _ = follow(system, [make_effect("cubic_stiffness", "T1", system, {"k3": k3})], still(angle))
+    assert effort == pytest.approx(KAPPA * angle + k3 * angle**3)
+
+
+def test_rest_curvature_is_where_the_object_comes_to_rest() -> None:
+    system = link(prescribed=(), links=2)
+    bent = system.with_effects([make_effect("rest_curvature", "T1", system, {"qx": 0.1, "qy": -0.2})])
+    rest = Statics(compile_step(bent, H, use_compiler=False)).solve([], bent.parameters.vector())
+    assert rest.state[:6] == pytest.approx([0.1, -0.2, 0.0] * 2)
+
+
+def test_bend_anisotropy_stiffens_one_way() -> None:
+    for axis, factor in (("x", 1.0), ("y", 1.25)):
+        system = link(prescribed=sorted(JOINTS, key=lambda joint, first=axis: joint[-1] != first))
+        effect = make_effect("bend_anisotropy", "T1", system, {"ratio": 0.25})
+        assert follow(system, [effect], still(0.3))[0] == pytest.approx(KAPPA * factor * 0.3)
+
+
+# -- masses, lengths, gravity, air ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "location", "values", "torque"),
+    [
+        ("density", "T1", {"scale": 1.3}, 1.3 * MASS * G * LENGTH / 2),
+        ("length_scale", "T1", {"scale": 1.1}, MASS * G * 1.1 * LENGTH / 2),
+        ("point_mass", "w_T1", {"mass": 0.05}, MASS * G * LENGTH / 2 + 0.05 * G * LENGTH),
+        ("gravity_scale", "object", {"fraction": -0.4}, 0.6 * MASS * G * LENGTH / 2),
+    ],
+)
+def test_weight_at_a_horizontal_link(kind, location, values, torque) -> None:
+    system = link(gravity=(0, 0, -G))
+    effort, _ = follow(system, [make_effect(kind, location, system, values)], still(math.pi / 2))
+    assert effort == pytest.approx(KAPPA * math.pi / 2 - torque)
+
+
+@pytest.mark.parametrize(
+    ("kind", "location", "values", "inertia"),
+    [
+        ("density", "T1", {"scale": 1.3}, 1.3 * INERTIA),
+        ("length_scale", "T1", {"scale": 1.1}, MASS * (1.1**2 * LENGTH**2 / 3 + RADIUS**2 / 4)),
+        ("point_mass", "w_T1", {"mass": 0.05}, INERTIA + 0.05 * LENGTH**2),
+        ("gravity_scale", "object", {"fraction": -0.4}, INERTIA),
+    ],
+)
+def test_inertia_of_an_accelerated_link(kind, location, values, inertia) -> None:
+    system = link()
+    path = 0.5 * 20.0 * (H * np.arange(10)[:, None]) ** 2
+    effort, _ = follow(system, [make_effect(kind, location, system, values)], path, {"T1.bend": 0.0})
+    assert effort[2:] == pytest.approx(20.0 * inertia, rel=1e-6)
+
+
+def test_gravity_tilt_turns_the_weight() -> None:
+    system = link(gravity=(0, 0, -G))
+    effort, _ = follow(system, [make_effect("gravity_tilt", "world", system, {"ry": 0.03})], still(0.0))
+    assert effort == pytest.approx(MASS * G * LENGTH / 2 * math.sin(0.03))
+
+
+def test_drag_of_a_turning_link() -> None:
+    system, rate, cd = link(), 6.0, 1.2
+    effort, _ = follow(system, [make_effect("aerodynamic_drag", "T1", system, {"cd": cd})], turning(rate))
+    nominal, _ = follow(system, [], turning(rate))
+    force = 0.5 * 1.2 * cd * 2 * RADIUS * LENGTH * (rate * LENGTH / 2) ** 2
+    assert effort - nominal == pytest.approx(force * LENGTH / 2, rel=1e-3)
+
+
+# -- springs where the model is rigid ---------------------------------------------------------------------------------
+
+
+def rest_of(system: System, *effects):
+    step = compile_step(system.with_effects(effects), H, use_compiler=False)
+    rest = Statics(step).solve([], step.system.parameters.vector(), tolerance=1e-9)
+    assert rest.converged
+    return step, rest
+
+
+def test_a_mount_is_a_spring_in_series() -> None:
+    system = link(gravity=(0.3, 0, 0), prescribed=())
+    effect = make_effect("mount_compliance", "base", system, {"stiffness": 12.0})
+    step, rest = rest_of(system, effect)
+    names = step.system.mechanism.joint_names
+    assert names == ("mount_compliance@base_x", "mount_compliance@base_y", "T1_0_x", "T1_0_y", "T1_0_z")
+    mount, bend = rest.state[1], rest.state[3]
+    # both bear the same torque
+    assert 12.0 * mount == pytest.approx(KAPPA * bend)
+    assert 12.0 * mount == pytest.approx(MASS * 0.3 * LENGTH / 2 * math.cos(mount + bend))
+    assert rest.state[0] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_junction_turns_all_branches() -> None:
+    segments = [Segment("T1", LENGTH, MASS, RADIUS, 2, damping=0.0)]
+    segments += [
+        Segment(n, 0.2, 0.05, RADIUS, 1, parent="T1", rotation=roll_pitch_yaw(lean, 0, 0), damping=0.0)
+        for n, lean in (("T2", -0.5), ("T3", 0.5))
+    ]
+    system = System.build(objects=[(flexible_object(segments), None, None)], gravity=(0.4, 0.0, 0.0))
+    step, rest = rest_of(system, make_effect("junction_compliance", "w_T1", system, {"stiffness": 8.0}))
+    at = step.system.mechanism.joint_index
+    # the torque of both branches about the junction's y axis goes through its spring
+    theta = step.system.parameters.vector()
+    kinematics = forward_kinematics(step.system.mechanism, ca.SX(ca.DM(rest.state[: step.sizes["n"]])))
+    where = ca.Function("p", [step.system.parameters.symbols], [kinematics.position(f"w_{n}") for n in ("T1", "T2", "T3")])
+    junction, *tips = (np.array(p).ravel() for p in where(theta))
+    axis_function = ca.Function("a", [step.system.parameters.symbols], [kinematics.screws[at("T2_0_x") - 1][:3]])
+    axis = np.array(axis_function(theta)).ravel()
+    torque = sum(np.cross((tip - junction) / 2, [0.05 * 0.4, 0, 0]) @ axis for tip in tips)
+    assert 8.0 * rest.state[at("junction_compliance@w_T1_y")] == pytest.approx(torque, rel=1e-6)
+
+
+def hanging(*effects_of, gravity=(0.0, 0.0, -G)):
+    """The one-link tube with its tip held from above by an arm joint that is prescribed at zero."""
+    up = Placement.of(transform(np.eye(3), [0, 0, LENGTH]))
+    joint = Joint("left_a", "revolute", -1, up, (0.0, 0.0, 1.0))
+    robot = Mechanism("arm", (joint,), {"left_gripper": Frame(0, Placement.identity())})
+    item = flexible_object([Segment("T1", LENGTH, MASS, RADIUS, 1, bend=KAPPA, damping=0.5)])
+    slide = Joint("foot", "prismatic", -1, Placement.identity(), (0.0, 0.0, 1.0))
+    tree = robot.joined(Mechanism("rail", (slide,), {"rail": Frame(0, Placement.identity())}))
+    grasp = Grasp("left", "left_gripper", "w_T1")
+    system = System.build(
+        tree, objects=[(item, "rail", None)], grasps=[grasp], prescribed=["left_a"], gravity=gravity, damping=0.0
+    )
+    return system, [make_effect(kind, "left", system, values) for kind, values in effects_of]
+
+
+def test_a_compliant_grasp_stretches_by_force_over_stiffness() -> None:
+    system, effects = hanging(("grasp_compliance", {"stiffness": 400.0, "damping": 3.0}))
+    step = compile_step(system.with_effects(effects), H, use_compiler=False)
+    rest = Statics(step).solve([0.0], step.system.parameters.vector())
+    assert rest.converged
+    # the tube hangs on the grasp alone: its foot slides
+    assert rest.state[step.system.mechanism.joint_index("foot")] == pytest.approx(-MASS * G / 400.0)
+
+
+def test_damping_calms_a_bouncing_grasp() -> None:
+    sway = []
+    for damping in (0.0, 8.0):
+        system, effects = hanging(("grasp_compliance", {"stiffness": 50.0, "damping": damping}))
+        step = compile_step(system.with_effects(effects), 0.001, use_compiler=False)
+        at = step.system.mechanism.joint_index("foot")
+        sweep = simulate(step, step.system.parameters.vector(), np.zeros(step.sizes["nx"]), 400)
+        assert sweep.status.ok
+        sway.append(np.std(sweep.state[300:, at]))
+    assert sway[1] < 0.1 * sway[0]
+
+
+def test_a_slipping_grasp_creeps_at_its_rate() -> None:
+    system, effects = hanging(("grasp_slip", {"slip_per_load": 0.005}))
+    step = compile_step(system.with_effects(effects), H, use_compiler=False)
+    theta = step.system.parameters.vector()
+    rest = Statics(step).solve([0.0], theta)
+    sweep = simulate(step, theta, rest.state, 40)
+    assert sweep.status.ok
+    foot, offset = sweep.state[:, step.system.mechanism.joint_index("foot")], sweep.state[:, -1]
+    # the gripper pulls the tube up, so it creeps towards the tip and the tube sinks
+    assert offset[-1] == pytest.approx(0.005 * MASS * G * 40 * H, rel=0.02)
+    assert foot[-1] == pytest.approx(-offset[-1], abs=1e-9)
+
+
+def test_a_grasp_offset_moves_the_held_point() -> None:
+    system, effects = hanging(("grasp_offset", {"dz": 0.013}))
+    step = compile_step(system.with_effects(effects), H, use_compiler=False)
+    rest = Statics(step).solve([0.0], step.system.parameters.vector())
+    assert rest.state[step.system.mechanism.joint_index("foot")] == pytest.approx(0.013)
+
+
+# -- arm joints -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "extra"),
+    [
+        ("joint_viscous", {"b": 0.7}, lambda v: 0.7 * v),
+        ("joint_coulomb", {"tau_c": 0.9}, lambda v: 0.9 * math.copysign(1, v)),
+        ("joint_stribeck", {"tau_s": 0.9, "v_stribeck": 0.5}, lambda v: 0.9 * math.exp(-4.0) * math.copysign(1, v)),
+    ],
+)
+@pytest.mark.parametrize("rate", [1.0, -1.0])
+def test_friction_works_against_the_motion(kind, values, extra, rate) -> None:
+    system = hinge()
+    effort, _ = follow(system, [make_effect(kind, "left_a", system, values)], turning(rate))
+    assert effort == pytest.approx(extra(rate), rel=1e-6, abs=1e-9)
+
+
+def test_spring_rotor_and_link_mass_at_an_arm_joint() -> None:
+    system = hinge(gravity=(0, 0, -G))
+    load, _ = follow(system, [], still(1.0))
+    spring = make_effect("joint_spring", "left_a", system, {"stiffness": 20.0, "rest_angle": 0.4})
+    assert follow(system, [spring], still(1.0))[0] == pytest.approx(load + 20.0 * 0.6)
+    heavy = make_effect("link_mass", "left_a", system, {"scale": 1.15})
+    assert follow(system, [heavy], still(1.0))[0] == pytest.approx(1.15 * load)
+    path = 0.5 * 20.0 * (H * np.arange(10)[:, None]) ** 2
+    rotor = make_effect("rotor_inertia", "left_a", system, {"armature": 0.3})
+    more = follow(system, [rotor], path)[0] - follow(system, [], path)[0]
+    assert more[2:] == pytest.approx(0.3 * 20.0)
+
+
+def test_gripper_mass_is_felt_by_a_bare_arm() -> None:
+    system = hinge(gravity=(0, 0, -G))
+    assert "left_gripper" in EFFECTS["point_mass"].likely(system)
+    load, _ = follow(system, [], still(math.pi / 2))
+    mass = make_effect("point_mass", "left_gripper", system, {"mass": 0.33})
+    assert follow(system, [mass], still(math.pi / 2))[0] == pytest.approx(load - 0.33 * G * LENGTH)
+
+
+# -- what sensors read ------------------------------------------------------------------------------------------------
+
+
+def read(system: System, effects, sensor, q=None, effort=None) -> np.ndarray:
+    whole = system.with_effects(effects)
+    function = sensor_function(whole, sensor, ())
+    n = whole.size
+    at = (np.zeros(n) if q is None else q, np.zeros(len(whole.internal)), np.zeros(n) if effort is None else effort)
+    return np.array(function(*at, whole.parameters.vector())[0]).ravel()
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "angle", "torque"),
+    [
+        ("encoder_offset", {"offset": 0.02}, 0.52, 3.0),
+        ("series_elasticity", {"stiffness": 300.0}, 0.51, 3.0),
+        ("backlash", {"width": 0.01}, 0.5 + 0.005 * math.tanh(3.0 / 0.2), 3.0),
+        ("effort_gain", {"scale": 0.9}, 0.5, 2.7),
+        ("effort_offset", {"offset": -0.4}, 0.5, 2.6),
+    ],
+)
+def test_joint_readings_and_the_way_back(kind, values, angle, torque) -> None:
+    system = hinge()
+    effect = make_effect(kind, "left_a", system, values)
+    seen = [read(system, [effect], s(("left_a",)), [0.5], [3.0])[0] for s in (AngleSensor, EffortSensor)]
+    assert seen == pytest.approx([angle, torque])
+    back = [
+        effect.correct(f"joints.{quantity}.left_a", ca.SX(reading), ca.SX(3.0))
+        for quantity, reading in zip(("position", "effort"), seen, strict=True)
+    ]
+    value = ca.Function("back", [effect.parameters.symbols], back)(ca.DM([p.value for p in effect.parameters]))
+    assert [float(x) for x in value] == pytest.approx([0.5, 3.0])
+    assert effect.correct("joints.position.other", ca.SX(1), ca.SX(1)).is_one()
+
+
+POSE = np.eye(4)
+POSE[:3, 3] = [1.0, 0.0, 0.2]
+
+
+def test_cameras_see_points_elsewhere() -> None:
+    system = link(prescribed=())
+    eye = PointSensor("points_camera", ("w_T1",), ("w_T1",), tuple(map(tuple, POSE)))
+    true, centre = np.array([0.0, 0.0, LENGTH]), POSE[:3, 3]
+    assert read(system, [], eye) == pytest.approx(true)
+
+    def seen(kind: str, **values: float) -> np.ndarray:
+        effect = make_effect(kind, "camera", system, values)
+        other = PointSensor("points_mocap", ("w_T1",), ("w_T1",))
+        assert read(system, [effect], other) == pytest.approx(true)
+        return read(system, [effect], eye)
+
+    assert seen("camera_translation", x=0.01, z=-0.02) - true == pytest.approx([0.01, 0.0, -0.02])
+    turned = seen("camera_rotation", ry=0.05)
+    assert np.linalg.norm(turned - centre) == pytest.approx(np.linalg.norm(true - centre))
+    assert turned - true == pytest.approx(np.cross([0, 0.05, 0], true - centre), abs=2e-3)
+    assert seen("camera_scale", scale=1.02) - centre == pytest.approx(1.02 * (true - centre))
+    ray = (centre - true) / np.linalg.norm(centre - true)
+    assert seen("surface_offset", fraction=0.5) - true == pytest.approx(0.5 * RADIUS * ray)
+
+
+def test_latency_belongs_to_cameras_and_late_torque_to_arms() -> None:
+    system = hinge("driven")
+    late = make_effect("effort_delay", "left", system, {"delay": 0.03})
+
+    def seconds(effect, channel: str, camera: bool = False) -> float:
+        values = ca.DM([p.value for p in effect.parameters])
+        return float(ca.Function("d", [effect.parameters.symbols], [effect.delay(channel, camera)])(values))
+
+    assert seconds(late, "torque.left_a") == 0.03
+    assert seconds(late, "joints.effort.left_a") == -0.03
+    assert seconds(late, "joints.position.left_a") == seconds(late, "torque.right_a") == 0.0
+    tube = link(prescribed=())
+    latency = make_effect("camera_latency", "camera", tube, {"delay": 0.05})
+    assert seconds(latency, "points_camera.w_T1", True) == 0.05
+    assert seconds(latency, "points_mocap.w_T1", False) == 0.0
+
+
+def test_a_fast_clock_slows_what_is_recorded() -> None:
+    system, steps = link(prescribed=()), 300
+    true = swing(system, [], 0.05, steps)
+    recorded = swing(system, [make_effect("clock_scale", "clock", system, {"scale": 1.1})], 0.05, steps)
+    t = H * np.arange(steps + 1)
+    assert recorded == pytest.approx(np.interp(t / 1.1, t, true), abs=2e-3)

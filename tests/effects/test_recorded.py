@@ -1,0 +1,173 @@
+"""Effects on what is recorded: inputs are corrected, samples are shifted in time, and all of it is differentiated."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.effects import make_effect
+from yid_ocp.errors import DataError
+from yid_ocp.integrator.step import compile_step
+from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
+from yid_ocp.problem.inputs import Grid, camera_pose, held_torque, held_torque_slope, sensors_present
+from yid_ocp.sensors import sensor_function
+
+H, STEPS = 0.01, 24
+NAMES = ("left_a", "left_b", "left_c")
+KINDS = {
+    "encoder_offset": {"left_b": {"offset": 0.01}},
+    "series_elasticity": {"left_b": {"stiffness": 400.0}},
+    "backlash": {"left_c": {"width": 0.006}},
+    "effort_gain": {"left_a": {"scale": 0.93}, "left_b": {"scale": 1.04}},
+    "effort_offset": {"left_b": {"offset": -0.3}},
+    "effort_delay": {"left": {"delay": 0.013}},
+    "camera_latency": {"camera": {"delay": 0.0217}},
+    "camera_rotation": {"camera": {"rx": 0.02}},
+    "clock_scale": {"clock": {"scale": 0.97}},
+    "kelvin_voigt": {"T3": {"tau": 0.03}},
+}
+
+
+def recording(bench, effort: bool = True, camera: bool = True) -> Recording:
+    """Smooth motion about the bench's posture, effort about that at rest, points somewhere near."""
+    rng = np.random.default_rng(5)
+    t = H * np.arange(STEPS + 1)
+    ramp = np.minimum(t / 0.1, 1.0)[:, None] ** 2
+    position = bench.posture + 0.02 * ramp * np.sin(14 * t[:, None] + np.arange(3))
+    load = np.array([0.5, -3.0, 1.0]) if not len(bench.rest.torque) else bench.rest.torque
+    torque = load + 0.4 * ramp * np.sin(11 * t[:, None] + 2 * np.arange(3))
+    joints = JointGroup(NAMES, t, position, effort=torque if effort else None, position_std=1e-4, effort_std=0.05)
+    groups = [PointGroup("points_arm", ("w_T2",), t, rng.normal(size=(len(t), 1, 3)), np.array(0.01), "arm")]
+    if camera:
+        seen = np.sort(rng.uniform(0.0, t[-1], 9))
+        place = rng.normal(size=(9, 2, 3))
+        groups.append(
+            PointGroup("points_camera", ("w_T1", "w_T3"), seen, place, np.array(0.02), "camera", pose=np.array(bench.pose))
+        )
+    return Recording(joints, tuple(groups), name="made")
+
+
+def problem(bench, kinds, *, neutral=False, feedback="none", free=(), **options) -> EstimationProblem:
+    effects = [
+        make_effect(kind, place, bench.system, {} if neutral else values)
+        for kind in kinds
+        for place, values in KINDS[kind].items()
+    ]
+    step = compile_step(bench.system.with_effects(effects), H, use_compiler=False)
+    names = tuple(name for effect in effects for name in effect.parameters.names)
+    settings = ProblemOptions(
+        path_cutoff=float("inf"), feedback=feedback, gains=(20.0, 20.0, 10.0), tie_break=0.0, **options
+    )
+    return EstimationProblem(step, [recording(bench)], ("T1.bend", *names, *free), settings)
+
+
+CASES = [("prescribed", "none"), ("driven", "none"), ("driven", "proportional"), ("driven", "lqr")]
+
+
+@pytest.mark.parametrize(("mode", "feedback"), CASES)
+def test_neutral_readings_change_nothing(mode, feedback, benches) -> None:
+    bench = benches[mode]
+    plain = problem(bench, (), feedback=feedback)
+    full = problem(bench, KINDS, neutral=True, feedback=feedback)
+    one, other = (p.evaluate(p.start, derivatives=False) for p in (plain, full))
+    assert one.ok, one.message
+    assert other.residual == pytest.approx(one.residual, rel=1e-9, abs=1e-9)
+    assert not plain.readings.active
+    assert full.readings.active
+
+
+@pytest.mark.parametrize(("mode", "feedback"), CASES)
+def test_derivatives_agree_with_differences_and_with_the_adjoint(mode, feedback, benches) -> None:
+    task = problem(benches[mode], KINDS, feedback=feedback)
+    x = task.start
+    result = task.evaluate(x)
+    assert result.ok, result.message
+    for column, name in enumerate(task.names):
+        width = 1e-5 if name.endswith(("delay", "offset", "width", "compliance")) else 1e-4
+        shift = np.zeros(len(x))
+        shift[column] = width
+        above, below = (task.evaluate(x + sign * shift, derivatives=False).residual for sign in (1, -1))
+        numeric = (above - below) / (2 * width)
+        exact = result.jacobian[:, column]
+        assert np.max(np.abs(exact - numeric)) <= 1e-4 * np.max(np.abs(exact)) + 1e-5, name
+    _, gradient, _ = task.gradient(x)
+    assert gradient == pytest.approx(result.jacobian.T @ result.residual, rel=1e-6, abs=1e-6)
+
+
+def test_a_delay_at_a_sample_has_the_mean_slope_of_both_sides(driven, prescribed) -> None:
+    for bench, kind in ((driven, "effort_delay"), (prescribed, "effort_delay"), (driven, "camera_latency")):
+        task = problem(bench, (kind,), neutral=True)
+        x, column = task.start, task.names.index(next(n for n in task.names if n.startswith(kind)))
+        exact = task.evaluate(x).jacobian[:, column]
+        shift = np.zeros(len(x))
+        shift[column] = 1e-5
+        above, below = (task.evaluate(x + sign * shift, derivatives=False).residual for sign in (1, -1))
+        # a sample that would be looked for before the recording stays at its start
+        numeric = (above - below) / 2e-5
+        assert np.max(np.abs(exact - numeric)) <= 1e-3 * np.max(np.abs(exact))
+
+
+def test_torque_acts_late() -> None:
+    t = H * np.arange(6)
+    joints = JointGroup(("a", "b"), t, np.zeros((6, 2)), effort=np.array([[1.0, 2, 4, 8, 16, 32], [0, 1, 0, 1, 0, 1]]).T)
+    grid = Grid(0.0, H, 5)
+    prompt = held_torque(joints, ("a", "b"), grid, "made")
+    late = held_torque(joints, ("a", "b"), grid, "made", np.array([H, 0.25 * H]))
+    assert late[:, 0] == pytest.approx([1.0, 1, 2, 4, 8])
+    assert late[1:, 1] == pytest.approx(0.75 * prompt[1:, 1] + 0.25 * prompt[:-1, 1])
+    slope = held_torque_slope(joints, ("a", "b"), grid, "made", np.array([0.0, 0.25 * H]))
+    assert slope[:, 0] == pytest.approx(-np.array([0.5, 1.5, 3.0, 6.0, 12.0]) / H)
+    assert slope[1:, 1] == pytest.approx(-np.diff(prompt[:, 1]) / H)
+
+
+def test_a_late_camera_sees_the_past(driven, sensors) -> None:
+    task = problem(driven, ("camera_latency",), neutral=True)
+    delay = 3 * H
+    index = task.names.index("camera_latency@camera.delay")
+    x = task.start.copy()
+    now = task.evaluate(x, derivatives=False).episodes[0]
+    x[index] = delay
+    late = task.evaluate(x, derivatives=False).episodes[0]
+    episode = task.episodes[0]
+    at = next(i for i, s in enumerate(episode.samples) if s.sensor.group == "points_camera")
+    moved = episode.samples[at]
+    assert late.predicted[1 - at] == pytest.approx(now.predicted[1 - at], abs=1e-9)
+    position = np.maximum(moved.node + moved.fraction - 3.0, 0.0)
+    n = driven.system.size
+    function = sensor_function(task.system, sensors.camera, ())
+    nodes = np.array([np.array(function(s[:n], [], np.zeros(n), task.theta)[0]).ravel() for s in now.sweep.state])
+    for k in range(6):
+        expected = np.interp(position, np.arange(len(nodes)), nodes[:, k])
+        assert late.predicted[at][:, k] == pytest.approx(expected, abs=1e-9)
+
+
+def test_an_offset_is_taken_out_of_the_prescribed_path(prescribed) -> None:
+    task = problem(prescribed, ("encoder_offset",))
+    inputs = task.inputs(task.episodes[0], task.theta, ("encoder_offset@left_b.offset",))
+    assert inputs.path - task.episodes[0].path == pytest.approx(np.tile([0.0, -0.01, 0.0], (STEPS + 1, 1)))
+    assert np.all(inputs.by_path[:, 1] == -1)
+
+
+def test_a_gear_needs_recorded_effort(prescribed) -> None:
+    effect = make_effect("series_elasticity", "left_b", prescribed.system)
+    step = compile_step(prescribed.system.with_effects([effect]), H, use_compiler=False)
+    with pytest.raises(DataError, match="effort that the recording does not have"):
+        EstimationProblem(step, [recording(prescribed, effort=False)], ("T1.bend",))
+
+
+def test_what_a_recording_holds(driven) -> None:
+    full = recording(driven)
+    assert sensors_present([full]) == {"joints.position", "joints.effort", "camera"}
+    assert sensors_present([recording(driven, effort=False, camera=False)]) == {"joints.position"}
+    arm, camera = full.points
+    assert camera_pose(arm) is None
+    assert camera_pose(camera) is not None
+    unposed = PointGroup("points_camera", ("p",), [0.0], np.zeros((1, 1, 3)), clock="nominal")
+    assert camera_pose(unposed) == tuple(map(tuple, np.eye(4)))
+    assert "nominal_clock" in sensors_present([Recording(points=(unposed,))])
+
+
+def test_options_can_switch_the_camera_off(driven) -> None:
+    task = problem(driven, ("camera_latency",), sensors={"points_camera": SensorOptions(use=False)})
+    assert np.all(task.evaluate(task.start).jacobian[:, -1] == 0)

@@ -1,0 +1,188 @@
+"""Names, places, bounds and reports of effects, and what is said to whoever asks for what there is not."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import numpy as np
+import pytest
+
+from yid_ocp.data.synthetic import paper_system
+from yid_ocp.effects import EFFECTS, SENSORS, candidates, make_effect, vocabulary
+from yid_ocp.effects import base as places
+from yid_ocp.errors import ConfigError, ModelError
+from yid_ocp.model import Effect, Mechanism, Segment, System, flexible_object
+from yid_ocp.model.system import RecordedEffect
+from yid_ocp.problem.cable import Cable, CableOptions, cable_system
+
+
+@pytest.fixture(scope="module")
+def one_arm() -> System:
+    return paper_system(1)
+
+
+@pytest.fixture(scope="module")
+def beam() -> System:
+    """Panda with a beam on its hand, its joints prescribed."""
+    names = [f"panda_joint{i}" for i in range(1, 8)]
+    robot = Mechanism.from_urdf("package:panda", joints=names)
+    item = flexible_object([Segment("beam", 0.52, 0.33, 0.01, 3, clamped=True, rigidity=True)], name="beam")
+    return System.build(robot, objects=[(item, "panda_hand", None)], prescribed=names)
+
+
+@pytest.fixture(scope="module")
+def cable() -> System:
+    from yid_ocp.data.recording import PointGroup, Recording
+
+    parent = tuple(f"p{i}" for i in range(7))
+    where = {name: [0.1 * i, 0.0, 1.0] for i, name in enumerate(parent)}
+    where |= {"c1": [0.3, 0.1, 1.0], "c2": [0.3, 0.2, 1.0]}
+    layout = Cable(parent, {"a": ("p3", "c1", "c2")}, where)
+    t = np.arange(3) * 0.01
+    points = np.tile(np.array([where[name] for name in layout.vertices]), (3, 1, 1))
+    group = PointGroup("points", layout.vertices, t, points, np.array(0.001), "motion capture")
+    return cable_system([Recording(points=(group,))], layout, CableOptions())
+
+
+def test_the_vocabulary_is_the_shared_one(shared) -> None:
+    text = (shared / "reference" / "effects.md").read_text(encoding="utf-8")
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line.startswith("|")]
+    table = {row[0]: row for row in rows[2:]}
+    assert set(EFFECTS) == set(table)
+    system = paper_system(1)
+    spots = dict(candidates(system, SENSORS))
+    for kind, row in table.items():
+        effect = make_effect(kind, spots[kind], system)
+        for quantity in effect.quantities:
+            assert re.search(rf"\b{quantity.reported[0]}\b", row[2]), f"{kind}: {quantity.reported[0]} not in '{row[2]}'"
+
+
+def test_every_kind_describes_itself(one_arm) -> None:
+    assert [kind for kind, _, _ in vocabulary()] == list(EFFECTS)
+    for kind, equation, _ in vocabulary():
+        assert equation
+        assert EFFECTS[kind].__doc__
+    for kind, place in candidates(one_arm, SENSORS):
+        effect = make_effect(kind, place, one_arm)
+        assert isinstance(effect, Effect)
+        assert isinstance(effect, RecordedEffect)
+        assert effect.amplitudes
+        for quantity, entry in zip(effect.quantities, effect.parameters, strict=True):
+            assert entry.name == f"{kind}@{place}.{quantity.name}"
+            assert entry.value == quantity.neutral
+            low, high = effect.prior_range[entry.name]
+            assert entry.lower <= low < high <= entry.upper
+            assert entry.unit == quantity.unit
+            assert quantity.description
+
+
+def test_candidates_of_the_papers_system(one_arm) -> None:
+    found = candidates(one_arm, SENSORS)
+    assert {kind for kind, _ in found} == set(EFFECTS)
+    assert len(found) == len(set(found))
+    blind = candidates(one_arm, ["joints.position"])
+    assert not {kind for kind, _ in blind} & {"camera_scale", "effort_gain", "clock_scale"}
+    assert ("kelvin_voigt", "T3") in blind
+    assert ("junction_compliance", "w_T1") in blind
+    assert ("grasp_slip", "left") in blind
+    with pytest.raises(ModelError, match="camera"):
+        candidates(one_arm, ["kamera"])
+
+
+def test_places_of_two_arms() -> None:
+    two = paper_system(2)
+    assert set(places.arms(two)) == {"left", "right"}
+    assert all(len(joints) == 7 for joints in places.arms(two).values())
+    found = candidates(two, SENSORS)
+    assert {("effort_delay", "left"), ("effort_delay", "right"), ("grasp_offset", "right")} <= set(found)
+
+
+def test_places_of_a_beam_on_a_gripper(beam) -> None:
+    found = candidates(beam, ["joints.position", "joints.effort"])
+    assert ("mount_compliance", "base") in found
+    assert ("effort_delay", "gripper") in found
+    assert ("gravity_scale", "object") in found
+    assert not [place for kind, place in found if kind.startswith(("grasp", "junction", "camera"))]
+    # without efforts nothing shows what is wrong with a prescribed joint
+    assert not [place for _, place in candidates(beam, ["joints.position"]) if place.startswith("panda_joint4")][1:]
+    bare = System.build(beam.mechanism, prescribed=beam.prescribed)
+    assert [p for k, p in candidates(bare, SENSORS) if k == "point_mass"]
+
+
+def test_places_of_a_branched_cable(cable) -> None:
+    found = candidates(cable, ["nominal_clock"])
+    assert {("mount_compliance", "clamp_start"), ("junction_compliance", "junction_a")} <= set(found)
+    assert {("grasp_compliance", "clamp_end"), ("grasp_slip", "clamp_end")} <= set(found)
+    assert {("kelvin_voigt", "parent"), ("kelvin_voigt", "a"), ("point_mass", "junction_a")} <= set(found)
+    assert not places.robot_joints(cable)
+    changed = cable.with_effects([make_effect(kind, place, cable) for kind, place in found])
+    assert changed.size == cable.size + 4
+    assert changed.prescribed == cable.prescribed
+    branch = changed.mechanism.joints[changed.mechanism.joint_index("a_0_x")]
+    assert changed.mechanism.joints[branch.parent].name == "junction_compliance@junction_a_y"
+
+
+@pytest.mark.parametrize(
+    ("kind", "place", "error", "text"),
+    [
+        ("kelvin_vogt", "T3", ConfigError, "kelvin_voigt"),
+        ("kelvin_voigt", "T4", ModelError, "T1, T2, T3"),
+        ("kelvin_voigt", "left_w0", ModelError, "does not fit"),
+        ("joint_coulomb", "left_w3", ModelError, "left_w0"),
+        ("grasp_slip", "right", ModelError, "allowed: left"),
+        ("junction_compliance", "w_T2", ModelError, "w_T1"),
+        ("point_mass", "w_T9", ModelError, "w_T"),
+    ],
+)
+def test_a_place_that_does_not_fit(kind, place, error, text, one_arm) -> None:
+    with pytest.raises(error, match=text):
+        make_effect(kind, place, one_arm)
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [({"tao": 0.1}, "did you mean 'tau'"), ({"tau": -0.1}, "outside its bounds"), ({"tau": math.nan}, "finite")],
+)
+def test_a_value_that_does_not_fit(values, text, one_arm) -> None:
+    with pytest.raises(ConfigError, match=text):
+        make_effect("kelvin_voigt", "T3", one_arm, values)
+
+
+def test_the_same_effect_twice_is_refused(one_arm) -> None:
+    effect = make_effect("kelvin_voigt", "T3", one_arm)
+    with pytest.raises(ConfigError, match="named twice"):
+        one_arm.with_effects([effect, make_effect("kelvin_voigt", "T3", one_arm)])
+    assert len(one_arm.with_effects([effect, make_effect("kelvin_voigt", "T2", one_arm)]).effects) == 2
+
+
+def test_a_compliance_is_given_and_reported_as_stiffness(one_arm) -> None:
+    effect = make_effect("grasp_compliance", "left", one_arm, {"stiffness": 500.0})
+    name = "grasp_compliance@left.compliance"
+    assert effect.parameters[name].value == pytest.approx(2e-3)
+    found = effect.reported({name: 4e-3}, {name: 4e-4})
+    assert found["stiffness"].value == pytest.approx(250.0)
+    assert found["stiffness"].std == pytest.approx(25.0)
+    assert found["stiffness"].unit == "N/m"
+    assert found["damping"].unit == "N s/m"
+    rigid = effect.reported({name: 0.0}, {name: 1e-4})["stiffness"]
+    assert math.isinf(rigid.value)
+    assert math.isnan(rigid.std)
+    with pytest.raises(ConfigError, match="positive"):
+        make_effect("grasp_compliance", "left", one_arm, {"stiffness": 0.0})
+    assert effect.shapes == ("grasp_compliance@left.damping",)
+
+
+def test_names_and_places_survive_added_joints(one_arm) -> None:
+    effects = [make_effect(k, p, one_arm) for k, p in (("mount_compliance", "base"), ("junction_compliance", "w_T1"))]
+    changed = one_arm.with_effects(effects)
+    names = changed.mechanism.joint_names
+    assert names[:7] == one_arm.driven
+    assert [n for n in names if "@" not in n] == list(one_arm.mechanism.joint_names)
+    for j, joint in enumerate(changed.mechanism.joints):
+        assert joint.parent < j
+    parent = changed.mechanism.joints[names.index("T3_0_x")].parent
+    assert names[parent] == "junction_compliance@w_T1_y"
+    assert names[changed.mechanism.joints[names.index("T2_0_x")].parent] == names[parent]
+    assert places.robot_joints(changed) == places.robot_joints(one_arm)
+    assert changed.mechanism.frame("w_T1").joint == names.index("T1_3_z")

@@ -1,0 +1,180 @@
+"""Steps one and two: the noise floor, and whether the residual is larger or less random than noise alone would be.
+
+Under the null hypothesis the whitened residual r is noise of unit deviation whose colour rho is known (white, or that
+of the smoothing filter). Then r'r/n has the variance 2/n (1 + 2 sum rho_l^2), which is that of a chi-squared variable
+with n/(1 + 2 sum rho_l^2) degrees of freedom; a free parameter takes one of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.stats
+from numpy.typing import NDArray
+
+from yid_ocp.diagnosis.hypotheses import Series
+from yid_ocp.problem import EstimationProblem
+
+Array = NDArray[np.float64]
+
+WINDOW = 0.5
+"""Length of the windows in which the residual is looked at [s]."""
+
+
+@dataclass(frozen=True)
+class Floor:
+    """Noise deviation of one channel.
+
+    Attributes
+    ----------
+    channel, unit : str
+    std : float
+        Median deviation of its samples, after smoothing where they are smoothed, in `unit`.
+    samples : int
+    """
+
+    channel: str
+    unit: str
+    std: float
+    samples: int
+
+
+@dataclass(frozen=True)
+class Window:
+    """One channel over a stretch of time.
+
+    Attributes
+    ----------
+    recording, channel : str
+    begin, end : float
+        [s]
+    z : float
+        Excess of r'r over its expectation, in deviations.
+    flagged : bool
+        Whether it is more than chance among all windows (false-discovery rate).
+    """
+
+    recording: str
+    channel: str
+    begin: float
+    end: float
+    z: float
+    flagged: bool
+
+
+@dataclass(frozen=True)
+class NullTest:
+    """Is there a gap?
+
+    Attributes
+    ----------
+    chi2_per_dof : float
+    degrees : float
+        Effective, of coloured noise.
+    p_value : float
+        Of a residual this large under noise alone.
+    channels : dict of channel to float
+        Mean square of its whitened residual.
+    whiteness : dict of channel to float
+        p-value of its first autocorrelations under the noise's colour (Ljung-Box; NaN for smoothed channels).
+    windows : tuple of Window
+    """
+
+    chi2_per_dof: float
+    degrees: float
+    p_value: float
+    channels: dict[str, float]
+    whiteness: dict[str, float]
+    windows: tuple[Window, ...]
+
+
+def noise_floor(problem: EstimationProblem) -> tuple[Floor, ...]:
+    """Noise levels that the problem presumes, channel by channel."""
+    found: dict[str, list[Array]] = {}
+    units: dict[str, str] = {}
+    for episode in problem.episodes:
+        for samples in episode.samples:
+            for column, channel in enumerate(samples.channel_of_column):
+                found.setdefault(channel, []).append(samples.std[np.isfinite(samples.std[:, column]), column])
+                units[channel] = samples.sensor.unit
+    joined = {channel: np.concatenate(parts) for channel, parts in found.items()}
+    return tuple(Floor(c, units[c], float(np.median(v)), len(v)) for c, v in joined.items() if len(v))
+
+
+def spread(colour: Array) -> float:
+    """1 + 2 sum rho_l^2: how many coloured samples count as one in a mean square."""
+    return float(1 + 2 * np.sum(colour[1:] ** 2))
+
+
+def null_test(
+    series: Sequence[Series], residual: Array, parameters: int, level: float = 0.01
+) -> NullTest:
+    """Compare a whitened residual with noise.
+
+    Parameters
+    ----------
+    series : sequence of Series
+    residual : ndarray, shape (nr,)
+        Rows that belong to no series (priors) are passed over.
+    parameters : int
+        Free ones, which took part of the noise with them.
+    level : float
+        False-discovery rate of the windows.
+    """
+    count = sum(len(s.rows) for s in series)
+    effective = max(sum(len(s.rows) / spread(s.colour) for s in series) - parameters, 1.0)
+    total = float(sum(np.sum(residual[s.rows] ** 2) for s in series))
+    ratio = total / max(count - parameters, 1)
+    p_value = float(scipy.stats.chi2.sf(ratio * effective, effective))
+    channels, whiteness = {}, {}
+    for channel in dict.fromkeys(s.channel for s in series):
+        own = [s for s in series if s.channel == channel]
+        channels[channel] = float(np.mean(np.concatenate([residual[s.rows] for s in own]) ** 2))
+        whiteness[channel] = _whiteness([residual[s.rows] for s in own]) if len(own[0].colour) == 1 else float("nan")
+    return NullTest(ratio, effective, p_value, channels, whiteness, _windows(series, residual, level))
+
+
+def _whiteness(parts: Sequence[Array], lags: int = 10) -> float:
+    """Ljung-Box p-value, doi:10.1093/biomet/65.2.297."""
+    statistic, degrees = 0.0, 0
+    for r in parts:
+        n = len(r)
+        if n <= 3 * lags or not np.any(r):
+            continue
+        # whitened noise has mean zero: an offset is part of what must be noticed
+        power = float(r @ r)
+        for lag in range(1, lags + 1):
+            rho = float(r[lag:] @ r[:-lag]) / power
+            statistic += n * (n + 2) * rho**2 / (n - lag)
+        degrees += lags
+    return float(scipy.stats.chi2.sf(statistic, degrees)) if degrees else float("nan")
+
+
+def _windows(series: Sequence[Series], residual: Array, level: float) -> tuple[Window, ...]:
+    raw: list[tuple[str, str, float, float, float, float]] = []
+    merged: dict[tuple[str, str], list[Series]] = {}
+    for s in series:
+        merged.setdefault((s.recording, s.channel), []).append(s)
+    for (recording, channel), own in merged.items():
+        last = max(float(s.t[-1]) for s in own)
+        for k in range(int(last / WINDOW) + 1):
+            begin, total, degrees, count = k * WINDOW, 0.0, 0.0, 0
+            for s in own:
+                inside = (s.t >= begin) & (s.t < begin + WINDOW)
+                r = residual[s.rows[inside]]
+                total, count = total + float(r @ r), count + len(r)
+                degrees += len(r) / spread(s.colour)
+            if count:
+                p = float(scipy.stats.chi2.sf(total / count * degrees, degrees))
+                z = (total / count - 1) * np.sqrt(degrees / 2)
+                raw.append((recording, channel, begin, min(begin + WINDOW, last), float(z), p))
+    p_values = np.array([entry[5] for entry in raw])
+    order = np.argsort(p_values)
+    # Benjamini and Hochberg (1995), doi:10.1111/j.2517-6161.1995.tb02031.x
+    passed = np.flatnonzero(p_values[order] <= level * np.arange(1, len(raw) + 1) / max(len(raw), 1))
+    flagged = np.zeros(len(raw), bool)
+    if len(passed):
+        flagged[order[: passed[-1] + 1]] = True
+    return tuple(Window(*entry[:5], bool(flag)) for entry, flag in zip(raw, flagged, strict=True))

@@ -1,0 +1,332 @@
+"""Steps three and five: what could be seen at all, and which candidate lowers the residual, in one sensitivity sweep.
+
+With r the whitened residual of the nominal fit, J_theta its sensitivity to what that fit frees, J_j that to the
+amplitudes of candidate j and P = I - J_theta J_theta^+:
+
+    G_j = J_j' P J_j,  s_j = -J_j' P r,  LM_j = s_j' S_j^-1 s_j,
+
+S_j = G_j for white noise of unit deviation, and the sum of the scores' autocovariances (Bartlett's weights, Newey and
+West 1987, doi:10.2307/1913610) for a coloured residual. The decrease of r'r that the linear model promises is
+s_j' G_j^-1 s_j, less where the amplitude would leave its bounds.
+
+Parameters that say nothing while the amplitude is neutral (relaxation times and the like) are taken over a grid, the
+best one counting as the best of that many tries (Davies 1987, doi:10.1093/biomet/74.1.33, bounded by Bonferroni).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.stats
+from numpy.typing import NDArray
+
+from yid_ocp.diagnosis.hypotheses import Composed, Series
+from yid_ocp.effects import EffectBase
+from yid_ocp.errors import SolverError
+
+Array = NDArray[np.float64]
+
+GRID = 4
+"""Values tried of every shape parameter."""
+DETECTION = 2.576 + 1.282
+"""Deviations of a detectable amplitude: found at the 1 % level nine times out of ten."""
+
+
+@dataclass(frozen=True)
+class Signature:
+    """What a candidate does to the residual, to first order.
+
+    Attributes
+    ----------
+    effect : EffectBase
+    shape : dict of str to float
+        Values of its shape parameters.
+    columns : ndarray, shape (nr, p)
+        P J_j, by its amplitudes.
+    """
+
+    effect: EffectBase
+    shape: dict[str, float]
+    columns: Array
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """The residual and all signatures at one point.
+
+    Attributes
+    ----------
+    residual : ndarray, shape (nr,)
+        P r.
+    signatures : tuple of Signature
+        One for each candidate and grid value.
+    values : dict of str to float
+        Where it was taken.
+    """
+
+    residual: Array
+    signatures: tuple[Signature, ...]
+    values: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Visibility:
+    """What the data could tell of a candidate, before looking at the residual.
+
+    Attributes
+    ----------
+    effect : EffectBase
+    detectable : dict of amplitude to float
+        Smallest value that would be noticed, in the parameter's unit.
+    visible : bool
+        Whether one of them lies within the range that an engineer would expect.
+    """
+
+    effect: EffectBase
+    detectable: dict[str, float]
+    visible: bool
+
+
+@dataclass(frozen=True)
+class Score:
+    """How well a candidate explains the residual, to first order.
+
+    Attributes
+    ----------
+    effect : EffectBase
+    step : dict of str to float
+        Amplitudes to which the linear model would go, and the shape values.
+    decrease : float
+        Promised decrease of r'r.
+    statistic : float
+        LM with robust covariance.
+    p_value : float
+    """
+
+    effect: EffectBase
+    step: dict[str, float]
+    decrease: float
+    statistic: float
+    p_value: float
+
+
+def shape_grid(effect: EffectBase, count: int = GRID) -> list[dict[str, float]]:
+    """Values at which a candidate's shape parameters are tried: even over their range, or even in the logarithm."""
+    if not effect.shapes:
+        return [{}]
+    axes = []
+    for name in effect.shapes:
+        low, high = effect.prior_range[name]
+        axes.append(np.geomspace(low, high, count) if low > 0 else np.linspace(low, high, count))
+    return [{name: float(axis[i]) for name, axis in zip(effect.shapes, axes, strict=True)} for i in range(count)]
+
+
+def linearise(
+    problem: Composed, base: Sequence[EffectBase], values: Mapping[str, float], grid: int = GRID
+) -> Linearisation:
+    """Residual and signatures of all candidates but those in the model already.
+
+    Parameters
+    ----------
+    problem : Composed
+    base : sequence of EffectBase
+        In the model, with all their parameters free.
+    values : mapping of str to float
+        Unknowns of the fit.
+    grid : int
+        Values of every shape parameter.
+
+    Raises
+    ------
+    SolverError
+        The model cannot be rolled out there.
+    """
+    labels = {effect.label for effect in base}
+    others = [effect for effect in problem.effects if effect.label not in labels]
+    grids = {effect.label: shape_grid(effect, grid) for effect in others}
+    own = [name for effect in base for name in effect.parameters.names]
+    residual, basis = np.zeros(0), np.zeros((0, 0))
+    signatures: list[Signature] = []
+    for k in range(max((len(g) for g in grids.values()), default=0)):
+        chosen = [effect for effect in others if k < len(grids[effect.label])]
+        shape = {name: value for effect in chosen for name, value in grids[effect.label][k].items()}
+        swept = [name for effect in chosen for name in effect.amplitudes]
+        trial = problem.at(shape).freeing((), [*own, *swept])
+        evaluation = trial.evaluate(trial.unknowns(values))
+        if not evaluation.ok or evaluation.jacobian is None:
+            raise SolverError(f"the model cannot be linearised: {evaluation.message}", where="diagnosis")
+        names = list(trial.names)
+        places = [names.index(name) for name in swept]
+        rest = np.setdiff1d(np.arange(len(names)), places)
+        rows = len(evaluation.residual) - trial.tie_break_rows
+        if k == 0:
+            nuisance = evaluation.jacobian[:rows][:, rest]
+            basis = _basis(nuisance)
+            residual = evaluation.residual[:rows]
+            residual = residual - basis @ (basis.T @ residual)
+        moved = evaluation.jacobian[:rows][:, places]
+        moved = moved - basis @ (basis.T @ moved)
+        at = 0
+        for effect in chosen:
+            width = len(effect.amplitudes)
+            signatures.append(Signature(effect, grids[effect.label][k], moved[:, at : at + width]))
+            at += width
+    return Linearisation(residual, tuple(signatures), dict(values))
+
+
+def _basis(matrix: Array) -> Array:
+    """Orthonormal basis of the columns, those that depend on others left out."""
+    size = np.linalg.norm(matrix, axis=0)
+    scaled = matrix[:, size > 0] / size[size > 0]
+    u, singular, _ = np.linalg.svd(scaled, full_matrices=False)
+    return np.asarray(u[:, singular > 1e-7 * max(singular.max(initial=0.0), 1e-300)])
+
+
+def visibility(point: Linearisation, series: Sequence[Series]) -> tuple[Visibility, ...]:
+    """Detectable amplitude of every candidate: `DETECTION` deviations under the noise's colour, from J alone."""
+    found: dict[str, Visibility] = {}
+    for signature in point.signatures:
+        effect = signature.effect
+        information = signature.columns.T @ signature.columns
+        noise = _coloured(signature.columns, series)
+        inverse = np.linalg.pinv(information, rcond=1e-10, hermitian=True)
+        covariance = inverse @ noise @ inverse
+        detectable = {}
+        visible = False
+        for i, name in enumerate(effect.amplitudes):
+            informed = information[i, i] > 1e-16
+            size = DETECTION * float(np.sqrt(max(covariance[i, i], 0.0))) if informed else float("inf")
+            detectable[name] = size
+            quantity = next(q for q in effect.quantities if name.endswith(f".{q.name}"))
+            visible |= size < max(abs(bound - quantity.neutral) for bound in effect.prior_range[name])
+        best = found.get(effect.label)
+        if best is None or (visible and not best.visible) or min(detectable.values()) < min(best.detectable.values()):
+            found[effect.label] = Visibility(effect, detectable, visible or (best is not None and best.visible))
+    return tuple(found.values())
+
+
+def _coloured(columns: Array, series: Sequence[Series]) -> Array:
+    """X' Omega X under the noise's known colour."""
+    total = np.zeros((columns.shape[1], columns.shape[1]))
+    for s in series:
+        x = columns[s.rows]
+        total += x.T @ x
+        for lag, rho in enumerate(s.colour[1:], 1):
+            if lag < len(x):
+                cross = rho * (x[lag:].T @ x[:-lag])
+                total += cross + cross.T
+    return total
+
+
+def robust(columns: Array, residual: Array, series: Sequence[Series]) -> Array:
+    """Covariance of X' r for a residual of unknown colour, shape (p, p)."""
+    width = columns.shape[1]
+    total = np.zeros((width, width))
+    for s in series:
+        u = columns[s.rows] * residual[s.rows, None]
+        count = len(u)
+        lags = int(np.sqrt(count))
+        padded = np.fft.rfft(u, 2 * count, axis=0)
+        for a in range(width):
+            for b in range(width):
+                covariance = np.fft.irfft(padded[:, a] * np.conj(padded[:, b]), 2 * count)
+                weights = 1 - np.arange(1, lags + 1) / (lags + 1)
+                total[a, b] += covariance[0] + weights @ (covariance[1 : lags + 1] + covariance[-1 : -lags - 1 : -1])
+    return (total + total.T) / 2
+
+
+def scores(point: Linearisation, series: Sequence[Series], visible: Sequence[Visibility]) -> tuple[Score, ...]:
+    """Score of every candidate that the data can see, by the promised decrease, best first."""
+    seen = {entry.effect.label for entry in visible if entry.visible}
+    best: dict[str, Score] = {}
+    tries: dict[str, int] = {}
+    for signature in point.signatures:
+        label = signature.effect.label
+        if label not in seen:
+            continue
+        tries[label] = tries.get(label, 0) + 1
+        score = _score(signature, point.residual, series)
+        if label not in best or score.decrease > best[label].decrease:
+            best[label] = score
+    final = [
+        Score(s.effect, s.step, s.decrease, s.statistic, min(1.0, s.p_value * tries[label]))
+        for label, s in best.items()
+    ]
+    return tuple(sorted(final, key=lambda s: -s.decrease))
+
+
+def _score(signature: Signature, residual: Array, series: Sequence[Series]) -> Score:
+    effect, x = signature.effect, signature.columns
+    quantities = {f"{effect.label}.{q.name}": q for q in effect.quantities}
+    neutral = np.array([quantities[name].neutral for name in effect.amplitudes])
+    information, slope = x.T @ x, -(x.T @ residual)
+    plain = np.linalg.pinv(information, rcond=1e-10, hermitian=True) @ slope
+    lower = np.array([quantities[name].lower for name in effect.amplitudes]) - neutral
+    upper = np.array([quantities[name].upper for name in effect.amplitudes]) - neutral
+    step = np.clip(plain, lower, upper)
+    decrease = float(2 * slope @ step - step @ information @ step)
+    covariance = robust(x, residual, series)
+    floor = _coloured(x, series)
+    # a residual below the noise must not make a score look sure
+    covariance = covariance if np.trace(covariance) > np.trace(floor) else floor
+    statistic = float(slope @ np.linalg.pinv(covariance, rcond=1e-10, hermitian=True) @ slope)
+    p_value = float(scipy.stats.chi2.sf(statistic, len(step)))
+    if len(step) == 1 and lower[0] == 0:
+        if plain[0] <= 0:
+            statistic, p_value = 0.0, 1.0
+        p_value = p_value / 2 if statistic > 0 else 1.0
+    values = dict(zip(effect.amplitudes, map(float, neutral + step), strict=True)) | signature.shape
+    return Score(effect, values, max(decrease, 0.0), statistic, p_value)
+
+
+@dataclass(frozen=True)
+class Confusability:
+    """How far candidates can stand in for each other.
+
+    Attributes
+    ----------
+    labels : tuple of str
+    matrix : ndarray, shape (nj, nj)
+        Fraction of row j's signature that column i's can explain, beyond what the nominal parameters can.
+    """
+
+    labels: tuple[str, ...]
+    matrix: Array
+
+    def like(self, label: str, limit: float) -> tuple[str, ...]:
+        """Candidates that explain at least `limit` of another one's signature."""
+        row = self.matrix[self.labels.index(label)]
+        return tuple(n for n, f in zip(self.labels, row, strict=True) if f >= limit and n != label)
+
+
+def confusability(point: Linearisation, chosen: Sequence[Score] = ()) -> Confusability:
+    """Fractions of signatures explained by each other, at the scores' shape values or the middle of the grid.
+
+    Every amplitude counts in units of its prior range.
+    """
+    shape = {s.effect.label: {k: v for k, v in s.step.items() if k in s.effect.shapes} for s in chosen}
+    groups: dict[str, list[Signature]] = {}
+    for signature in point.signatures:
+        groups.setdefault(signature.effect.label, []).append(signature)
+    kept = []
+    for label, group in groups.items():
+        wanted = shape.get(label)
+        kept.append(next((s for s in group if s.shape == wanted), group[len(group) // 2]))
+    scale = [
+        np.array([(s.effect.prior_range[n][1] - s.effect.prior_range[n][0]) / 2 for n in s.effect.amplitudes])
+        for s in kept
+    ]
+    every = np.hstack([s.columns * f for s, f in zip(kept, scale, strict=True)]) if kept else np.zeros((0, 0))
+    gram = every.T @ every
+    edges = np.cumsum([0, *(s.columns.shape[1] for s in kept)])
+    blocks = [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    matrix = np.zeros((len(kept), len(kept)))
+    inverses = [np.linalg.pinv(gram[b, b], rcond=1e-8, hermitian=True) for b in blocks]
+    for j, row in enumerate(blocks):
+        size = float(np.trace(gram[row, row]))
+        for i, column in enumerate(blocks):
+            cross = gram[row, column]
+            matrix[j, i] = float(np.trace(cross @ inverses[i] @ cross.T)) / size if size > 0 else 0.0
+    return Confusability(tuple(s.effect.label for s in kept), np.clip(matrix, 0.0, 1.0))

@@ -1,0 +1,278 @@
+"""What the sweeps over a rollout take and return, whichever kernel computes them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# Newton iterations of one step before it is given up.
+ITERATION_LIMIT = 60
+
+
+class StepCode(IntEnum):
+    """How Newton's iteration of a step ended."""
+
+    OK = 0
+    NOT_CONVERGED = 1
+    SINGULAR = 2
+    NOT_FINITE = 3
+
+
+MESSAGES = {
+    StepCode.OK: "converged",
+    StepCode.NOT_CONVERGED: "Newton did not converge; try a smaller time step, more damping, or a fitting start",
+    StepCode.SINGULAR: "the step's equations are singular; look for redundant grasps or a coordinate without inertia",
+    StepCode.NOT_FINITE: "the state is no longer finite; the motion is unstable open loop: add feedback or damping",
+}
+
+
+@dataclass(frozen=True)
+class StepStatus:
+    """Outcome of a step or of a rollout.
+
+    Attributes
+    ----------
+    code : StepCode
+    step : int
+        Steps completed.
+    error : float
+        Last Newton correction [rad or m].
+    iterations, factorisations : int
+        Totals over all steps.
+    effort : ndarray, shape (nc,)
+        Of the last step: effort that the prescribed coordinates needed at its first node [N m].
+    internal : ndarray, shape (nz,)
+        Internal coordinates after the last step.
+    """
+
+    code: StepCode
+    step: int
+    error: float
+    iterations: int
+    factorisations: int
+    effort: Array = field(default_factory=lambda: np.zeros(0), repr=False)
+    internal: Array = field(default_factory=lambda: np.zeros(0), repr=False)
+
+    @property
+    def ok(self) -> bool:
+        """Whether every step converged."""
+        return self.code == StepCode.OK
+
+    @property
+    def message(self) -> str:
+        """The outcome in words, with the step, the residual and what to try."""
+        if self.ok:
+            return MESSAGES[self.code]
+        return f"step {self.step}: {MESSAGES[self.code]} (last correction {self.error:.2g})"
+
+
+@dataclass(frozen=True)
+class Directions:
+    """What to differentiate a rollout by: d columns, the first ones the named parameters.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Parameters of theta.
+    start : ndarray, shape (nx, d)
+        Derivative of the initial state (q, p, z).
+    torque : ndarray, optional, shape (N, nu, d)
+        Derivative of the nominal torque.
+    path : ndarray, optional, shape (N + 1, nc, d)
+        Derivative of the prescribed coordinates.
+    """
+
+    names: tuple[str, ...]
+    start: Array
+    torque: Array | None = None
+    path: Array | None = None
+
+    @property
+    def count(self) -> int:
+        """d, the number of directions."""
+        return self.start.shape[1]
+
+
+@dataclass(frozen=True)
+class Feedback:
+    """The tracking filter u_k = ubar_k - K_k (x_k[index] - xbar_k).
+
+    Attributes
+    ----------
+    index : ndarray of int, shape (nb,)
+        Rows of the state (q, p, z) that are fed back.
+    gain : ndarray, shape (N, nu, nb)
+        K_k [N m/rad for a coordinate, 1/s for a momentum].
+    reference : ndarray, shape (N, nb)
+        Measured values of these rows.
+    """
+
+    index: NDArray[np.int32]
+    gain: Array
+    reference: Array
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A rollout and, where asked for, its forward sensitivities.
+
+    Attributes
+    ----------
+    state : ndarray, shape (N + 1, nx)
+        (q, p, z) at every node.
+    multipliers : ndarray, shape (N, m)
+        [N s]
+    effort : ndarray, shape (N, nc)
+        Effort of prescribed coordinates at nodes 0..N-1 [N m]; at node 0 it presumes that p_0 came from a step before
+        (`Rest` gives such a p_0); after p_0 = dL/dv it holds only half a step's impulse, half the effort.
+    torque : ndarray, shape (N, nu)
+        Applied torque [N m].
+    by_state, by_multipliers, by_effort : ndarray, shape (..., d), or None
+        Derivatives by the directions; like everything else NaN after a step that failed.
+    status : StepStatus
+    """
+
+    state: Array
+    multipliers: Array
+    effort: Array
+    torque: Array
+    by_state: Array | None
+    by_multipliers: Array | None
+    by_effort: Array | None
+    status: StepStatus
+
+
+@dataclass(frozen=True)
+class Gradient:
+    """Derivatives of a scalar cost along a rollout, from the adjoint sweep.
+
+    Attributes
+    ----------
+    by_theta : ndarray, shape (len(names),)
+    by_start : ndarray, shape (nx,)
+        By the initial state.
+    by_torque : ndarray, shape (N, nu)
+        By the nominal torque.
+    by_path : ndarray, shape (N + 1, nc)
+        By the prescribed coordinates at every node, those at node 0 as in `by_start`.
+
+    All NaN where a step's equations turned out singular.
+    """
+
+    by_theta: Array
+    by_start: Array
+    by_torque: Array
+    by_path: Array
+
+
+@dataclass(frozen=True)
+class Stages:
+    """Equations of many steps at once, along a trajectory that need not satisfy them.
+
+    Attributes
+    ----------
+    rows : ndarray, shape (N, nt)
+        Balance (n), internal (nz) and constraint (m) rows of every step.
+    p1 : ndarray, shape (N, n)
+        What p_{k+1} should be.
+    rows_new, p1_new : ndarray, shape (N, nt, nt) and (N, n, nt)
+        Derivatives by (q_{k+1}, z_{k+1}, lam_k).
+    rows_old, p1_old : ndarray, shape (N, nt, n + nz) and (N, n, n + nz)
+        Derivatives by (q_k, z_k); that of the balance by p_k is the identity.
+    rows_input, p1_input : ndarray, shape (N, nt, nu) and (N, n, nu)
+        Derivatives by the torque.
+    rows_theta, p1_theta : ndarray, shape (N, nt, ntheta) and (N, n, ntheta)
+        Derivatives by the chosen parameters.
+    """
+
+    rows: Array
+    p1: Array
+    rows_new: Array
+    rows_old: Array
+    rows_input: Array
+    p1_new: Array
+    p1_old: Array
+    p1_input: Array
+    rows_theta: Array
+    p1_theta: Array
+
+
+class Kernel(Protocol):
+    """What the compiled and the interpreted implementation of the sweeps have in common."""
+
+    def sweep(
+        self,
+        theta: Array,
+        start: Array,
+        torque: Array,
+        path: Array,
+        feedback: Feedback | None,
+        wanted: Directions | None,
+    ) -> Sweep:
+        """Roll out over len(torque) steps from the state `start`."""
+        ...
+
+    def adjoint(
+        self,
+        theta: Array,
+        swept: Sweep,
+        feedback: Feedback | None,
+        names: tuple[str, ...],
+        by_state: Array,
+        by_multipliers: Array | None,
+        by_effort: Array | None,
+    ) -> Gradient:
+        """Gradient of a cost whose partial derivatives along the rollout are given."""
+        ...
+
+    def stages(
+        self,
+        theta: Array,
+        state: Array,
+        multipliers: Array,
+        torque: Array,
+        names: tuple[str, ...],
+        derivatives: bool,
+    ) -> Stages:
+        """Equations of len(torque) steps along a trajectory, with their Jacobians where asked for."""
+        ...
+
+
+# The order in which `yid_stages` takes them.
+STAGE_MATRICES = (
+    "rows_new",
+    "rows_old",
+    "rows_input",
+    "p1_new",
+    "p1_old",
+    "p1_input",
+    "rows_theta",
+    "p1_theta",
+)
+
+
+def empty_stages(sizes: dict[str, int], count: int, width: int, derivatives: bool) -> Stages:
+    """Zeros in the shapes of `count` steps and `width` parameters, without matrices where no derivatives are wanted."""
+    n, nz, m, nu = sizes["n"], sizes["nz"], sizes["m"], sizes["nu"]
+    nt, steps = n + nz + m, count if derivatives else 0
+    return Stages(
+        np.zeros((count, nt)),
+        np.zeros((count, n)),
+        *(np.zeros((steps, rows, columns)) for rows in (nt, n) for columns in (nt, n + nz, nu)),
+        *(np.zeros((steps, rows, width)) for rows in (nt, n)),
+    )
+
+
+def status_of(code: int, info: Array, effort: Array, state: Array, sizes: dict[str, int]) -> StepStatus:
+    """Status from a kernel's code and its (steps done, last correction, iterations, factorisations)."""
+    done = int(info[0])
+    last = effort[done - 1] if done else np.zeros(sizes["nc"])
+    return StepStatus(
+        StepCode(code), done, float(info[1]), int(info[2]), int(info[3]), last, state[done, 2 * sizes["n"] :]
+    )

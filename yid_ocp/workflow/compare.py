@@ -1,0 +1,146 @@
+"""The command `compare`: several methods on one problem, one table, and whether they agree."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from yid_ocp.analysis.compare import PUBLISHED, Comparison, compare
+from yid_ocp.errors import nearest
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.report.pictures import draw_convergence
+from yid_ocp.solvers import SOLVERS, Iterate
+from yid_ocp.solvers.base import Solver
+from yid_ocp.workflow.build import build_problem
+from yid_ocp.workflow.folder import Monitor, Silent, input_hashes, new_run_folder, versions
+from yid_ocp.workflow.settings import Run, dump_config
+from yid_ocp.workflow.solve import solve_result
+
+FORMAT = "yid-compare/1"
+
+
+@dataclass(frozen=True)
+class CompareOutcome:
+    """What `run_compare` leaves: the run folder, result.json's contents and the comparison."""
+
+    folder: Path
+    result: dict[str, Any]
+    comparison: Comparison
+
+    @property
+    def ok(self) -> bool:
+        """Whether any method converged."""
+        return any(run.solution.status.value == "converged" for run in self.comparison.runs)
+
+
+def chosen_solvers(run: Run) -> list[Solver]:
+    """The methods of a configuration with their settings.
+
+    Raises
+    ------
+    ConfigError
+        Unknown method or setting, or none at all.
+    """
+    if not run.compare.methods:
+        raise run.refuse("there is no method to compare", "compare", "methods", allowed=", ".join(SOLVERS))
+    solvers: list[Solver] = []
+    for name, settings in run.compare.methods.items():
+        if name not in SOLVERS:
+            hint = nearest(name, SOLVERS)
+            raise run.refuse(f"there is no method '{name}'", "compare", "methods", allowed=", ".join(SOLVERS), hint=hint)
+        kind: Any = SOLVERS[name]
+        known = [entry.name for entry in dataclasses.fields(kind) if entry.name not in ("name", "needs_rollout")]
+        for key in settings or {}:
+            if key not in known:
+                hint = nearest(key, known)
+                raise run.refuse(f"{name} has no setting '{key}'", "compare", "methods", name, key, hint=hint)
+        solvers.append(kind(**(settings or {})))
+    return solvers
+
+
+def run_compare(run: Run, out: str | Path | None = None, monitor: Monitor | None = None) -> CompareOutcome:
+    """Run every method, compare, and write the run folder.
+
+    Parameters
+    ----------
+    run : Run
+    out : str or Path, optional
+        The run folder; see `new_run_folder`.
+    monitor : Monitor, optional
+
+    Returns
+    -------
+    CompareOutcome
+
+    Raises
+    ------
+    ConfigError, DataError, ModelError, OutputError
+    """
+    watcher = monitor or Silent()
+    solvers = chosen_solvers(run)
+    published = _published(run)
+    with new_run_folder(run, out, "compare") as folder:
+        inputs = input_hashes(run)
+        folder.write("config.yaml", dump_config(run))
+        watcher.stage("building the model and its compiled step")
+        problem = build_problem(run)
+        truth = _truth(problem)
+        current = [""]
+
+        def note(name: str, entry: Iterate) -> None:
+            if name != current[0]:
+                current[0] = name
+                watcher.stage(f"solving by {name}")
+            folder.log("iterate", method=name, iteration=entry.iteration, cost=entry.cost, seconds=entry.seconds)
+            watcher.iterate(entry)
+
+        comparison = compare(problem, solvers, truth, note)
+        result = compare_result(problem, comparison, published, truth) | {"inputs": inputs, "versions": versions()}
+        draw_convergence(folder.path / "convergence.png", comparison)
+        written = folder.write_json("result.json", result)
+    return CompareOutcome(folder.path, written, comparison)
+
+
+def compare_result(
+    problem: EstimationProblem, comparison: Comparison, published: dict[str, float], truth: dict[str, float]
+) -> dict[str, Any]:
+    """`yid-compare/1` without inputs and versions: one `yid-solve/1` for each method, with its price."""
+    methods = {}
+    for run in comparison.runs:
+        methods[run.method] = solve_result(problem, run.solution, run.held_out) | {
+            "whitened_cost": run.whitened_cost,
+            "wall_seconds": run.wall_seconds,
+            "cpu_seconds": run.cpu_seconds,
+            "peak_memory_mib": run.peak_memory,
+            "disagreements": comparison.agreement[run.method],
+        }
+    return {
+        "format": FORMAT,
+        "methods": methods,
+        "reference": comparison.reference,
+        "agree": comparison.agree,
+        "explained": list(comparison.explained),
+        "published": published,
+        "truth": truth,
+    }
+
+
+def _published(run: Run) -> dict[str, float]:
+    name = run.compare.published
+    if name is None:
+        return PUBLISHED.get(run.name, {})
+    if name not in PUBLISHED:
+        raise run.refuse(
+            f"the paper has no experiment '{name}'", "compare", "published", allowed=", ".join(PUBLISHED)
+        )
+    return PUBLISHED[name]
+
+
+def _truth(problem: EstimationProblem) -> dict[str, float]:
+    """Parameter values that the recordings of a virtual experiment carry along."""
+    known: dict[str, float] = {}
+    for episode in problem.episodes:
+        known |= {name: value for name, value in episode.recording.truth.items() if name in problem.free}
+    return known
