@@ -4,7 +4,9 @@
 
 Free vertices are all but the two held at each end. A prediction knows the held vertices throughout and the free ones in
 the first two frames; its error is the root mean square Euclidean distance over free vertices and later frames. All
-values are per unit weight: the linear density is nominal, no force was measured.
+values are per unit weight: the linear density is nominal, no force was measured. `nominal` and `undeformed rest` are the
+model with the measured undeformed shape as its rest shape, at guessed and at fitted stiffness and damping; for `fitted`
+the rest shape was estimated as well.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import statistics
 import sys
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +28,7 @@ import yid_ocp as yid
 from yid_ocp.data.recording import Recording, read_recording
 from yid_ocp.problem.baselines import linear_carry, move_with_clamps, positions, prediction_error, stay
 from yid_ocp.problem.cable import (
+    BranchOptions,
     Cable,
     CableOptions,
     cable_problem_options,
@@ -43,7 +47,8 @@ TIME_STEP = 0.01  # [s]
 NOISE = 2e-4  # of motion capture, from the scatter of third differences (0.10 to 0.20 mm) [m]
 MODEL_ERROR = 0.1  # about 15 mm that last for some fifty frames [m]
 GRAVITY = 9.81  # [m/s^2]
-OPTIONS = CableOptions(memory=0.5, rest_angles=True)
+BRANCH = BranchOptions(bend=1.5e-3, twist=1e-3, damping=1e-3, twist_damping=1e-3)  # a guess
+OPTIONS = CableOptions(default=BRANCH, memory=0.5, rest_angles=True)
 
 
 def branched_cable(folder: Path = FOLDER) -> Cable:
@@ -76,9 +81,13 @@ def run(folder: Path = FOLDER, iterations: int = 15) -> dict[str, Any]:
     step = yid.compile_step(system, TIME_STEP, "left_damping")
     seconds = {"build_and_compile": time.perf_counter() - clock}
     options = cable_problem_options(cable, estimate + held_out, NOISE, MODEL_ERROR, options=OPTIONS)
+    plain = {name: 0.0 for name in system.parameters.names if name.endswith(".memory")}
+    names = free_parameters(cable, CableOptions(default=BRANCH))
+    undeformed = EstimationProblem(step, estimate, names, replace(options, priors={}), plain, held_out)
     problem = EstimationProblem(step, estimate, free_parameters(cable, OPTIONS), options, None, held_out)
     clock = time.perf_counter()
-    nominal = vertex_errors(problem, cable, problem.start)
+    nominal = vertex_errors(undeformed, cable, undeformed.start)
+    vertex_errors(problem, cable, problem.start)
     seconds["starts"] = time.perf_counter() - clock
     episode, (theta, deviation) = problem.episodes[0], problem.split(problem.start, 0)
     clock = time.perf_counter()
@@ -88,6 +97,10 @@ def run(folder: Path = FOLDER, iterations: int = 15) -> dict[str, Any]:
     solution = solve(problem, GaussNewton(iterations=iterations))
     seconds["fit"] = time.perf_counter() - clock
     fitted = vertex_errors(problem, cable, solution.x)
+    clock = time.perf_counter()
+    simple = solve(undeformed, GaussNewton(iterations=iterations))
+    seconds["fit_undeformed_rest"] = time.perf_counter() - clock
+    by_simple = vertex_errors(undeformed, cable, simple.x)
     files = {}
     for recording in (*estimate, *held_out):
         errors = baselines(recording, cable)
@@ -96,6 +109,7 @@ def run(folder: Path = FOLDER, iterations: int = 15) -> dict[str, Any]:
             "held_out": recording in held_out,
             "error": model,
             "nominal": nominal[recording.name],
+            "undeformed_rest": by_simple[recording.name],
             "baselines": errors,
             "ratio_to_linear_carry": errors["linear_carry"] / model,
         }
@@ -115,7 +129,7 @@ def run(folder: Path = FOLDER, iterations: int = 15) -> dict[str, Any]:
 
 def medians(files: list[dict[str, Any]]) -> dict[str, float]:
     """Medians over files of every error, and the ratio of the strongest baseline's median to the model's."""
-    result = {key: statistics.median(entry[key] for entry in files) for key in ("error", "nominal")}
+    result = {key: statistics.median(entry[key] for entry in files) for key in ("error", "nominal", "undeformed_rest")}
     result |= {name: statistics.median(e["baselines"][name] for e in files) for name in files[0]["baselines"]}
     result["ratio_to_linear_carry"] = result["linear_carry"] / result["error"]
     return result
@@ -137,12 +151,13 @@ def parameters(cable: Cable, x: Any, covariance: Any, names: tuple[str, ...]) ->
 def show(result: Mapping[str, Any], console: Console) -> None:
     """The same as tables."""
     table = Table(title="prediction error over free vertices and 5 s [mm]")
-    columns = ("file", "stays", "moves with clamps", "linear carry", "nominal", "fitted", "linear carry / fitted")
+    columns = ("file", "stays", "with clamps", "linear carry", "nominal", "undeformed rest", "fitted", "carry / fitted")
     for column in columns:
         table.add_column(column, justify="left" if column == "file" else "right")
 
     def row(name: str, entry: Mapping[str, Any], plain: Mapping[str, float]) -> None:
-        errors = [plain["stay"], plain["move_with_clamps"], plain["linear_carry"], entry["nominal"], entry["error"]]
+        errors = [plain["stay"], plain["move_with_clamps"], plain["linear_carry"]]
+        errors += [entry["nominal"], entry["undeformed_rest"], entry["error"]]
         table.add_row(name, *(f"{1e3 * e:.1f}" for e in errors), f"{entry['ratio_to_linear_carry']:.2f}")
 
     for name, entry in result["files"].items():

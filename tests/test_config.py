@@ -242,6 +242,34 @@ def test_springs_on_joints(written, urdf_folder):
     assert (system.driven, system.prescribed) == ((), ())
 
 
+def test_effects_bring_their_parameters(written):
+    text = (
+        "model:\n"
+        "  object: {kind: y}\n"
+        "  effects:\n"
+        "    - {kind: kelvin_voigt, location: T3}\n"
+        "    - {kind: density, location: T2, values: {scale: 1.1}}\n"
+        "parameters:\n"
+        "  kelvin_voigt@T3.tau: {free: true, initial: 0.02}\n"
+    )
+    run = load_config(written(text))
+    system = build_system(run)
+    assert [(effect.kind, effect.location) for effect in system.effects] == [("kelvin_voigt", "T3"), ("density", "T2")]
+    assert system.parameters["kelvin_voigt@T3.tau"].value == 0.02
+    assert system.parameters["density@T2.scale"].value == 1.1
+    (written(dump_config(run), "again.yaml")).exists()
+    assert load_config(written(dump_config(run))) == run
+    for old, new, message in (
+        ("kelvin_voigt, loc", "kelvin_voight, loc", "line 4: model.effects.0"),
+        ("location: T2", "location: T9", "line 5: model.effects.1"),
+        ("location: T3", "place: T3", "did you mean"),
+        ("scale: 1.1", "scale: much", "model.effects.1.values"),
+    ):
+        with pytest.raises((ConfigError, ModelError), match="error|") as caught:
+            load_system(written(text.replace(old, new)))
+        assert message in str(caught.value)
+
+
 def test_errors_of_the_model_name_the_setting(written):
     for text, message in (
         ("model:\n  robot: package:baxterr\n", "line 2: model.robot"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import logging
 import os
 import sys
 import tempfile
@@ -277,8 +278,8 @@ def compare_summary(result: dict[str, Any]) -> list[str]:
     costs = [entry["whitened_cost"] for entry in methods.values()]
     row("cost (whitened)", *("failed" if cost is None else f"{cost:.6g}" for cost in costs))
     for channel in sorted({c for e in methods.values() for h in e["held_out"] for c in h.get("rmse", {})}):
-        cells = [[h["rmse"][channel] for h in e["held_out"] if channel in h.get("rmse", {})] for e in methods.values()]
-        row(f"held out: {channel}", *(f"{sum(c) / len(c):.3g}" if c else "failed" for c in cells))
+        errors = [[h["rmse"][channel] for h in e["held_out"] if channel in h.get("rmse", {})] for e in methods.values()]
+        row(f"held out: {channel}", *(f"{sum(e) / len(e):.3g}" if e else "failed" for e in errors))
     row("iterations", *(str(entry["iterations"]) for entry in methods.values()))
     row("evaluations", *(str(entry["evaluations"]) for entry in methods.values()))
     row("wall time [s]", *(f"{entry['wall_seconds']:.2f}" for entry in methods.values()))
@@ -457,6 +458,20 @@ def _say_folder(folder: Path, quiet: bool) -> None:
     print(folder if quiet or shown.startswith("..") else f"run folder: {shown}")
 
 
+@contextlib.contextmanager
+def _notices() -> Iterator[None]:
+    """Show the library's warnings on standard error while a command runs."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setLevel(logging.WARNING)
+    handler.setFormatter(logging.Formatter("notice: %(message)s"))
+    logger = logging.getLogger("yid_ocp")
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+
+
 def parser() -> argparse.ArgumentParser:
     """The argument parser of all commands."""
     from yid_ocp import __version__
@@ -486,7 +501,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SystemExit as error:
         return int(error.code or 0)
     try:
-        return int(arguments.run(arguments))
+        with _notices():
+            return int(arguments.run(arguments))
     except YidError as error:
         print(f"error: {error}", file=sys.stderr)
         return WRONG_INPUT

@@ -260,6 +260,15 @@ def _kind(member: Any) -> str:
     return str(get_args(_stripped(_hints(member)["kind"])[0])[0])
 
 
+def _sequence_of(hint: Any) -> Any:
+    """Settings class of the entries of a list; None for other types."""
+    bare, _ = _stripped(hint)
+    arguments = get_args(bare)
+    if get_origin(bare) is tuple and len(arguments) == 2 and arguments[1] is Ellipsis:
+        return arguments[0] if _member(arguments[0], None) is not None else None
+    return None
+
+
 def _mapping_of(hint: Any) -> Any:
     """Type of the values of a mapping; None for other types."""
     for member in _options(hint):
@@ -293,6 +302,11 @@ class _Reader:
             return None if nullable else self._settings(kind, {}, path)
         if kind is not None:
             return self._settings(self._chosen(hint, raw, path), raw, path)
+        entries = _sequence_of(hint)
+        if entries is not None:
+            if not isinstance(raw, list):
+                raise self._wrong(raw, hint, path)
+            return tuple(self.build(entries, value, (*path, i)) for i, value in enumerate(raw))
         inner = _mapping_of(hint)
         if inner is not None and _member(inner, None) is not None:
             if raw is not None and not isinstance(raw, dict):
@@ -481,6 +495,9 @@ def _schema(hint: Any) -> dict[str, Any]:
         if type(None) in get_args(bare):
             parts.append({"type": "null"})
         return (parts[0] if len(parts) == 1 else {"anyOf": parts}) | note
+    entries = _sequence_of(bare)
+    if entries is not None:
+        return {"type": "array", "items": _schema(entries)} | note
     inner = _mapping_of(bare)
     if inner is not None and _member(inner, None) is not None:
         return {"type": "object", "additionalProperties": _schema(inner)} | note

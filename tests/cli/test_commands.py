@@ -105,6 +105,21 @@ def test_a_resolved_configuration_runs_again(cli, pendulum, tmp_path):
     assert first["parameters"] == second["parameters"]
 
 
+def test_without_the_extra_report(pendulum, tmp_path):
+    code = (
+        "import sys; sys.modules.update(dict.fromkeys(('jinja2', 'plotly', 'markupsafe')));"
+        "import importlib.util as util; find = util.find_spec;"
+        "util.find_spec = lambda name, *a: None if name in ('jinja2', 'plotly') else find(name, *a);"
+        "from yid_ocp.cli import main; sys.exit(main(sys.argv[1:]))"
+    )
+    command = [sys.executable, "-c", code, "solve", str(pendulum), "--out", "run"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("yid-ocp[report]") == 1
+    assert (tmp_path / "run" / "result.json").is_file()
+    assert not (tmp_path / "run" / "report.html").exists()
+
+
 def test_quiet_prints_the_folder_alone(cli, pendulum, tmp_path):
     done = cli("solve", pendulum, "--quiet", "--out", tmp_path / "here")
     assert done.code == 0

@@ -9,6 +9,9 @@ import numpy as np
 import pytest
 
 from yid_ocp.effects import EFFECTS
+from yid_ocp.integrator.codegen import compiler
+from yid_ocp.integrator.rollout import adjoint_gradient
+from yid_ocp.integrator.step import compile_step
 from yid_ocp.sensors import sensor_function
 
 STEPS = 4
@@ -92,3 +95,20 @@ def test_readings_have_exact_slopes(which, prescribed, all_effects, sensors) -> 
         shift[system.parameters.index(name)] = 1e-6
         above, below = (np.array(function(q, z, effort, theta + sign * shift)[0]) for sign in (1, -1))
         assert np.allclose(exact[:, column], (above - below).ravel() / 2e-6, rtol=1e-6, atol=1e-8), name
+
+
+@pytest.mark.skipif(compiler() is None, reason="no C compiler")
+def test_compiled_and_interpreted_agree_with_every_effect(cases) -> None:
+    case = cases("driven", "away")
+    bench = case.bench
+    step = compile_step(case.step.system, case.step.time_step)
+    assert step.compiled
+    fast, slow = bench.run(step, case.values, case.names, case.start, STEPS).sweep, case.run.sweep
+    for field in ("state", "multipliers", "by_state", "by_multipliers"):
+        one, other = getattr(fast, field), getattr(slow, field)
+        assert np.max(np.abs(one - other)) <= 1e-8 * np.max(np.abs(other)), field
+    weight = np.random.default_rng(1).normal(size=slow.state.shape)
+    exact = np.einsum("kx,kxd->d", weight, slow.by_state)
+    for s, sweep in ((step, fast), (case.step, slow)):
+        gradient = adjoint_gradient(s, case.run.theta, sweep, case.names, weight)
+        assert gradient.by_theta == pytest.approx(exact, rel=1e-6, abs=1e-8 * np.max(np.abs(exact)))

@@ -192,7 +192,7 @@ def test_free_parameters_are_parameters(cable):
     recording = as_recording(cable, PERIOD * np.arange(4), {})
     names = free_parameters(cable, options)
     assert set(names) <= set(cable_system([recording], cable, options).parameters.names)
-    assert {"parent.memory", "c.twist_damping", "parent_3_z.rest", "c_0_x.rest"} <= set(names)
+    assert {"parent.memory", "c.twist_damping", "parent_3_y.rest", "c_0_x.rest"} <= set(names)
     assert not any(name.endswith(".mass") for name in names)
 
 

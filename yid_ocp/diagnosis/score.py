@@ -19,6 +19,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.signal
 import scipy.stats
 from numpy.typing import NDArray
 
@@ -212,29 +213,28 @@ def _coloured(columns: Array, series: Sequence[Series]) -> Array:
     total = np.zeros((columns.shape[1], columns.shape[1]))
     for s in series:
         x = columns[s.rows]
-        total += x.T @ x
-        for lag, rho in enumerate(s.colour[1:], 1):
-            if lag < len(x):
-                cross = rho * (x[lag:].T @ x[:-lag])
-                total += cross + cross.T
-    return total
+        if len(s.colour) > 1:
+            both = np.concatenate([s.colour[:0:-1], s.colour])[:, None]
+            total += x.T @ scipy.signal.oaconvolve(x, both, mode="full", axes=0)[len(s.colour) - 1 :][: len(x)]
+        else:
+            total += x.T @ x
+    return (total + total.T) / 2
 
 
 def robust(columns: Array, residual: Array, series: Sequence[Series]) -> Array:
-    """Covariance of X' r for a residual of unknown colour, shape (p, p)."""
-    width = columns.shape[1]
-    total = np.zeros((width, width))
+    """Covariance of X' r for a residual of unknown colour, shape (p, p).
+
+    Bartlett's weights of L = sqrt(M) lags are the mean square of the sums over all windows of that length.
+    """
+    total = np.zeros((columns.shape[1], columns.shape[1]))
     for s in series:
         u = columns[s.rows] * residual[s.rows, None]
-        count = len(u)
-        lags = int(np.sqrt(count))
-        padded = np.fft.rfft(u, 2 * count, axis=0)
-        for a in range(width):
-            for b in range(width):
-                covariance = np.fft.irfft(padded[:, a] * np.conj(padded[:, b]), 2 * count)
-                weights = 1 - np.arange(1, lags + 1) / (lags + 1)
-                total[a, b] += covariance[0] + weights @ (covariance[1 : lags + 1] + covariance[-1 : -lags - 1 : -1])
-    return (total + total.T) / 2
+        length = int(np.sqrt(len(u))) + 1
+        cumulative = np.vstack([np.zeros((length, u.shape[1])), np.cumsum(u, axis=0)])
+        cumulative = np.vstack([cumulative, np.tile(cumulative[-1], (length - 1, 1))])
+        sums = cumulative[length:] - cumulative[:-length]
+        total += sums.T @ sums / length
+    return total
 
 
 def scores(point: Linearisation, series: Sequence[Series], visible: Sequence[Visibility]) -> tuple[Score, ...]:

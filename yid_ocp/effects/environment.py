@@ -134,7 +134,8 @@ def _on_bodies(
         F_j = S_j . W_j         dF_j/dv_i = dF_i/dv_j = S_i . K_j S_j
         dF_j/dq_i = D_i . K_j S_j       dF_i/dq_j = S_i . (K_j D_j + S_j x* W_j)
 
-    because turning joint i turns a body and its wrench together, up to the velocity D_i that the turn adds.
+    because turning joint i turns a body and its wrench together, up to the velocity D_i that the turn adds; hence the A
+    and T of `ClosedForce`.
 
     Parameters
     ----------
@@ -147,7 +148,8 @@ def _on_bodies(
     """
     tree = kinematics.mechanism
     n, screws = len(tree.joints), kinematics.screws
-    force, by_q, by_v = ca.SX(n, 1), ca.SX(n, n), ca.SX(n, n)
+    zero = ca.SX(ca.DM.zeros(6))
+    force, along, turned = ca.SX(n, 1), [zero] * n, [zero] * n
     wrenches, slopes = dict(wrenches), dict(slopes)
     for j in reversed(range(n)):
         if j not in wrenches:
@@ -156,15 +158,8 @@ def _on_bodies(
         if parent >= 0:
             wrenches[parent] = wrenches[parent] + wrenches[j] if parent in wrenches else wrenches[j]
             slopes[parent] = slopes[parent] + slopes[j] if parent in slopes else slopes[j]
-        above = velocity[parent] if parent >= 0 else ca.SX(ca.DM.zeros(6))
-        extra = motion_cross(above, screws[j])
         force[j] = ca.dot(screws[j], wrenches[j])
-        along = slopes[j] @ screws[j]
-        turned = slopes[j] @ extra + force_cross(screws[j], wrenches[j])
-        for i in tree.ancestors(j):
-            before = tree.joints[i].parent
-            added = motion_cross(velocity[before], screws[i]) if before >= 0 else ca.SX(ca.DM.zeros(6))
-            by_v[i, j] = by_v[j, i] = ca.dot(screws[i], along)
-            by_q[i, j] = ca.dot(screws[i], turned)
-            by_q[j, i] = ca.dot(added, along)
-    return ClosedForce(force, by_q, by_v)
+        along[j] = slopes[j] @ screws[j]
+        added = motion_cross(velocity[parent], screws[j]) if parent >= 0 else zero
+        turned[j] = slopes[j] @ added + force_cross(screws[j], wrenches[j])
+    return ClosedForce(ca.densify(force), ca.horzcat(*along), ca.horzcat(*turned))

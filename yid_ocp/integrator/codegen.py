@@ -23,7 +23,7 @@ import platformdirs
 from numpy.typing import NDArray
 
 from yid_ocp.errors import OutputError
-from yid_ocp.integrator.discrete import DiscreteEquations, Push
+from yid_ocp.integrator.discrete import DiscreteEquations
 
 log = logging.getLogger(__name__)
 
@@ -70,12 +70,14 @@ def step_functions(equations: DiscreteEquations) -> StepFunctions:
     h, rigid = e.h, e.rigid
     bodies, bodies_p = (e.row_scale * (h / 2 * rigid.by_q + sign * rigid.by_v) for sign in (-1, 1))
     balance = e.balance_rest + e.p0 + bodies
-    if e.pushes is not None:
-        balance += e.pushes[0].impulse
-        bodies, bodies_p = (part + p.impulse for part, p in zip((bodies, bodies_p), e.pushes, strict=True))
+    if e.closed_impulses is not None:
+        balance += e.closed_impulses[0]
+        bodies, bodies_p = (part + push for part, push in zip((bodies, bodies_p), e.closed_impulses, strict=True))
     plus, minus = rigid.S + h / 2 * rigid.D, rigid.S - h / 2 * rigid.D
     lower, upper = rigid.B / 2 - rigid.F / h, rigid.B / 2 + rigid.F / h
-    parts = (plus, minus, lower, upper, rigid.S[:3, :], h / 4 * rigid.G)
+    parts = [plus, minus, lower, upper, rigid.S[:3, :], h / 4 * rigid.G]
+    if e.closed is not None:
+        parts += [e.closed.A, h / 2 * e.closed.T]
     pairs = ca.vertcat(*(ca.vec(ca.densify(part).T) for part in parts))
 
     unknown = ca.vertcat(e.q1, e.z1, e.lam)
@@ -89,20 +91,10 @@ def step_functions(equations: DiscreteEquations) -> StepFunctions:
         gaps = [ca.SX(rows, count) for count in (n, e.lam.numel() + n, e.u.numel())]
         return ca.horzcat(gaps[0], blocks[0], gaps[1], blocks[1], gaps[2])
 
-    def by_pushes(rows: int, p: Push) -> ca.SX:
-        """Slopes given in closed form, in the columns of q_{k+1} and q_k."""
-        wide = ca.SX(rows, inputs.numel())
-        n, at = e.q0.numel(), unknown.numel()
-        wide[:n, :n], wide[:n, at : at + n] = p.by_q1, p.by_q0
-        return wide
-
     m = e.lam.numel()
     rest = ca.jacobian(ca.vertcat(e.balance_rest, e.internal, ca.SX(m, 1)), inputs)
     rest += by_internal(ca.vertcat(bodies, ca.SX(e.z0.numel() + m, 1)))
     rest_p = ca.jacobian(e.p1_rest, inputs) + by_internal(bodies_p)
-    if e.pushes is not None:
-        rest += by_pushes(rest.size1(), e.pushes[0])
-        rest_p += by_pushes(rest_p.size1(), e.pushes[1])
     by_q1 = ca.substitute(e.constraint_matrix, old, ca.vertcat(e.q1, e.z1))
     if e.constraint_gain is not None:
         # the rows of a relaxing grasp depend on where it was before as well
@@ -242,6 +234,9 @@ def kernel_source(functions: StepFunctions, tables: Structure) -> str:
         "SZ_W": max(f.sz_w() for f in functions.all),
         "SZ_IW": max(f.sz_iw() for f in functions.all),
         "ROW_SCALED": int(bool(system.compliant)),
+        "CLOSED": int(e.closed is not None),
+        "CLOSED_LEFT": e.closed_shares[0],
+        "CLOSED_RIGHT": e.closed_shares[1],
     }
     lines = [f"#define {name} {value}" for name, value in sizes.items()]
 

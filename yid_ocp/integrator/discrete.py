@@ -30,22 +30,6 @@ ForceSplit = Literal["symmetric", "left", "left_damping"]
 
 
 @dataclass(frozen=True)
-class Push:
-    """The impulse of a force with slopes in closed form on one side of a step, and its derivatives.
-
-    Attributes
-    ----------
-    impulse : casadi.SX, shape (n, 1)
-        [N m s]
-    by_q0, by_q1 : casadi.SX, shape (n, n)
-    """
-
-    impulse: ca.SX
-    by_q0: ca.SX
-    by_q1: ca.SX
-
-
-@dataclass(frozen=True)
 class DiscreteEquations:
     """One step of a system, symbolically.
 
@@ -83,9 +67,11 @@ class DiscreteEquations:
         Closed-form derivatives of the bodies' Lagrangian at the midpoint.
     balance_rest, p1_rest : casadi.SX, shape (n, 1)
         What is left of `momentum_balance` and `p1` when the bodies' Lagrangian, p_k, the constraints' pull and the
-        pushes are taken out; with the closed form this gives the Jacobians without differentiating the tree.
-    pushes : pair of Push, or None
-        In `momentum_balance` and in `p1`: forces that effects give with their slopes.
+        closed force are taken out; this gives the Jacobians without differentiating the tree.
+    closed : ClosedForce or None
+        Sum of the forces that effects give with their slopes, at the midpoint.
+    closed_shares : (float, float)
+        Parts of its impulse h F in `momentum_balance` and in `p1`.
     constraint_matrix : casadi.SX, shape (m, n)
         Dphi(q_k), so that the pull is its transpose times lam.
     pull_by_q : casadi.SX, shape (n, n)
@@ -115,7 +101,8 @@ class DiscreteEquations:
     rigid: RigidBody
     balance_rest: ca.SX
     p1_rest: ca.SX
-    pushes: tuple[Push, Push] | None
+    closed: ClosedForce | None
+    closed_shares: tuple[float, float]
     constraint_matrix: ca.SX
     pull_by_q: ca.SX
     row_scale: ca.SX
@@ -129,6 +116,14 @@ class DiscreteEquations:
     def residual(self) -> ca.SX:
         """Residual of the step's unknowns: free rows of the balance, internal and constraint equations."""
         return ca.vertcat(self.momentum_balance[list(self.system.free_indices)], self.internal, self.constraint)
+
+    @property
+    def closed_impulses(self) -> tuple[ca.SX, ca.SX] | None:
+        """Impulse of the closed force in `momentum_balance` and in `p1`, shape (n, 1) [N m s]; None without one."""
+        if self.closed is None:
+            return None
+        first, second = (part * self.h * self.row_scale * self.closed.force for part in self.closed_shares)
+        return first, second
 
     @property
     def closure(self) -> ca.SX:
@@ -246,14 +241,11 @@ def discrete_equations(system: System, force_split: ForceSplit = "symmetric") ->
     def placed(expression: ca.SX) -> ca.SX:
         return ca.densify(ca.substitute(expression, midpoint, midpoint_values))
 
-    def push(part: float) -> Push:
-        by_q, by_v = (sum((getattr(c, name) for c in closed), ca.SX(n, n)) for name in ("by_q", "by_v"))
-        by_q0, by_q1 = (part * scale * (h / 2 * by_q + sign * by_v) for sign in (-1, 1))
-        impulse = part * h * scale * sum((c.force for c in closed), ca.SX(n, 1))
-        there = (ca.sparsify(ca.substitute(x, midpoint, midpoint_values)) for x in (by_q0, by_q1))
-        return Push(placed(impulse), *there)
-
-    pushes = (push(viscous_share), push(1 - viscous_share)) if closed else None
+    total: ClosedForce | None = None
+    if closed:
+        total = ClosedForce(*(placed(sum(parts[1:], parts[0])) for parts in zip(*((c.force, c.A, c.T) for c in closed))))
+        balance += viscous_share * h * scale * sum((c.force for c in closed), ca.SX(n, 1))
+        p1 += (1 - viscous_share) * h * scale * sum((c.force for c in closed), ca.SX(n, 1))
     relaxation = system.constraint_relaxation()
     gain = None if relaxation is None else 1 + relaxation / h
     if gain is not None:
@@ -273,18 +265,19 @@ def discrete_equations(system: System, force_split: ForceSplit = "symmetric") ->
         theta=system.parameters.symbols,
         time_step=time_step,
         h=h,
-        momentum_balance=placed(balance) if pushes is None else placed(balance) + pushes[0].impulse,
+        momentum_balance=placed(balance),
         internal=placed(ca.vertcat(*(equations[name] for name in names)) if names else ca.SX(0, 1)),
         internal_at_rest=placed(
             ca.vertcat(*(at_rest.get(name, equations[name]) for name in names)) if names else ca.SX(0, 1)
         ),
         constraint=ca.densify(phi_there - system.constraint_compliance() * lam / h),
         constraint_gain=gain,
-        p1=placed(p1) if pushes is None else placed(p1) + pushes[1].impulse,
+        p1=placed(p1),
         rigid=RigidBody(**{name: placed(getattr(rigid, name)) for name in fields}),
         balance_rest=placed(balance_rest),
         p1_rest=placed(p1_rest),
-        pushes=pushes,
+        closed=total,
+        closed_shares=(viscous_share, 1 - viscous_share),
         constraint_matrix=matrix,
         pull_by_q=pull_by_q,
         row_scale=ca.densify(scale),

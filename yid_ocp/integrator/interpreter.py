@@ -84,7 +84,7 @@ class InterpretedKernel:
         nt, nqz = n + nz + m, n + nz
         pairs, rest, rest_p, by_unknown = (np.array(x).ravel() for x in self._step.functions.linear(*arguments))
         plus, minus, lower, upper = (pairs[6 * n * i : 6 * n * (i + 1)].reshape(6, n) for i in range(4))
-        turn, moment = pairs[24 * n : 27 * n].reshape(3, n), pairs[27 * n :].reshape(3, n)
+        turn, moment = (pairs[3 * n * i : 3 * n * (i + 1)].reshape(3, n) for i in (8, 9))
         weight = moment.T @ turn
         low, up = (
             np.where(self._mask, lower.T @ plus + weight, 0.0),
@@ -104,6 +104,17 @@ class InterpretedKernel:
         rows_new[:n, :n] = scale[:, None] * slope
         rows_old[:n, :n] = scale[:, None] * both(here, here)
         p1_new[:, :n], p1_old[:, :n] = scale[:, None] * both(there, there), scale[:, None] * slope.T
+        if self._step.equations.closed is not None:
+            along, turned = (pairs[6 * n * i : 6 * n * (i + 1)].reshape(6, n) for i in (5, 6))
+            screw = (plus + minus) / 2
+            by_rate, by_turn, by_posture = (
+                np.where(self._mask, x.T @ y, 0.0) for x, y in ((along, screw), (along, plus - screw), (turned, screw))
+            )
+            for part, new, old in zip(
+                self._step.equations.closed_shares, (rows_new, p1_new), (rows_old, p1_old), strict=True
+            ):
+                new[:n, :n] += part * scale[:, None] * both(by_turn + by_rate, by_posture + by_rate)
+                old[:n, :n] += part * scale[:, None] * both(by_turn - by_rate, by_posture - by_rate)
         for key, values, blocks in (
             ("rest", rest, (rows_new, rows_old, rows_input)),
             ("rest_p", rest_p, (p1_new, p1_old, p1_input)),

@@ -19,7 +19,7 @@ typedef int (*theta_function)(const double **, double **, long long *, double *,
 
 typedef struct {
     double balance[ONE(N)], internal[ONE(NZ)], constraint[ONE(M)], p1[ONE(N)];
-    double pairs[30 * ONE(N)];
+    double pairs[(30 + 12 * CLOSED) * ONE(N)];
     double rest[ONE(NNZ_REST)], rest_p[ONE(NNZ_REST_P)], by_unknown[ONE(NNZ_CONSTRAINT)];
     double matrix_nz[ONE(NNZ_MATRIX)], pull_nz[ONE(NNZ_PULL)];
     double Phi[ONE(M)][ONE(N)];
@@ -142,6 +142,31 @@ static void linearise(Work *k, const Point *a, int everything) {
                 }
         }
     }
+    if (CLOSED)
+        for (int j = 0; j < N; j++) {
+            const double *A = P + 30 * N + j, *T = A + 6 * N;
+            for (int run = ancestor_start[j]; run < ancestor_start[j + 1]; run++)
+                for (int i = ancestor_run[2 * run]; i < ancestor_run[2 * run + 1]; i++) {
+                    /* S.A, h/2 D.A and h/2 S.T, from S = (P + D)/2 and h/2 D = (P - D)/2 */
+                    double sa = 0, da = 0, st = 0;
+                    for (int c = 0; c < 6; c++) {
+                        const double s = 0.5 * (P[c * N + i] + D[c * N + i]);
+                        sa += s * A[c * N];
+                        da += (P[c * N + i] - s) * A[c * N];
+                        st += s * T[c * N];
+                    }
+                    k->R1[j][i] += CLOSED_LEFT * (da + sa);
+                    if (i != j) k->R1[i][j] += CLOSED_LEFT * (st + sa);
+                    if (!everything) continue;
+                    k->R0[j][i] += CLOSED_LEFT * (da - sa);
+                    k->P1[j][i] += CLOSED_RIGHT * (da + sa);
+                    k->P0[j][i] += CLOSED_RIGHT * (da - sa);
+                    if (i == j) continue;
+                    k->R0[i][j] += CLOSED_LEFT * (st - sa);
+                    k->P1[i][j] += CLOSED_RIGHT * (st + sa);
+                    k->P0[i][j] += CLOSED_RIGHT * (st - sa);
+                }
+        }
     if (ROW_SCALED)
         for (int j = 0; j < N; j++)
             for (int i = 0; i < N; i++) {

@@ -169,19 +169,22 @@ class NodeState:
 
 @dataclass(frozen=True)
 class ClosedForce:
-    """A generalized force F(q, v) that takes energy out, with its derivatives in closed form.
+    """The generalized force F(q, v) of wrenches that take energy out of bodies, with its slopes in closed form.
+
+    With S_j and D_j as in `RigidBody`, for i an ancestor of joint j or j itself:
+
+        dF_j/dv_i = dF_i/dv_j = S_i . A_j       dF_j/dq_i = D_i . A_j       dF_i/dq_j = S_i . T_j
 
     Attributes
     ----------
     force : casadi.SX, shape (n, 1)
         [N m or N]
-    by_q, by_v : casadi.SX, shape (n, n)
-        dF/dq and dF/dv.
+    A, T : casadi.SX, shape (6, n)
     """
 
     force: ca.SX
-    by_q: ca.SX
-    by_v: ca.SX
+    A: ca.SX
+    T: ca.SX
 
 
 @dataclass(frozen=True)
@@ -201,7 +204,7 @@ class Terms:
     at_rest : mapping of str to casadi.SX
         Equation (= 0) that takes its place in a static equilibrium, where its own says nothing or cannot hold.
     closed : ClosedForce, optional
-        A dissipative force whose slopes are given, because differentiating it would cost too much.
+        A dissipative force on bodies whose slopes are given, because differentiating it would cost too much.
     """
 
     lagrangian: ca.SX = field(default_factory=lambda: ca.SX(0))

@@ -173,7 +173,7 @@ class CableOptions:
         start if the cable is at rest there. Becomes the parameter `SEGMENT.memory`; it counts less for a recording that
         starts in motion, by the factor 1/(1 + (start speed/`start.speed_scale`)^2).
     rest_angles : bool
-        Whether every joint has a parameter `JOINT.rest` [rad], its rest angle beside the undeformed shape's.
+        Whether every bend has a parameter `JOINT.rest` [rad], its rest angle beside the undeformed shape's.
     gravity : tuple of float
         [m/s^2]
     """
@@ -266,7 +266,7 @@ def cable_problem_options(
     recordings: Sequence[Recording],
     noise: float,
     model_error: float,
-    rest_std: float = 0.3,
+    rest_std: float = 0.2,
     path_cutoff: float = 8.0,
     options: CableOptions | None = None,
 ) -> ProblemOptions:
@@ -325,7 +325,7 @@ def free_parameters(cable: Cable, options: CableOptions | None = None) -> tuple[
     if options.rest_angles:
         for name, chain in cable.chains.items():
             links = len(chain) - (2 if name == cable.parent_name else 1)
-            names += [f"{name}_{i}_{axis}{REST}" for i in range(links) for axis in "xyz"]
+            names += [f"{name}_{i}_{axis}{REST}" for i in range(links) for axis in "xy"]
     return tuple(names)
 
 
@@ -401,10 +401,12 @@ def _with_rest_angles(item: FlexibleObject) -> FlexibleObject:
     entries = [
         Parameter(f"{spring.joint}{REST}", 0.0, "rad", -np.pi, np.pi, "rest angle beside the undeformed shape's")
         for spring in item.elastic
+        if spring.kind == "bend"
     ]
-    elastic = tuple(replace(s, rest=s.rest + e.symbol) for s, e in zip(item.elastic, entries, strict=True))
+    rest = {entry.name: entry.symbol for entry in entries}
+    elastic = (replace(s, rest=s.rest + rest.get(f"{s.joint}{REST}", 0)) for s in item.elastic)
     tree = replace(item.mechanism, parameters=item.mechanism.parameters.joined(entries))
-    return replace(item, mechanism=tree, elastic=elastic)
+    return replace(item, mechanism=tree, elastic=tuple(elastic))
 
 
 def _with_memory(item: FlexibleObject, memory: float) -> FlexibleObject:

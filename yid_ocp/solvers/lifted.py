@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,7 +63,7 @@ class Lifted:
     cost_tolerance: float = 1e-5
     defect_tolerance: float = 1e-7
     name: str = "lifted"
-    needs_rollout: bool = False
+    needs_rollout: ClassVar[bool] = False
 
     def run(self, problem: EstimationProblem, start: Array, callback: Callback | None) -> Outcome:
         """See `Solver.run`."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import casadi as ca
 import numpy as np
@@ -57,7 +57,7 @@ class MultipleShooting:
     mu_init: float = 1e-5
     ipopt: dict[str, Any] = field(default_factory=dict)
     name: str = "multiple_shooting"
-    needs_rollout: bool = False
+    needs_rollout: ClassVar[bool] = False
 
     def run(self, problem: EstimationProblem, start: Array, callback: Callback | None) -> Outcome:
         """See `Solver.run`."""

@@ -14,6 +14,7 @@ import numpy as np
 
 from yid_ocp.analysis.convergence import grasp_gaps
 from yid_ocp.data.recording import Recording, read_recording
+from yid_ocp.effects import make_effect
 from yid_ocp.errors import DataError, ModelError, YidError, nearest
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model import FlexibleObject, Grasp, Mechanism, Segment, System, flexible_object
@@ -88,6 +89,10 @@ def build_system(run: Run, links: int | None = None) -> System:
     with located(run, "model", "object"):
         objects = _objects(run, everywhere, links)
     mode = model.arms.mode
+    for i, name in enumerate(model.arms.passive):
+        if name not in joints:
+            raise run.refuse(f"there is no joint '{name}'", "model", "arms", "passive", i, hint=nearest(name, joints))
+    moved = tuple(name for name in joints if name not in model.arms.passive)
     grasps = [
         Grasp(name, grasp.holder, grasp.held, grasp.kind, ca.SX(ca.DM(roll_pitch_yaw(*grasp.rpy))))
         for name, grasp in model.grasp.items()
@@ -99,13 +104,21 @@ def build_system(run: Run, links: int | None = None) -> System:
             robot,
             objects=objects,
             grasps=grasps,
-            driven=joints if mode == "driven" else (),
-            prescribed=joints if mode == "prescribed" else (),
+            driven=moved if mode == "driven" else (),
+            prescribed=moved if mode == "prescribed" else (),
             damping=damping,
             gravity=model.gravity,
             points=model.points,
             springs={name: Spring(s.stiffness, s.rest) for name, s in model.springs.items()},
         )
+    return _completed(run, system)
+
+
+def _completed(run: Run, system: System) -> System:
+    """The system with its effects, its parameters at the values and bounds of the settings."""
+    for i, said in enumerate(run.model.effects):
+        with located(run, "model", "effects", i):
+            system = system.with_effects([make_effect(said.kind, said.location, system, dict(said.values))])
     return replace(system, parameters=_set_parameters(run, system.parameters))
 
 
@@ -137,7 +150,7 @@ def _cable_model(run: Run) -> System:
     )
     with located(run, "model", "object"):
         system = cable_system(recordings, cable, options)
-    return replace(system, parameters=_set_parameters(run, system.parameters))
+    return _completed(run, system)
 
 
 def build_cable(run: Run) -> Cable | None:

@@ -49,7 +49,9 @@ def chosen_solvers(run: Run) -> list[Solver]:
     for name, settings in run.compare.methods.items():
         if name not in SOLVERS:
             hint = nearest(name, SOLVERS)
-            raise run.refuse(f"there is no method '{name}'", "compare", "methods", allowed=", ".join(SOLVERS), hint=hint)
+            raise run.refuse(
+                f"there is no method '{name}'", "compare", "methods", allowed=", ".join(SOLVERS), hint=hint
+            )
         kind: Any = SOLVERS[name]
         known = [entry.name for entry in dataclasses.fields(kind) if entry.name not in ("name", "needs_rollout")]
         for key in settings or {}:
@@ -132,9 +134,7 @@ def _published(run: Run) -> dict[str, float]:
     if name is None:
         return PUBLISHED.get(run.name, {})
     if name not in PUBLISHED:
-        raise run.refuse(
-            f"the paper has no experiment '{name}'", "compare", "published", allowed=", ".join(PUBLISHED)
-        )
+        raise run.refuse(f"the paper has no experiment '{name}'", "compare", "published", allowed=", ".join(PUBLISHED))
     return PUBLISHED[name]
 
 

@@ -151,11 +151,21 @@ class SpringSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class EffectSettings:
+    """An effect beyond the nominal model; its parameters are named kind@location.quantity."""
+
+    kind: Annotated[str, About("kelvin_voigt, joint_coulomb, ...")]
+    location: Annotated[str, About("a segment, point, joint, grasp, arm, base, object, world, camera or clock")]
+    values: Annotated[Mapping[str, float], About("quantities that are not neutral")] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
 class ArmSettings:
     """Which joints of the robot move, and what is known of them."""
 
     joints: Annotated[tuple[str, ...] | None, About("in configuration order; all movable ones when absent")] = None
     mode: Annotated[ArmMode, About("driven by measured effort, moved as measured, or passive")] = "driven"
+    passive: Annotated[tuple[str, ...], About("joints among them that nothing drives, whatever the mode")] = ()
     locked: Annotated[Mapping[str, float], About("value of joints that do not move", "rad or m")] = field(
         default_factory=dict
     )
@@ -176,6 +186,7 @@ class ModelSettings:
     ] = 0.05
     gravity: Annotated[Triple, About("acceleration of free fall in the world", "m/s^2")] = (0.0, 0.0, -9.81)
     points: Annotated[tuple[str, ...] | None, About("frames that sensors may see; the segments' tips")] = None
+    effects: Annotated[tuple[EffectSettings, ...], About("added to the nominal model, in this order")] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

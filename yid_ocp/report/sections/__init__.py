@@ -81,14 +81,12 @@ def section(
 
 def written_sections(findings: Findings, environment: jinja2.Environment) -> list[dict[str, str]]:
     """The sections that have something to say: name, title and HTML, in order."""
-    from markupsafe import Markup
-
     result = []
     for name in sorted(SECTIONS, key=lambda entry: SECTIONS[entry].order):
         context = SECTIONS[name].prepare(findings)
         if context is not None:
             html = environment.get_template(f"{name}.html").render(context)
-            result.append({"name": name, "title": SECTIONS[name].title, "html": Markup(html)})
+            result.append({"name": name, "title": SECTIONS[name].title, "html": html})
     return result
 
 

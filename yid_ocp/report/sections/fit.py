@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup
 
 from yid_ocp.problem.problem import Episode, EpisodeResult
 from yid_ocp.report import figures
@@ -29,13 +28,13 @@ def prepare(findings: Findings) -> Mapping[str, Any] | None:
     if findings.problem is None or not findings.episodes:
         return None
     result = findings.result
-    pictures: list[tuple[str, Markup]] = []
+    pictures: list[tuple[str, str]] = []
     left = 0
     for role, episode, outcome in findings.episodes:
         for title, picture in _pictures(findings, role, episode, outcome):
             if len(pictures) < MOST_PICTURES:
                 role_words = "held out" if role == "held_out" else "estimated on"
-                pictures.append((f"{title} in {episode.name} ({role_words})", Markup(figures.html(picture))))
+                pictures.append((f"{title} in {episode.name} ({role_words})", figures.html(picture)))
             else:
                 left += 1
     residuals = _whitened(findings)
@@ -48,7 +47,7 @@ def prepare(findings: Findings) -> Mapping[str, Any] | None:
         "words": WORDS,
         "pictures": pictures,
         "left": left,
-        "histogram": Markup(figures.html(figures.residual_histogram(residuals))) if residuals else None,
+        "histogram": figures.html(figures.residual_histogram(residuals)) if residuals else None,
         "chi2": None if findings.solution is None else findings.solution.chi2_per_dof,
     }
 

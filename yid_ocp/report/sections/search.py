@@ -6,8 +6,6 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from markupsafe import Markup
-
 from yid_ocp.report import figures
 from yid_ocp.report.sections import Findings, section
 
@@ -19,4 +17,4 @@ def prepare(findings: Findings) -> Mapping[str, Any] | None:
     if solution is None or len(solution.history) < 2:
         return None
     picture = figures.cost_history([h.cost for h in solution.history], [h.note for h in solution.history])
-    return {"solution": solution, "finite": math.isfinite(solution.cost), "picture": Markup(figures.html(picture))}
+    return {"solution": solution, "finite": math.isfinite(solution.cost), "picture": figures.html(picture)}

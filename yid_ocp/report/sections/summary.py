@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from markupsafe import Markup
-
 from yid_ocp.report import figures
 from yid_ocp.report.sections import Findings, section
 
@@ -30,5 +28,5 @@ def prepare(findings: Findings) -> Mapping[str, Any] | None:
         "free": free,
         "words": WORDS,
         "by_verdict": by_verdict,
-        "pictures": [Markup(figures.html(figures.estimates(values, unit))) for unit, values in by_unit.items()],
+        "pictures": [figures.html(figures.estimates(values, unit)) for unit, values in by_unit.items()],
     }

@@ -1,0 +1,127 @@
+"""All methods reach the same optimum of the same problem, near the truth of the other engine."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from yid_ocp.errors import SolverError
+from yid_ocp.solvers import GaussNewton, Lifted, MultipleShooting, SingleShooting, Status, SteepestDescent, solve
+
+SEEN = ("T1.bend", "T1.twist", "T2.bend")
+
+
+@pytest.fixture(scope="module")
+def short(make_problem):
+    """The first two seconds, three parameters that they determine."""
+    return make_problem(free=SEEN, duration=2.0)
+
+
+@pytest.fixture(scope="module")
+def reference(short):
+    return solve(short, GaussNewton())
+
+
+def within(solution, reference, deviations=0.1):
+    spread = np.sqrt(np.diag(reference.covariance))
+    return np.all(np.abs(solution.x - reference.x) <= deviations * spread)
+
+
+def test_gauss_newton_recovers_the_truth_of_another_engine(make_problem, recording):
+    solution = solve(make_problem(), GaussNewton())
+    assert solution.status == Status.CONVERGED
+    assert 0.9 < solution.chi2_per_dof < 1.2
+    for name, entry in solution.parameters.items():
+        if entry.free and entry.verdict == "identifiable":
+            assert abs(entry.value - recording.truth[name]) < max(0.05 * recording.truth[name], 3 * entry.std), name
+    verdicts = {name: entry.verdict for name, entry in solution.parameters.items() if entry.free}
+    assert verdicts["T1.bend"] == verdicts["T2.bend"] == "identifiable"
+    assert verdicts["T2.twist"] == verdicts["T3.twist"] == "not_identifiable"
+
+
+def test_history_falls_and_is_told(short):
+    told = []
+    solution = solve(short, GaussNewton(), callback=told.append)
+    costs = [entry.cost for entry in solution.history]
+    assert told == list(solution.history)
+    assert all(after <= before * (1 + 1e-12) for before, after in zip(costs, costs[1:], strict=False))
+    assert solution.cost == pytest.approx(costs[-1], rel=1e-9)
+
+
+def test_single_shooting_agrees(short, reference):
+    solution = solve(short, SingleShooting())
+    assert solution.status == Status.CONVERGED
+    assert within(solution, reference)
+    assert solution.cost == pytest.approx(reference.cost, rel=1e-5)
+
+
+@pytest.mark.parametrize(("interval", "hessian"), [(1, "gauss_newton"), (10, "gauss_newton")])
+def test_multiple_shooting_agrees(make_problem, interval, hessian):
+    problem = make_problem(free=("T1.bend", "T2.bend"), duration=0.4 if interval == 1 else 1.0)
+    single = solve(problem, GaussNewton())
+    solution = solve(problem, MultipleShooting(node_interval=interval, hessian=hessian))
+    assert solution.status == Status.CONVERGED, solution.message
+    assert within(solution, single)
+    assert solution.cost == pytest.approx(single.cost, rel=1e-4)
+
+
+def test_lifted_agrees(short, reference):
+    solution = solve(short, Lifted())
+    assert solution.status == Status.CONVERGED, solution.message
+    assert within(solution, reference)
+
+
+def test_steepest_descent_lowers_the_papers_cost(make_problem):
+    problem = make_problem(free=("T1.bend", "T2.bend"), duration=2.0, weighting="paper")
+    solution = solve(problem, SteepestDescent(iterations=60, trial="spectral"))
+    assert solution.history[-1].cost < 0.05 * solution.history[0].cost
+    assert solution.parameters["T1.bend"].value == pytest.approx(22.0, rel=0.05)
+
+
+def test_estimated_start_gives_the_same_optimum_in_both_formulations(make_problem):
+    problem = make_problem(free=("T1.bend", "T2.bend"), duration=0.6, initial_state="estimated")
+    single = solve(problem, GaussNewton())
+    multiple = solve(problem, MultipleShooting(node_interval=10))
+    spread = np.sqrt(np.diag(single.covariance))[:2]
+    assert np.all(np.abs(single.x[:2] - multiple.x[:2]) <= 0.2 * spread)
+
+
+def test_bounds_are_respected(one_arm, recording, make_problem):
+    problem = make_problem(free=("T1.bend", "T2.bend"), duration=1.0)
+    system = problem.system
+    narrow = type(system)(**{**vars(system), "parameters": system.parameters.with_bounds({"T1.bend": (0.0, 15.0)})})
+    problem.system = narrow
+    for solver in (GaussNewton(), SingleShooting(), MultipleShooting(node_interval=10)):
+        solution = solve(problem, solver)
+        assert solution.x[0] <= 15.0 + 1e-9, solver.name
+        assert solution.x[0] == pytest.approx(15.0, abs=1e-2), solver.name
+
+
+def test_open_loop_needs_multiple_shooting(make_problem):
+    """Without feedback the arm leaves the measured motion, and one rollout over the recording means nothing."""
+    problem = make_problem(free=("T1.bend", "T2.bend"), feedback="none", duration=2.0)
+    single = solve(problem, GaussNewton(iterations=30))
+    nodes = solve(problem, MultipleShooting(node_interval=10))
+    assert nodes.status == Status.CONVERGED, nodes.message
+    assert nodes.history[-1].cost < 0.5 * single.cost or single.status != Status.CONVERGED
+
+
+def test_limited_memory_is_refused_with_a_reason(short):
+    solver = MultipleShooting(ipopt={"hessian_approximation": "limited-memory"})
+    with pytest.raises(SolverError, match="limited-memory"):
+        solver.run(short, short.start, None)
+
+
+def test_recording_shorter_than_a_node_interval(short):
+    with pytest.raises(SolverError, match="fewer than one node interval"):
+        MultipleShooting(node_interval=1000).run(short, short.start, None)
+
+
+def test_iteration_limit_is_a_status_with_the_best_point(short):
+    for solver in (GaussNewton(iterations=1), MultipleShooting(node_interval=10, iterations=2)):
+        solution = solve(short, solver)
+        assert solution.status == Status.ITERATION_LIMIT
+        assert np.all(np.isfinite(solution.x))
+        assert "iterations" in solution.message
+
+

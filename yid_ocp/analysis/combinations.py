@@ -1,0 +1,125 @@
+"""Names for what is seen of several parameters when each by itself is not: a sum, springs in series, a ratio."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+MISMATCH = 0.05  # of a direction against that of a plain combination, both of unit length
+STRETCH = 1.3  # factor on the first parameter in the test of a combination at a finite change
+NOTHING = 0.1  # a combination holds when the data then move by less than this share of what one change alone does
+
+
+@dataclass(frozen=True)
+class Component:
+    """One parameter's part in a direction of relative changes: name, part, value and unit."""
+
+    name: str
+    part: float
+    value: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Form:
+    """A combination of two parameters.
+
+    Attributes
+    ----------
+    words : str
+        With {a} and {b} for the names.
+    slope : callable
+        From the two values to the relative changes (a, b) that leave it as it is.
+    partner : callable
+        From (a, b, new a) to the b that leaves it as it is.
+    same_unit : bool
+        Whether it makes sense only for equal units.
+    """
+
+    words: str
+    slope: Callable[[float, float], tuple[float, float]]
+    partner: Callable[[float, float, float], float]
+    same_unit: bool
+
+
+FORMS: tuple[Form, ...] = (
+    Form("1/{a} + 1/{b}, as springs in series are", lambda a, b: (a, -b), lambda a, b, n: 1 / (1 / a + 1 / b - 1 / n), True),
+    Form("{a} + {b}, as springs side by side are", lambda a, b: (b, -a), lambda a, b, n: a + b - n, True),
+    Form("the ratio {a} / {b}", lambda a, b: (1.0, 1.0), lambda a, b, n: b * n / a, False),
+    Form("the product {a} x {b}", lambda a, b: (1.0, -1.0), lambda a, b, n: b * a / n, False),
+)
+
+
+def combination_words(parts: Sequence[Component], moved: Callable[[Mapping[str, float]], float] | None) -> str:
+    """What is seen of parameters that a direction leaves open, in a sentence.
+
+    Parameters
+    ----------
+    parts : sequence of Component
+        Of the direction that is not seen.
+    moved : callable, optional
+        From new values of parameters to how far the data move [deviations]; tells combinations apart that look alike
+        for small changes. Without it the trade is described and not named.
+    """
+    if len(parts) == 1:
+        return f"{parts[0].name} is not seen"
+    names = [part.name for part in parts]
+    listed = f"{', '.join(names[:-1])} and {names[-1]}"
+    if len(parts) == 2 and moved is not None:
+        form = _form(parts[0], parts[1], moved)
+        if form is not None:
+            return f"{listed} are seen only as {form.words.format(a=names[0], b=names[1])}"
+    largest = max(abs(part.part) for part in parts)
+    trade = " with ".join(f"{part.name} {10 * part.part / largest:+.2g} %" for part in parts)
+    return f"{listed} are seen only together: {trade} changes nothing that is measured"
+
+
+def _form(first: Component, second: Component, moved: Callable[[Mapping[str, float]], float]) -> Form | None:
+    direction = np.array([first.part, second.part])
+    direction /= np.linalg.norm(direction)
+    a, b = first.value, second.value
+    tried: list[tuple[float, Form]] = []
+    for form in FORMS:
+        if form.same_unit and first.unit != second.unit:
+            continue
+        slope = np.array(form.slope(a, b))
+        if 1.0 - abs(float(slope @ direction)) / float(np.linalg.norm(slope)) > MISMATCH**2:
+            continue
+        new_a = a * STRETCH
+        new_b = form.partner(a, b, new_a)
+        if new_b > 0:
+            tried.append((moved({first.name: new_a, second.name: new_b}), form))
+    if not tried:
+        return None
+    least, best = min(tried, key=lambda entry: entry[0])
+    return best if least <= max(NOTHING * moved({first.name: a * STRETCH}), 1.0) else None
+
+
+def sparse_basis(vectors: Array) -> list[Array]:
+    """Basis of the space of some row vectors with few components each, of unit length.
+
+    Row echelon form with complete pivoting: as many components as there are vectors stand in one vector only.
+
+    Parameters
+    ----------
+    vectors : ndarray, shape (d, p)
+    """
+    rows = vectors.copy()
+    taken: list[int] = []
+    for i in range(len(rows)):
+        open_columns = [j for j in range(rows.shape[1]) if j not in taken]
+        block = np.abs(rows[i:][:, open_columns])
+        at = np.unravel_index(int(np.argmax(block)), block.shape)
+        pivot, column = i + int(at[0]), open_columns[int(at[1])]
+        rows[[i, pivot]] = rows[[pivot, i]]
+        rows[i] /= rows[i, column]
+        for k in range(len(rows)):
+            if k != i:
+                rows[k] -= rows[k, column] * rows[i]
+        taken.append(column)
+    return [row / np.linalg.norm(row) for row in rows]

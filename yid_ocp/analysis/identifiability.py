@@ -1,0 +1,453 @@
+"""What recordings say about parameters: Fisher information, correlations, unseen directions in words, verdicts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from yid_ocp.analysis.combinations import Component, combination_words, sparse_basis
+from yid_ocp.analysis.profile import Profile, profile_likelihood
+from yid_ocp.errors import ConfigError, SolverError, nearest
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.problem import Evaluation
+from yid_ocp.solvers.base import IDENTIFIABLE, WEAK, Solution, uncertainty, verdict
+
+Array = NDArray[np.float64]
+StartKnowledge = Literal["known", "unknown"]
+
+GRASP_NUISANCE = "grasp_offset@"
+GRASP_STD = 0.01  # prior of where a grasp sits [m]
+# A column this much smaller than the largest counts as zero where nuisances are eliminated.
+RANK_TOLERANCE = 1e-10
+
+
+@dataclass(frozen=True)
+class ParameterInformation:
+    """What the recordings say about one parameter.
+
+    Attributes
+    ----------
+    value : float
+        At which the information was taken, in `unit`.
+    unit : str
+    std : float
+        Standard deviation with all other unknowns free; infinite where nothing informs it.
+    std_relative : float
+        The same over the value.
+    std_alone : float
+        Relative deviation if everything else were known.
+    verdict : str
+        identifiable (relative deviation up to 10 %), weak (up to 400 %) or not_identifiable; a parameter whose interval
+        was asked for and is open on one side is at best weak, open on both sides not_identifiable.
+    interval : (float or None, float or None), or None
+        95 % interval by profile likelihood, None for an open end; None as a whole where it was not asked for.
+    """
+
+    value: float
+    unit: str
+    std: float
+    std_relative: float
+    std_alone: float
+    verdict: str
+    interval: tuple[float | None, float | None] | None = None
+
+
+@dataclass(frozen=True)
+class Direction:
+    """A joint relative change of parameters and how well it is seen.
+
+    Attributes
+    ----------
+    singular_value : float
+        Of the whitened sensitivity to relative changes, nuisances eliminated: deviations of the data per unit change.
+    std_relative : float
+        Its reciprocal, the deviation along the direction.
+    components : mapping of parameter to float
+        The direction, of unit length.
+    verdict : str
+        Limits as for a parameter.
+    words : str
+    """
+
+    singular_value: float
+    std_relative: float
+    components: Mapping[str, float]
+    verdict: str
+    words: str
+
+
+@dataclass(frozen=True)
+class Identifiability:
+    """What a set of recordings can tell about the free parameters.
+
+    Attributes
+    ----------
+    parameters : mapping of str to ParameterInformation
+    names : tuple of str, length p
+        In the order of the matrices.
+    correlations : ndarray, shape (p, p)
+        NaN in rows of parameters that nothing informs.
+    information : ndarray, shape (p, p)
+        Fisher information of relative changes, nuisances eliminated.
+    directions : tuple of Direction
+        Least seen first; those that a single parameter or a plain combination stands for are named so.
+    nuisances : tuple of str
+        Unknowns that were estimated along.
+    chi2_per_dof : float
+        At the point; deviations are scaled by its square root where it exceeds one.
+    profiles : mapping of str to Profile
+    """
+
+    parameters: Mapping[str, ParameterInformation]
+    names: tuple[str, ...]
+    correlations: Array
+    information: Array
+    directions: tuple[Direction, ...]
+    nuisances: tuple[str, ...]
+    chi2_per_dof: float
+    profiles: Mapping[str, Profile] = field(default_factory=dict)
+
+    @property
+    def identifiable(self) -> tuple[str, ...]:
+        """Names of parameters with that verdict."""
+        return tuple(name for name, entry in self.parameters.items() if entry.verdict == "identifiable")
+
+    @property
+    def unseen(self) -> tuple[Direction, ...]:
+        """Directions that are not identifiable."""
+        return tuple(entry for entry in self.directions if entry.verdict == "not_identifiable")
+
+
+def identifiability(
+    problem: EstimationProblem,
+    solution: Solution | ArrayLike | None = None,
+    *,
+    start: StartKnowledge = "unknown",
+    grasp_std: float | None = GRASP_STD,
+    intervals: Iterable[str] | Literal["all"] = (),
+) -> Identifiability:
+    """Which free parameters the problem's recordings determine, and what they leave open.
+
+    The Fisher information of independent Gaussian noise is I = J' J, J = d r/d x the whitened sensitivities; the
+    deviation of one unknown is the root of the diagonal of its inverse, with all nuisances in it.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    solution : Solution or array_like, optional
+        Point at which to judge (a solution of this problem, or its unknown vector); the initial values when absent.
+    start : "unknown" or "known"
+        Whether every recording's initial state is estimated along, with the problem's prior about what it presumes.
+    grasp_std : float, optional
+        Prior deviation of the fixed `grasp_offset@...` parameters of a system that has any, which are estimated along
+        [m]; None for grasps that are known.
+    intervals : iterable of str, or "all"
+        Parameters whose interval by profile likelihood is wanted.
+
+    Returns
+    -------
+    Identifiability
+
+    Raises
+    ------
+    SolverError
+        The model cannot be rolled out at the point.
+    ConfigError
+        An interval is wanted of what is not a free parameter.
+
+    References
+    ----------
+    Ljung (1999), System Identification, section 7.4; Raue et al. (2009), Bioinformatics 25:1923,
+    doi:10.1093/bioinformatics/btp358.
+    """
+    given = unknown_vector(problem, solution)
+    wide = with_nuisances(problem, given, start, grasp_std)
+    x = carried(given, problem.names, wide)
+    evaluation = wide.evaluate(x)
+    if not evaluation.ok or evaluation.jacobian is None:
+        raise SolverError(
+            f"the model cannot be rolled out where its information is asked for: {evaluation.message}",
+            hint="solve first, or choose other initial values",
+        )
+    names = tuple(name for name in problem.names if not name.startswith("start."))
+    wanted = names if intervals == "all" else tuple(intervals)
+    for name in wanted:
+        if name not in names:
+            raise ConfigError(f"'{name}' is not a free parameter", hint=nearest(name, names), where="intervals")
+    chosen = [wide.names.index(name) for name in names]
+    covariance, chi2 = uncertainty(wide, evaluation)
+    inflation = math.sqrt(max(1.0, chi2))
+    split = split_rows(wide, evaluation, chosen)
+    scale = np.where(x[chosen] != 0, np.abs(x[chosen]), wide.scales[chosen])
+    sensitivity = split.sensitivity * scale / inflation
+    information = sensitivity.T @ sensitivity
+
+    deviation = np.sqrt(np.diag(covariance)[chosen])
+    limit = 1e6 * np.maximum(np.abs(x[chosen]), np.maximum(np.abs(wide.start[chosen]), 1e-12))
+    deviation = np.where(deviation < limit, deviation, np.inf)
+    profiles = {
+        name: profile_likelihood(wide, x, wide.names.index(name), float(deviation[names.index(name)]), evaluation)
+        for name in wanted
+    }
+    alone = np.linalg.norm(split.alone * scale / inflation, axis=0)
+    parameters = {}
+    for i, name in enumerate(names):
+        entry = problem.system.parameters[name.split("[")[0]]
+        profile = profiles.get(name)
+        interval = None if profile is None else (profile.lower, profile.upper)
+        value, std = float(x[chosen[i]]), float(deviation[i])
+        parameters[name] = ParameterInformation(
+            value,
+            entry.unit,
+            std,
+            std / scale[i],
+            1.0 / alone[i] if alone[i] > 0 else math.inf,
+            lowered(verdict(value, std), interval),
+            interval,
+        )
+    known = np.isfinite(deviation)
+    correlations = np.full((len(names), len(names)), np.nan)
+    block = covariance[np.ix_(chosen, chosen)] / np.outer(deviation, deviation)
+    correlations[np.ix_(known, known)] = block[np.ix_(known, known)]
+    seer = _Seer(wide, x, evaluation, names, chosen, split, scale, inflation)
+    nuisances = tuple(name for name in wide.names if name not in names)
+    return Identifiability(parameters, names, correlations, information, seer.directions(), nuisances, chi2, profiles)
+
+
+def lowered(said: str, interval: tuple[float | None, float | None] | None) -> str:
+    """A verdict that an interval with open ends does not contradict."""
+    if interval is None or None not in interval:
+        return said
+    if interval == (None, None):
+        return "not_identifiable"
+    return "weak" if said == "identifiable" else said
+
+
+# -- nuisances --------------------------------------------------------------------------------------------------------
+
+
+def unknown_vector(problem: EstimationProblem, solution: Solution | ArrayLike | None) -> Array:
+    """A problem's unknowns from a solution, an array or, when absent, its start; `SolverError` where they do not fit."""
+    if solution is None:
+        return problem.start
+    if isinstance(solution, Solution):
+        x = problem.start
+        for name, value in zip(solution.names, solution.x, strict=True):
+            if name in problem.names:
+                x[problem.names.index(name)] = value
+        return x
+    x = np.array(solution, float)
+    if x.shape != (len(problem.names),):
+        raise SolverError(f"the point has shape {x.shape}", allowed=f"({len(problem.names)},), as problem.names")
+    return x
+
+
+def with_nuisances(
+    problem: EstimationProblem, x: Array, start: StartKnowledge, grasp_std: float | None
+) -> EstimationProblem:
+    """The problem with start and grasps among its unknowns, or with a known start in place of an estimated one.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    x : ndarray, shape (nx,)
+        Where an estimated start becomes a known one.
+    start : "unknown" or "known"
+    grasp_std : float, optional
+        [m]
+    """
+    options = problem.options
+    initial, known = options.initial_state, dict(options.known_start)
+    values = {name: dict(entry) for name, entry in options.recording_values.items()}
+    if start == "unknown" and initial == "given":
+        # the fit's start stays where it is, and what it presumed becomes the centre of a prior
+        for i, episode in enumerate(problem.episodes):
+            theta, _ = problem.split(x, i)
+            if episode.name not in known:
+                fitted = problem.fitted_start(episode, problem.own_theta(episode, theta))
+                known[episode.name] = fitted.state
+                values.setdefault(episode.name, {}).update(fitted.values)
+    elif start == "known" and initial == "estimated":
+        for i, episode in enumerate(problem.episodes):
+            state, _, message = problem.start_state(episode, *problem.split(x, i))
+            if message:
+                raise SolverError(f"there is no start to be known: {message}", where=episode.name)
+            known[episode.name] = state
+    initial = "estimated" if start == "unknown" else "equilibrium" if initial == "estimated" else initial
+    grasps = [
+        entry.name
+        for entry in problem.system.parameters
+        if grasp_std is not None and entry.name.startswith(GRASP_NUISANCE) and entry.name not in problem.free
+    ]
+    if initial == options.initial_state and not grasps:
+        return problem
+    priors = dict(options.priors) | {name: float(grasp_std) for name in grasps if grasp_std is not None}
+    changed = replace(options, initial_state=initial, known_start=known, recording_values=values, priors=priors)
+    nominal = dict(zip(problem.system.parameters.names, problem.theta, strict=True))
+    recordings = [episode.recording for episode in problem.episodes]
+    return EstimationProblem(problem.step, recordings, (*problem.free, *grasps), changed, nominal)
+
+
+def carried(x: Array, names: Sequence[str], other: EstimationProblem) -> Array:
+    """Unknowns of another problem: those of the same name, its own start for the rest."""
+    result = other.start
+    place = {name: i for i, name in enumerate(names)}
+    for i, name in enumerate(other.names):
+        if name in place:
+            result[i] = x[place[name]]
+    return result
+
+
+# -- sensitivities ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SplitRows:
+    """Whitened sensitivities of the parameters of interest.
+
+    Attributes
+    ----------
+    alone : ndarray, shape (nr, p)
+        With everything else known, priors of the parameters themselves left out.
+    sensitivity : ndarray, shape (nr, p)
+        The part of it that no change of nuisances explains.
+    nuisance : ndarray, shape (nr, nn)
+        Sensitivities of the nuisances, their priors below those of the data.
+    """
+
+    alone: Array
+    sensitivity: Array
+    nuisance: Array
+
+
+def split_rows(problem: EstimationProblem, evaluation: Evaluation, chosen: Sequence[int]) -> SplitRows:
+    """Sensitivities of chosen unknowns, those of all others eliminated together with their priors."""
+    assert evaluation.jacobian is not None
+    total = len(evaluation.residual) - problem.tie_break_rows
+    data = total - problem.stated_prior_rows
+    noise = problem.paper_noise if problem.options.weighting == "paper" else 1.0
+    jacobian = np.vstack([evaluation.jacobian[:data] / noise, evaluation.jacobian[data:total]])
+    others = np.setdiff1d(np.arange(jacobian.shape[1]), chosen)
+    # what is known beforehand of the parameters themselves is not something that a sensor sees
+    jacobian[data:, chosen] = 0.0
+    alone, nuisance = jacobian[:, chosen], jacobian[:, others] * problem.scales[others]
+    return SplitRows(alone, without(alone, nuisance), nuisance)
+
+
+def without(columns: Array, explained: Array) -> Array:
+    """Part of columns that is orthogonal to others."""
+    if explained.shape[1] == 0:
+        return columns
+    vectors, singular, _ = np.linalg.svd(explained, full_matrices=False)
+    basis = vectors[:, singular > RANK_TOLERANCE * max(float(singular.max(initial=0.0)), 1e-300)]
+    return np.asarray(columns - basis @ (basis.T @ columns))
+
+
+@dataclass(frozen=True)
+class _Seer:
+    """Turns sensitivities into directions with words."""
+
+    problem: EstimationProblem
+    x: Array
+    evaluation: Evaluation
+    names: tuple[str, ...]
+    chosen: Sequence[int]
+    split: SplitRows
+    scale: Array
+    inflation: float
+
+    def directions(self) -> tuple[Direction, ...]:
+        relative = self.split.sensitivity * self.scale / self.inflation
+        alone = np.linalg.norm(self.split.alone * self.scale / self.inflation, axis=0)
+        count = len(self.names)
+        found: list[Direction] = []
+        hidden = [i for i in range(count) if alone[i] * WEAK < 1.0]
+        for i in hidden:
+            size = float(np.linalg.norm(relative[:, i]))
+            found.append(self._direction(size, np.eye(count)[i], f"{self.names[i]} is not seen by any sensor"))
+        rest = [i for i in range(count) if i not in hidden]
+        if rest:
+            _, singular, vectors = np.linalg.svd(relative[:, rest], full_matrices=False)
+            wide = np.zeros((len(rest), count))
+            wide[: len(vectors), rest] = vectors
+            sizes = np.zeros(len(rest))
+            sizes[: len(singular)] = singular
+            blind = sizes * WEAK < 1.0
+            if np.any(blind):
+                for vector in sparse_basis(_completed(wide, rest, blind)):
+                    found.append(self._direction(float(np.linalg.norm(relative @ vector)), vector, self._why(vector)))
+            found += [
+                self._direction(float(size), vector, self._strength(float(size), vector))
+                for size, vector in zip(sizes[~blind], wide[~blind], strict=True)
+            ]
+        return tuple(sorted(found, key=lambda entry: entry.singular_value))
+
+    def _direction(self, size: float, vector: Array, words: str) -> Direction:
+        vector = vector * np.sign(vector[np.argmax(np.abs(vector))])
+        std = 1.0 / size if size > 0 else math.inf
+        components = {name: float(part) for name, part in zip(self.names, vector, strict=True)}
+        return Direction(size, std, components, verdict(1.0, std), words)
+
+    def _components(self, vector: Array) -> list[Component]:
+        return [
+            Component(name, float(part), float(self.x[index]), self.problem.system.parameters[name.split("[")[0]].unit)
+            for name, part, index in zip(self.names, vector, self.chosen, strict=True)
+            if abs(part) > 0.05 * np.max(np.abs(vector))
+        ]
+
+    def _why(self, vector: Array) -> str:
+        parts = self._components(vector)
+        seen_alone = float(np.linalg.norm(self.split.alone @ (self.scale * vector)))
+        if seen_alone / self.inflation * WEAK >= 1.0:
+            what = parts[0].name if len(parts) == 1 else "this: " + combination_words(parts, None)
+            return f"{what} cannot be told apart from {self._culprit(vector)}"
+        return combination_words(parts, self._moved)
+
+    def _culprit(self, vector: Array) -> str:
+        """Which nuisances hide a direction."""
+        others = [name for i, name in enumerate(self.problem.names) if i not in set(self.chosen)]
+        column = (self.split.alone @ (self.scale * vector))[:, None] / self.inflation
+        groups = {"the unknown start": "start.", "where the grasp sits": GRASP_NUISANCE}
+        for words, prefix in groups.items():
+            at = [i for i, name in enumerate(others) if name.startswith(prefix)]
+            if at and np.linalg.norm(without(column, self.split.nuisance[:, at])) * WEAK < 1.0:
+                return words
+        return "the unknown start and where the grasp sits"
+
+    def _moved(self, changes: Mapping[str, float]) -> float:
+        """How far the data move when parameters take other values, beyond what nuisances explain [deviations]."""
+        x = self.x.copy()
+        for name, value in changes.items():
+            x[self.problem.names.index(name)] = value
+        evaluation = self.problem.evaluate(x, derivatives=False)
+        if not evaluation.ok:
+            return math.inf
+        rows = len(self.split.alone) - self.problem.stated_prior_rows
+        noise = self.problem.paper_noise if self.problem.options.weighting == "paper" else 1.0
+        change = np.zeros((len(self.split.alone), 1))
+        change[:rows, 0] = (evaluation.residual[:rows] - self.evaluation.residual[:rows]) / noise
+        return float(np.linalg.norm(without(change, self.split.nuisance))) / self.inflation
+
+    def _strength(self, size: float, vector: Array) -> str:
+        parts = self._components(vector)
+        how = "is seen" if size * IDENTIFIABLE >= 1.0 else "is seen only weakly"
+        what = parts[0].name if len(parts) == 1 else "a joint change of " + _listed([part.name for part in parts])
+        return f"{what} {how} (± {100 / size:.2g} %)"
+
+
+def _completed(wide: Array, rest: Sequence[int], blind: NDArray[np.bool_]) -> Array:
+    """Orthonormal basis of what the seen directions leave, shape (number blind, p)."""
+    seen = wide[~blind][:, rest]
+    vectors = np.linalg.svd(np.eye(len(rest)) - seen.T @ seen)[0][:, : int(blind.sum())]
+    result = np.zeros((int(blind.sum()), wide.shape[1]))
+    result[:, rest] = vectors.T
+    return result
+
+
+def _listed(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

@@ -1,0 +1,304 @@
+"""Profile likelihood of one unknown: the best fit at fixed values of it, and the interval that follows."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.problem import Evaluation
+from yid_ocp.solvers.base import uncertainty
+from yid_ocp.solvers.gauss_newton import bounded_step
+
+Array = NDArray[np.float64]
+
+LEVEL = 3.841458820694124
+"""Quantile 0.95 of chi2 with one degree of freedom."""
+
+REACH = math.log(1e3)  # how far a positive unknown is followed, up and down, before its interval counts as open
+ANCHOR = math.log(1e3)  # other positive unknowns stay put that nothing informs: one deviation for a factor of 1000
+REFIT_TOLERANCE = 1e-3  # chi2 that a refit may leave on the table
+ROOT_TOLERANCE = 0.01  # of the root of delta chi2 against its level's
+REFITS, ATTEMPTS = 30, 12
+WIDENING, OVERSHOOT = 3.0, 1.3
+
+
+@dataclass(frozen=True)
+class Profile:
+    """Profile likelihood of one unknown.
+
+    Attributes
+    ----------
+    name : str
+    value : float
+        At the best fit.
+    lower, upper : float or None
+        Ends of the 95 % interval; None where it is open.
+    values, delta_chi2 : ndarray, shape (k,)
+        Points at which the others were refitted, in order, and chi2 above the best, over max(1, chi2 per degree of
+        freedom).
+    notes : tuple of str
+        Why an end is open where that is not for lack of information, or that a better fit was met on the way.
+    """
+
+    name: str
+    value: float
+    lower: float | None
+    upper: float | None
+    values: Array
+    delta_chi2: Array
+    notes: tuple[str, ...] = ()
+
+
+def profile_likelihood(
+    problem: EstimationProblem,
+    x: Array,
+    index: int,
+    std: float,
+    evaluation: Evaluation | None = None,
+    level: float = LEVEL,
+) -> Profile:
+    """Interval of one unknown from  min over all others of chi2(x) - chi2(best) = level.
+
+    Each value is reached from the last one, the others first moved along the tangent and then by Gauss-Newton.
+    Unknowns that are positive by nature move in their logarithm. The tie-break does not count.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    x : ndarray, shape (nx,)
+        The best fit.
+    index : int
+        Which unknown.
+    std : float
+        Its standard deviation, for the first guess; may be infinite.
+    evaluation : Evaluation, optional
+        At `x`, with the Jacobian.
+    level : float
+        3.84 for 95 %.
+
+    Returns
+    -------
+    Profile
+        An end is open where the level is not reached before the unknown's bound, or before it has changed by a factor
+        of 1000.
+
+    References
+    ----------
+    Venzon and Moolgavkar (1988), Applied Statistics 37:87, doi:10.2307/2347496.
+    """
+    best = problem.evaluate(x) if evaluation is None else evaluation
+    walk = _Walk(problem, x, index, best, level)
+    size = std / abs(x[index]) if walk.logarithmic else std
+    size = min(size, 1.0) if walk.logarithmic else min(size, 10 * float(problem.scales[index]))
+    lower = walk.end(-1, size)
+    upper = walk.end(1, size)
+    order = np.argsort([point.value for point in walk.points])
+    values = np.array([walk.points[i].value for i in order])
+    deltas = np.array([walk.points[i].chi2 for i in order]) - walk.base
+    notes = walk.notes
+    if walk.base < -max(REFIT_TOLERANCE * 10, 0.01):
+        notes = [*notes, f"a fit better by {-walk.base:.2g} in chi2 was met; the point was not the best one"]
+    return Profile(problem.names[index], float(x[index]), lower, upper, values, deltas, tuple(notes))
+
+
+@dataclass(frozen=True)
+class _Point:
+    """A refit at one value: unknowns, chi2 above the first one, residual rows and their Jacobian."""
+
+    value: float
+    x: Array
+    chi2: float
+    rows: Array
+    jacobian: Array
+
+
+class _Walk:
+    """Follows the profile to both sides."""
+
+    def __init__(self, problem: EstimationProblem, x: Array, index: int, best: Evaluation, level: float) -> None:
+        self.problem, self.index, self.level = problem, index, level
+        lower, upper = problem.bounds
+        self.positive = problem.positive & (x > 0)
+        self.logarithmic = bool(self.positive[index])
+        # infinite bounds and bounds at zero become infinite ones of the coordinates
+        with np.errstate(divide="ignore", invalid="ignore"):
+            self.lower = np.where(self.positive, np.log(np.maximum(lower, 0.0)), lower)
+            self.upper = np.where(self.positive, np.log(np.maximum(upper, 0.0)), upper)
+        self.others = np.array([i for i in range(len(x)) if i != index], int)
+        self.anchored = np.array([i for i in self.others if self.positive[i]], int)
+        self.centre = self.coordinates(x)
+        self.noise = problem.paper_noise if problem.options.weighting == "paper" else 1.0
+        self.scale = max(1.0, uncertainty(problem, best)[1])
+        self.first = self._chi2(best)
+        self.base = 0.0
+        self.notes: list[str] = []
+        rows, jacobian = self._rows(best, self.centre)
+        self.points = [_Point(float(x[index]), self.centre, 0.0, rows, jacobian)]
+
+    def coordinates(self, x: Array) -> Array:
+        """Logarithms of positive unknowns, the others as they are."""
+        return np.where(self.positive, np.log(np.where(self.positive, x, 1.0)), x)
+
+    def unknowns(self, s: Array) -> Array:
+        """The inverse of `coordinates`."""
+        return np.where(self.positive, np.exp(np.where(self.positive, s, 0.0)), s)
+
+    def end(self, sign: int, size: float) -> float | None:
+        """Where the profile crosses the level on one side; None where it does not."""
+        start = self.points[0]
+        limit = self._limit(sign)
+        target = math.sqrt(self.level)
+        inside, s = start, self.centre[self.index]
+        outside: _Point | None = None
+        barrier: float | None = None
+        step = target * size
+        for _ in range(ATTEMPTS):
+            reach = limit if barrier is None else barrier
+            trial = s + sign * step
+            trial = min(trial, reach) if sign > 0 else max(trial, reach)
+            if abs(trial - s) < 1e-9 * max(1.0, abs(s)):
+                break
+            point = self._refit(inside, trial)
+            if point is None:
+                barrier, step = trial, 0.5 * abs(trial - s)
+                if step < 1e-3 * max(abs(trial - self.centre[self.index]), 1e-12):
+                    break
+                continue
+            self.points.append(point)
+            self.base = min(self.base, point.chi2)
+            height = self._height(point)
+            if abs(height - target) < ROOT_TOLERANCE * target:
+                return point.value
+            if height > target:
+                outside = point
+                break
+            inside, s = point, trial
+            if trial == limit:
+                return None
+            # the root of a parabola is a line, whose slope from the start tells how far the level still is
+            gone = abs(trial - self.centre[self.index])
+            ahead = gone * (target / height - 1.0) * OVERSHOOT if height > 0.05 * target else math.inf
+            step = min(max(ahead, 0.2 * gone), WIDENING * gone) if barrier is None else 0.5 * abs(barrier - s)
+        if outside is None:
+            if barrier is None:
+                self.notes.append(f"no end was met {'above' if sign > 0 else 'below'} in {ATTEMPTS} refits")
+            else:
+                value = self.unknowns(np.full(len(self.centre), barrier))[self.index]
+                self.notes.append(f"the model cannot be rolled out {'above' if sign > 0 else 'below'} {value:.4g}")
+            return None
+        return self._root(inside, outside, target)
+
+    def _limit(self, sign: int) -> float:
+        bound = float((self.upper if sign > 0 else self.lower)[self.index])
+        if not self.logarithmic:
+            reach = self.centre[self.index] + sign * 1e3 * float(self.problem.scales[self.index])
+        else:
+            reach = self.centre[self.index] + sign * REACH
+        return min(bound, reach) if sign > 0 else max(bound, reach)
+
+    def _height(self, point: _Point) -> float:
+        return math.sqrt(max(point.chi2 - self.base, 0.0))
+
+    def _root(self, inside: _Point, outside: _Point, target: float) -> float:
+        """Regula falsi (Illinois) on the root of delta chi2, which is nearly a line."""
+        a, b = inside, outside
+        at = [float(point.x[self.index]) for point in (a, b)]
+        heights = [self._height(a) - target, self._height(b) - target]
+        for _ in range(ATTEMPTS):
+            if min(abs(heights[0]), abs(heights[1])) < ROOT_TOLERANCE * target:
+                break
+            s = at[1] - heights[1] * (at[1] - at[0]) / (heights[1] - heights[0])
+            near = a if abs(s - at[0]) < abs(s - at[1]) else b
+            point = self._refit(near, s)
+            if point is None:
+                break
+            self.points.append(point)
+            self.base = min(self.base, point.chi2)
+            height = self._height(point) - target
+            if height * heights[1] < 0:
+                a, at[0], heights[0] = b, at[1], heights[1]
+            else:
+                heights[0] *= 0.5
+            b, at[1], heights[1] = point, s, height
+        s = at[1] - heights[1] * (at[1] - at[0]) / (heights[1] - heights[0])
+        whole = self.centre.copy()
+        whole[self.index] = s
+        return float(self.unknowns(whole)[self.index])
+
+    def _refit(self, near: _Point, s: float) -> _Point | None:
+        """Best fit of the others at coordinate `s` of the profiled one, None where no rollout succeeds."""
+        now = near.x.copy()
+        change = s - now[self.index]
+        others = self.others
+        tangent = -near.jacobian[:, self.index] * change
+        if len(others):
+            low, high = self.lower[others] - now[others], self.upper[others] - now[others]
+            now[others] += bounded_step(near.jacobian[:, others], -tangent, 0.0, low, high)
+        now[self.index] = s
+        found = self._at(now)
+        if found is None:
+            # the tangent may lead too far; the others where they were
+            now = near.x.copy()
+            now[self.index] = s
+            found = self._at(now)
+        damping, rejected = 1e-8, 0
+        for _ in range(REFITS):
+            if found is None or not len(others):
+                break
+            jacobian = found.jacobian[:, others]
+            low, high = self.lower[others] - now[others], self.upper[others] - now[others]
+            step = bounded_step(jacobian, found.rows, damping, low, high)
+            largest = float(np.max(np.abs(step[self.positive[others]]), initial=0.0))
+            step *= min(1.0, 1.5 / max(largest, 1e-300))
+            promised = -2.0 * float(found.rows @ (jacobian @ step)) - float(np.sum((jacobian @ step) ** 2))
+            if promised / self.scale < REFIT_TOLERANCE:
+                break
+            trial = now.copy()
+            trial[others] += step
+            after = self._at(trial)
+            before = float(found.rows @ found.rows)
+            if after is not None and float(after.rows @ after.rows) < before:
+                now, found, damping, rejected = trial, after, max(damping / 5, 1e-12), 0
+            else:
+                damping, rejected = max(damping * 10, 1e-6), rejected + 1
+                if rejected > 8:
+                    break
+        return found
+
+    def _at(self, s: Array) -> _Point | None:
+        x = self.unknowns(s)
+        evaluation = self.problem.evaluate(x)
+        if not evaluation.ok or evaluation.jacobian is None:
+            return None
+        rows, jacobian = self._rows(evaluation, s)
+        chi2 = (self._chi2(evaluation) - self.first) / self.scale
+        return _Point(float(x[self.index]), s.copy(), chi2, rows, jacobian)
+
+    def _parts(self, evaluation: Evaluation) -> tuple[int, int]:
+        total = len(evaluation.residual) - self.problem.tie_break_rows
+        return total - self.problem.stated_prior_rows, total
+
+    def _chi2(self, evaluation: Evaluation) -> float:
+        """Twice the cost without the tie-break, in units of the noise."""
+        data, total = self._parts(evaluation)
+        priors, tied = evaluation.residual[data:total], evaluation.residual[total:]
+        stated = float(priors @ priors)
+        return (2.0 * evaluation.cost - float(tied @ tied) - stated) / self.noise**2 + stated
+
+    def _rows(self, evaluation: Evaluation, s: Array) -> tuple[Array, Array]:
+        """Residual and Jacobian by the coordinates, with the anchors in place of the tie-break."""
+        assert evaluation.jacobian is not None
+        data, total = self._parts(evaluation)
+        slope = np.where(self.positive, self.unknowns(s), 1.0)
+        anchors = np.zeros((len(self.anchored), len(s)))
+        anchors[np.arange(len(self.anchored)), self.anchored] = 1.0 / ANCHOR
+        rows = [evaluation.residual[:data] / self.noise, evaluation.residual[data:total]]
+        jacobian = [evaluation.jacobian[:data] / self.noise, evaluation.jacobian[data:total]]
+        return (
+            np.concatenate([*rows, (s - self.centre)[self.anchored] / ANCHOR]),
+            np.vstack([*(block * slope for block in jacobian), anchors]),
+        )
