@@ -3,8 +3,8 @@
     python benchmarks/cable.py [--folder FOLDER] [--json FILE] [--iterations N]
 
 Free vertices are all but the two held at each end. A prediction knows the held vertices throughout and the free ones in
-the first two frames; its error is the root mean square Euclidean distance over free vertices and later frames. All
-values are per unit weight: the linear density is nominal, no force was measured. `nominal` and `undeformed rest` are the
+the first two frames; its error is the root mean square Euclidean distance over free vertices and later frames. Values
+are per unit weight: the linear density is nominal, as no force was measured. `nominal` and `undeformed rest` are the
 model with the measured undeformed shape as its rest shape, at guessed and at fitted stiffness and damping; for `fitted`
 the rest shape was estimated as well.
 """

@@ -257,15 +257,14 @@ def test_effects_bring_their_parameters(written):
     assert [(effect.kind, effect.location) for effect in system.effects] == [("kelvin_voigt", "T3"), ("density", "T2")]
     assert system.parameters["kelvin_voigt@T3.tau"].value == 0.02
     assert system.parameters["density@T2.scale"].value == 1.1
-    (written(dump_config(run), "again.yaml")).exists()
     assert load_config(written(dump_config(run))) == run
     for old, new, message in (
         ("kelvin_voigt, loc", "kelvin_voight, loc", "line 4: model.effects.0"),
         ("location: T2", "location: T9", "line 5: model.effects.1"),
-        ("location: T3", "place: T3", "did you mean"),
+        ("location: T3", "locaton: T3", "did you mean 'location'?"),
         ("scale: 1.1", "scale: much", "model.effects.1.values"),
     ):
-        with pytest.raises((ConfigError, ModelError), match="error|") as caught:
+        with pytest.raises((ConfigError, ModelError)) as caught:
             load_system(written(text.replace(old, new)))
         assert message in str(caught.value)
 

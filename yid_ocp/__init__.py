@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from yid_ocp.problem import ProblemOptions as ProblemOptions
     from yid_ocp.problem import SensorOptions as SensorOptions
     from yid_ocp.solvers import GaussNewton as GaussNewton
+    from yid_ocp.solvers import Lifted as Lifted
+    from yid_ocp.solvers import MultipleShooting as MultipleShooting
     from yid_ocp.solvers import SingleShooting as SingleShooting
     from yid_ocp.solvers import Solution as Solution
     from yid_ocp.solvers import Status as Status
@@ -37,8 +39,8 @@ if TYPE_CHECKING:
 
     __version__: str
 
-# One row for each module; what a later part of the package offers (identifiability, diagnose, MultipleShooting,
-# compare) is entered here and imported above.
+# One row for each module; what a later part of the package offers (identifiability, diagnose, compare) is entered
+# here and imported above.
 _HOMES: dict[str, tuple[str, ...]] = {
     "config": ("load_config", "load_problem", "load_system"),
     "data": ("Recording", "read_any", "read_recording", "write_recording"),
@@ -47,7 +49,16 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "integrator.step": ("compile_step",),
     "model": ("FlexibleObject", "Grasp", "Mechanism", "Segment", "System", "flexible_object"),
     "problem": ("EstimationProblem", "ProblemOptions", "SensorOptions"),
-    "solvers": ("GaussNewton", "SingleShooting", "Solution", "Status", "SteepestDescent", "solve"),
+    "solvers": (
+        "GaussNewton",
+        "Lifted",
+        "MultipleShooting",
+        "SingleShooting",
+        "Solution",
+        "Status",
+        "SteepestDescent",
+        "solve",
+    ),
 }
 _MODULE_OF = {name: module for module, names in _HOMES.items() for name in names}
 
@@ -56,7 +67,9 @@ __all__ = [
     "FlexibleObject",
     "GaussNewton",
     "Grasp",
+    "Lifted",
     "Mechanism",
+    "MultipleShooting",
     "ProblemOptions",
     "Recording",
     "Segment",

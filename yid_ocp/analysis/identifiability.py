@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.analysis.combinations import Component, combination_words, sparse_basis
-from yid_ocp.analysis.profile import Profile, profile_likelihood
+from yid_ocp.analysis.profile import Profile, best_fit, profile_likelihood
 from yid_ocp.errors import ConfigError, SolverError, nearest
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.problem import Evaluation
@@ -45,7 +45,8 @@ class ParameterInformation:
         identifiable (relative deviation up to 10 %), weak (up to 400 %) or not_identifiable; a parameter whose interval
         was asked for and is open on one side is at best weak, open on both sides not_identifiable.
     interval : (float or None, float or None), or None
-        95 % interval by profile likelihood, None for an open end; None as a whole where it was not asked for.
+        95 % interval by profile likelihood about the best fit of all unknowns, None for an open end; None as a whole
+        where it was not asked for.
     """
 
     value: float
@@ -190,10 +191,12 @@ def identifiability(
     deviation = np.sqrt(np.diag(covariance)[chosen])
     limit = 1e6 * np.maximum(np.abs(x[chosen]), np.maximum(np.abs(wide.start[chosen]), 1e-12))
     deviation = np.where(deviation < limit, deviation, np.inf)
-    profiles = {
-        name: profile_likelihood(wide, x, wide.names.index(name), float(deviation[names.index(name)]), evaluation)
-        for name in wanted
-    }
+    profiles = {}
+    if wanted:
+        best, there = best_fit(wide, x)
+        for name in wanted:
+            std = float(deviation[names.index(name)])
+            profiles[name] = profile_likelihood(wide, best, wide.names.index(name), std, there)
     alone = np.linalg.norm(split.alone * scale / inflation, axis=0)
     parameters = {}
     for i, name in enumerate(names):
@@ -205,8 +208,8 @@ def identifiability(
             value,
             entry.unit,
             std,
-            std / scale[i],
-            1.0 / alone[i] if alone[i] > 0 else math.inf,
+            std / float(scale[i]),
+            1.0 / float(alone[i]) if alone[i] > 0 else math.inf,
             lowered(verdict(value, std), interval),
             interval,
         )

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.problem import Evaluation
 from yid_ocp.solvers.base import uncertainty
-from yid_ocp.solvers.gauss_newton import bounded_step
+from yid_ocp.solvers.gauss_newton import GaussNewton, bounded_step
 
 Array = NDArray[np.float64]
 
@@ -23,6 +23,8 @@ ANCHOR = math.log(1e3)  # other positive unknowns stay put that nothing informs:
 REFIT_TOLERANCE = 1e-3  # chi2 that a refit may leave on the table
 ROOT_TOLERANCE = 0.01  # of the root of delta chi2 against its level's
 REFITS, ATTEMPTS = 30, 12
+POLISH = 20  # iterations that bring all unknowns, nuisances among them, to their best fit
+CLIFF, EDGE = 10.0, 1e-3  # height that is no parabola's, of the level's; distance of two sides, of that from the fit
 WIDENING, OVERSHOOT = 3.0, 1.3
 
 
@@ -93,16 +95,22 @@ def profile_likelihood(
     best = problem.evaluate(x) if evaluation is None else evaluation
     walk = _Walk(problem, x, index, best, level)
     size = std / abs(x[index]) if walk.logarithmic else std
-    size = min(size, 1.0) if walk.logarithmic else min(size, 10 * float(problem.scales[index]))
+    size = min(size, 0.5) if walk.logarithmic else min(size, 10 * float(problem.scales[index]))
     lower = walk.end(-1, size)
     upper = walk.end(1, size)
     order = np.argsort([point.value for point in walk.points])
     values = np.array([walk.points[i].value for i in order])
     deltas = np.array([walk.points[i].chi2 for i in order]) - walk.base
     notes = walk.notes
-    if walk.base < -max(REFIT_TOLERANCE * 10, 0.01):
+    if walk.base < -0.1 * level:
         notes = [*notes, f"a fit better by {-walk.base:.2g} in chi2 was met; the point was not the best one"]
     return Profile(problem.names[index], float(x[index]), lower, upper, values, deltas, tuple(notes))
+
+
+def best_fit(problem: EstimationProblem, x: Array) -> tuple[Array, Evaluation]:
+    """The problem's optimum near a point, and the evaluation there with its Jacobian."""
+    outcome = GaussNewton(iterations=POLISH).run(problem, x, None)
+    return outcome.x, problem.evaluate(outcome.x)
 
 
 @dataclass(frozen=True)
@@ -204,27 +212,32 @@ class _Walk:
         return math.sqrt(max(point.chi2 - self.base, 0.0))
 
     def _root(self, inside: _Point, outside: _Point, target: float) -> float:
-        """Regula falsi (Illinois) on the root of delta chi2, which is nearly a line."""
+        """Regula falsi (Illinois) on the root of delta chi2, which is nearly a line; bisection where it is a cliff."""
         a, b = inside, outside
-        at = [float(point.x[self.index]) for point in (a, b)]
         heights = [self._height(a) - target, self._height(b) - target]
-        for _ in range(ATTEMPTS):
-            if min(abs(heights[0]), abs(heights[1])) < ROOT_TOLERANCE * target:
+        share = 1.0  # of the older side's height that counts, halved each time that side is kept
+        for attempt in range(2 * ATTEMPTS + 1):
+            at = [float(point.x[self.index]) for point in (a, b)]
+            older = share * heights[0]
+            cliff = max(heights) > CLIFF * target
+            s = 0.5 * (at[0] + at[1]) if cliff else at[1] - heights[1] * (at[1] - at[0]) / (heights[1] - older)
+            # a cliff's edge is known well enough when its two sides are near each other
+            near = abs(at[1] - at[0]) < EDGE * abs(at[1] - self.centre[self.index])
+            if min(map(abs, heights)) < ROOT_TOLERANCE * target or near or attempt == 2 * ATTEMPTS:
+                s = at[int(abs(heights[1]) < abs(heights[0]))]
                 break
-            s = at[1] - heights[1] * (at[1] - at[0]) / (heights[1] - heights[0])
-            near = a if abs(s - at[0]) < abs(s - at[1]) else b
-            point = self._refit(near, s)
+            # beyond the end the others may sit where nothing moves them any more
+            point = self._refit(a if heights[0] < heights[1] else b, s)
             if point is None:
                 break
             self.points.append(point)
             self.base = min(self.base, point.chi2)
             height = self._height(point) - target
             if height * heights[1] < 0:
-                a, at[0], heights[0] = b, at[1], heights[1]
+                a, heights[0], share = b, heights[1], 1.0
             else:
-                heights[0] *= 0.5
-            b, at[1], heights[1] = point, s, height
-        s = at[1] - heights[1] * (at[1] - at[0]) / (heights[1] - heights[0])
+                share *= 0.5
+            b, heights[1] = point, height
         whole = self.centre.copy()
         whole[self.index] = s
         return float(self.unknowns(whole)[self.index])

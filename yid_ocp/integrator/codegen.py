@@ -27,8 +27,10 @@ from yid_ocp.integrator.discrete import DiscreteEquations
 
 log = logging.getLogger(__name__)
 
-FLAGS = ("-O2", "-ftree-vectorize", "-ffp-contract=fast", "-fopenmp-simd", "-fPIC", "-shared")
+FLAGS = ("-ftree-vectorize", "-ffp-contract=fast", "-fopenmp-simd", "-fPIC", "-shared")
 NATIVE = ("-march=native",)
+# -O2 takes minutes on single functions of tens of thousands of lines, for a gain of some 10 %.
+SHORT, LONG, LONG_FROM = "-O2", "-O1", 45_000
 Indices = NDArray[np.int32]
 
 
@@ -354,19 +356,22 @@ def _machine() -> str:
     return f"{version}|{platform.system()}|{processor}"
 
 
-def compile_library(source: str) -> ctypes.CDLL | None:
+def compile_library(source: str, straight_line: bool = False) -> ctypes.CDLL | None:
     """Shared library of a C source, from the cache where it is there; None where nothing can compile it.
 
     Parameters
     ----------
+    straight_line : bool
+        Whether the text is one long function without loops, on which the compiler should not dwell.
     source : str
         C text. The cache key is the hash of this text, the flags, the compiler, the processor and CasADi's version.
     """
     path = compiler()
     if path is None:
         return None
+    level = LONG if straight_line or source.count("\n") > LONG_FROM else SHORT
     key = hashlib.sha256(
-        "\0".join([source, *FLAGS, *NATIVE, _machine(), ca.CasadiMeta.version()]).encode()
+        "\0".join([source, level, *FLAGS, *NATIVE, _machine(), ca.CasadiMeta.version()]).encode()
     ).hexdigest()[:32]
     target = cache_folder() / f"{key}.so"
     if not target.exists():
@@ -374,7 +379,7 @@ def compile_library(source: str) -> ctypes.CDLL | None:
             text, built = Path(work) / "source.c", Path(work) / "library.so"
             text.write_text(source, encoding="utf-8")
             for flags in ((*FLAGS, *NATIVE), FLAGS):
-                command = [path, *flags, str(text), "-o", str(built), "-lm"]
+                command = [path, level, *flags, str(text), "-o", str(built), "-lm"]
                 run = subprocess.run(command, capture_output=True, text=True, check=False)
                 if run.returncode == 0:
                     break
@@ -407,7 +412,7 @@ class Mapped:
         self.shared = frozenset(shared)
         self._inputs = [function.numel_in(i) for i in range(function.n_in())]
         self._outputs = [function.nnz_out(i) for i in range(function.n_out())]
-        self._library = compile_library(self._source()) if use_compiler else None
+        self._library = compile_library(self._source(), straight_line=True) if use_compiler else None
 
     def _source(self) -> str:
         name, f = self.function.name(), self.function

@@ -82,7 +82,7 @@ class CompiledKernel:
     def _theta_columns(self, names: tuple[str, ...]) -> _CompiledColumns:
         if names not in self._columns:
             function = codegen.theta_function(self._step.equations, names)
-            library = codegen.compile_library(codegen.function_source(function))
+            library = codegen.compile_library(codegen.function_source(function), straight_line=True)
             if library is None:
                 raise ModelError("the compiler worked for the step but not for its derivatives", hint="set CC=none")
             address = ctypes.cast(library.by_theta, ctypes.c_void_p).value

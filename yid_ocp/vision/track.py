@@ -6,6 +6,7 @@ Every frame ends as a fitted shape or with the reason why it was dropped; nothin
 from __future__ import annotations
 
 import math
+import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -99,6 +100,8 @@ class FrameReport:
         Points of the cloud, points left by the filters, nodes of the skeleton.
     delay : float
         Of its stamp beyond the common offset, NaN where it cannot be told [s].
+    seconds : float
+        Processor time from the filtered cloud to the fitted points [s].
     fit : Fit or None
     """
 
@@ -111,6 +114,7 @@ class FrameReport:
     filtered: int
     nodes: int
     delay: float
+    seconds: float
     fit: Fit | None
 
     @property
@@ -377,7 +381,7 @@ class _Tracker:
         options = self.options
         stamp = float(self.film.t[index])
         t, delay = stamp - clock.offset, float(clock.delay[row])
-        report = FrameReport(index, self.film.names[index], stamp, t, reason, raw, 0, 0, delay, None)
+        report = FrameReport(index, self.film.names[index], stamp, t, reason, raw, 0, 0, delay, 0.0, None)
         if reason or cloud is None:
             return report, None
         if self.span is not None and not self.span[0] <= t <= self.span[1]:
@@ -391,13 +395,15 @@ class _Tracker:
             return replace(report, filtered=len(cloud), reason=f"too few points of the object: {len(cloud)} left"), None
         if len(cloud) > options.filters.most:
             cloud = cloud.keep(np.sort(self.rng.choice(len(cloud), options.filters.most, replace=False)))
+        begun = time.process_time()
         found = skeleton(cloud, self.rng, options.walk)
         report = replace(report, filtered=len(cloud), nodes=len(found.nodes))
         if not len(found.nodes):
             return replace(report, reason="no part of the cloud is dense enough for a skeleton"), None
         rest = cloud.keep(found.connected)
         fit = self._best_fit(Sight(rest.points, rest.weight, found.nodes, self.camera), q, t, last)
-        report = replace(report, fit=fit, reason=self._judge(fit))
+        spent = time.process_time() - begun
+        report = replace(report, fit=fit, reason=self._judge(fit), seconds=spent)
         stage = None
         if index in self.wanted:
             stage = Stages(self.film.names[index], self.film.world(index), rest.points, found, fit, self.camera)
