@@ -150,10 +150,10 @@ def parameters(cable: Cable, x: Any, covariance: Any, names: tuple[str, ...]) ->
 
 def show(result: Mapping[str, Any], console: Console) -> None:
     """The same as tables."""
-    table = Table(title="prediction error over free vertices and 5 s [mm]")
+    table = Table(title="prediction error over free vertices and 5 s [mm], * held out")
     columns = ("file", "stays", "with clamps", "linear carry", "nominal", "undeformed rest", "fitted", "carry / fitted")
     for column in columns:
-        table.add_column(column, justify="left" if column == "file" else "right")
+        table.add_column(column, justify="left" if column == "file" else "right", no_wrap=column == "file")
 
     def row(name: str, entry: Mapping[str, Any], plain: Mapping[str, float]) -> None:
         errors = [plain["stay"], plain["move_with_clamps"], plain["linear_carry"]]
@@ -161,8 +161,8 @@ def show(result: Mapping[str, Any], console: Console) -> None:
         table.add_row(name, *(f"{1e3 * e:.1f}" for e in errors), f"{entry['ratio_to_linear_carry']:.2f}")
 
     for name, entry in result["files"].items():
-        row(f"{name}{' (held out)' if entry['held_out'] else ''}", entry, entry["baselines"])
-    row("median of held-out", result["held_out_median"], result["held_out_median"])
+        row(f"{name}{' *' if entry['held_out'] else ''}", entry, entry["baselines"])
+    row("median of *", result["held_out_median"], result["held_out_median"])
     console.print(table)
     values = Table(title="per unit weight")
     for column in ("parameter", "value", "relative deviation", "unit"):

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from yid_ocp.data import read_any as read_any
     from yid_ocp.data import read_recording as read_recording
     from yid_ocp.data import write_recording as write_recording
+    from yid_ocp.diagnosis import Finding as Finding
+    from yid_ocp.diagnosis import diagnose as diagnose
     from yid_ocp.errors import YidError as YidError
     from yid_ocp.integrator.rollout import simulate as simulate
     from yid_ocp.integrator.step import compile_step as compile_step
@@ -44,6 +46,7 @@ if TYPE_CHECKING:
 _HOMES: dict[str, tuple[str, ...]] = {
     "config": ("load_config", "load_problem", "load_system"),
     "data": ("Recording", "read_any", "read_recording", "write_recording"),
+    "diagnosis": ("Finding", "diagnose"),
     "errors": ("YidError",),
     "integrator.rollout": ("simulate",),
     "integrator.step": ("compile_step",),
@@ -64,6 +67,7 @@ _MODULE_OF = {name: module for module, names in _HOMES.items() for name in names
 
 __all__ = [
     "EstimationProblem",
+    "Finding",
     "FlexibleObject",
     "GaussNewton",
     "Grasp",
@@ -82,6 +86,7 @@ __all__ = [
     "YidError",
     "__version__",
     "compile_step",
+    "diagnose",
     "flexible_object",
     "load_config",
     "load_problem",

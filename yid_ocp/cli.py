@@ -96,6 +96,19 @@ def _compare(arguments: argparse.Namespace) -> int:
     return DONE if outcome.ok else FAILED
 
 
+def _diagnose(arguments: argparse.Namespace) -> int:
+    from yid_ocp.config import DIAGNOSIS_DEFAULT, load_config
+    from yid_ocp.workflow.diagnose import run_diagnose
+
+    run = load_config(arguments.config, arguments.overrides, DIAGNOSIS_DEFAULT)
+    with _progress(arguments.quiet) as monitor:
+        outcome = run_diagnose(run, arguments.out, monitor)
+    if not arguments.quiet:
+        _print(diagnose_summary(outcome.result))
+    _say_folder(outcome.folder, arguments.quiet)
+    return DONE
+
+
 def _simulate(arguments: argparse.Namespace) -> int:
     from yid_ocp.workflow.simulate import run_simulate
 
@@ -202,6 +215,9 @@ def _schema_arguments(parser: argparse.ArgumentParser) -> None:
 COMMANDS: tuple[Command, ...] = (
     Command("solve", "estimate the free parameters from recordings", _solve, configured(optional=True)),
     Command("compare", "run several methods on one problem and say whether they agree", _compare, configured()),
+    Command(
+        "diagnose", "find the gap between model and recordings, and what makes it", _diagnose, configured(optional=True)
+    ),
     Command("simulate", "write what the model says would be recorded", _simulate, _simulate_arguments),
     Command("check", "validate a configuration, its recordings and the model before a long run", _check, configured()),
     Command("inspect", "show the model's equations in numbers", _inspect, configured()),
@@ -292,6 +308,27 @@ def compare_summary(result: dict[str, Any]) -> list[str]:
     if result["agree"]:
         lines.append("all methods agree on the identifiable parameters within their uncertainty")
     return lines
+
+
+def diagnose_summary(result: dict[str, Any]) -> list[str]:
+    """Lines that tell a person what a `yid-diagnosis/1` result says."""
+    import textwrap
+
+    lines = [*textwrap.wrap(result["summary"], 100), ""]
+    before, after, units = (result["gap"][a][b] for a, b in (("before", "rmse"), ("after", "rmse"), ("before", "unit")))
+    rows: Rows = [("held-out channel", "before", "after", "unit")]
+    rows += [(c, f"{e:.3g}", f"{after[c]:.3g}" if c in after else "", units[c]) for c, e in before.items()]
+    lines += [*table(rows), ""]
+    rows = [("candidate", "parameters", "closure alone", "score", "p")]
+    for entry in result["which"][:8]:
+        known = {name: q for name, q in entry["parameters"].items() if q["value"] is not None}
+        spread = {name: "" if q["std"] is None else f" ± {q['std']:.2g}" for name, q in known.items()}
+        values = ", ".join(f"{name} = {q['value']:.3g}{spread[name]} {q['unit']}" for name, q in known.items())
+        closed = "" if entry["closure"] is None else f"{100 * entry['closure']:.3g} %"
+        label = f"{entry['kind']}@{entry['location']}"
+        rows.append((label, values, closed, f"{entry['score']:.3g}", f"{entry['p_value']:.2g}"))
+    lines += [*table(rows), ""] if len(rows) > 1 else []
+    return [*lines, f"verdict: {result['verdict']} ({sum(result['seconds'].values()):.1f} s)"]
 
 
 def check_summary(result: dict[str, Any]) -> list[str]:

@@ -30,9 +30,10 @@ from yid_ocp.workflow.settings import dump_config as dump_config
 
 KeyPath = tuple[str | int, ...]
 DEFAULT = "dual_arm_vision.yaml"
+DIAGNOSIS_DEFAULT = "diagnosis.yaml"
 
 
-def load_config(path: str | Path | None = None, overrides: Sequence[str] = ()) -> Run:
+def load_config(path: str | Path | None = None, overrides: Sequence[str] = (), default: str = DEFAULT) -> Run:
     """Read and check a configuration file.
 
     Parameters
@@ -41,6 +42,8 @@ def load_config(path: str | Path | None = None, overrides: Sequence[str] = ()) -
         The YAML file; the embedded default when absent.
     overrides : sequence of str
         `a.b=c` each: the key and a value in YAML that replaces or adds to the file's.
+    default : str
+        Name of the embedded file.
 
     Returns
     -------
@@ -53,8 +56,8 @@ def load_config(path: str | Path | None = None, overrides: Sequence[str] = ()) -
         file, line and key, what is allowed and the nearest known key.
     """
     if path is None:
-        entry = resources.files("yid_ocp.data").joinpath("defaults", DEFAULT)
-        text, name, origin, base = entry.read_text(encoding="utf-8"), Path(DEFAULT).stem, "embedded default", Path.cwd()
+        entry = resources.files("yid_ocp.data").joinpath("defaults", default)
+        text, name, origin, base = entry.read_text(encoding="utf-8"), Path(default).stem, "embedded default", Path.cwd()
         file = str(entry)
     else:
         given = Path(path)

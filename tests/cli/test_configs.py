@@ -22,7 +22,7 @@ DEFT = "../../shared/recordings/deft/bdlo1_train_{}.h5"
 QUICK = {
     **dict.fromkeys(PAPER, COARSE),
     "baxter_arm": ("solver.duration=1.0",),
-    **dict.fromkeys(("springs_series_ends", "springs_series_joint", "springs_torsion"), ("solver.compiler=false",)),
+    **dict.fromkeys(("springs_series_ends", "springs_series_joint", "springs_torsion"), ()),
     "deft_bdlo1": (
         "solver.duration=0.1",
         "solver.iterations=2",

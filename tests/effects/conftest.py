@@ -10,11 +10,13 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.effects import SENSORS, EffectBase, candidates, make_effect
 from yid_ocp.integrator.rollout import Statics, simulate
 from yid_ocp.integrator.step import Directions, Step, Sweep, compile_step
 from yid_ocp.model import Grasp, Mechanism, Segment, System, flexible_object, forward_kinematics
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, roll_pitch_yaw, transform
+from yid_ocp.problem.cable import Cable, CableOptions, cable_system
 from yid_ocp.sensors import EffortSensor, PointSensor, Sensor, sensor_function
 
 POSTURE = np.array([0.3, 0.8, 0.9])
@@ -60,7 +62,7 @@ def build(prescribed: bool = False, grasped: bool = True) -> System:
     """The arm at `POSTURE` holding the tip of T2 of the undeformed object, 2 cm beside it."""
     robot, item = arm(), small_y(np.eye(4))
     gap = position(robot, "left_gripper", POSTURE) - position(item.mechanism, "w_T2", np.zeros(12))
-    foot = transform(np.eye(3), gap + [0.01, -0.02, -0.015])
+    foot = transform(np.eye(3), gap + np.array([0.01, -0.02, -0.015]))
     names = robot.joint_names
     return System.build(
         robot,
@@ -124,9 +126,7 @@ class Bench:
         begin = self.start(step) if start is None else start
         directions = Directions(tuple(names), np.zeros((len(begin), len(names)))) if names else None
         count = steps or self.steps
-        sweep = simulate(
-            step, theta, begin, count, self.torque[:count], self.path[: count + 1], directions=directions
-        )
+        sweep = simulate(step, theta, begin, count, self.torque[:count], self.path[: count + 1], directions=directions)
         return Run(step, theta, begin, sweep)
 
     def nominal_part(self, run: Run) -> np.ndarray:
@@ -146,6 +146,22 @@ class Bench:
         return np.array([np.array(function(x[:n], x[2 * n :], e, run.theta)[0]).ravel() for x, e in rows])
 
 
+PARENT = tuple(f"p{i}" for i in range(7))
+
+
+def made_cable() -> tuple[Cable, Recording]:
+    """A cable of six edges with a branch of two, and a recording in which its clamps sway."""
+    where = {name: [0.1 * i, 0.0, 1.0] for i, name in enumerate(PARENT)}
+    where |= {"c1": [0.3, 0.1, 1.0], "c2": [0.3, 0.2, 1.0]}
+    layout = Cable(PARENT, {"a": ("p3", "c1", "c2")}, where)
+    t = H * np.arange(21)
+    points = np.tile(np.array([where[name] for name in layout.vertices]), (len(t), 1, 1))
+    points[:, :, 2] -= 0.02 * np.sin(np.pi * points[0, :, 0] / 0.6)
+    points[:, -4:, 1] += 0.01 * np.sin(9 * t)[:, None]
+    group = PointGroup("points", layout.vertices, t, points, np.array(0.01), "motion capture", clock="nominal")
+    return layout, Recording(points=(group,), name="sway")
+
+
 CAMERA = PointSensor("points_camera", ("w_T1", "w_T3"), ("w_T1", "w_T3"), POSE)
 
 
@@ -162,6 +178,12 @@ def prescribed() -> Bench:
 @pytest.fixture(scope="session")
 def benches(driven, prescribed) -> dict[str, Bench]:
     return {"driven": driven, "prescribed": prescribed}
+
+
+@pytest.fixture(scope="session")
+def cable() -> tuple[Cable, Recording, System]:
+    layout, recording = made_cable()
+    return layout, recording, cable_system([recording], layout, CableOptions())
 
 
 @pytest.fixture(scope="session")

@@ -42,9 +42,8 @@ def recording(bench, effort: bool = True, camera: bool = True) -> Recording:
     if camera:
         seen = np.sort(rng.uniform(0.0, t[-1], 9))
         place = rng.normal(size=(9, 2, 3))
-        groups.append(
-            PointGroup("points_camera", ("w_T1", "w_T3"), seen, place, np.array(0.02), "camera", pose=np.array(bench.pose))
-        )
+        pose = np.array(bench.pose)
+        groups.append(PointGroup("points_camera", ("w_T1", "w_T3"), seen, place, np.array(0.02), "camera", pose=pose))
     return Recording(joints, tuple(groups), name="made")
 
 
@@ -110,7 +109,8 @@ def test_a_delay_at_a_sample_has_the_mean_slope_of_both_sides(driven, prescribed
 
 def test_torque_acts_late() -> None:
     t = H * np.arange(6)
-    joints = JointGroup(("a", "b"), t, np.zeros((6, 2)), effort=np.array([[1.0, 2, 4, 8, 16, 32], [0, 1, 0, 1, 0, 1]]).T)
+    effort = np.array([[1.0, 2.0, 4.0, 8.0, 16.0, 32.0], [0.0, 1.0, 0.0, 1.0, 0.0, 1.0]]).T
+    joints = JointGroup(("a", "b"), t, np.zeros((6, 2)), effort=effort)
     grid = Grid(0.0, H, 5)
     prompt = held_torque(joints, ("a", "b"), grid, "made")
     late = held_torque(joints, ("a", "b"), grid, "made", np.array([H, 0.25 * H]))
@@ -166,6 +166,19 @@ def test_what_a_recording_holds(driven) -> None:
     unposed = PointGroup("points_camera", ("p",), [0.0], np.zeros((1, 1, 3)), clock="nominal")
     assert camera_pose(unposed) == tuple(map(tuple, np.eye(4)))
     assert "nominal_clock" in sensors_present([Recording(points=(unposed,))])
+
+
+def test_a_cable_from_a_fitted_start(cable, all_effects) -> None:
+    layout, made, system = cable
+    options = ProblemOptions(initial_state="given", clamps=layout.clamps, path_cutoff=float("inf"), tie_break=0.0)
+    residuals = []
+    for one in (system, system.with_effects(all_effects(system))):
+        step = compile_step(one, H, "left_damping", use_compiler=False)
+        found = EstimationProblem(step, [made], ("parent.bend",), options)
+        result = found.evaluate(found.start)
+        assert result.ok, result.message
+        residuals.append(np.column_stack([result.residual, result.jacobian]))
+    assert residuals[1] == pytest.approx(residuals[0], rel=1e-6, abs=1e-7)
 
 
 def test_options_can_switch_the_camera_off(driven) -> None:

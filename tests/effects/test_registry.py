@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 
-import numpy as np
 import pytest
 
 from yid_ocp.data.synthetic import paper_system
@@ -14,7 +13,6 @@ from yid_ocp.effects import base as places
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model import Effect, Mechanism, Segment, System, flexible_object
 from yid_ocp.model.system import RecordedEffect
-from yid_ocp.problem.cable import Cable, CableOptions, cable_system
 
 
 @pytest.fixture(scope="module")
@@ -31,20 +29,6 @@ def beam() -> System:
     return System.build(robot, objects=[(item, "panda_hand", None)], prescribed=names)
 
 
-@pytest.fixture(scope="module")
-def cable() -> System:
-    from yid_ocp.data.recording import PointGroup, Recording
-
-    parent = tuple(f"p{i}" for i in range(7))
-    where = {name: [0.1 * i, 0.0, 1.0] for i, name in enumerate(parent)}
-    where |= {"c1": [0.3, 0.1, 1.0], "c2": [0.3, 0.2, 1.0]}
-    layout = Cable(parent, {"a": ("p3", "c1", "c2")}, where)
-    t = np.arange(3) * 0.01
-    points = np.tile(np.array([where[name] for name in layout.vertices]), (3, 1, 1))
-    group = PointGroup("points", layout.vertices, t, points, np.array(0.001), "motion capture")
-    return cable_system([Recording(points=(group,))], layout, CableOptions())
-
-
 def test_the_vocabulary_is_the_shared_one(shared) -> None:
     text = (shared / "reference" / "effects.md").read_text(encoding="utf-8")
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line.startswith("|")]
@@ -55,7 +39,7 @@ def test_the_vocabulary_is_the_shared_one(shared) -> None:
     for kind, row in table.items():
         effect = make_effect(kind, spots[kind], system)
         for quantity in effect.quantities:
-            assert re.search(rf"\b{quantity.reported[0]}\b", row[2]), f"{kind}: {quantity.reported[0]} not in '{row[2]}'"
+            assert re.search(rf"\b{quantity.reported[0]}\b", row[2]), f"{kind}: {quantity.reported[0]} not in {row[2]}"
 
 
 def test_every_kind_describes_itself(one_arm) -> None:
@@ -111,6 +95,7 @@ def test_places_of_a_beam_on_a_gripper(beam) -> None:
 
 
 def test_places_of_a_branched_cable(cable) -> None:
+    _, _, cable = cable
     found = candidates(cable, ["nominal_clock"])
     assert {("mount_compliance", "clamp_start"), ("junction_compliance", "junction_a")} <= set(found)
     assert {("grasp_compliance", "clamp_end"), ("grasp_slip", "clamp_end")} <= set(found)

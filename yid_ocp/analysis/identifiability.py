@@ -100,7 +100,7 @@ class Identifiability:
     nuisances : tuple of str
         Unknowns that were estimated along.
     chi2_per_dof : float
-        At the point; deviations are scaled by its square root where it exceeds one.
+        At the point; deviations are scaled by its square root where it exceeds one and the point is a fit.
     profiles : mapping of str to Profile
     """
 
@@ -183,6 +183,9 @@ def identifiability(
     chosen = [wide.names.index(name) for name in names]
     covariance, chi2 = uncertainty(wide, evaluation)
     inflation = math.sqrt(max(1.0, chi2))
+    if solution is None:
+        # far from the data chi2 says nothing of the noise
+        covariance, inflation = covariance / inflation**2, 1.0
     split = split_rows(wide, evaluation, chosen)
     scale = np.where(x[chosen] != 0, np.abs(x[chosen]), wide.scales[chosen])
     sensitivity = split.sensitivity * scale / inflation
@@ -267,8 +270,8 @@ def with_nuisances(
     options = problem.options
     initial, known = options.initial_state, dict(options.known_start)
     values = {name: dict(entry) for name, entry in options.recording_values.items()}
-    if start == "unknown" and initial == "given":
-        # the fit's start stays where it is, and what it presumed becomes the centre of a prior
+    if initial == "given":
+        # the fit's start stays where it is, and becomes the centre of a prior where it is unknown
         for i, episode in enumerate(problem.episodes):
             theta, _ = problem.split(x, i)
             if episode.name not in known:

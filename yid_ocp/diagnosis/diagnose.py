@@ -13,9 +13,16 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.hypotheses import Choice, Composed, Series, chosen_effects, residual_series
 from yid_ocp.diagnosis.localise import Place, localise
 from yid_ocp.diagnosis.null_test import NullTest, noise_floor, null_test
-from yid_ocp.diagnosis.score import Confusability, Linearisation, Score, Visibility, confusability, linearise
+from yid_ocp.diagnosis.score import (
+    Confusability,
+    Linearisation,
+    Score,
+    Visibility,
+    confusability,
+    linearise,
+    visibility,
+)
 from yid_ocp.diagnosis.score import scores as score_all
-from yid_ocp.diagnosis.score import visibility
 from yid_ocp.diagnosis.select import Closure, Fit, closure, gain, refit, refit_all, within_reach
 from yid_ocp.diagnosis.verdict import Absorbed, Added, Finding, Thresholds, decide, has_gap, next_experiment
 from yid_ocp.effects import EffectBase
@@ -90,7 +97,7 @@ def diagnose(
     clock.lap("null_test")
     say(f"screening {len(effects)} candidates")
     point = linearise(composed, (), nominal.values)
-    seen = visibility(point, series)
+    seen = visibility(point)
     ranked = score_all(point, series, seen)
     alike = confusability(point, ranked)
     where = localise(series, nominal.evaluation.residual, before, ranked, seen)
@@ -180,7 +187,7 @@ def held_out_test(fit: Fit, level: float) -> NullTest:
     problem = fit.problem
     x = problem.unknowns(fit.values)
     residuals = []
-    for (episode, result) in problem.validate(x):
+    for episode, result in problem.validate(x):
         if isinstance(result, str):
             raise DataError(
                 f"the held-out recording cannot be predicted: {result}",
@@ -230,13 +237,15 @@ def compose(
     added : tuple of Added
     """
     series = residual_series(nominal.problem)
-    current, first, added = nominal, (), []
+    current = nominal
+    first: tuple[Fit, ...] = ()
+    added: list[Added] = []
     while len(added) < limits.effects:
         base = [entry.effect for entry in added]
         if added:
             say(f"scoring what is left beside {', '.join(e.label for e in base)}")
             point = linearise(composed, base, current.values)
-            ranked = score_all(point, series, visibility(point, series))
+            ranked = score_all(point, series, visibility(point))
             alike = confusability(point, ranked)
         tried = shortlist([s for s in ranked if s.p_value < limits.level], alike, limits)
         if not tried:
@@ -287,7 +296,7 @@ def _remaining_where(
     residual = fit.evaluation.residual
     test = null_test(series, residual, len(fit.values), limits.level)
     point: Linearisation = linearise(composed, [entry.effect for entry in added], fit.values, 2)
-    seen: tuple[Visibility, ...] = visibility(point, series)
+    seen: tuple[Visibility, ...] = visibility(point)
     return localise(series, residual, test, score_all(point, series, seen), seen)
 
 
@@ -300,9 +309,7 @@ def absorption(before: Fit, after: Fit) -> tuple[Absorbed, ...]:
     )
 
 
-def _message(
-    verdict: str, before: NullTest, nominal: Fit, seen: Sequence[Visibility], limits: Thresholds
-) -> str:
+def _message(verdict: str, before: NullTest, nominal: Fit, seen: Sequence[Visibility], limits: Thresholds) -> str:
     if verdict != "insufficient_data":
         return ""
     if not any(entry.visible for entry in seen):

@@ -78,7 +78,9 @@ def chosen_effects(system: System, recordings: Sequence[Recording], choice: Choi
     possible = candidates(system, sensors_present(recordings))
     if isinstance(choice, str):
         if choice != "all":
-            raise ConfigError(f"candidates = '{choice}'", where="diagnosis.candidates", allowed="all, or a list of kinds")
+            raise ConfigError(
+                f"candidates = '{choice}'", where="diagnosis.candidates", allowed="all, or a list of kinds"
+            )
         return [make_effect(kind, place, system) for kind, place in possible]
     pairs: list[tuple[str, str]] = []
     for text in choice:
@@ -95,7 +97,9 @@ def chosen_effects(system: System, recordings: Sequence[Recording], choice: Choi
             )
         pairs += [pair for pair in found if pair not in pairs]
     if not pairs:
-        raise ConfigError("there is no candidate to try", where="diagnosis.candidates", allowed="all, or a list of kinds")
+        raise ConfigError(
+            "there is no candidate to try", where="diagnosis.candidates", allowed="all, or a list of kinds"
+        )
     return [make_effect(kind, place, system) for kind, place in pairs]
 
 
@@ -122,10 +126,11 @@ class _SlicedStatics(Statics):
         torque: ArrayLike | None = None,
         guess: ArrayLike | None = None,
         names: Sequence[str] = (),
+        tolerance: float = 1e-10,
     ) -> Rest:
         if not names:
-            return super().solve(posture, theta, torque, guess, ())
-        rest = super().solve(posture, theta, torque, guess, self._names)
+            return super().solve(posture, theta, torque, guess, (), tolerance)
+        rest = super().solve(posture, theta, torque, guess, self._names, tolerance)
         return replace(rest, by_theta=rest.by_theta[:, [self._names.index(name) for name in names]])
 
 
@@ -173,6 +178,7 @@ class Composed(EstimationProblem):
     effects: tuple[EffectBase, ...]
     nominal: tuple[str, ...]
     blocks: bool
+    _everything: tuple[str, ...]
 
     @staticmethod
     def of(problem: EstimationProblem, effects: Sequence[EffectBase], held_out: Sequence[Recording] = ()) -> Composed:
@@ -277,8 +283,8 @@ def _masked(episode: Episode, parity: int) -> Episode:
     for entry in episode.samples:
         t = (entry.node + entry.fraction) * episode.grid.time_step
         hidden = (np.floor(t / BLOCK).astype(int) % 2 != parity)[:, None] & np.ones(entry.value.shape, bool)
-        blank = {"value": np.where(hidden, np.nan, entry.value), "weight": np.where(hidden, 0.0, entry.weight)}
-        samples.append(replace(entry, **blank))
+        value, weight = np.where(hidden, np.nan, entry.value), np.where(hidden, 0.0, entry.weight)
+        samples.append(replace(entry, value=value, weight=weight))
     return replace(episode, samples=tuple(samples))
 
 
@@ -321,7 +327,8 @@ def smoothed_colour(cutoff: float, step: float) -> Array:
     half = int(2 / (cutoff * step)) + 10
     impulse = np.zeros((2 * half + 1, 1))
     impulse[half] = 1.0
-    response = Smoother(cutoff)(step * np.arange(2 * half + 1), impulse)[:, 0]
+    times = step * np.arange(2 * half + 1, dtype=float)
+    response = Smoother(cutoff)(times, impulse)[:, 0]
     full = np.correlate(response, response, "full")[2 * half :]
     return np.asarray(full[:half] / full[0])
 

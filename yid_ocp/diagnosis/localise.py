@@ -68,9 +68,7 @@ def by_effort(series: Sequence[Series], residual: Array, windows: Sequence[Windo
     return _ranked({joint: max(value, 0.0) for joint, value in excess.items()}, set(excess), flagged)
 
 
-def by_scores(
-    scores: Sequence[Score], visible: Sequence[Visibility], windows: Sequence[Window]
-) -> tuple[Place, ...]:
+def by_scores(scores: Sequence[Score], visible: Sequence[Visibility], windows: Sequence[Window]) -> tuple[Place, ...]:
     """Shares of places in the decrease of r'r that the best candidate of each promises."""
     places = dict.fromkeys(entry.effect.location for entry in visible)
     seen = {entry.effect.location for entry in visible if entry.visible}

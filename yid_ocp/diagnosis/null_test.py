@@ -108,9 +108,7 @@ def spread(colour: Array) -> float:
     return float(1 + 2 * np.sum(colour[1:] ** 2))
 
 
-def null_test(
-    series: Sequence[Series], residual: Array, parameters: int, level: float = 0.01
-) -> NullTest:
+def null_test(series: Sequence[Series], residual: Array, parameters: int, level: float = 0.01) -> NullTest:
     """Compare a whitened residual with noise.
 
     Parameters

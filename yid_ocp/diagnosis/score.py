@@ -5,9 +5,9 @@ amplitudes of candidate j and P = I - J_theta J_theta^+:
 
     G_j = J_j' P J_j,  s_j = -J_j' P r,  LM_j = s_j' S_j^-1 s_j,
 
-S_j = G_j for white noise of unit deviation, and the sum of the scores' autocovariances (Bartlett's weights, Newey and
-West 1987, doi:10.2307/1913610) for a coloured residual. The decrease of r'r that the linear model promises is
-s_j' G_j^-1 s_j, less where the amplitude would leave its bounds.
+S_j = G_j for white noise of unit deviation, and the sum of the scores' autocovariances for a coloured residual, taken as
+it would be with the candidate's step done (Bartlett's weights, Newey and West 1987, doi:10.2307/1913610). The decrease
+of r'r that the linear model promises is s_j' G_j^-1 s_j, less where the amplitude would leave its bounds.
 
 Parameters that say nothing while the amplitude is neutral (relaxation times and the like) are taken over a grid, the
 best one counting as the best of that many tries (Davies 1987, doi:10.1093/biomet/74.1.33, bounded by Bonferroni).
@@ -15,6 +15,7 @@ best one counting as the best of that many tries (Davies 1987, doi:10.1093/biome
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -23,7 +24,7 @@ import scipy.signal
 import scipy.stats
 from numpy.typing import NDArray
 
-from yid_ocp.diagnosis.hypotheses import Composed, Series
+from yid_ocp.diagnosis.hypotheses import Composed, Series, residual_series
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import SolverError
 
@@ -46,11 +47,14 @@ class Signature:
         Values of its shape parameters.
     columns : ndarray, shape (nr, p)
         P J_j, by its amplitudes.
+    noise : ndarray, shape (p, p)
+        Covariance of `columns'` r under the noise's own colour.
     """
 
     effect: EffectBase
     shape: dict[str, float]
     columns: Array
+    noise: Array
 
 
 @dataclass(frozen=True)
@@ -149,6 +153,7 @@ def linearise(
     grids = {effect.label: shape_grid(effect, grid) for effect in others}
     own = [name for effect in base for name in effect.parameters.names]
     residual, basis = np.zeros(0), np.zeros((0, 0))
+    series = residual_series(problem.freeing((), own))
     signatures: list[Signature] = []
     for k in range(max((len(g) for g in grids.values()), default=0)):
         chosen = [effect for effect in others if k < len(grids[effect.label])]
@@ -172,7 +177,8 @@ def linearise(
         at = 0
         for effect in chosen:
             width = len(effect.amplitudes)
-            signatures.append(Signature(effect, grids[effect.label][k], moved[:, at : at + width]))
+            columns = np.ascontiguousarray(moved[:, at : at + width])
+            signatures.append(Signature(effect, grids[effect.label][k], columns, _coloured(columns, series)))
             at += width
     return Linearisation(residual, tuple(signatures), dict(values))
 
@@ -185,13 +191,13 @@ def _basis(matrix: Array) -> Array:
     return np.asarray(u[:, singular > 1e-7 * max(singular.max(initial=0.0), 1e-300)])
 
 
-def visibility(point: Linearisation, series: Sequence[Series]) -> tuple[Visibility, ...]:
+def visibility(point: Linearisation) -> tuple[Visibility, ...]:
     """Detectable amplitude of every candidate: `DETECTION` deviations under the noise's colour, from J alone."""
     found: dict[str, Visibility] = {}
     for signature in point.signatures:
         effect = signature.effect
         information = signature.columns.T @ signature.columns
-        noise = _coloured(signature.columns, series)
+        noise = signature.noise
         inverse = np.linalg.pinv(information, rcond=1e-10, hermitian=True)
         covariance = inverse @ noise @ inverse
         detectable = {}
@@ -211,8 +217,11 @@ def visibility(point: Linearisation, series: Sequence[Series]) -> tuple[Visibili
 def _coloured(columns: Array, series: Sequence[Series]) -> Array:
     """X' Omega X under the noise's known colour."""
     total = np.zeros((columns.shape[1], columns.shape[1]))
+    size = float(np.max(np.abs(columns), initial=0.0))
     for s in series:
         x = columns[s.rows]
+        if not np.any(np.abs(x) > 1e-6 * size):
+            continue
         if len(s.colour) > 1:
             both = np.concatenate([s.colour[:0:-1], s.colour])[:, None]
             total += x.T @ scipy.signal.oaconvolve(x, both, mode="full", axes=0)[len(s.colour) - 1 :][: len(x)]
@@ -267,8 +276,9 @@ def _score(signature: Signature, residual: Array, series: Sequence[Series]) -> S
     upper = np.array([quantities[name].upper for name in effect.amplitudes]) - neutral
     step = np.clip(plain, lower, upper)
     decrease = float(2 * slope @ step - step @ information @ step)
-    covariance = robust(x, residual, series)
-    floor = _coloured(x, series)
+    # the candidate's own share of the residual would hide it: what would be left is what its score scatters with
+    covariance = robust(x, residual + x @ step, series)
+    floor = signature.noise
     # a residual below the noise must not make a score look sure
     covariance = covariance if np.trace(covariance) > np.trace(floor) else floor
     statistic = float(slope @ np.linalg.pinv(covariance, rcond=1e-10, hermitian=True) @ slope)
@@ -321,7 +331,7 @@ def confusability(point: Linearisation, chosen: Sequence[Score] = ()) -> Confusa
     every = np.hstack([s.columns * f for s, f in zip(kept, scale, strict=True)]) if kept else np.zeros((0, 0))
     gram = every.T @ every
     edges = np.cumsum([0, *(s.columns.shape[1] for s in kept)])
-    blocks = [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    blocks = [slice(a, b) for a, b in itertools.pairwise(edges)]
     matrix = np.zeros((len(kept), len(kept)))
     inverses = [np.linalg.pinv(gram[b, b], rcond=1e-8, hermitian=True) for b in blocks]
     for j, row in enumerate(blocks):

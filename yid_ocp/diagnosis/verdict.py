@@ -1,4 +1,4 @@
-"""Steps eight and nine: the verdict with its thresholds, what the missing effect did to the stiffnesses, and the words."""
+"""Steps eight and nine: the verdict with its thresholds, where the stiffnesses go, and the words."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 from yid_ocp.diagnosis.localise import Place
 from yid_ocp.diagnosis.null_test import Floor, NullTest
 from yid_ocp.diagnosis.score import Confusability, Score, Visibility
-from yid_ocp.diagnosis.select import Closure, Fit
+from yid_ocp.diagnosis.select import Closure, Fit, closure
 from yid_ocp.effects import EffectBase
 
 FORMAT = "yid-diagnosis/1"
@@ -219,8 +219,6 @@ def _number(value: float) -> float | None:
 
 def which(finding: Finding) -> list[dict[str, Any]]:
     """Candidates, best first: what was added, then the other refits by held-out loss, then the rest by score."""
-    from yid_ocp.diagnosis.select import closure
-
     scores = {score.effect.label: score for score in finding.scores}
     listed: dict[str, dict[str, Any]] = {}
     entries: list[tuple[EffectBase, Fit | None]] = [(a.effect, finding.last) for a in finding.added if finding.effects]
@@ -290,9 +288,20 @@ _DEPENDS = {
     "how long it is held": ("standard_linear_solid", "hysteresis", "grasp_slip"),
     "how hard it accelerates": ("rotor_inertia", "density", "link_mass", "point_mass"),
     "how far it bends": ("cubic_stiffness", "rest_curvature", "bend_anisotropy", "joint_spring"),
-    "how it stands against gravity": ("gravity_scale", "gravity_tilt", "effort_offset", "encoder_offset", "effort_gain"),
+    "how it stands against gravity": (
+        "gravity_scale",
+        "gravity_tilt",
+        "effort_offset",
+        "encoder_offset",
+        "effort_gain",
+    ),
     "how hard it pulls at its ends": (
-        "grasp_compliance", "grasp_offset", "mount_compliance", "junction_compliance", "series_elasticity", "backlash",
+        "grasp_compliance",
+        "grasp_offset",
+        "mount_compliance",
+        "junction_compliance",
+        "series_elasticity",
+        "backlash",
     ),
     "when it is read": ("effort_delay", "camera_latency", "clock_scale"),
     "where the camera stands": ("camera_translation", "camera_rotation", "camera_scale", "surface_offset"),
@@ -377,7 +386,8 @@ def sentences(finding: Finding) -> str:
             text.append("What remains is noise.")
         moved = [a for a in finding.absorbed if abs(a.after - a.before) > 0.1 * max(abs(a.before), 1e-9)]
         if moved:
-            text.append("With it " + ", ".join(f"{a.name} goes from {a.before:.3g} to {a.after:.3g}" for a in moved[:6]) + ".")
+            steps = (f"{a.name} goes from {a.before:.3g} to {a.after:.3g}" for a in moved[:6])
+            text.append(f"With it {', '.join(steps)}.")
     elif finding.verdict == "unknown":
         best = finding.fits[0] if finding.fits else None
         said = "" if best is None else f" (the best, {best.effects[0].label}, does not explain half of it)"

@@ -1,4 +1,4 @@
-"""The library of unmodelled effects: kinds, where each can sit, and `make_effect`; add one file with one registration.
+"""The library of unmodelled effects: kinds, where each can sit, `make_effect`; a new kind is one file with one class.
 
 A kind's equation, quantities, units, bounds and ranges stand at its class; `docs/extending.md` shows a new one.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from importlib import import_module
+from pkgutil import iter_modules
 
 from yid_ocp.effects import base
 from yid_ocp.effects.base import EFFECTS as EFFECTS
@@ -16,13 +17,13 @@ from yid_ocp.effects.base import Reported as Reported
 from yid_ocp.errors import ModelError, nearest
 from yid_ocp.model.system import System
 
-FAMILIES = ("elasticity", "damping", "friction", "inertia", "actuator", "grasp", "environment", "sensing")
 SENSORS = ("joints.position", "joints.effort", "camera", "nominal_clock")
 """What `candidates` may be told of a recording: measured joint angles, joint efforts, points seen by a camera, and a
 clock that is a sample index times a nominal period."""
 
-for _family in FAMILIES:
-    import_module(f"yid_ocp.effects.{_family}")
+# every file of this folder registers its kinds when it is imported
+for _family in iter_modules(__path__):
+    import_module(f"{__name__}.{_family.name}")
 
 
 def make_effect(kind: str, location: str, system: System, values: Mapping[str, float] | None = None) -> EffectBase:

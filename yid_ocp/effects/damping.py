@@ -77,9 +77,10 @@ class StandardLinearSolid(EffectBase):
 
 @EFFECTS.register("hysteresis")
 class Hysteresis(EffectBase):
-    """A Dahl element beside every spring of a segment, bends and twists: F = -stiffness z, dz/dt = v - |v| z / yield_angle.
+    """A Dahl element beside every spring of a segment, bends and twists.
 
-    |v| is rounded off below `SLOW`. At the start of a recording z = 0: what came before is not known.
+    F = -stiffness z, dz/dt = v - |v| z / yield_angle, with |v| rounded off below `SLOW`. At the start of a recording
+    z = 0: what came before is not known.
 
     References
     ----------

@@ -26,6 +26,8 @@ from yid_ocp.model.y_object import AXES
 
 REFERENCE_ANGLE = 0.5
 """Stands for the largest angle in the data where a range depends on it [rad]."""
+RELAXATION = 5e-3
+"""Of mounts and junctions [s]: too short to damp any motion that is seen."""
 
 _SPRING = Quantity(
     "compliance",
@@ -147,7 +149,10 @@ class JointSpring(EffectBase):
 
 @EFFECTS.register("mount_compliance")
 class MountCompliance(EffectBase):
-    """A two-axis rotational spring under the object's foot, massless: it turns about x and y of the first link."""
+    """A two-axis rotational spring under the object's foot, massless: it turns about x and y of the first link.
+
+    It has the relaxation time `RELAXATION`.
+    """
 
     equation = "two joints with V = 1/2 stiffness q^2 before the first link"
 
@@ -174,7 +179,7 @@ class JunctionCompliance(EffectBase):
     """A two-axis rotational spring, massless, between a segment and the branches that leave it at one place.
 
     At `w_PARENT` all branches turn together about x and y of the parent's last link, at `junction_BRANCH` one turns
-    about its own.
+    about its own. It has the relaxation time `RELAXATION`.
     """
 
     equation = "two joints with V = 1/2 stiffness q^2 before the branches"
@@ -216,4 +221,5 @@ def _sprung(system: System, hung: tuple[str, ...], at: Placement | None, label: 
         rest = Placement.identity() if at is None else inverse(place) @ joints[index].placement
         joints[index] = replace(joints[index], parent=first + 1, placement=rest)
     compliant = {**system.compliant, **{joint.name: compliance for joint in chain}}
-    return replace(system, mechanism=replace(tree, joints=tuple(joints)), compliant=compliant)
+    relaxing = {**system.relaxing, **{joint.name: RELAXATION for joint in chain}}
+    return replace(system, mechanism=replace(tree, joints=tuple(joints)), compliant=compliant, relaxing=relaxing)

@@ -231,7 +231,8 @@ def discrete_equations(system: System, force_split: ForceSplit = "symmetric") ->
     row_scale, held = [ca.SX(1)] * n, [ca.SX(0)] * n
     for joint, compliance in system.compliant.items():
         index = system.mechanism.joint_index(joint)
-        row_scale[index], held[index] = compliance, h / 2 * qm[index]
+        relaxed = qm[index] + system.relaxing[joint] * vm[index] if joint in system.relaxing else qm[index]
+        row_scale[index], held[index] = compliance, h / 2 * relaxed
     scale, spring = ca.vertcat(*row_scale), ca.vertcat(*held)
     balance_rest = scale * (h / 2 * extra_q - extra_v + push_left) - spring
     p1_rest = scale * (h / 2 * extra_q + extra_v + push_right) - spring

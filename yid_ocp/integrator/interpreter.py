@@ -110,11 +110,11 @@ class InterpretedKernel:
             by_rate, by_turn, by_posture = (
                 np.where(self._mask, x.T @ y, 0.0) for x, y in ((along, screw), (along, plus - screw), (turned, screw))
             )
-            for part, new, old in zip(
+            for share, new, old in zip(
                 self._step.equations.closed_shares, (rows_new, p1_new), (rows_old, p1_old), strict=True
             ):
-                new[:n, :n] += part * scale[:, None] * both(by_turn + by_rate, by_posture + by_rate)
-                old[:n, :n] += part * scale[:, None] * both(by_turn - by_rate, by_posture - by_rate)
+                new[:n, :n] += share * scale[:, None] * both(by_turn + by_rate, by_posture + by_rate)
+                old[:n, :n] += share * scale[:, None] * both(by_turn - by_rate, by_posture - by_rate)
         for key, values, blocks in (
             ("rest", rest, (rows_new, rows_old, rows_input)),
             ("rest_p", rest_p, (p1_new, p1_old, p1_input)),
@@ -137,7 +137,16 @@ class InterpretedKernel:
             self._theta_functions[names] = codegen.theta_function(self._step.equations, names)
         return [np.array(ca.densify(out)) for out in self._theta_functions[names].call(arguments)]
 
-    def _newton(self, arguments: list[Array | float], phi: Array, scale: Array) -> tuple[StepCode, float, Array, int]:
+    def _factorised(self, arguments: list[Array | float], phi: Array, scale: Array) -> list[Array] | None:
+        """LU factors of the step's Jacobian, None where it is singular."""
+        jacobian = self._linearise(arguments, phi, scale).rows_new[np.ix_(self._unknown, self._unknown)]
+        *factors, singular = scipy.linalg.lapack.dgetrf(jacobian)
+        return None if singular else factors
+
+    def _newton(
+        self, arguments: list[Array | float], phi: Array, scale: Array, kept: list[list[Array]]
+    ) -> tuple[StepCode, float, Array, int]:
+        """Newton with the factors in `kept` for as long as they contract, damped with fresh ones after that."""
         n, nz = self._step.sizes["n"], self._step.sizes["nz"]
         count = len(self._free) + nz
         q1, z1, lam = arguments[1], arguments[4], arguments[5]
@@ -151,17 +160,22 @@ class InterpretedKernel:
                 return StepCode.NOT_FINITE, error, p1, iteration
             if len(self._unknown) == 0:
                 return StepCode.OK, 0.0, p1, iteration
-            jacobian = self._linearise(arguments, phi, scale).rows_new[np.ix_(self._unknown, self._unknown)]
-            *factors, singular = scipy.linalg.lapack.dgetrf(jacobian)
-            if singular:
-                return StepCode.SINGULAR, error, p1, iteration
-            delta = -scipy.linalg.lu_solve(factors, rows[self._unknown], check_finite=False)
+            fresh = not kept
+            if fresh:
+                factors = self._factorised(arguments, phi, scale)
+                if factors is None:
+                    return StepCode.SINGULAR, error, p1, iteration
+                kept[:] = [factors]
+            delta = -scipy.linalg.lu_solve(kept[0], rows[self._unknown], check_finite=False)
             error = float(np.max(np.abs(delta[:count]), initial=0.0))
             if not math.isfinite(error):
                 return StepCode.SINGULAR, error, p1, iteration
             if error <= tolerance or (error < 1e3 * tolerance and error > 0.5 * previous):
                 lam += delta[count:]
                 return StepCode.OK, error, p1, iteration
+            if not fresh and (error > 0.1 * previous or error > 0.5):
+                kept.clear()
+                continue
             previous = error
             keep = q1.copy(), z1.copy(), lam.copy()
             factor = 0.5 / error if error > 0.5 else 1.0
@@ -169,9 +183,10 @@ class InterpretedKernel:
                 q1[self._free] += factor * delta[: len(self._free)]
                 z1 += factor * delta[len(self._free) : count]
                 lam += factor * delta[count:]
-                trial = scipy.linalg.lu_solve(
-                    factors, self._rows(arguments, phi, scale)[0][self._unknown], check_finite=False
-                )
+                if not fresh:
+                    break
+                after = self._rows(arguments, phi, scale)[0][self._unknown]
+                trial = scipy.linalg.lu_solve(kept[0], after, check_finite=False)
                 if np.max(np.abs(trial[:count]), initial=0.0) <= (1 - 0.25 * factor) * error:
                     break
                 if factor < 1e-4:
@@ -202,6 +217,7 @@ class InterpretedKernel:
         by_effort = np.full((steps, s["nc"], d), np.nan)
         if wanted is not None:
             by_state[0] = wanted.start
+        kept: list[list[Array]] = []
         total, code, error, k = 0, StepCode.OK, 0.0, 0
         lam = np.zeros(m)
         for k in range(steps):
@@ -224,10 +240,11 @@ class InterpretedKernel:
                 self._step.time_step,
             ]
             phi = self._matrix(arguments)
-            code, error, p1, spent = self._newton(arguments, phi, scale)
+            code, error, p1, spent = self._newton(arguments, phi, scale, kept)
             if code != StepCode.OK:
+                kept.clear()
                 q1[self._free], z1[:], lam[:] = x[self._free], x[2 * n :], 0.0
-                code, error, p1, more = self._newton(arguments, phi, scale)
+                code, error, p1, more = self._newton(arguments, phi, scale, kept)
                 spent += more
             total += spent
             state[k + 1] = np.concatenate([q1, p1, z1])

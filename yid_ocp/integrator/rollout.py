@@ -380,7 +380,7 @@ def relaxed(step: Step, q: ArrayLike, theta: ArrayLike) -> Array:
 
 
 def momentum_of(step: Step, q: ArrayLike, v: ArrayLike, theta: ArrayLike) -> Array:
-    """Generalized momentum dL/dv at (q, v) [N m s].
+    """Generalized momentum dL/dv at (q, v) [N m s]; of a compliant coordinate times its compliance.
 
     Parameters
     ----------
@@ -396,7 +396,7 @@ def momentum_of(step: Step, q: ArrayLike, v: ArrayLike, theta: ArrayLike) -> Arr
     e, s = step.equations, step.sizes
     half = np.atleast_2d(np.asarray(v, float)) * step.time_step / 2
     middle = np.atleast_2d(np.asarray(q, float))
-    function = ca.Function("momentum", e.arguments, [e.rigid.by_v])
+    function = ca.Function("momentum", e.arguments, [e.row_scale * e.rigid.by_v])
     none = [np.zeros(s[key]) for key in ("n", "nz", "nz", "m", "nu")]
     rows = [
         np.array(function(m - d, m + d, *none, theta, step.time_step)).ravel()

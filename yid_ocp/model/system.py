@@ -223,8 +223,15 @@ class Effect(Protocol):
     equations of internal coordinates. At neutral parameters both must leave the nominal model unchanged.
     """
 
-    kind: str
-    location: str
+    @property
+    def kind(self) -> str:
+        """Under which it is registered."""
+        ...
+
+    @property
+    def location(self) -> str:
+        """Where it sits."""
+        ...
 
     @property
     def parameters(self) -> Parameters:
@@ -295,6 +302,9 @@ class System:
     compliant : mapping of joint name to casadi.SX
         Coordinates held by a spring of this compliance [rad/(N m)], zero meaning rigid; their equations and momentum
         are multiplied by it so that they stay regular at zero.
+    relaxing : mapping of joint name to float
+        Relaxation time T of some compliant coordinates [s]: q + T dq/dt = compliance x torque. A massless one needs it to
+        forget a start that does not fit its load.
     segments : tuple of SegmentLayout
     points : tuple of str
         Frames that a sensor may see.
@@ -311,6 +321,7 @@ class System:
     gravity: ca.SX = field(default_factory=lambda: ca.SX(ca.DM([0.0, 0.0, -9.81])))
     time_scale: ca.SX = field(default_factory=lambda: ca.SX(1))
     compliant: Mapping[str, ca.SX] = field(default_factory=dict)
+    relaxing: Mapping[str, float] = field(default_factory=dict)
     segments: tuple[SegmentLayout, ...] = ()
     points: tuple[str, ...] = ()
     effects: tuple[Effect, ...] = ()

@@ -30,6 +30,8 @@ CONSTRAINT_STD = 1e-5
 # The object is first pulled into place softly, by measurements with so many times their deviation: pulled hard at once,
 # it ends in knots.
 SOFTNESS = (1000.0, 100.0, 10.0, 1.0)
+# The stage before which the best of all trials is chosen: there the object has its place and hardly its details.
+SELECTION = 2
 # Parameters of a joint whose rest angle is told from the start: its angle there [rad] and the torque it bears [N m].
 PRESET = ("start", "load")
 # Parameter that is told the root mean square speed of the measured points at the start [m/s].
@@ -77,7 +79,9 @@ class StartFit:
         self.local = tuple(local)
         system, e = step.system, step.equations
         self._known = [*system.driven_indices, *system.prescribed_indices]
-        self._free = [i for i in range(system.size) if i not in set(self._known)]
+        # what follows its load at once has no start of its own
+        idle = {system.mechanism.joint_index(joint) for joint in system.compliant}
+        self._free = [i for i in range(system.size) if i not in set(self._known) | idle]
         self._sensors: dict[Sensor, ca.Function] = {}
         chosen = ca.vertcat(*(system.parameters[name].symbol for name in self.local)) if self.local else ca.SX(0, 1)
         kinematics = forward_kinematics(system.mechanism, e.q1)
@@ -147,13 +151,12 @@ class StartFit:
         guess = rest.copy()
         guess[self._known] = posture
         guess[list(system.prescribed_indices)] = path[first]
-        q, values, best = guess, theta[index], np.inf
-        for trial in self._trials(theta[index]):
-            found = guess, trial, np.inf
-            for softness in SOFTNESS:
-                found = self._fit(*found[:2], frames[first], theta, rest, weight, len(index), softness)
-            if found[2] < best:
-                q, values, best = found
+        found = [(guess, trial, np.inf) for trial in self._trials(theta[index])]
+        for stage, softness in enumerate(SOFTNESS):
+            if stage == SELECTION:
+                found = [min(found, key=lambda entry: entry[2])]
+            found = [self._fit(q, v, frames[first], theta, rest, weight, len(index), softness) for q, v, _ in found]
+        q, values, _ = found[0]
         theta = theta.copy()
         theta[index] = values
         velocity = np.zeros(system.size)

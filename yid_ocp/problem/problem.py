@@ -25,7 +25,6 @@ from yid_ocp.problem.inputs import (
     camera_pose,
     columns,
     held_torque,
-    held_torque_slope,
     joint_loads,
     make_grid,
     prescribed_path,
@@ -320,6 +319,7 @@ class EstimationProblem:
     @property
     def _start_rows(self) -> tuple[int, ...]:
         known = set(self.system.driven_indices) | set(self.system.prescribed_indices)
+        known |= {self.system.mechanism.joint_index(joint) for joint in self.system.compliant}
         return tuple(i for i in range(self.system.size) if i not in known)
 
     def split(self, x: ArrayLike, episode: int) -> tuple[Array, Array]:
@@ -673,38 +673,7 @@ class EstimationProblem:
         wanted : tuple of str
             Parameters by which to differentiate.
         """
-        readings, nu = self.readings, len(self.system.driven)
-        first = episode.torque[0] if nu else np.zeros(0)
-        if not readings.active:
-            return Inputs(episode.torque, first, episode.path, episode.measured_arm)
-        torque, arm, path, by_torque, by_first, by_arm, by_path = (
-            episode.torque,
-            episode.measured_arm,
-            episode.path,
-            *(None,) * 4,
-        )
-        fill = np.zeros((1, len(self.system.prescribed)))
-        joints = episode.recording.joints
-        if nu and (readings.delays_torque or readings.corrects_efforts):
-            assert joints is not None
-            delay, by_delay = readings.torque_delay(theta, wanted)
-            where = (joints, self.system.driven, episode.grid, episode.name)
-            if readings.delays_torque:
-                torque = held_torque(*where, delay)
-            rows = np.vstack([torque, first])
-            padded = np.hstack([rows, np.tile(fill, (len(rows), 1))])
-            _, true, _, by_theta, by_reading = readings.true(np.zeros_like(padded), padded, theta, wanted)
-            by_theta = by_theta[:, :nu].copy()
-            if readings.delays_torque and wanted:
-                slope = by_reading[:-1, :nu] * held_torque_slope(*where, delay)
-                by_theta[:-1] += slope[:, :, None] * by_delay
-            torque, first = true[:-1, :nu], true[-1, :nu]
-            by_torque, by_first = by_theta[:-1], by_theta[-1]
-        if readings.corrects_angles:
-            measured = np.hstack([episode.measured_arm, episode.path])
-            true, _, by_angle, _, _ = readings.true(measured, episode.load, theta, wanted)
-            arm, path, by_arm, by_path = true[:, :nu], true[:, nu:], by_angle[:, :nu], by_angle[:, nu:]
-        return Inputs(torque, first, path, arm, by_torque, by_first, by_path, by_arm)
+        return self.readings.inputs(episode, theta, wanted)
 
     def evaluate(self, x: ArrayLike, derivatives: bool = True) -> Evaluation:
         """Residual, cost and, where asked for, Jacobian at an unknown vector.

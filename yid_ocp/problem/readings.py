@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
@@ -12,7 +13,11 @@ from numpy.typing import NDArray
 from yid_ocp.integrator.codegen import Mapped
 from yid_ocp.integrator.step import Feedback
 from yid_ocp.model.system import RecordedEffect, System
+from yid_ocp.problem.inputs import held_torque, held_torque_slope
 from yid_ocp.sensors import Sensor
+
+if TYPE_CHECKING:
+    from yid_ocp.problem.problem import Episode
 
 Array = NDArray[np.float64]
 
@@ -160,6 +165,39 @@ class Readings:
             self._maps[names] = Mapped(function, shared=(2,), use_compiler=self._compiled)
         a, e, a_theta, e_theta, e_reading = self._maps[names](angle, effort, theta)
         return a[:, :, 0], e[:, :, 0], a_theta, e_theta, e_reading[:, :, 0]
+
+    def inputs(self, episode: Episode, theta: Array, names: tuple[str, ...]) -> Inputs:
+        """What drives an episode's rollout: the recording, as far as no effect says that it reads something else.
+
+        Parameters
+        ----------
+        episode : Episode
+        theta : ndarray, shape (ntheta,)
+        names : tuple of str
+            Parameters by which to differentiate.
+        """
+        torque, arm, path = episode.torque, episode.measured_arm, episode.path
+        nu, nc = torque.shape[1], path.shape[1]
+        first = torque[0] if nu else np.zeros(0)
+        by_torque = by_first = by_arm = by_path = None
+        if nu and (self.delays_torque or self.corrects_efforts):
+            joints = episode.recording.joints
+            assert joints is not None
+            where = (joints, self.system.driven, episode.grid, episode.name)
+            delay, by_delay = self.torque_delay(theta, names)
+            if self.delays_torque:
+                torque = held_torque(*where, delay)
+            readings = np.pad(np.vstack([torque, first]), ((0, 0), (0, nc)))
+            _, true, _, by_theta, by_reading = self.true(np.zeros_like(readings), readings, theta, names)
+            by_theta = by_theta[:, :nu].copy()
+            if self.delays_torque and names:
+                slope = by_reading[:-1, :nu] * held_torque_slope(*where, delay)
+                by_theta[:-1] += slope[:, :, None] * by_delay
+            torque, first, by_torque, by_first = true[:-1, :nu], true[-1, :nu], by_theta[:-1], by_theta[-1]
+        if self.corrects_angles:
+            true, _, by_angle, _, _ = self.true(np.hstack([arm, path]), episode.load, theta, names)
+            arm, path, by_arm, by_path = true[:, :nu], true[:, nu:], by_angle[:, :nu], by_angle[:, nu:]
+        return Inputs(torque, first, path, arm, by_torque, by_first, by_path, by_arm)
 
     def torque_delay(self, theta: Array, names: tuple[str, ...]) -> tuple[Array, Array]:
         """How long after it was recorded each driven joint's torque acts, shape (nu,) [s], and its derivative."""

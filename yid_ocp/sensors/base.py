@@ -16,16 +16,13 @@ from yid_ocp.model.system import NodeState, System
 class Sensor(Protocol):
     """A group of measured channels that share a clock.
 
-    Attributes
-    ----------
-    group : str
-        Name of the recording's group.
-    channels : tuple of str
-        `group.point` (three outputs each) or `joints.quantity.JOINT` (one output each).
-    unit : str
+    Channels are named `group.point` (three outputs each) or `joints.quantity.JOINT` (one output each).
     """
 
-    group: str
+    @property
+    def group(self) -> str:
+        """Name of the recording's group."""
+        ...
 
     @property
     def channels(self) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ bends at the next joint reach every direction) and stay at rest.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import casadi as ca
@@ -33,6 +33,8 @@ NODE_FACTOR = math.pi / 4
 
 _AWAY = -0.5  # cosine of normal and sight beyond which a point cannot be on the side that the camera sees
 _STATIONS = 6  # per link, where it is asked whether points are near
+_OWN_SHARE = 0.3
+_TOUCHING = 1e-3  # [m]
 _LEAST_STIFFNESS = 1e-2  # of the mean; softer bends are still held this much
 
 
@@ -63,6 +65,8 @@ class FitOptions:
         At most so many in a pass.
     weight_cap : float
         A point counts at most for so many of the camera's.
+    least_coverage : float
+        A link with points along a smaller share of its length is hidden, or not where the fit has it.
     """
 
     scales: tuple[float, ...] = (0.15, 0.05)
@@ -75,6 +79,7 @@ class FitOptions:
     rate_std: float = 3.0
     iterations: int = 25
     weight_cap: float = 6.0
+    least_coverage: float = 0.5
 
     def __post_init__(self) -> None:
         for name in ("noise", "noise_correlation", "grasp_std", "direction_std", "bend_std", "rate_std", "weight_cap"):
@@ -97,11 +102,14 @@ class Fit:
     std : ndarray, shape (np, 3)
         Deviation of each coordinate by the curvature of the cost [m].
     distance : float
-        Mean of |e_i| over all processed points, each counted for 0.1 m at most: the value of equation (3) [m].
+        Mean of |e_i| over the points of the cloud, each counted for 0.1 m at most: the value of equation (3) [m].
+        Parts of the cloud that are not connected with the largest one and lie off the shape are left out.
     inliers : float
-        Share of the points nearer than three times the last scale.
-    coverage : mapping of segment to float
-        Share of each segment's length along which there are points.
+        Share of these points that are nearer than three times the last scale.
+    coverage : ndarray, shape (K,)
+        Share of each link's length along which there are points.
+    seen : ndarray of bool, shape (np,)
+        Whether there are points enough about each of the system's points, or a gripper that holds it.
     iterations : int
     centre_line : ndarray, shape (K, 2, 3)
         Start and end of every link [m].
@@ -112,7 +120,8 @@ class Fit:
     std: Array
     distance: float
     inliers: float
-    coverage: Mapping[str, float]
+    coverage: Array
+    seen: NDArray[np.bool_]
     iterations: int
     centre_line: Array
 
@@ -126,6 +135,8 @@ class Sight:
     points : ndarray, shape (N, 3)
         Surface points in the world [m].
     weight : ndarray, shape (N,)
+    part : ndarray of int, shape (N,)
+        Connected part of the skeleton's graph to which each point belongs, 0 for the largest.
     nodes : ndarray, shape (K, 3)
         Of their skeleton [m].
     camera : ndarray, shape (3,)
@@ -134,6 +145,7 @@ class Sight:
 
     points: Array
     weight: Array
+    part: Integers
     nodes: Array
     camera: Array
 
@@ -206,7 +218,7 @@ class ShapeFit:
         self,
         sight: Sight,
         q_known: Array,
-        start: Array | None = None,
+        starts: Sequence[Array] = (),
         previous: tuple[Array, float] | None = None,
     ) -> Fit:
         """Fit the shape in one frame.
@@ -216,8 +228,9 @@ class ShapeFit:
         sight : Sight
         q_known : ndarray, shape (n,)
             Configuration whose robot part is right; the object's part is not used.
-        start : ndarray, shape (n,), optional
-            Where the search for the object's part begins; at rest where absent.
+        starts : sequence of ndarray, each (n,)
+            Where the search for the object's part begins, besides the shape at rest. The passes on the nodes, which
+            cost little, run from all of them, the others from the best that was found.
         previous : (ndarray of shape (n,), float), optional
             Configuration in the frame before and the time since then [s]: a prior.
 
@@ -236,38 +249,50 @@ class ShapeFit:
         q = self.rest.copy()
         known = [self.system.mechanism.joint_index(name) for name in self.known]
         q[known] = q_known[known]
-        q[free] = (self.rest if start is None else start)[free]
         weight = np.minimum(sight.weight, options.weight_cap)
         # nodes weigh together as much as the points, which share their errors
         node_weight = np.full(len(sight.nodes), weight.sum() / len(sight.nodes))
         factor = 1.0 / (options.noise_correlation * options.noise**2)
-        iterations, hessian = 0, np.eye(len(free))
         passes = [(sight.nodes, node_weight, NODE_FACTOR, scale) for scale in options.scales]
         passes += [(sight.points, weight, 1.0, scale) for scale in options.surface_scales]
-        for points, heft, share, scale in passes:
-            task = _Task(points, heft * factor, share, scale, sight.camera, previous)
-            q, hessian, used = self._minimise(q, task)
+        tasks = [_Task(p, w * factor, share, scale, sight.camera, previous) for p, w, share, scale in passes]
+        found, iterations = [], 0
+        for start in (*starts, self.rest):
+            trial = q.copy()
+            trial[free] = start[free]
+            cost, hessian = math.inf, np.eye(len(free))
+            for task in tasks[: len(options.scales)]:
+                trial, hessian, cost, used = self._minimise(trial, task)
+                iterations += used
+            found.append((cost, trial, hessian))
+        _, q, hessian = min(found, key=lambda entry: entry[0])
+        for task in tasks[len(options.scales) :]:
+            q, hessian, _, used = self._minimise(q, task)
             iterations += used
-        last = passes[-1]
-        error, link, along = self._errors(q, last[0], last[2], sight.camera)
+        near = (options.surface_scales or options.scales)[-1] * 3
+        error, link, along = self._errors(q, sight.points, 1.0, sight.camera)
         size = np.abs(error)
-        share_in = size < 3 * last[3]
+        share_in = size < near
+        own = _own_parts(sight.part, share_in, weight)
         points, jacobian = self._seen(q)
         spread = np.array(jacobian) @ np.linalg.solve(hessian, np.array(jacobian).T)
         corners = np.array(self._corners(q)[0]).reshape(-1, 2, 3)
+        coverage = self._coverage(link[share_in], along[share_in])
+        places = np.array(points).reshape(-1, 3)
         return Fit(
             q,
-            np.array(points).reshape(-1, 3),
+            places,
             np.sqrt(np.maximum(np.diag(spread), 0.0)).reshape(-1, 3),
-            float(np.average(np.minimum(size, 0.1), weights=last[1])),
-            float(np.average(share_in, weights=last[1])),
-            self._coverage(link[share_in], along[share_in]),
+            float(np.average(np.minimum(size, 0.1)[own], weights=weight[own])),
+            float(np.average(share_in[own], weights=weight[own])),
+            coverage,
+            self._seen_points(corners, places, coverage),
             iterations,
             corners,
         )
 
-    def _minimise(self, q: Array, task: _Task) -> tuple[Array, Array, int]:
-        """Levenberg and Marquardt's method; the configuration, the Hessian there, and the number of iterations."""
+    def _minimise(self, q: Array, task: _Task) -> tuple[Array, Array, float, int]:
+        """Levenberg and Marquardt's method: the configuration, the Hessian and the cost there, the iterations."""
         free = list(self.free)
         cost, gradient, hessian = self._system(q, task)
         damping = 1e-3
@@ -288,7 +313,7 @@ class ShapeFit:
                 damping *= 10
                 if size < 1e-5 or damping > 1e6:
                     break
-        return q, hessian, used
+        return q, hessian, cost, used
 
     def _errors(self, q: Array, points: Array, share: float, camera: Array) -> tuple[Array, Integers, Array]:
         """e_i, the link that each point belongs to, and where along it (0 to 1)."""
@@ -351,15 +376,29 @@ class ShapeFit:
             hessian += slow**2 * np.eye(len(change))
         return cost, gradient, hessian
 
-    def _coverage(self, link: Integers, along: Array) -> dict[str, float]:
+    def _coverage(self, link: Integers, along: Array) -> Array:
         stations = link * _STATIONS + np.minimum((along * _STATIONS).astype(np.int64), _STATIONS - 1)
         filled = np.bincount(stations, minlength=len(self.radius) * _STATIONS).reshape(-1, _STATIONS) > 0
-        owners = np.array(self.owner)
-        return {s.name: float(filled[owners == s.name].mean()) for s in self.system.segments}
+        return np.asarray(filled.mean(axis=1))
+
+    def _seen_points(self, corners: Array, places: Array, coverage: Array) -> NDArray[np.bool_]:
+        """A point is seen where a link that begins or ends there is."""
+        apart = np.linalg.norm(corners[:, :, None] - places, axis=3).min(axis=1)
+        covered = (apart < _TOUCHING) & (coverage[:, None] >= self.options.least_coverage)
+        held = {grasp.held for grasp in self.system.grasps}
+        return np.asarray(covered.any(axis=0) | np.array([name in held for name in self.system.points]))
 
     def place(self, q: ArrayLike) -> Array:
         """The system's points at a configuration, shape (np, 3) [m]."""
         return np.array(self._seen(np.asarray(q, float))[0]).reshape(-1, 3)
+
+
+def _own_parts(part: Integers, near: NDArray[np.bool_], weight: Array) -> NDArray[np.bool_]:
+    """Points of the largest part, and of others that mostly lie on the shape."""
+    total = np.bincount(part, weight)
+    share = np.bincount(part, weight * near) / np.maximum(total, 1e-12)
+    share[0] = 1.0
+    return np.asarray(share[part] >= _OWN_SHARE)
 
 
 @dataclass(frozen=True, eq=False)

@@ -46,6 +46,10 @@ class TrackOptions:
     clock : ClockOptions
     d_max : float
         A frame whose points are further from the fitted shape than this on average is dropped [m].
+    largest_bend : float
+        As is one whose shape has a joint that is bent further [rad].
+    worse : float
+        As is one where this distance is so many times the median of all good frames.
     least_inliers : float
         As is one of which a smaller share of the points lies on the shape.
     point_std_max : float
@@ -67,6 +71,8 @@ class TrackOptions:
     fit: FitOptions = field(default_factory=FitOptions)
     clock: ClockOptions = field(default_factory=ClockOptions)
     d_max: float = 0.012
+    largest_bend: float = 1.2
+    worse: float = 1.7
     least_inliers: float = 0.6
     point_std_max: float = 0.02
     std_floor: float = 0.003
@@ -326,6 +332,8 @@ class _Tracker:
             if stage is not None and report.good:
                 kept.append(stage)
         self.tell(2 * total, 2 * total, "done")
+        usual = float(np.median([f.fit.distance for f in frames if f.good and f.fit is not None] or [0.0]))
+        frames = [self._compared(frame, usual) for frame in frames]
         return self._track(frames, clock, kept)
 
     def _check_clock(self, usable: Sequence[int]) -> None:
@@ -401,21 +409,16 @@ class _Tracker:
         if not len(found.nodes):
             return replace(report, reason="no part of the cloud is dense enough for a skeleton"), None
         rest = cloud.keep(found.connected)
-        fit = self._best_fit(Sight(rest.points, rest.weight, found.nodes, self.camera), q, t, last)
+        part = found.part[found.label[found.connected]]
+        sight = Sight(rest.points, rest.weight, part, found.nodes, self.camera)
+        before = () if last is None else (last[0],)
+        fit = self.shape.solve(sight, q, before, None if last is None else (last[0], t - last[1]))
         spent = time.process_time() - begun
         report = replace(report, fit=fit, reason=self._judge(fit), seconds=spent)
         stage = None
         if index in self.wanted:
             stage = Stages(self.film.names[index], self.film.world(index), rest.points, found, fit, self.camera)
         return report, stage
-
-    def _best_fit(self, sight: Sight, q: Array, t: float, last: tuple[Array, float] | None) -> Fit:
-        if last is not None:
-            fit = self.shape.solve(sight, q, last[0], (last[0], t - last[1]))
-            if not self._judge(fit):
-                return fit
-        fresh = self.shape.solve(sight, q)
-        return fresh if last is None or fresh.distance <= fit.distance else fit
 
     def _judge(self, fit: Fit) -> str:
         options = self.options
@@ -424,9 +427,18 @@ class _Tracker:
         if fit.distance > options.d_max:
             limit = 1e3 * options.d_max
             return f"the shape does not fit: {1e3 * fit.distance:.1f} mm off on average, d_max is {limit:g} mm"
+        bend = float(np.abs((fit.q - self.shape.rest)[list(self.shape.free)]).max())
+        if bend > options.largest_bend:
+            return f"the shape is folded: a joint is bent by {math.degrees(bend):.0f} degrees"
         if fit.inliers < options.least_inliers:
             return f"the shape does not fit: only {100 * fit.inliers:.0f} % of the points lie on it"
         return ""
+
+    def _compared(self, frame: FrameReport, usual: float) -> FrameReport:
+        if not frame.good or frame.fit is None or frame.fit.distance <= self.options.worse * usual:
+            return frame
+        off = f"{1e3 * frame.fit.distance:.1f} mm off on average, {1e3 * usual:.1f} mm are usual"
+        return replace(frame, reason=f"the shape fits worse than in other frames: {off}")
 
     def _track(self, frames: Sequence[FrameReport], clock: Clock, kept: Sequence[Stages]) -> Track:
         good = [frame for frame in frames if frame.good]
@@ -447,6 +459,7 @@ class _Tracker:
             velocity = np.asarray(CubicSpline(t, position, axis=0)(t, 1))
             std = np.hypot(std, np.abs(velocity) * uncertain)
         unseen = np.linalg.norm(std, axis=2) > math.sqrt(3.0) * self.options.point_std_max
+        unseen |= ~np.array([fit.seen[columns] for fit in fits])
         return Track(
             self.names,
             t,

@@ -1,0 +1,205 @@
+"""One case of each verdict, the format of what comes out, and input that is refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from jsonschema import validate
+
+from yid_ocp.diagnosis import Thresholds, diagnose
+from yid_ocp.errors import YidError
+from yid_ocp.problem import ProblemOptions, SensorOptions
+
+NUMBER, TEXT = {"type": "number"}, {"type": "string"}
+MAYBE = {"type": ["number", "null"]}
+PLACES = {
+    "type": "array",
+    "items": {
+        "type": "object",
+        "properties": {
+            "location": TEXT,
+            "share": {"type": "number", "minimum": 0, "maximum": 1},
+            "observable": {"type": "boolean"},
+            "windows": {"type": "array", "items": {"type": "array", "items": NUMBER, "minItems": 2, "maxItems": 2}},
+        },
+        "required": ["location", "share", "observable", "windows"],
+    },
+}
+EFFECT = {"type": "object", "properties": {"kind": TEXT, "location": TEXT}, "required": ["kind", "location"]}
+STATE = {
+    "type": "object",
+    "properties": {
+        "rmse": {"type": "object", "additionalProperties": NUMBER},
+        "chi2_per_dof": NUMBER,
+        "p_value": {"type": "number", "minimum": 0, "maximum": 1},
+    },
+    "required": ["rmse", "chi2_per_dof", "p_value"],
+}
+SCHEMA = {
+    "type": "object",
+    "properties": {
+        "format": {"const": "yid-diagnosis/1"},
+        "verdict": {"enum": ["effect", "confusable", "no_gap", "unknown", "insufficient_data"]},
+        "gap": {
+            "type": "object",
+            "properties": {
+                "before": STATE,
+                "after": STATE,
+                "closure": MAYBE,
+                "closure_ci": {"type": ["array", "null"], "items": MAYBE, "minItems": 2, "maxItems": 2},
+                "held_out": {"type": "array", "items": TEXT, "minItems": 1},
+            },
+            "required": ["before", "after", "closure", "closure_ci", "held_out"],
+        },
+        "where": PLACES,
+        "which": {
+            "type": "array",
+            "items": {
+                "type": "object",
+                "properties": {
+                    "kind": TEXT,
+                    "location": TEXT,
+                    "parameters": {
+                        "type": "object",
+                        "additionalProperties": {
+                            "type": "object",
+                            "properties": {"value": MAYBE, "std": MAYBE, "unit": TEXT},
+                            "required": ["value", "std", "unit"],
+                        },
+                    },
+                    "score": NUMBER,
+                    "p_value": NUMBER,
+                    "closure": MAYBE,
+                },
+                "required": ["kind", "location", "parameters", "score", "p_value", "closure"],
+            },
+        },
+        "effects": {"type": "array", "items": EFFECT},
+        "remaining": {
+            "type": "object",
+            "properties": {"p_value": NUMBER, "where": PLACES},
+            "required": ["p_value", "where"],
+        },
+        "confusable": {"type": "array", "items": {"type": "array", "items": EFFECT, "minItems": 2}},
+        "next_experiment": TEXT,
+    },
+    "required": ["format", "verdict", "gap", "where", "which", "effects", "remaining", "confusable", "next_experiment"],
+}
+FRICTION = ("joint_coulomb", "link_mass@elbow", "effort_offset@elbow")
+
+
+def found(bench, effects, candidates, *, held_out=True, **how):
+    recordings = [bench.recording(effects, seed, **how) for seed in (1, 2)]
+    problem = bench.problem(recordings[:1])
+    finding = diagnose(problem, candidates, recordings[1:] if held_out else (), thresholds=Thresholds(effects=2))
+    result = json.loads(json.dumps(finding.to_dict()))
+    validate(result, SCHEMA)
+    assert sum(place["share"] for place in result["where"]) == pytest.approx(1.0)
+    return finding, result
+
+
+def test_a_withheld_effect_is_named_placed_and_measured(bench):
+    finding, result = found(bench, {"joint_coulomb@elbow": {"tau_c": 0.1}}, FRICTION)
+    assert result["verdict"] == "effect"
+    assert result["effects"] == [{"kind": "joint_coulomb", "location": "elbow"}]
+    assert result["which"][0]["kind"] == "joint_coulomb"
+    assert result["where"][0]["location"] == "elbow"
+    said = result["which"][0]["parameters"]["tau_c"]
+    assert abs(said["value"] - 0.1) < 4 * said["std"]
+    low, high = result["gap"]["closure_ci"]
+    assert 0.9 < low <= result["gap"]["closure"] <= high + 1e-12
+    assert result["gap"]["after"]["chi2_per_dof"] < 1.1 < result["gap"]["before"]["chi2_per_dof"]
+    damping = next(entry for entry in finding.absorbed if entry.name == "elbow.damping")
+    assert damping.before > damping.after, "friction hides in the damping until it is named"
+    assert "joint_coulomb@elbow with tau_c" in result["summary"]
+
+
+def test_a_model_that_is_right_has_no_gap(bench):
+    _, result = found(bench, {}, FRICTION)
+    assert result["verdict"] == "no_gap"
+    assert result["effects"] == []
+    assert result["gap"]["closure"] is None
+    assert result["gap"]["before"] == result["gap"]["after"]
+
+
+def test_one_recording_is_split_in_blocks_and_the_report_says_so(bench):
+    _, result = found(bench, {"joint_coulomb@elbow": {"tau_c": 0.1}}, FRICTION, held_out=False)
+    assert result["verdict"] == "effect"
+    assert result["effects"] == [{"kind": "joint_coulomb", "location": "elbow"}]
+    assert result["held_out_in_blocks"]
+    assert "blocks" in result["summary"]
+
+
+def test_an_effect_that_is_not_in_the_library_is_unknown_but_placed(bench):
+    def rattle(t):
+        return np.stack([0 * t, 0.15 * np.sin(2 * np.pi * 7.3 * t)], axis=1)
+
+    _, result = found(bench, {}, FRICTION, torque=rattle)
+    assert result["verdict"] == "unknown"
+    assert result["effects"] == []
+    assert result["where"][0]["location"] == "elbow"
+
+
+def test_effects_that_do_the_same_are_confusable(bench):
+    # turning gravity about x and turning the first joint about x are one and the same
+    _, result = found(
+        bench, {"gravity_tilt@world": {"rx": 0.05}}, ("gravity_tilt", "encoder_offset@shoulder", "link_mass@elbow")
+    )
+    assert result["verdict"] == "confusable"
+    labels = {f"{entry['kind']}@{entry['location']}" for entry in result["confusable"][0]}
+    assert labels == {"gravity_tilt@world", "encoder_offset@shoulder"}
+    assert result["next_experiment"]
+
+
+def test_a_moment_of_data_is_insufficient(bench):
+    _, result = found(bench, {"joint_coulomb@elbow": {"tau_c": 0.1}}, FRICTION, duration=0.04)
+    assert result["verdict"] == "insufficient_data"
+    assert result["effects"] == []
+    assert "effective samples" in result["message"]
+
+
+def refused(call, *words):
+    with pytest.raises(YidError) as caught:
+        call()
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_held_out_data_must_be_other_data(bench):
+    recording = bench.recording({}, 1, duration=0.5)
+    copy = replace(recording, name="another_name")
+    refused(lambda: diagnose(bench.problem([recording]), FRICTION, [copy]), "both estimated on and held out")
+
+
+@pytest.mark.parametrize(
+    ("candidates", "words"),
+    [
+        (["kelvin_voigt"], ("kelvin_voigt does not fit",)),
+        (["joint_coulom"], ("joint_coulom", "joint_coulomb")),
+        (["joint_coulomb@elbo"], ("elbo", "elbow")),
+        (["camera_latency"], ("camera_latency does not fit", "camera")),
+        ([], ("no candidate",)),
+        ("everything", ("all",)),
+    ],
+)
+def test_candidates_that_do_not_fit_are_refused(bench, candidates, words):
+    problem = bench.problem([bench.recording({}, 1, duration=0.5)])
+    refused(lambda: diagnose(problem, candidates), *words)
+
+
+@pytest.mark.parametrize("std", [None, 0.0])
+def test_a_noise_level_that_is_zero_or_absent_is_refused(bench, std):
+    recording = bench.recording({}, 1, duration=0.5)
+    silent = replace(recording, joints=replace(recording.joints, effort_std=std))
+    refused(lambda: diagnose(bench.problem([silent]), FRICTION), "noise level")
+
+
+def test_the_papers_weighting_cannot_be_diagnosed(bench):
+    options = ProblemOptions(
+        weighting="paper", path_cutoff=float("inf"), sensors={"joints.effort": SensorOptions(std=0.02)}
+    )
+    problem = bench.problem([bench.recording({}, 1, duration=0.5)], options=options)
+    refused(lambda: diagnose(problem, FRICTION), "whitened")

@@ -1,0 +1,173 @@
+"""The steps of a diagnosis, each on its own."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.stats
+
+from yid_ocp.diagnosis import closure, confusability, linearise, null_test, refit, residual_series, scores, visibility
+from yid_ocp.diagnosis.hypotheses import Composed, Series, chosen_effects, smoothed_colour
+from yid_ocp.diagnosis.localise import by_effort
+from yid_ocp.diagnosis.score import robust, shape_grid
+from yid_ocp.diagnosis.select import Loss, gain, within_reach
+from yid_ocp.effects import make_effect
+
+
+def white(rows, colour=None):
+    t = 0.01 * np.arange(len(rows))
+    return Series("run", "points.tip", "points", "m", t, rows, np.ones(1) if colour is None else colour)
+
+
+@pytest.fixture(scope="module")
+def screened(bench):
+    recordings = [bench.recording({"joint_coulomb@elbow": {"tau_c": 0.1}}, seed, duration=2.0) for seed in (1, 2)]
+    problem = bench.problem(recordings[:1])
+    choice = ("effort_offset", "joint_coulomb", "joint_stribeck@elbow", "rotor_inertia@elbow", "link_mass@elbow")
+    effects = chosen_effects(bench.system, recordings, choice)
+    composed = Composed.of(problem, effects, recordings[1:])
+    nominal = refit(composed, (), {})
+    return composed, nominal, linearise(composed, (), nominal.values)
+
+
+def test_p_values_of_matching_noise_are_uniform():
+    rng = np.random.default_rng(5)
+    rows = np.arange(400)
+    p = [null_test([white(rows)], rng.standard_normal(400), 0).p_value for _ in range(300)]
+    assert scipy.stats.kstest(p, "uniform").pvalue > 0.01
+
+
+def test_p_values_of_coloured_noise_are_uniform_when_its_colour_is_known():
+    rng = np.random.default_rng(6)
+    colour = smoothed_colour(5.0, 0.01)
+    lags = np.abs(np.subtract.outer(np.arange(400), np.arange(400)))
+    covariance = np.where(lags < len(colour), colour[np.minimum(lags, len(colour) - 1)], 0.0)
+    values, vectors = np.linalg.eigh(covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0))
+    rows = np.arange(400)
+    p = np.array([null_test([white(rows, colour)], root @ rng.standard_normal(400), 0).p_value for _ in range(300)])
+    assert scipy.stats.kstest(p, "uniform").pvalue > 1e-3
+    blind = np.array([null_test([white(rows)], root @ rng.standard_normal(400), 0).p_value for _ in range(300)])
+    assert np.mean(blind < 0.01) > np.mean(p < 0.01), "taking coloured noise for white raises false alarms"
+
+
+def test_a_burst_is_flagged_where_it_is():
+    rng = np.random.default_rng(7)
+    r = rng.standard_normal(1000)
+    r[310:340] += 4
+    test = null_test([white(np.arange(1000))], r, 0)
+    assert [(w.begin, w.end) for w in test.windows if w.flagged] == [(3.0, 3.5)]
+    assert test.whiteness["points.tip"] < 1e-3
+
+
+def test_screening_finds_the_withheld_effect_first(screened):
+    _, nominal, point = screened
+    series = residual_series(nominal.problem)
+    ranked = scores(point, series, visibility(point))
+    assert ranked[0].effect.label == "joint_coulomb@elbow"
+    assert ranked[0].step["joint_coulomb@elbow.tau_c"] == pytest.approx(0.1, rel=0.1)
+    assert ranked[0].p_value < 1e-6
+    assert all(a.decrease >= b.decrease for a, b in zip(ranked, ranked[1:], strict=False))
+
+
+def test_the_promised_decrease_is_that_of_a_refit_where_the_model_is_linear(screened):
+    composed, nominal, point = screened
+    series = residual_series(nominal.problem)
+    ranked = {s.effect.label: s for s in scores(point, series, visibility(point))}
+    for label in ("joint_coulomb@elbow", "rotor_inertia@elbow", "effort_offset@shoulder"):
+        if label not in ranked:
+            continue
+        effect = next(e for e in composed.effects if e.label == label)
+        fit = refit(composed, (effect,), nominal.values)
+        assert 2 * (nominal.cost - fit.cost) == pytest.approx(ranked[label].decrease, rel=1e-3, abs=1e-3)
+
+
+def test_what_the_fit_has_explained_is_projected_off(screened):
+    _, nominal, point = screened
+    jacobian = nominal.evaluation.jacobian[: len(point.residual)]
+    size = np.linalg.norm(jacobian, axis=0)
+    assert np.abs(jacobian.T @ point.residual / size).max() < 1e-8 * np.linalg.norm(point.residual)
+    for signature in point.signatures:
+        leak = np.abs(jacobian.T @ signature.columns / size[:, None]).max()
+        assert leak < 1e-8 * max(np.abs(signature.columns).max(), 1e-300) * len(jacobian)
+
+
+def test_a_candidate_explains_itself_and_nothing_explains_more(screened):
+    _, _, point = screened
+    table = confusability(point)
+    assert np.diag(table.matrix) == pytest.approx(1.0)
+    assert np.all((table.matrix >= 0) & (table.matrix <= 1))
+    assert "joint_stribeck@elbow" in table.labels
+
+
+def test_detectable_amplitudes_do_not_depend_on_the_residual_and_fall_with_the_noise(screened):
+    _, nominal, point = screened
+    table = {v.effect.label: v for v in visibility(point)}
+    silent = {v.effect.label: v for v in visibility(type(point)(0 * point.residual, point.signatures, {}))}
+    assert all(table[label].detectable == silent[label].detectable for label in table)
+    coulomb = table["joint_coulomb@elbow"].detectable["joint_coulomb@elbow.tau_c"]
+    assert 0 < coulomb < 0.1
+    del nominal
+
+
+def test_robust_covariance_of_white_scores_is_the_plain_one():
+    rng = np.random.default_rng(8)
+    x = rng.standard_normal((4000, 2))
+    total = np.mean([robust(x, rng.standard_normal(4000), [white(np.arange(4000))]) for _ in range(40)], axis=0)
+    assert total == pytest.approx(x.T @ x, rel=0.1, abs=300)
+
+
+def test_shapes_are_tried_over_their_range(bench):
+    effect = make_effect("joint_stribeck", "elbow", bench.system)
+    grid = shape_grid(effect, 4)
+    values = [entry["joint_stribeck@elbow.v_stribeck"] for entry in grid]
+    assert (values[0], values[-1]) == pytest.approx(effect.prior_range["joint_stribeck@elbow.v_stribeck"])
+    assert shape_grid(make_effect("joint_coulomb", "elbow", bench.system)) == [{}]
+
+
+def loss(squares, counts):
+    return Loss(np.asarray(squares, float), np.asarray(counts, float), {})
+
+
+def test_closure_is_the_part_of_the_gap_that_is_gone():
+    rng = np.random.default_rng(9)
+    counts = np.full(40, 50.0)
+    noise = 50 * (1 + 0.1 * rng.standard_normal(40))
+    before, after = loss(noise + 100, counts), loss(noise + 25, counts)
+    found = closure(before, after)
+    assert found.value == pytest.approx(1 - after.gap / before.gap)
+    assert found.low < found.value < found.high
+    assert 0.6 < found.low
+    assert found.high < 0.9
+    assert closure(before, before).value == 0
+    assert np.isnan(closure(loss(0.9 * counts, counts), after).value)
+
+
+def test_a_rollout_that_failed_never_wins():
+    counts = np.full(10, 50.0)
+    good, failed = loss(counts, counts), loss(np.full(10, np.inf), counts)
+    assert gain(failed, good)[0] == np.inf
+    assert gain(good, failed)[0] == -np.inf
+
+
+def test_the_simplest_within_one_standard_error_wins(screened):
+    composed, nominal, _ = screened
+    effects = {e.label: e for e in composed.effects}
+    one = refit(composed, (effects["joint_coulomb@elbow"],), nominal.values)
+    two = refit(composed, (effects["joint_coulomb@elbow"], effects["effort_offset@shoulder"]), nominal.values)
+    assert within_reach([two, one])[0] is one
+    assert nominal not in within_reach([nominal, one])
+
+
+def test_effort_residuals_say_which_joint():
+    rng = np.random.default_rng(10)
+    series = [
+        Series("run", f"joints.effort.{joint}", "joints.effort", "N m", 0.01 * np.arange(500), rows, np.ones(1))
+        for joint, rows in (("a", np.arange(500)), ("b", np.arange(500, 1000)))
+    ]
+    r = rng.standard_normal(1000)
+    r[500:] *= 3
+    places = by_effort(series, r, ())
+    assert [p.location for p in places] == ["b", "a"]
+    assert places[0].share > 0.95
+    assert sum(p.share for p in places) == pytest.approx(1)

@@ -1,0 +1,502 @@
+"""Experiments that were not made: other grasps, arms and motions, every sensor that could look on, and their information."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from yid_ocp.analysis.identifiability import StartKnowledge, carried, with_nuisances
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.data.synthetic import Motion, initial_posture, simulate_in_mujoco
+from yid_ocp.errors import DataError, SolverError, YidError
+from yid_ocp.integrator.step import Step, compile_step
+from yid_ocp.model.kinematics import forward_kinematics
+from yid_ocp.model.mechanism import Frame, Placement
+from yid_ocp.model.system import System
+from yid_ocp.problem import EstimationProblem, SensorOptions
+from yid_ocp.problem.inputs import Grid, camera_pose
+from yid_ocp.problem.problem import Episode
+
+Array = NDArray[np.float64]
+
+CAMERA, ARM = "points_camera", "points_arm"
+MARKER_DISTANCE = 0.03  # of a marker from the axis [m]
+CAMERA_STD, CAMERA_RATE = 5e-3, 3.0  # of a camera where there was none [m], [Hz]
+ARM_STD = 1e-3  # of points that an arm measures where it measured none [m]
+TORQUE_STD = 0.1  # of joint torques whose noise nobody stated [N m]
+# Two arms hold the object pushed together and away from the robot: at its full stretch a branched tube snaps [m].
+TOGETHER, FORWARD = 0.05, 0.08
+
+
+@dataclass(frozen=True)
+class View:
+    """What a sensor sees of one frame.
+
+    Attributes
+    ----------
+    group, frame : str
+        Group of the recording and frame of the mechanism.
+    times : ndarray, shape (M,)
+        Since the start of the recording [s].
+    std : ndarray, shape (M, 3)
+        [m]
+    """
+
+    group: str
+    frame: str
+    times: Array
+    std: Array
+
+
+@dataclass(frozen=True)
+class Setting:
+    """The experiment that was made, and what its variations may use.
+
+    Attributes
+    ----------
+    problem : EstimationProblem
+    x : ndarray, shape (nx,)
+        Point at which to judge.
+    start : "unknown" or "known"
+    grasp_std : float or None
+    second_arm : System, optional
+        The system with one more arm, its grasp included.
+    torque_std : float
+        Of joint torques as a measurement, where the recording states none [N m].
+    seed : int
+        Of another motion.
+    """
+
+    problem: EstimationProblem
+    x: Array
+    start: StartKnowledge = "unknown"
+    grasp_std: float | None = None
+    second_arm: System | None = None
+    torque_std: float = TORQUE_STD
+    seed: int = 11
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Every parameter at the point."""
+        theta, _ = self.problem.split(self.x, 0)
+        return dict(zip(self.problem.system.parameters.names, map(float, theta), strict=True))
+
+    def camera(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
+        """The camera's group, the times of its frames since the start and its typical deviation [m]."""
+        for group in used_groups(self.problem, episode):
+            if camera_pose(group) is not None:
+                std = self._std(group)
+                return group, group.t - episode.grid.start, float(np.nanmedian(std))
+        return None, regular_times(episode.grid, CAMERA_RATE), CAMERA_STD
+
+    def arm(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
+        """The same of what the arms measure."""
+        for group in used_groups(self.problem, episode):
+            if "arm" in group.name or group.sensor == "arm":
+                return group, group.t - episode.grid.start, float(np.nanmedian(self._std(group)))
+        return None, episode.grid.times - episode.grid.start, ARM_STD
+
+    def views(self, episode: Episode) -> list[View]:
+        """What the sensors of the recording saw, point by point."""
+        found = []
+        for group in used_groups(self.problem, episode):
+            std = self._std(group)
+            for point, frame in self.frames(group).items():
+                at = group.names.index(point)
+                seen = np.all(np.isfinite(group.position[:, at]), axis=1)
+                found.append(View(group.name, frame, group.t[seen] - episode.grid.start, std[seen, at]))
+        return found
+
+    def frames(self, group: PointGroup) -> dict[str, str]:
+        """Frame that each used point of a group marks."""
+        choice = self.problem.options.sensors.get(group.name, SensorOptions())
+        wanted = choice.points if choice.points is not None else group.names
+        frames = {point: choice.frames.get(point, point) for point in wanted}
+        return {p: f for p, f in frames.items() if f in self.problem.system.mechanism.frames}
+
+    def _std(self, group: PointGroup) -> Array:
+        said = self.problem.options.sensors.get(group.name, SensorOptions()).std
+        if isinstance(said, float):
+            return np.full(group.position.shape, said)
+        if group.std is None:
+            raise DataError(f"the noise level of group '{group.name}' is not known", hint="set it under `sensors`")
+        return group.std
+
+
+def used_groups(problem: EstimationProblem, episode: Episode) -> list[PointGroup]:
+    """Groups of points that the problem looks at."""
+    sensors = problem.options.sensors
+    return [g for g in episode.recording.points if sensors.get(g.name, SensorOptions()).use]
+
+
+def regular_times(grid: Grid, rate: float) -> Array:
+    """Times of an even clock over a recording, from its start [s]."""
+    return np.arange(0.0, grid.steps * grid.time_step + 1e-9, 1.0 / rate)
+
+
+# -- what could be seen -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Sight:
+    """A frame that could be seen: its name, what it is in words, who could see it; `frame` where it must be added."""
+
+    name: str
+    words: str
+    arm: bool
+    frame: Frame | None = None
+
+
+def sights(system: System) -> list[Sight]:
+    """Tips and middles of segments and markers beside tubes; of a mechanism without any its links and markers on them."""
+    tree = system.mechanism
+    held = {grasp.held for grasp in system.grasps}
+    found: list[Sight] = []
+    for segment in system.segments:
+        count, tip = len(segment.links), f"w_{segment.name}"
+        found.append(Sight(tip, f"the end of {segment.name}", False))
+        if count > 1:
+            found.append(Sight(f"{segment.name}_{(count - 1) // 2}_tip", f"the middle of {segment.name}", False))
+        beside = _displaced(tree.frame(tip), (MARKER_DISTANCE, 0.0, 0.0))
+        words = f"a marker {100 * MARKER_DISTANCE:g} cm off the axis at the end of {segment.name}"
+        found.append(Sight(f"{segment.name}_marker", words, tip in held, beside))
+    if system.segments:
+        return found
+    moving = [name for name, frame in tree.frames.items() if frame.joint >= 0]
+    found = [Sight(name, name, False) for name in moving]
+    for spring in system.elastic:
+        joint = tree.joints[tree.joint_index(spring.joint)]
+        if joint.kind == "revolute":
+            across = np.eye(3)[int(np.argmin(np.abs(joint.axis)))]
+            across -= np.array(joint.axis) * float(across @ joint.axis)
+            across *= MARKER_DISTANCE / float(np.linalg.norm(across))
+            frame = _displaced(Frame(tree.joint_index(spring.joint), Placement.identity()), across)
+            words = f"a marker {100 * MARKER_DISTANCE:g} cm off the axis of {spring.joint}"
+            found.append(Sight(f"{spring.joint}_marker", words, False, frame))
+    return found
+
+
+def _displaced(frame: Frame, offset: ArrayLike) -> Frame:
+    shift = Placement(ca.SX(ca.DM.eye(3)), ca.SX(ca.DM(np.asarray(offset, float))))
+    return Frame(frame.joint, frame.placement @ shift)
+
+
+def seeing(step: Step, frames: Mapping[str, Frame]) -> Step:
+    """The same step of a system with more frames; sensors need no new equations of motion."""
+    mechanism = step.system.mechanism
+    other = copy.copy(step)
+    other.system = replace(step.system, mechanism=replace(mechanism, frames={**mechanism.frames, **frames}))
+    return other
+
+
+# -- layouts ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Layout:
+    """One experiment's mechanics and motion with everything that could be seen of it.
+
+    Attributes
+    ----------
+    problem : EstimationProblem
+        With nuisances, and with every sight in view at every node.
+    x : ndarray, shape (nx,)
+    names : tuple of str
+        Free parameters, in the order of judgements.
+    slopes : mapping of (episode, group, frame) to ndarray, shape (N + 1, 3, nx)
+        Sensitivity of a frame's position at every node.
+    fixed : ndarray, shape (nx, nx)
+        Information that does not depend on points: priors of nuisances, joint torques that are measured.
+    notes : tuple of str
+        What would stand in the way on a real robot, such as joint limits.
+    """
+
+    problem: EstimationProblem
+    x: Array
+    names: tuple[str, ...]
+    slopes: Mapping[tuple[int, str, str], Array]
+    fixed: Array
+    notes: tuple[str, ...] = ()
+    _known: dict[tuple[int, str, str, bytes, bytes], Array] = field(default_factory=dict, repr=False)
+
+    def information(self, views: Sequence[Sequence[View]]) -> Array:
+        """Fisher information of some views, one list for each recording, together with what is fixed."""
+        total = self.fixed.copy()
+        for i, episode in enumerate(self.problem.episodes):
+            for view in views[i % len(views)]:
+                total += self._of(i, episode.grid, view)
+        return total
+
+    def _of(self, episode: int, grid: Grid, view: View) -> Array:
+        key = (episode, view.group, view.frame, view.times.tobytes(), view.std.tobytes())
+        if key not in self._known:
+            inside = (view.times >= -1e-9) & (view.times <= grid.steps * grid.time_step + 1e-9)
+            node, fraction = grid.locate(grid.start + view.times[inside])
+            slopes = self.slopes[episode, view.group, view.frame]
+            after = slopes[np.minimum(node + 1, grid.steps)]
+            rows = slopes[node] + fraction[:, None, None] * (after - slopes[node])
+            rows = (rows / view.std[inside][:, :, None]).reshape(-1, rows.shape[2])
+            self._known[key] = rows.T @ rows
+        return self._known[key]
+
+
+MECHANICS: Mapping[str, str] = {
+    "weld": "weld grasps in place of points",
+    "second_arm": "a second arm",
+    "motion": "another motion",
+    "travel": "another motion of twice the travel",
+    "torque": "joint torques as a measurement, the arms' motion as known",
+}
+
+
+class Workshop:
+    """Builds layouts, each once.
+
+    Parameters
+    ----------
+    setting : Setting
+    tell : callable, optional
+        Told what takes time.
+    """
+
+    def __init__(self, setting: Setting, tell: Callable[[str], None] | None = None) -> None:
+        self.setting = setting
+        self._tell = tell or (lambda text: None)
+        self._layouts: dict[frozenset[str], Layout | str] = {}
+
+    def layout(self, mechanics: frozenset[str]) -> Layout | str:
+        """The experiment with changes of mechanics, or why there is none."""
+        if mechanics not in self._layouts:
+            if mechanics:
+                self._tell("working out " + " and ".join(MECHANICS[name] for name in sorted(mechanics)))
+            try:
+                self._layouts[mechanics] = self._build(mechanics)
+            except YidError as error:
+                self._layouts[mechanics] = error.what
+        return self._layouts[mechanics]
+
+    def possible(self) -> list[str]:
+        """Changes of mechanics that make sense for the system."""
+        setting, system = self.setting, self.setting.problem.system
+        found = []
+        if any(grasp.kind != "weld" for grasp in system.grasps):
+            found.append("weld")
+        if setting.second_arm is not None:
+            found.append("second_arm")
+        if system.driven:
+            found += ["motion", "travel"]
+        measured = any("joints.effort" in s.sensor.group for e in setting.problem.episodes for s in e.samples)
+        if (system.driven or system.prescribed) and not measured and setting.problem.episodes[0].recording.joints:
+            found.append("torque")
+        return found
+
+    def _build(self, mechanics: frozenset[str]) -> Layout:
+        setting = self.setting
+        base = setting.problem
+        system, recordings, notes = self._experiment(mechanics)
+        if "torque" in mechanics:
+            system = replace(system, driven=(), prescribed=(*system.prescribed, *system.driven))
+        if mechanics - {"motion", "travel"} or system is not base.system:
+            step = compile_step(system, base.step.time_step, base.step.force_split, use_compiler=False)
+        else:
+            step = base.step
+        seen = sights(system)
+        step = seeing(step, {sight.name: sight.frame for sight in seen if sight.frame is not None})
+        wide = with_nuisances(base, setting.x, setting.start, setting.grasp_std)
+        sensors = {k: v for k, v in base.options.sensors.items() if k == "joints.effort"}
+        if "torque" in mechanics:
+            sensors = {"joints.effort": self._torque_options()}
+        options = replace(
+            wide.options, sensors=sensors, robust_scale=math.inf, tie_break=0.0, weighting="whitened", duration=None
+        )
+        dense = [self._dense(entry, i, seen, "torque" in mechanics) for i, entry in enumerate(recordings)]
+        values = {name: v for name, v in setting.values.items() if name in step.system.parameters}
+        nuisances = [name for name in wide.free if name not in base.free]
+        problem = EstimationProblem(step, dense, (*base.free, *nuisances), options, values)
+        x = carried(setting.x, base.names, problem)
+        evaluation = problem.evaluate(x)
+        if not evaluation.ok or evaluation.jacobian is None:
+            raise SolverError(f"the model cannot be rolled out: {evaluation.message}")
+        slopes: dict[tuple[int, str, str], Array] = {}
+        fixed = np.zeros((len(x), len(x)))
+        row = 0
+        for i, episode in enumerate(problem.episodes):
+            for samples in episode.samples:
+                count, width = samples.value.shape
+                block = evaluation.jacobian[row : row + count * width]
+                row += count * width
+                if samples.sensor.width == 3:
+                    parts = block.reshape(count, width // 3, 3, len(x))
+                    for k, frame in enumerate(samples.sensor.frames):
+                        slopes[i, samples.sensor.group, frame] = parts[:, k]
+                else:
+                    fixed += block.T @ block
+        names = tuple(name for name in problem.names if name.split("[")[0] in base.free)
+        stated = evaluation.jacobian[row : row + problem.stated_prior_rows].copy()
+        # what is presumed of the parameters themselves stays out: what is asked is what sensors say
+        stated[:, [problem.names.index(name) for name in names]] = 0.0
+        return Layout(problem, x, names, slopes, fixed + stated.T @ stated, tuple(notes))
+
+    def _experiment(self, mechanics: frozenset[str]) -> tuple[System, list[Recording], list[str]]:
+        """System and motion, driven as in the recordings."""
+        setting = self.setting
+        base = setting.problem
+        recordings = [self._cut(episode) for episode in base.episodes]
+        system = base.system
+        if "second_arm" in mechanics:
+            assert setting.second_arm is not None
+            system = setting.second_arm
+        if "weld" in mechanics:
+            system = self._welded(system, mechanics - {"weld", "torque", "motion", "travel"})
+        if not mechanics & {"motion", "travel", "second_arm"}:
+            return system, recordings, []
+        made: list[Recording] = []
+        notes: list[str] = []
+        for i, episode in enumerate(base.episodes):
+            try:
+                recording, beyond = self._moved(system, episode, setting.seed + i, "travel" in mechanics)
+            except DataError:
+                if system.driven != base.system.driven or not base.held_out or "travel" in mechanics:
+                    raise
+                recording, beyond = self._cut(base.held_out[i % len(base.held_out)]), []
+            made.append(replace(recording, name=episode.name))
+            notes += [note for note in beyond if note not in notes]
+        return system, made, notes
+
+    def _cut(self, episode: Episode) -> Recording:
+        """The part of a recording that the problem uses."""
+        if self.setting.problem.options.duration is None:
+            return episode.recording
+        return episode.recording.slice(-math.inf, float(episode.grid.times[-1]) + 1e-6)
+
+    def _welded(self, system: System, others: frozenset[str]) -> System:
+        """Grasps as welds that keep the orientation in which the ends lie at the start."""
+        layout = self.layout(others)
+        if isinstance(layout, str):
+            raise SolverError(layout)
+        problem = layout.problem
+        episode = problem.episodes[0]
+        state, _, message = problem.start_state(episode, *problem.split(layout.x, 0))
+        if message:
+            raise SolverError(message)
+        q, parameters = ca.SX.sym("q", system.size), problem.system.parameters
+        kinematics = forward_kinematics(problem.system.mechanism, q)
+        turned = []
+        for grasp in system.grasps:
+            pose = kinematics.pose(grasp.holder).rotation.T @ kinematics.pose(grasp.held).rotation
+            rotation = ca.Function("turn", [q, parameters.symbols], [pose])
+            theta, _ = problem.split(layout.x, 0)
+            turned.append(replace(grasp, kind="weld", rotation=ca.SX(rotation(state[: system.size], theta))))
+        return replace(system, grasps=tuple(turned))
+
+    def _moved(self, system: System, episode: Episode, seed: int, twice: bool) -> tuple[Recording, list[str]]:
+        """A motion of the driven joints in MuJoCo, from the recording's posture, and what a robot could not do of it."""
+        setting = self.setting
+        base = setting.problem
+        values = {name: v for name, v in setting.values.items() if name in system.parameters}
+        measured = dict(zip(base.system.driven, map(float, episode.measured_arm[0]), strict=True))
+        posture = measured
+        if system.driven != base.system.driven:
+            posture = initial_posture(system, values, seed=measured, offsets=_pushed_together(system, values))
+        duration = episode.grid.steps * episode.grid.time_step
+        travel = _travel(base.system, setting.values, episode) * (2.0 if twice else 1.0)
+        speed = 2.8 if twice else 1.4
+        motion = Motion.multisine(
+            system, values, seed=seed, posture=posture, travel=travel, speed=speed, duration=duration
+        )
+        run = simulate_in_mujoco(system, values, motion, duration=duration, posture=posture)
+        driven = list(system.driven_indices)
+        joints = JointGroup(system.driven, run.t, run.q[:, driven], effort=run.effort, position_std=0.0, effort_std=0.0)
+        notes = []
+        for k, name in enumerate(system.driven):
+            joint = system.mechanism.joints[driven[k]]
+            q, effort = run.q[:, driven[k]], run.effort[:, k]
+            if q.min() < joint.lower or q.max() > joint.upper:
+                notes.append(f"{name} would leave its range")
+            if np.abs(effort).max() > joint.effort_limit:
+                notes.append(f"{name} would need more than its torque")
+        return Recording(joints, source="what if", name=episode.name), notes
+
+    def _dense(self, recording: Recording, index: int, seen: Sequence[Sight], torque: bool) -> Recording:
+        """The recording with every sight in view at every node, at unit deviation, and efforts to be predicted."""
+        setting = self.setting
+        base = setting.problem
+        episode = base.episodes[index % len(base.episodes)]
+        joints = recording.joints
+        t = joints.t if joints is not None else episode.recording.points[0].t
+        step = base.step.time_step
+        times = t[0] + step * np.arange(math.floor(float(t[-1] - t[0]) / step + 1e-6) + 1)
+        wanted: dict[str, list[str]] = {}
+        poses: dict[str, Array | None] = {CAMERA: np.eye(4), ARM: None}
+        sensors = {CAMERA: "camera", ARM: "arm"}
+        for view in setting.views(episode):
+            wanted.setdefault(view.group, []).append(view.frame)
+        for group in used_groups(base, episode):
+            poses[group.name], sensors[group.name] = group.pose, group.sensor
+        camera, arm = setting.camera(episode)[0], setting.arm(episode)[0]
+        look = wanted.setdefault(CAMERA if camera is None else camera.name, [])
+        look += [sight.name for sight in seen if sight.name not in look]
+        feel = wanted.setdefault(ARM if arm is None else arm.name, [])
+        feel += [sight.name for sight in seen if sight.arm and sight.name not in feel]
+        held = {grasp.held for grasp in (setting.second_arm or base.system).grasps}
+        feel += [frame for frame in held if frame not in feel]
+        groups = tuple(
+            PointGroup(
+                name, tuple(frames), times, np.zeros((len(times), len(frames), 3)), 1.0, sensors[name], pose=poses[name]
+            )
+            for name, frames in wanted.items()
+            if frames
+        )
+        if torque and joints is not None and joints.effort is None:
+            joints = replace(joints, effort=np.zeros_like(joints.position))
+        return replace(recording, joints=joints, points=groups)
+
+    def _torque_options(self) -> SensorOptions:
+        joints = self.setting.problem.episodes[0].recording.joints
+        said = None if joints is None else joints.effort_std
+        stated = said is not None and bool(np.all(np.asarray(said) > 0))
+        known = None if joints is None else joints.position_std
+        return SensorOptions(
+            std=None if stated else self.setting.torque_std, position_std=0.0 if known is None else None
+        )
+
+
+def _travel(system: System, values: Mapping[str, float], episode: Episode) -> float:
+    """Largest distance of a gripper from where it starts [m]."""
+    q = ca.SX.sym("q", system.size)
+    tree = replace(system.mechanism, parameters=system.parameters).numeric(values)
+    kinematics = forward_kinematics(tree, q)
+    whole = np.zeros((len(episode.measured_arm), system.size))
+    whole[:, list(system.driven_indices)] = episode.measured_arm
+    farthest = 0.0
+    for grasp in system.grasps:
+        tip = ca.Function("tip", [q], [kinematics.position(grasp.holder)]).map(len(whole))
+        path = np.array(tip(whole.T)).T
+        farthest = max(farthest, float(np.max(np.linalg.norm(path - path[0], axis=1))))
+    return farthest if farthest > 0 else 0.11
+
+
+def _pushed_together(system: System, values: Mapping[str, float]) -> dict[str, Array]:
+    """Offsets of grippers that take an object held by several out of its full stretch."""
+    q = ca.SX.sym("q", system.size)
+    tree = replace(system.mechanism, parameters=system.parameters).numeric(values)
+    kinematics = forward_kinematics(tree, q)
+    place = ca.Function("place", [q], [ca.horzcat(*(kinematics.position(name) for name in system.points))])
+    points = np.array(place(np.zeros(system.size))).T
+    middle, held = points.mean(0), {name: points[i] for i, name in enumerate(system.points)}
+    away = np.array([middle[0], middle[1], 0.0])
+    away /= max(float(np.linalg.norm(away)), 1e-9)
+    offsets = {}
+    for grasp in system.grasps:
+        if grasp.held in held:
+            inward = middle - held[grasp.held]
+            offsets[grasp.name] = TOGETHER * inward / max(float(np.linalg.norm(inward)), 1e-9) + FORWARD * away
+    return offsets
+
+

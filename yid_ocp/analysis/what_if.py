@@ -1,0 +1,329 @@
+"""Which single change of an experiment would make which parameters identifiable, and the smallest set that does for all."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from yid_ocp.analysis.identifiability import GRASP_STD, StartKnowledge, identifiability, unknown_vector
+from yid_ocp.analysis.layouts import (
+    ARM,
+    CAMERA,
+    MECHANICS,
+    TORQUE_STD,
+    Layout,
+    Setting,
+    View,
+    Workshop,
+    regular_times,
+    sights,
+)
+from yid_ocp.errors import SolverError
+from yid_ocp.model.system import System
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.problem import Episode
+from yid_ocp.solvers.base import WEAK, Solution, verdict
+
+Array = NDArray[np.float64]
+
+FASTER = (10.0, 30.0)  # rates of the camera to try [Hz]
+FLOOR = 1e-16  # of eigenvalues of the information on relative changes: deviations up to 1e8
+LARGEST_SET = 3
+
+
+@dataclass(frozen=True)
+class Change:
+    """One change of an experiment.
+
+    Attributes
+    ----------
+    name : str
+        `weld`, `second_arm`, `motion`, `travel`, `torque`, `camera:FRAME`, `arm:FRAME` or `rate:HERTZ`.
+    words : str
+    mechanics : str
+        Key of `MECHANICS`, empty where only sensors change.
+    camera, arm : tuple of str
+        Frames that they see beside what they saw.
+    rate : float or None
+        Of the camera [Hz].
+    """
+
+    name: str
+    words: str
+    mechanics: str = ""
+    camera: tuple[str, ...] = ()
+    arm: tuple[str, ...] = ()
+    rate: float | None = None
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What an experiment with some changes would tell.
+
+    Attributes
+    ----------
+    changes : tuple of str
+        Names; empty for the experiment as it is.
+    words : str
+    std_relative : mapping of parameter to float
+        Empty where the experiment could not be worked out.
+    verdicts : mapping of parameter to str
+    identifiable : int
+        How many parameters.
+    gain : float
+        1/2 log det(1 + 16 I) over relative changes [nat]: what is learned by someone who beforehand knew each
+        parameter to within its limit of identifiability, 400 %.
+    message : str
+        Why it could not be worked out, or what stands in the way on a real robot.
+    """
+
+    changes: tuple[str, ...]
+    words: str
+    std_relative: Mapping[str, float]
+    verdicts: Mapping[str, str]
+    identifiable: int
+    gain: float
+    message: str = ""
+
+    @property
+    def complete(self) -> bool:
+        """Whether every parameter is identifiable."""
+        return bool(self.verdicts) and self.identifiable == len(self.verdicts)
+
+
+@dataclass(frozen=True)
+class WhatIf:
+    """Changes of an experiment, ranked.
+
+    Attributes
+    ----------
+    base : Outcome
+        The experiment as it is.
+    singles : tuple of Outcome
+        Single changes, most identifiable parameters first, then by gain; those that could not be worked out last.
+    smallest : tuple of Outcome
+        All sets of fewest changes with which every parameter is identifiable, largest gain first; empty where none of
+        up to three changes does it.
+    greedy : tuple of Outcome
+        Best single change added one after the other.
+    searched : int
+        Sets of changes that were judged.
+    """
+
+    base: Outcome
+    singles: tuple[Outcome, ...]
+    smallest: tuple[Outcome, ...]
+    greedy: tuple[Outcome, ...]
+    searched: int
+
+
+def what_if(
+    problem: EstimationProblem,
+    solution: Solution | ArrayLike | None = None,
+    *,
+    start: StartKnowledge = "unknown",
+    grasp_std: float | None = GRASP_STD,
+    second_arm: System | None = None,
+    torque_std: float = TORQUE_STD,
+    seed: int = 11,
+    largest: int = LARGEST_SET,
+    only: Iterable[str] | None = None,
+    tell: Callable[[str], None] | None = None,
+) -> WhatIf:
+    """Rank changes of an experiment by how many parameters they would make identifiable.
+
+    Nothing is measured for it: new sensors look at the rollout of the recorded motion, the tracking filter keeping the
+    arms on it; new motions and a second arm are simulated in MuJoCo (or, another motion, taken from held-out
+    recordings where MuJoCo is not installed).
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    solution : Solution or array_like, optional
+        Point at which to judge; the initial values when absent.
+    start, grasp_std
+        Nuisances, as in `identifiability`.
+    second_arm : System, optional
+        The system with one more arm and its grasp; without it that change is not tried.
+    torque_std : float
+        Noise of joint torques as a measurement, where the recordings state none [N m].
+    seed : int
+        Of another motion.
+    largest : int
+        Largest set of changes to search for one that makes all parameters identifiable.
+    only : iterable of str, optional
+        Names of changes to consider, all when absent.
+    tell : callable, optional
+        Told what takes time.
+
+    Returns
+    -------
+    WhatIf
+
+    Raises
+    ------
+    SolverError
+        The model cannot be rolled out at the point.
+    ConfigError, DataError
+        As `identifiability`.
+    """
+    x = unknown_vector(problem, solution)
+    fit = None if solution is None else identifiability(problem, x, start=start, grasp_std=grasp_std)
+    inflation = 1.0 if fit is None else max(1.0, fit.chi2_per_dof)
+    setting = Setting(problem, x, start, grasp_std, second_arm, torque_std, seed)
+    judge = _Judge(setting, Workshop(setting, tell), inflation)
+    base = judge(())
+    if not base.verdicts:
+        raise SolverError(base.message)
+    wanted = None if only is None else set(only)
+    changes = [change for change in possible_changes(setting, judge.workshop) if wanted is None or change.name in wanted]
+    singles = ranked([judge((change,)) for change in changes])
+    greedy = _greedy(judge, changes, base, largest)
+    smallest: list[Outcome] = []
+    for size in range(0 if base.complete else 1, largest + 1):
+        smallest = [
+            outcome
+            for chosen in itertools.combinations(changes, size)
+            if compatible(chosen)
+            for outcome in [judge(chosen)]
+            if outcome.complete
+        ]
+        if smallest or not changes:
+            break
+    return WhatIf(base, tuple(singles), tuple(ranked(smallest)), tuple(greedy), judge.count)
+
+
+def possible_changes(setting: Setting, workshop: Workshop) -> list[Change]:
+    """All single changes that make sense for an experiment."""
+    episode = setting.problem.episodes[0]
+    camera, arm = setting.camera(episode)[0], setting.arm(episode)[0]
+    looked = {view.frame for view in setting.views(episode) if camera is not None and view.group == camera.name}
+    felt = {view.frame for view in setting.views(episode) if arm is not None and view.group == arm.name}
+    changes = [Change(name, MECHANICS[name], name) for name in workshop.possible()]
+    system = setting.problem.system
+    for sight in sights(system):
+        if sight.name not in looked | felt:
+            changes.append(Change(f"camera:{sight.name}", f"{sight.words}, seen by the camera", camera=(sight.name,)))
+        if sight.arm and sight.name not in felt:
+            changes.append(Change(f"arm:{sight.name}", f"{sight.words}, seen by the arm", arm=(sight.name,)))
+    if camera is not None:
+        now = 1.0 / float(np.median(np.diff(camera.t))) if len(camera.t) > 1 else 0.0
+        changes += [
+            Change(f"rate:{rate:g}", f"the camera at {rate:g} Hz without gaps", rate=rate) for rate in FASTER if rate > now
+        ]
+    return changes
+
+
+def compatible(changes: Sequence[Change]) -> bool:
+    """Whether changes can be made together: one rate, one motion."""
+    rates = sum(change.rate is not None for change in changes)
+    motions = sum(change.mechanics in ("motion", "travel") for change in changes)
+    return rates <= 1 and motions <= 1
+
+
+def ranked(outcomes: Iterable[Outcome]) -> list[Outcome]:
+    """Most identifiable parameters first, then by gain; what could not be worked out last."""
+    return sorted(outcomes, key=lambda entry: (not entry.verdicts, -entry.identifiable, -entry.gain))
+
+
+@dataclass
+class _Judge:
+    """Judges sets of changes, each once."""
+
+    setting: Setting
+    workshop: Workshop
+    inflation: float
+    count: int = 0
+
+    def __post_init__(self) -> None:
+        self._known: dict[frozenset[str], Outcome] = {}
+
+    def __call__(self, changes: Sequence[Change]) -> Outcome:
+        key = frozenset(change.name for change in changes)
+        if key not in self._known:
+            self._known[key] = self._judged(changes)
+            self.count += 1
+        return self._known[key]
+
+    def _judged(self, changes: Sequence[Change]) -> Outcome:
+        names = tuple(change.name for change in changes)
+        words = "; ".join(change.words for change in changes) if changes else "as it is"
+        layout = self.workshop.layout(frozenset(change.mechanics for change in changes if change.mechanics))
+        if isinstance(layout, str):
+            return Outcome(names, words, {}, {}, 0, -math.inf, layout)
+        views = [self._views(episode, changes, layout) for episode in self.setting.problem.episodes]
+        std, gain = judged(layout, layout.information(views) / self.inflation)
+        verdicts = {name: verdict(1.0, value) for name, value in std.items()}
+        count = sum(said == "identifiable" for said in verdicts.values())
+        return Outcome(names, words, std, verdicts, count, gain, "; ".join(layout.notes))
+
+    def _views(self, episode: Episode, changes: Sequence[Change], layout: Layout) -> list[View]:
+        setting = self.setting
+        camera, times, std = setting.camera(episode)
+        arm, arm_times, arm_std = setting.arm(episode)
+        looking, feeling = CAMERA if camera is None else camera.name, ARM if arm is None else arm.name
+        rate = next((change.rate for change in changes if change.rate is not None), None)
+        if rate is not None:
+            times = regular_times(episode.grid, rate)
+        held = {grasp.held for grasp in layout.problem.system.grasps}
+        # a point that a second arm now holds is that arm's to measure
+        taken = held - {grasp.held for grasp in setting.problem.system.grasps}
+        views = []
+        for view in setting.views(episode):
+            if view.group == looking and view.frame in taken:
+                continue
+            if view.group == looking and rate is not None:
+                view = View(looking, view.frame, times, np.full((len(times), 3), std))
+            views.append(view)
+        views += [
+            View(looking, frame, times, np.full((len(times), 3), std)) for change in changes for frame in change.camera
+        ]
+        feels = [*sorted(taken), *(frame for change in changes for frame in change.arm)]
+        views += [View(feeling, frame, arm_times, np.full((len(arm_times), 3), arm_std)) for frame in feels]
+        return views
+
+
+def judged(layout: Layout, information: Array) -> tuple[dict[str, float], float]:
+    """Relative deviation of every free parameter, and the gain, from a Fisher information of all unknowns.
+
+    Parameters
+    ----------
+    layout : Layout
+    information : ndarray, shape (nx, nx)
+    """
+    problem, x = layout.problem, layout.x
+    chosen = [problem.names.index(name) for name in layout.names]
+    others = np.setdiff1d(np.arange(len(x)), chosen)
+    scale = problem.scales.copy()
+    scale[chosen] = np.where(x[chosen] != 0, np.abs(x[chosen]), scale[chosen])
+    scaled = information * np.outer(scale, scale)
+    own, cross = scaled[np.ix_(chosen, chosen)], scaled[np.ix_(chosen, others)]
+    if len(others):
+        own = own - cross @ np.linalg.lstsq(scaled[np.ix_(others, others)], cross.T, rcond=None)[0]
+    values, vectors = np.linalg.eigh(0.5 * (own + own.T))
+    values = np.maximum(values, FLOOR)
+    deviation = np.sqrt(np.sum(vectors**2 / values, axis=1))
+    gain = 0.5 * float(np.sum(np.log1p(WEAK**2 * values)))
+    return dict(zip(layout.names, map(float, deviation), strict=True)), gain
+
+
+def _greedy(judge: _Judge, changes: Sequence[Change], base: Outcome, largest: int) -> list[Outcome]:
+    chosen: tuple[Change, ...] = ()
+    steps: list[Outcome] = []
+    best = base
+    while len(chosen) < largest and not best.complete:
+        trials = [(*chosen, change) for change in changes if change not in chosen and compatible((*chosen, change))]
+        if not trials:
+            break
+        outcomes = [judge(trial) for trial in trials]
+        top = ranked(outcomes)[0]
+        if (top.identifiable, top.gain) <= (best.identifiable, best.gain):
+            break
+        chosen, best = trials[outcomes.index(top)], top
+        steps.append(top)
+    return steps
