@@ -416,9 +416,10 @@ def recording_summary(recording: Recording) -> list[str]:
 
 
 def table(rows: Rows) -> list[str]:
-    """Rows as aligned lines, the first one as head."""
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    """Rows as aligned lines, the first one as head; columns without an entry are left out."""
+    kept = [i for i in range(len(rows[0])) if any(row[i] for row in rows)]
+    widths = [max(len(row[i]) for row in rows) for i in kept]
+    lines = ["  ".join(row[i].ljust(width) for i, width in zip(kept, widths, strict=True)).rstrip() for row in rows]
     return [lines[0], "  ".join("-" * width for width in widths), *lines[1:]]
 
 

@@ -62,7 +62,7 @@ class Bench:
 def _bench(file: str) -> Bench:
     tree = Mechanism.from_urdf(file)
     system = System.build(tree, prescribed=JOINTS, damping=dict.fromkeys(JOINTS, 0.05))
-    return Bench(system, compile_step(system, TIME_STEP, use_compiler=False))
+    return Bench(system, compile_step(system, TIME_STEP))
 
 
 @pytest.fixture(scope="session")

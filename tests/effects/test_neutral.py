@@ -23,7 +23,7 @@ def test_all_together_change_nothing(mode, benches, all_effects, sensors) -> Non
     effects = all_effects(bench.system)
     plain, full = bench.run(bench.plain), bench.run(bench.step(*effects))
     assert full.sweep.status.ok
-    assert full.sweep.status.iterations <= plain.sweep.status.iterations + bench.steps
+    assert full.sweep.status.iterations <= 1.5 * plain.sweep.status.iterations
     assert largest(bench.nominal_part(full) - bench.nominal_part(plain), bench.nominal_part(plain)) < 1e-10
     assert largest(full.sweep.multipliers - plain.sweep.multipliers, plain.sweep.multipliers) < 1e-10
     watched = [sensors.camera, sensors.arm] + ([sensors.effort] if mode == "prescribed" else [])

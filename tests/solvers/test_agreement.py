@@ -123,5 +123,3 @@ def test_iteration_limit_is_a_status_with_the_best_point(short):
         assert solution.status == Status.ITERATION_LIMIT
         assert np.all(np.isfinite(solution.x))
         assert "iterations" in solution.message
-
-

@@ -48,7 +48,12 @@ def held_still(system: System) -> System:
 
 
 def natural_frequencies(
-    system: System, posture: Mapping[str, float], theta: Array, time_step: float, force_split: ForceSplit = "symmetric"
+    system: System,
+    posture: Mapping[str, float],
+    theta: Array,
+    time_step: float,
+    force_split: ForceSplit = "symmetric",
+    guess: Array | None = None,
 ) -> Frequencies:
     """Frequencies of the step map of a system about rest, from the eigenvalues of A_k without damping.
 
@@ -63,13 +68,15 @@ def natural_frequencies(
         h [s]; the midpoint rule lowers a frequency f to atan(pi f h)/(pi h).
     force_split : str
         See `compile_step`; matters for growth, not for the undamped frequencies.
+    guess : ndarray, shape (n,), optional
+        Configuration from which rest is sought.
     """
     still = held_still(system)
     if not still.free_indices:
         return Frequencies(np.zeros(0), message="every coordinate is prescribed, nothing can swing")
     step = compile_step(still, time_step, force_split, use_compiler=False)
     known = np.array([posture[name] for name in still.prescribed])
-    rest = Statics(step).solve(known, theta)
+    rest = Statics(step).solve(known, theta, guess=guess)
     if not rest.converged:
         return Frequencies(np.zeros(0), message=rest.message)
     undamped = theta.copy()

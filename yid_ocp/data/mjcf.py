@@ -193,6 +193,8 @@ def _refuse_inexpressible(system: System, value: Evaluator) -> None:
     for joint, compliance in system.compliant.items():
         if not value.vanishes(compliance):
             raise ModelError(f"joint '{joint}' is compliant", where="mujoco_xml", allowed="compliance zero")
+    if not value.vanishes(system.time_scale - 1):
+        raise ModelError("the clock is scaled", where="mujoco_xml", allowed="a clock that tells the true time")
 
 
 def _own_terms(system: System, effect: Effect) -> ca.SX:
@@ -202,7 +204,8 @@ def _own_terms(system: System, effect: Effect) -> ca.SX:
     terms = effect.terms(
         MidpointState(system, forward_kinematics(system.mechanism, q), q, v, none, none, u, reaction, {})
     )
-    return ca.vertcat(terms.lagrangian, none if terms.force is None else terms.force)
+    forces = (terms.force, terms.viscous, None if terms.closed is None else terms.closed.force)
+    return ca.vertcat(terms.lagrangian, *(none if force is None else force for force in forces))
 
 
 def _shares_body(tree: Mechanism, j: int) -> bool:

@@ -26,6 +26,8 @@ Array = NDArray[np.float64]
 SOLVER = GaussNewton(iterations=15, step_tolerance=1e-3, cost_tolerance=1e-6)
 """A refit starts near its end and must be good to a small part of its deviation only."""
 RESAMPLES = 1000
+TIE = 0.01
+"""Part of chi2/n by which two models may differ and still count as equal, however sure the difference."""
 
 
 @dataclass(frozen=True)
@@ -220,11 +222,11 @@ def gain(before: Loss, after: Loss) -> tuple[float, float]:
 
 
 def within_reach(fits: Sequence[Fit]) -> list[Fit]:
-    """Fits whose held-out loss is within one standard error of the best one's, the simplest first."""
+    """Fits whose held-out loss is within one standard error of the best one's (or `TIE` of it), the simplest first."""
     best = min(fits, key=lambda fit: fit.loss.mean)
     near = []
     for fit in fits:
         lost, error = gain(fit.loss, best.loss)
-        if fit is best or lost <= error:
+        if fit is best or lost <= max(error, TIE * best.loss.mean):
             near.append(fit)
     return sorted(near, key=lambda fit: (fit.size, fit.loss.mean))

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
 
 import numpy as np
 import scipy.sparse
@@ -24,10 +25,10 @@ from yid_ocp.integrator.rollout import momentum_of, simulate
 from yid_ocp.integrator.step import Directions, Feedback, Sweep
 from yid_ocp.problem.inputs import Smoother
 from yid_ocp.problem.problem import Episode, EstimationProblem
-from yid_ocp.problem.residuals import huber
+from yid_ocp.problem.residuals import Samples, huber
 
 Array = NDArray[np.float64]
-Sparse = scipy.sparse.csc_matrix
+Sparse: TypeAlias = Any
 
 # Mean square whitened residual above which a rollout is not the best guess of the node states.
 POOR_GUESS = 100.0
@@ -112,7 +113,9 @@ class Transcription:
                 if j < len(nodes) - 1:
                     places.append(np.arange(at, at + width))
                     at += width
-            layouts.append(Layout(nodes, np.array(state), np.array(places, dtype=np.int64).reshape(len(nodes) - 1, width)))
+            layouts.append(
+                Layout(nodes, np.array(state), np.array(places, dtype=np.int64).reshape(len(nodes) - 1, width))
+            )
         self.layouts = tuple(layouts)
         self.size = at
 
@@ -298,7 +301,9 @@ class Transcription:
         """DEL rows of every step, of which the multipliers are unknowns too."""
         layout = self.layouts[i]
         state, steps = w[layout.state], len(layout.nodes) - 1
-        value, block = self._stage_block(i, state[:-1], state[1:], w[layout.multipliers], self._theta(w, i), derivatives)
+        value, block = self._stage_block(
+            i, state[:-1], state[1:], w[layout.multipliers], self._theta(w, i), derivatives
+        )
         if not derivatives:
             return value.ravel(), None
         return value.ravel(), self._assembled(block, self._stage_columns(i, steps), value.shape[1])
@@ -325,7 +330,11 @@ class Transcription:
         else:
             # the kernel takes one trajectory: lay the pairs end to end and skip the steps in between
             chained = np.stack([before, after], axis=1).reshape(2 * steps, nx)
-            used, lam, held = slice(0, None, 2), np.repeat(multipliers, 2, axis=0)[:-1], np.repeat(torque, 2, axis=0)[:-1]
+            used, lam, held = (
+                slice(0, None, 2),
+                np.repeat(multipliers, 2, axis=0)[:-1],
+                np.repeat(torque, 2, axis=0)[:-1],
+            )
         stages = self.step.kernel.stages(theta, chained, lam, held, problem.shared, derivatives)
         free = np.array(problem.system.free_indices)
         kept = np.concatenate([free, np.arange(n, n + nz + m)])
@@ -435,9 +444,7 @@ class Transcription:
         first, last = int(nodes[j]), int(nodes[j + 1])
         feedback = self.problem.feedback(episode)
         if feedback is not None:
-            feedback = replace(
-                feedback, gain=feedback.gain[first:last], reference=feedback.reference[first:last]
-            )
+            feedback = replace(feedback, gain=feedback.gain[first:last], reference=feedback.reference[first:last])
         return simulate(
             self.step,
             theta,
@@ -514,7 +521,7 @@ class Transcription:
         return result
 
     def _at_nodes(
-        self, samples, outputs: Sequence[Array], columns: NDArray[np.int64], derivatives: bool  # type: ignore[no-untyped-def]
+        self, samples: Samples, outputs: Sequence[Array], columns: NDArray[np.int64], derivatives: bool
     ) -> tuple[Array, Sparse | None]:
         y, by_q, by_z, _, by_theta = outputs
         predicted = samples.interpolate(y[:, :, 0])
@@ -538,7 +545,9 @@ class Transcription:
             total = part if total is None else total + part
         return predicted, total
 
-    def _between_nodes(self, w: Array, i: int, samples, theta: Array, derivatives: bool) -> tuple[Array, Sparse | None]:  # type: ignore[no-untyped-def]
+    def _between_nodes(
+        self, w: Array, i: int, samples: Samples, theta: Array, derivatives: bool
+    ) -> tuple[Array, Sparse | None]:
         """Predictions at steps that the rollout eliminates, by the chain rule through the interval before them."""
         problem, layout, n = self.problem, self.layouts[i], self.n
         count, nx = len(problem.shared), self.nx
@@ -569,9 +578,7 @@ class Transcription:
         after = np.minimum(np.searchsorted(nodes, samples.node + 1), len(nodes) - 1)
         matrix: Sparse | None = None
         for place, share in ((before, 1.0 - samples.fraction), (after, samples.fraction)):
-            at = np.hstack(
-                [np.broadcast_to(np.arange(count), (len(place), count)), layout.state[owner[place]]]
-            )
+            at = np.hstack([np.broadcast_to(np.arange(count), (len(place), count)), layout.state[owner[place]]])
             part = self._assembled(total[place] * share[:, None, None], at, y.shape[1])
             matrix = part if matrix is None else matrix + part
         return predicted, matrix

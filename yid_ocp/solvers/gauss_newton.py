@@ -64,7 +64,9 @@ class GaussNewton:
             if rejected == 0:
                 recorder.accept(now.cost, x, projected_gradient(x, gradient, lower, upper, size))
             if len(recorder.history) > self.iterations:
-                message = f"no convergence in {self.iterations} iterations; raise solver.iterations or free fewer parameters"
+                message = (
+                    f"no convergence in {self.iterations} iterations; raise solver.iterations or free fewer parameters"
+                )
                 return self._end(Status.ITERATION_LIMIT, message, x, recorder)
             step = bounded_step(jacobian * size, residual, mu, (lower - x) / size, (upper - x) / size) * size
             promised = -float(gradient @ step) - 0.5 * float(np.sum((jacobian @ step) ** 2))
@@ -77,8 +79,9 @@ class GaussNewton:
                 moved = float(np.max(np.abs(step) / size))
                 x, now, rejected = np.clip(x + step, lower, upper), trial, 0
                 mu = max(mu * (0.2 if gain > 0.5 else 1.0 if gain > 0.2 else 3.0), 1e-12)
-                if moved < self.step_tolerance:
-                    recorder.accept(now.cost, x, projected_gradient(x, now.jacobian.T @ now.residual, lower, upper, size))
+                if moved < self.step_tolerance and now.jacobian is not None:
+                    slope = projected_gradient(x, now.jacobian.T @ now.residual, lower, upper, size)
+                    recorder.accept(now.cost, x, slope)
                     return self._end(Status.CONVERGED, "the step is below its tolerance", x, recorder)
                 continue
             rejected += 1
@@ -86,9 +89,13 @@ class GaussNewton:
             if mu > 1e10 or rejected > 40:
                 small = promised <= 1e-6 * max(now.cost, 1e-300)
                 status = Status.CONVERGED if small else Status.STALLED
-                message = "the cost cannot be lowered any further" if small else (
-                    f"no step lowers the cost ({trial.message or 'the linear model does not hold'}); "
-                    "start nearer, shorten the recording, or use multiple_shooting"
+                message = (
+                    "the cost cannot be lowered any further"
+                    if small
+                    else (
+                        f"no step lowers the cost ({trial.message or 'the linear model does not hold'}); "
+                        "start nearer, shorten the recording, or use multiple_shooting"
+                    )
                 )
                 return self._end(status, message, x, recorder)
 

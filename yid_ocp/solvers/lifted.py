@@ -96,7 +96,9 @@ class Lifted:
             done = now.defect < self.defect_tolerance
             recent = [entry.cost for entry in recorder.history[-4:]]
             still = len(recent) == 4 and max(recent) - min(recent) <= self.cost_tolerance * max(now.cost, 1e-300)
-            if done and (still or moved < self.step_tolerance or abs(promised) <= self.cost_tolerance * max(now.cost, 1e-300)):
+            if done and (
+                still or moved < self.step_tolerance or abs(promised) <= self.cost_tolerance * max(now.cost, 1e-300)
+            ):
                 return self._end(Status.CONVERGED, f"closed to {now.defect:.1e}", x, recorder)
             factor = 1.0
             while True:

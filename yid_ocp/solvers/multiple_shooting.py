@@ -82,7 +82,7 @@ class MultipleShooting:
         w0 = transcription.guess(start)
         lower, upper = transcription.bounds()
         nlp.prepare(w0)
-        options = {
+        options: dict[str, Any] = {
             "print_time": False,
             "no_nlp_grad": True,
             "error_on_fail": False,
@@ -129,7 +129,11 @@ class _Function(ca.Callback):
     """A CasADi function computed in Python."""
 
     def __init__(
-        self, name: str, inputs: Sequence[str], outputs: Sequence[str], sparsity: dict[str, ca.Sparsity],
+        self,
+        name: str,
+        inputs: Sequence[str],
+        outputs: Sequence[str],
+        sparsity: dict[str, ca.Sparsity],
         compute: Callable[..., list],
     ) -> None:
         ca.Callback.__init__(self)
@@ -154,7 +158,7 @@ class _Function(ca.Callback):
     def get_sparsity_out(self, i: int) -> ca.Sparsity:
         return self._sparsity[self._outputs[i]]
 
-    def eval(self, arguments: list[ca.DM]) -> list:
+    def eval(self, arguments: Sequence[ca.DM]) -> list:
         return self._compute(*(np.array(a).ravel() for a in arguments))
 
 
@@ -172,7 +176,8 @@ class _Nlp:
         """Fix scaling and sparsity from the start and from random points about it."""
         t = self.transcription
         rng = np.random.default_rng(0)
-        pattern_g = pattern_r = None
+        pattern_g: Any = None
+        pattern_r: Any = None
         for trial in range(3):
             w = w0 + (rng.normal(scale=1e-2, size=len(w0)) * np.maximum(np.abs(w0), 1e-2) if trial else 0.0)
             _, jacobian = t.constraints(w, True)

@@ -74,7 +74,9 @@ class SingleShooting:
             options={"maxiter": self.iterations, "ftol": self.cost_tolerance, "gtol": 1e-9, "maxls": 40, "maxcor": 20},
         )
         best = min(recorder.history, key=lambda entry: entry.cost if np.isfinite(entry.cost) else np.inf)
-        status = Status.CONVERGED if result.status == 0 else (
-            Status.ITERATION_LIMIT if result.status == 1 else Status.STALLED
+        status = (
+            Status.CONVERGED
+            if result.status == 0
+            else (Status.ITERATION_LIMIT if result.status == 1 else Status.STALLED)
         )
         return Outcome(status, str(result.message).lower(), best.x, tuple(recorder.history), recorder.evaluations)

@@ -138,9 +138,12 @@ def refine(run: Run, problem: EstimationProblem | None, warnings: list[str]) -> 
     posture = _posture(system, problem)
     if posture is None:
         return {"links": [], "time_step": [], "message": "no posture is known: the run names no recording"}
-    values = dict(zip(system.parameters.names, system.parameters.vector(), strict=True))
-    theta, split = system.parameters.vector(), run.solver.force_split
-    own = natural_frequencies(system, posture, theta, h, split)
+    theta, split, guess = system.parameters.vector(), run.solver.force_split, None
+    if problem is not None:
+        theta = problem.own_theta(problem.episodes[0], theta)
+        if problem.options.initial_state == "given":
+            guess = problem.fitted_start(problem.episodes[0], theta).state[: system.size]
+    own = natural_frequencies(system, posture, theta, h, split, guess)
     if own.message:
         return {"links": [], "time_step": [], "message": own.message}
     if own.growing:
@@ -148,8 +151,9 @@ def refine(run: Run, problem: EstimationProblem | None, warnings: list[str]) -> 
             f"{own.growing} modes grow from step to step about the first posture: take a shorter solver.time_step, "
             "solver.force_split: left_damping, or more damping"
         )
+    values = dict(zip(system.parameters.names, theta, strict=True))
     steps = [_row(h, own)]
-    steps += [_row(h / k, natural_frequencies(system, posture, theta, h / k, split)) for k in (2, 4)]
+    steps += [_row(h / k, natural_frequencies(system, posture, theta, h / k, split, guess)) for k in (2, 4)]
     _warn(warnings, "the time step goes", "s", steps, len(steps) - 1, 0)
     count = object_links(run)
     rows = []
