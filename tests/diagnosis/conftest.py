@@ -50,7 +50,7 @@ class Bench:
         if torque is not None:
             effort = effort + torque(t)
         measured = effort + noise * rng.standard_normal(effort.shape)
-        joints = JointGroup(JOINTS, t, path, effort=measured, position_std=1e-9, effort_std=NOISE)
+        joints = JointGroup(JOINTS, t, path, effort=measured, effort_std=NOISE)
         return Recording(joints, name=f"run_{seed}")
 
     def problem(self, recordings, held_out=(), free=FREE, options: ProblemOptions | None = None) -> EstimationProblem:

@@ -343,14 +343,14 @@ def with_springs(system: System, changed: Mapping[str, ElasticJoint]) -> System:
 
 
 def typical_stiffness(system: System, segment: str) -> float:
-    """Mean nominal bending stiffness of a segment's joints [N m/rad]."""
+    """Mean bending stiffness of a segment's joints at the parameters' nominal values, above zero [N m/rad]."""
     springs = segment_springs(system, segment)
     chosen = [s.stiffness for s in springs if s.kind == "bend"] or [s.stiffness for s in springs]
     if not chosen:
         return 1.0
     parameters = system.parameters
     function = ca.Function("stiffness", [parameters.symbols], [ca.vertcat(*chosen)])
-    return float(np.mean(np.array(function(parameters.vector()))))
+    return max(float(np.mean(np.array(function(parameters.vector())))), 1e-6)
 
 
 def on_joint(system: System, joint: str, value: ca.SX) -> ca.SX:

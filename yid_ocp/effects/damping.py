@@ -100,7 +100,7 @@ class Hysteresis(EffectBase):
         kappa = typical_stiffness(system, location)
         text = "stiffness of the element before it yields"
         return (
-            Quantity("stiffness", "N m/rad", 0.0, 0.0, 5 * kappa, (0.05 * kappa, kappa), text),
+            Quantity("stiffness", "N m/rad", 0.0, 0.0, 50 * kappa, (0.05 * kappa, kappa), text),
             Quantity("yield_angle", "rad", 0.15, 5e-3, 5.0, (0.05, 0.5), "angle over which it yields", shape=True),
         )
 

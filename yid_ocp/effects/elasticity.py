@@ -57,7 +57,7 @@ class CubicStiffness(EffectBase):
         """k3 [N m/rad^3]; its range is -0.5 to 1 times stiffness over `REFERENCE_ANGLE` squared."""
         unit = typical_stiffness(system, location) / REFERENCE_ANGLE**2
         text = "cubic stiffness of every joint"
-        return (Quantity("k3", "N m/rad^3", 0.0, -unit, 5 * unit, (-0.5 * unit, unit), text),)
+        return (Quantity("k3", "N m/rad^3", 0.0, -10 * unit, 50 * unit, (-0.5 * unit, unit), text),)
 
     def terms(self, state: MidpointState) -> Terms:
         """See the class."""

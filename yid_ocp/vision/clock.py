@@ -5,9 +5,9 @@ The robot's surface at the joint angles of time t - d should lie where the camer
     d = argmin sum_i min(|p_i - surface(q(t_i - d))|, c)^2
 
 over the camera's points near the moving links. Found by a search on a grid, then Gauss and Newton's method, with a
-shift of the camera as a further unknown, so that errors of its pose and of its depth are not taken for time. Clock offset
-and latency cannot be told apart and come as one number, stamp minus joint time. A minimum for every frame by itself finds
-those that were stamped late.
+shift of the camera as a further unknown, so that errors of its pose and of its depth are not taken for time. Clock
+offset and latency cannot be told apart and come as one number, stamp minus joint time. A minimum for every frame by
+itself finds those that were stamped late.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ _NARROWING = (1.0, 0.7, 0.5, 0.35, 0.35)  # of the reach, from iteration to iter
 _CLEARLY = 0.8  # of the misfit at the common offset, below which a frame's own minimum elsewhere is believed
 _LEAST_LATE = 0.02  # [s]; a stamp that is off by less is like the others
 _SHIFT = 1e-2  # weight, against that of the points, that keeps a shift that they do not tell small
+_NOTED_SHIFT = 0.01  # [m]
 _MEDIAN_SQUARE = 0.4549  # of a normal variable
 _STEP = 0.01  # over which velocities are taken [s]
 
@@ -63,7 +64,9 @@ class ClockOptions:
 
     def __post_init__(self) -> None:
         if self.search < 0 or not (self.reach > 0 and self.determined > 0 and self.late > 0):
-            raise ConfigError("a setting of the clock is not positive", where="clock options", allowed="positive; search from 0")
+            raise ConfigError(
+                "a setting of the clock is not positive", where="clock options", allowed="positive; search from 0"
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +84,9 @@ class Clock:
         Each frame's own offset minus the common one [s]; NaN where it cannot be told.
     delay_std : ndarray, shape (M,)
         [s]
+    shift : ndarray, shape (3,)
+        What would have to be added to the camera's points to bring them onto the arm [m]: an error of its pose, of its
+        depth or of the joints' zeros. It is only reported.
     message : str
         In words.
     """
@@ -90,6 +96,7 @@ class Clock:
     estimated: bool
     delay: Array
     delay_std: Array
+    shift: Array
     message: str
 
 
@@ -126,7 +133,7 @@ def estimate_clock(
 
     def taken(reason: str) -> Clock:
         text = f"clock offset {1e3 * chosen.offset:.0f} ms as given: {reason}"
-        return Clock(chosen.offset, math.inf, False, nothing, nothing, text)
+        return Clock(chosen.offset, math.inf, False, nothing, nothing, np.zeros(3), text)
 
     if chosen.search == 0:
         return taken("it was not to be estimated")
@@ -153,7 +160,8 @@ def estimate_clock(
         return taken("the arm hardly moves")
     if best in (0, len(coarse) - 1):
         return taken(f"no best offset within {chosen.search:g} s of it; the clocks may differ by more")
-    offset, shift = float(coarse[best]), np.zeros(3)
+    offset = float(coarse[best])
+    shift: Array = np.zeros(3)
     usual = sorted(samples)
     own, information = nothing.copy(), np.zeros(count)
     for narrowing in (_NARROWING, _NARROWING[-2:], _NARROWING[-2:]):
@@ -178,10 +186,12 @@ def estimate_clock(
         usual = [i for i in samples if abs(deviation[i]) < limit[i]]
         if len(usual) < 2:
             return taken("the frames do not agree on one")
-    return _summary(own, information, usual, offset, chosen)
+    return _summary(own, information, usual, offset, shift, chosen)
 
 
-def _summary(own: Array, information: Array, usual: list[int], offset: float, options: ClockOptions) -> Clock:
+def _summary(
+    own: Array, information: Array, usual: list[int], offset: float, shift: Array, options: ClockOptions
+) -> Clock:
     """Common offset and deviations, from the scatter of the frames' own offsets."""
     deviation = own[usual] - offset
     heft = information[usual]
@@ -194,10 +204,12 @@ def _summary(own: Array, information: Array, usual: list[int], offset: float, op
     if not std < options.determined:
         nothing = np.full(len(own), np.nan)
         text = f"clock offset {1e3 * options.offset:.0f} ms as given: the arm moves too little to tell"
-        return Clock(options.offset, math.inf, False, nothing, nothing, text)
+        return Clock(options.offset, math.inf, False, nothing, nothing, np.zeros(3), text)
     own_std = np.where(np.isfinite(own), own_std, np.nan)
     text = f"clock offset {1e3 * offset:.1f} ms ± {1e3 * std:.1f} ms (stamp minus joint time, from {count} frames)"
-    return Clock(offset, std, True, own - offset, own_std, text)
+    if np.linalg.norm(shift) > _NOTED_SHIFT:
+        text += f"; the camera sees the arm {1e3 * np.linalg.norm(shift):.0f} mm from where the joints have it"
+    return Clock(offset, std, True, own - offset, own_std, shift, text)
 
 
 def _arm_points(

@@ -92,7 +92,9 @@ class FilterOptions:
     def __post_init__(self) -> None:
         for name in ("voxel", "padding", "reach_margin", "outlier_ratio"):
             if not getattr(self, name) > 0:
-                raise ConfigError(f"{name} = {getattr(self, name)}", where="filter options", allowed="a positive number")
+                raise ConfigError(
+                    f"{name} = {getattr(self, name)}", where="filter options", allowed="a positive number"
+                )
 
 
 @dataclass(frozen=True, eq=False)

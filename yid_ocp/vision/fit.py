@@ -2,12 +2,12 @@
 
     q_o = argmin sum_i w_i rho(e_i) + |g(q)/s_g|^2 + |b(q)|^2,      e_i = |p_i - c_i(q)| - f r_i
 
-p_i: point of the cloud, or node of its skeleton; c_i: nearest point of the model's line segments, with r_i the radius of
-its tube. A camera sees surfaces: points lie at the radius (f = 1) from the centre line, on the camera's side; a node, the
-mean of the visible half of a tube, lies at f = pi/4. rho is Geman and McClure's loss. g: distance of held frames from the
-grippers, known from the joint angles. b: bends, in proportion to the square root of their stiffness, so that of all shapes
-through the points it is the one of least elastic energy. Twists about the tubes' axes move no centre line (the two
-bends at the next joint reach every direction) and stay at rest.
+p_i: point of the cloud, or node of its skeleton; c_i: nearest point of the model's line segments, with r_i the radius
+of its tube. A camera sees surfaces: points lie at the radius (f = 1) from the centre line, on the camera's side; a
+node, the mean of the visible half of a tube, lies at f = pi/4. rho is Geman and McClure's loss. g: distance of held
+frames from the grippers, known from the joint angles. b: bends, in proportion to the square root of their stiffness, so
+that of all shapes through the points it is the one of least elastic energy. Twists about the tubes' axes move no centre
+line (the two bends at the next joint reach every direction) and stay at rest.
 """
 
 from __future__ import annotations
@@ -297,7 +297,8 @@ class ShapeFit:
         cost, gradient, hessian = self._system(q, task)
         damping = 1e-3
         used = 0
-        for used in range(1, self.options.iterations + 1):
+        while used < self.options.iterations:
+            used += 1
             step = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), gradient)
             size = float(np.abs(step).max())
             trial = q.copy()

@@ -48,7 +48,7 @@ def open3d_module() -> ModuleType:
         import open3d
     except (ImportError, OSError) as error:
         raise DataError(f"vision needs Open3D, which cannot be loaded ({error})", hint=hint) from error
-    return open3d  # type: ignore[no-any-return]
+    return open3d
 
 
 @dataclass(frozen=True)
@@ -244,7 +244,9 @@ def read_film(folder: str | os.PathLike[str], *, pose: ArrayLike | None = None, 
     for name in names:
         if Path(name).suffix.lower() not in (*CLOUD_ENDINGS, DEPTH_ENDING):
             allowed = ", ".join((*CLOUD_ENDINGS, DEPTH_ENDING))
-            raise DataError(f"'{name}' is neither a cloud nor a depth image", where=str(path / STAMP_FILE), allowed=allowed)
+            raise DataError(
+                f"'{name}' is neither a cloud nor a depth image", where=str(path / STAMP_FILE), allowed=allowed
+            )
         if Path(name).suffix.lower() == DEPTH_ENDING and intrinsics is None:
             raise DataError(
                 "there are depth images but the camera's intrinsics are missing",
@@ -396,7 +398,9 @@ def _read_depth(path: Path) -> Array:
         image = np.asarray(o3d.io.read_image(str(path)))
     if image.ndim != 2 or image.dtype != np.uint16:
         raise DataError(
-            "the depth image is empty, damaged or not one channel of 16 bits", where=str(path), allowed="16-bit grey PNG"
+            "the depth image is empty, damaged or not one channel of 16 bits",
+            where=str(path),
+            allowed="16-bit grey PNG",
         )
     return image.astype(np.float64)
 

@@ -251,9 +251,7 @@ class Surfaces:
             cosine[rows, columns] = np.where(nearer, square, cosine[rows, columns])
         return depth, cosine
 
-    def _window(
-        self, pinhole: Pinhole, rotation: Array, origin: Array, part: int
-    ) -> tuple[slice, slice] | None:
+    def _window(self, pinhole: Pinhole, rotation: Array, origin: Array, part: int) -> tuple[slice, slice] | None:
         low, high = self._low[part], self._high[part]
         corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
         seen = (corners - origin) @ rotation
@@ -321,7 +319,7 @@ def robot_meshes(urdf: str | Path, mechanism: Mechanism, kind: MeshKind = "visua
                 file = mesh_file(geometry.mesh.filename, path)
                 if file not in cache:
                     try:
-                        loaded = trimesh.load(file, force="mesh")
+                        loaded: Any = trimesh.load(file, force="mesh")
                         cache[file] = Mesh(np.asarray(loaded.vertices, float), np.asarray(loaded.faces, np.int64))
                     except Exception as error:  # trimesh's readers raise many kinds
                         raise ModelError(f"the mesh cannot be read: {error}", where=str(file)) from error

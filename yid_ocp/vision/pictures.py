@@ -108,7 +108,9 @@ def draw_track(track: Track, file: str | os.PathLike[str]) -> None:
     lost = [frame.t for frame in track.frames if not frame.good and np.isfinite(frame.t)]
     for row, (panel, name) in enumerate(zip(axes, track.names, strict=True)):
         for axis, colour in enumerate((_BLUE, _ORANGE, _GREEN)):
-            centre = np.nanmean(track.position[:, row, axis]) if np.isfinite(track.position[:, row, axis]).any() else 0.0
+            centre = (
+                np.nanmean(track.position[:, row, axis]) if np.isfinite(track.position[:, row, axis]).any() else 0.0
+            )
             panel.plot(fine, 1e3 * (course[:, row, axis] - centre), color=colour, linewidth=1)
             seen = 1e3 * (track.position[:, row, axis] - centre)
             panel.errorbar(track.t, seen, 2e3 * track.std[:, row, axis], fmt=".", color=colour, label="xyz"[axis])

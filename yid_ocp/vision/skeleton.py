@@ -92,8 +92,8 @@ def walk(
 
     The seed is the lowest point. Its k1 nearest neighbours have a centroid; the k1 nearest neighbours of that centroid
     are the centred segment, whose centroid becomes a node where the segment has points enough. The segment is removed.
-    The remaining point that is nearest to it is the next seed; where none is within the radius, a point drawn at random.
-    It ends when no point is left.
+    The remaining point that is nearest to its centre is the next seed; where none is within the radius, a point drawn
+    at random. It ends when no point is left.
 
     Parameters
     ----------

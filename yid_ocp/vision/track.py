@@ -294,7 +294,7 @@ class _Tracker:
         self.rng = np.random.default_rng(options.seed)
 
     def posture(self, t: float) -> Array:
-        """Configuration at a time on the joints' clock, the object at rest; the ends of the recording hold beyond it."""
+        """Configuration at a time on the joints' clock, the object at rest; it stays at the recording's ends beyond."""
         q = self.shape.rest.copy()
         if self.angles is not None:
             q[[self.system.mechanism.joint_index(name) for name in self.shape.known]] = self.angles(t)
@@ -373,7 +373,7 @@ class _Tracker:
         if self.robot is None or self.span is None:
             nothing = np.full(len(stamps), np.nan)
             text = f"clock offset {1e3 * options.offset:.0f} ms as given: no robot to compare"
-            return Clock(options.offset, math.inf, False, nothing, nothing, text)
+            return Clock(options.offset, math.inf, False, nothing, nothing, np.zeros(3), text)
         return estimate_clock(self.robot, clouds, stamps, self.posture, self.rng, options)
 
     def _frame(
@@ -445,7 +445,9 @@ class _Tracker:
         if not good:
             count = Counter(frame.reason for frame in frames).most_common(3)
             listed = "; ".join(f"{reason} ({number} of {len(frames)})" for reason, number in count)
-            hint = "check the camera's pose, the unit of the clouds and the filters, and look at the pictures of a frame"
+            hint = (
+                "check the camera's pose, the unit of the clouds and the filters, and look at the pictures of a frame"
+            )
             if "metres" in listed:
                 hint = "say in camera.json that the unit is mm"
             raise DataError(f"not one frame could be used: {listed}", where=self.film.source, hint=hint)
@@ -500,7 +502,9 @@ def _joint_angles(
     for name in known:
         if name not in joints.names:
             raise DataError(
-                f"joint '{name}' of the model is not recorded", where=f"{recording.name}: joints", hint=nearest(name, joints.names)
+                f"joint '{name}' of the model is not recorded",
+                where=f"{recording.name}: joints",
+                hint=nearest(name, joints.names),
             )
     columns = [joints.names.index(name) for name in known]
     t, position = joints.t, joints.position[:, columns]
