@@ -18,13 +18,15 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 import yid_ocp
-from yid_ocp.data.recording import read_recording
+from yid_ocp.data.recording import Recording, read_recording
 from yid_ocp.data.synthetic import paper_system
 from yid_ocp.integrator.discrete import ForceSplit
 from yid_ocp.integrator.feedback import lqr_filter
 from yid_ocp.integrator.rollout import Statics
 from yid_ocp.integrator.step import Directions, Feedback, Step, Sweep, compile_step
 from yid_ocp.model import System
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.solvers.gauss_newton import bounded_step
 
 Array = NDArray[np.float64]
 
@@ -41,6 +43,7 @@ class Bench:
     """One of the paper's systems, tracking its shipped recording of 500 steps, and the same tree in Pinocchio."""
 
     size: int
+    recording: Recording
     system: System
     step: Step
     theta: Array
@@ -83,7 +86,7 @@ class Bench:
             for _ in range(50)
         ]
         return Bench(
-            size, system, step, theta, rest.state, torque, path, feedback, swept, model, model.createData(), points
+            size, recording, system, step, theta, rest.state, torque, path, feedback, swept, model, model.createData(), points
         )
 
     def directions(self, key: str, names: tuple[str, ...], everything: bool) -> Directions:
@@ -99,6 +102,12 @@ class Bench:
                 torque[:, :, nx:] = np.eye(nu)
                 self.keep[key] = Directions((), start, torque)
         return self.keep[key]
+
+    def problem(self) -> EstimationProblem:
+        """The estimation of six stiffnesses from the recording, made once."""
+        if "problem" not in self.keep:
+            self.keep["problem"] = EstimationProblem(self.step, [self.recording], STIFFNESSES)
+        return self.keep["problem"]
 
     def sweep(self, steps: int, directions: Directions | None = None) -> Sweep:
         """Track the recording over the first steps."""
@@ -157,6 +166,23 @@ def adjoint_500(bench: Bench) -> int:
     return 1
 
 
+def gradient_500(bench: Bench) -> int:
+    """Cost and gradient of an estimation problem of 500 steps: equilibrium, rollout, residual and adjoint sweep."""
+    problem = bench.problem()
+    problem.gradient(problem.start * 4.0)
+    return 1
+
+
+def gauss_newton_iteration(bench: Bench) -> int:
+    """One iteration of Gauss-Newton over 500 steps: residual, Jacobian by six stiffnesses, and the bounded step."""
+    problem = bench.problem()
+    now = problem.evaluate(problem.start * 4.0)
+    assert now.jacobian is not None
+    wide = np.full(len(problem.start), np.inf)
+    bounded_step(now.jacobian, now.residual, 1e-6, -wide, wide)
+    return 1
+
+
 def rnea_derivatives(bench: Bench) -> int:
     """Pinocchio's derivatives of inverse dynamics on the same tree: the yardstick."""
     model, data, derivatives = bench.model, bench.data, pin.computeRNEADerivatives
@@ -205,7 +231,8 @@ WORKLOADS: tuple[Workload, ...] = (
     Workload(rollout_500, "run"),
     Workload(sensitivities_500, "run"),
     Workload(adjoint_500, "run"),
-    # one iteration of a solver over 500 steps belongs here
+    Workload(gradient_500, "run"),
+    Workload(gauss_newton_iteration, "iteration"),
 )
 
 # key in the results: (workload, what it is divided by), for every size
@@ -217,6 +244,8 @@ RATIOS: dict[str, tuple[str, str]] = {
     "rollout_500_{n}_over_step": ("rollout_500", "step"),
     "sensitivities_500_{n}_over_step": ("sensitivities_500", "step"),
     "adjoint_{n}_over_step": ("adjoint_500", "step"),
+    "gradient_500_{n}_over_step": ("gradient_500", "step"),
+    "gauss_newton_iteration_{n}_over_step": ("gauss_newton_iteration", "step"),
 }
 
 

@@ -33,7 +33,7 @@ _NARROWING = (1.0, 0.7, 0.5, 0.35, 0.35)  # of the reach, from iteration to iter
 _CLEARLY = 0.8  # of the misfit at the common offset, below which a frame's own minimum elsewhere is believed
 _LEAST_LATE = 0.02  # [s]; a stamp that is off by less is like the others
 _SHIFT = 1e-2  # weight, against that of the points, that keeps a shift that they do not tell small
-_NOTED_SHIFT = 0.01  # [m]
+_NOTED_SHIFT = 0.006  # [m]
 _MEDIAN_SQUARE = 0.4549  # of a normal variable
 _STEP = 0.01  # over which velocities are taken [s]
 
@@ -166,11 +166,14 @@ def estimate_clock(
     own, information = nothing.copy(), np.zeros(count)
     for narrowing in (_NARROWING, _NARROWING[-2:], _NARROWING[-2:]):
         for share in narrowing:
-            rows = [_rows(robot, samples[i], float(stamps[i]) - offset, posture, share * chosen.reach) for i in usual]
+            reach = share * chosen.reach
+            rows = [_rows(robot, samples[i] + shift, float(stamps[i]) - offset, posture, reach) for i in usual]
             stacked = np.concatenate(rows)
-            normal = stacked[:, :4].T @ stacked[:, :4] + np.diag([1e-9, *[len(stacked) * _SHIFT] * 3])
-            change = np.linalg.solve(normal, -stacked[:, :4].T @ stacked[:, 4])
-            offset, shift = offset + float(np.clip(change[0], -0.05, 0.05)), change[1:]
+            held = np.diag([1e-9, *[len(stacked) * _SHIFT] * 3])
+            gradient = stacked[:, :4].T @ stacked[:, 4] + held @ np.append(0.0, shift)
+            change = np.linalg.solve(stacked[:, :4].T @ stacked[:, :4] + held, -gradient)
+            offset += float(np.clip(change[0], -0.05, 0.05))
+            shift = shift + change[1:]
         for i, points in samples.items():
             trial = _own(robot, points + shift, float(stamps[i]), offset, posture, chosen.reach, _NARROWING[-3:])
             lowest = float(coarse[int(np.argmin(curves[i]))])

@@ -456,6 +456,8 @@ class _Tracker:
         columns = [self.system.points.index(name) for name in self.names]
         position = np.array([fit.points[columns] for fit in fits])
         std = np.hypot(np.array([fit.std[columns] for fit in fits]), self.options.std_floor)
+        # where the arm seems displaced, so may the object be
+        std = np.hypot(std, np.abs(clock.shift))
         uncertain = math.hypot(self.options.stamp_std, clock.std if clock.estimated else 0.0)
         if len(t) > 1:
             velocity = np.asarray(CubicSpline(t, position, axis=0)(t, 1))

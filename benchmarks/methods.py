@@ -1,0 +1,70 @@
+"""Time to solution of every method from the same start, as ratios to Gauss-Newton in the same run.
+
+    python benchmarks/methods.py [--arms N] [--json FILE]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+from workloads import STIFFNESSES, TIME_STEP
+
+import yid_ocp
+from yid_ocp.analysis.compare import compare
+from yid_ocp.data.recording import read_recording
+from yid_ocp.data.synthetic import paper_system
+from yid_ocp.integrator.step import compile_step
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.solvers import GaussNewton, Lifted, MultipleShooting, SingleShooting
+
+RECORDINGS = {1: "single_arm_vision_estimate.h5", 2: "dual_arm_vision_estimate.h5"}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run every method from 3 N m/rad and print one table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--arms", type=int, choices=(1, 2), default=1)
+    parser.add_argument("--json", type=Path, metavar="FILE", help="store the ratios")
+    options = parser.parse_args(arguments)
+    recording = read_recording(Path(yid_ocp.__file__).parent / "data" / "defaults" / RECORDINGS[options.arms])
+    step = compile_step(paper_system(options.arms), TIME_STEP, "left_damping")
+    problem = EstimationProblem(step, [recording], STIFFNESSES)
+    problem.evaluate(problem.start * 4.0)  # compiles what is compiled once
+    methods = {
+        "gauss_newton": GaussNewton(),
+        "single_shooting": SingleShooting(),
+        "lifted": Lifted(),
+        "multiple_shooting, node every 10 steps": MultipleShooting(node_interval=10),
+        "multiple_shooting, node every step": MultipleShooting(node_interval=1),
+    }
+    table = Table(title=f"{recording.name}: 500 steps, from 3 N m/rad")
+    for title in ("method", "status", "cost", "iterations", "CPU [s]", "/ gauss_newton", "peak [MiB]"):
+        table.add_column(title, justify="left" if title in ("method", "status") else "right")
+    ratios: dict[str, float] = {}
+    reference = 0.0
+    for name, method in methods.items():
+        run = compare(problem, [method]).runs[0]
+        reference = reference or run.cpu_seconds
+        ratios[name] = run.cpu_seconds / reference
+        table.add_row(
+            name,
+            run.solution.status.value,
+            f"{run.whitened_cost:.2f}",
+            str(run.solution.iterations),
+            f"{run.cpu_seconds:.2f}",
+            f"{ratios[name]:.1f}",
+            f"{run.peak_memory:.0f}",
+        )
+    Console(width=None if sys.stdout.isatty() else 120).print(table)
+    if options.json is not None:
+        options.json.write_text(json.dumps(ratios, indent=2) + "\n", encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
