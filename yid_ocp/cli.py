@@ -96,6 +96,37 @@ def _compare(arguments: argparse.Namespace) -> int:
     return DONE if outcome.ok else FAILED
 
 
+def _identifiability(arguments: argparse.Namespace) -> int:
+    from yid_ocp.workflow.identifiability import Question, run_identifiability
+
+    run = _load(arguments)
+    names = [name for name in arguments.intervals.split(",") if name]
+    question = Question(
+        at="initial" if arguments.initial else "solution",
+        start="known" if arguments.known_start else "unknown",
+        grasp_std=None if arguments.known_grasp else Question().grasp_std,
+        intervals="all" if arguments.intervals == "all" else () if arguments.intervals == "none" else names,
+        what_if=arguments.what_if,
+    )
+    with _progress(arguments.quiet) as monitor:
+        outcome = run_identifiability(run, arguments.out, monitor, question)
+    if not arguments.quiet:
+        _print(identifiability_summary(outcome.result))
+    _say_folder(outcome.folder, arguments.quiet)
+    return DONE if outcome.ok else FAILED
+
+
+def _identifiability_arguments(parser: argparse.ArgumentParser) -> None:
+    configured()(parser)
+    parser.add_argument("--what-if", action="store_true", help="rank changes of the experiment; takes a few minutes")
+    parser.add_argument(
+        "--intervals", metavar="NAMES", default="all", help="profile likelihood of: all (default), none, or NAME,NAME"
+    )
+    parser.add_argument("--initial", action="store_true", help="judge at the initial values, without solving")
+    parser.add_argument("--known-start", action="store_true", help="take initial states as known, not estimated along")
+    parser.add_argument("--known-grasp", action="store_true", help="take the places of grasps as known")
+
+
 def _diagnose(arguments: argparse.Namespace) -> int:
     from yid_ocp.config import DIAGNOSIS_DEFAULT, load_config
     from yid_ocp.workflow.diagnose import run_diagnose
@@ -140,6 +171,18 @@ def _check(arguments: argparse.Namespace) -> int:
         outcome = run_check(run, arguments.out, monitor)
     if not arguments.quiet:
         _print(check_summary(outcome.result))
+    _say_folder(outcome.folder, arguments.quiet)
+    return DONE
+
+
+def _track(arguments: argparse.Namespace) -> int:
+    from yid_ocp.workflow.track import run_track
+
+    run = _load(arguments)
+    with _progress(arguments.quiet) as monitor:
+        outcome = run_track(run, arguments.out, monitor)
+    if not arguments.quiet:
+        _print(track_summary(outcome.result))
     _say_folder(outcome.folder, arguments.quiet)
     return DONE
 
@@ -216,11 +259,18 @@ COMMANDS: tuple[Command, ...] = (
     Command("solve", "estimate the free parameters from recordings", _solve, configured(optional=True)),
     Command("compare", "run several methods on one problem and say whether they agree", _compare, configured()),
     Command(
+        "identifiability",
+        "say which parameters the recordings determine, and which experiment would tell more",
+        _identifiability,
+        _identifiability_arguments,
+    ),
+    Command(
         "diagnose", "find the gap between model and recordings, and what makes it", _diagnose, configured(optional=True)
     ),
     Command("simulate", "write what the model says would be recorded", _simulate, _simulate_arguments),
     Command("check", "validate a configuration, its recordings and the model before a long run", _check, configured()),
     Command("inspect", "show the model's equations in numbers", _inspect, configured()),
+    Command("track", "measure the object's points in the frames of a depth camera", _track, configured()),
     Command("import", "turn CSV, rosbag or MCAP into a recording", _import, _import_arguments),
     Command("export", "turn a recording into CSV", _export, _export_arguments),
     Command("schema", "print the JSON Schema of configuration files, for editors", _schema, _schema_arguments),
@@ -270,6 +320,22 @@ def solve_summary(result: dict[str, Any]) -> list[str]:
     return lines
 
 
+def track_summary(result: dict[str, Any]) -> list[str]:
+    """Lines that tell a person what a `yid-track/1` result says."""
+    truth = result["truth_errors"]
+    rows: Rows = [("point", "frames", "± std [mm]", "error, median [mm]", "error, largest [mm]")]
+    for name, entry in result["points"].items():
+        cells = ["" if entry["std"] is None else f"{1e3 * entry['std']:.1f}"]
+        cells += [f"{1e3 * truth[name][key]:.1f}" if name in truth else "" for key in ("median", "largest")]
+        rows.append((name, str(entry["frames"]), *cells))
+    lines = [*table(rows), ""]
+    good = sum(not frame["reason"] for frame in result["frames"])
+    lines.append(f"{good} of {len(result['frames'])} frames are good, the fit took {1e3 * result['fit_seconds']:.0f} ms each")
+    lines += [f"dropped {number}: {reason}" for reason, number in result["dropped"].items()]
+    lines.append(result["clock"]["message"])
+    return lines
+
+
 def compare_summary(result: dict[str, Any]) -> list[str]:
     """Lines that tell a person what a `yid-compare/1` result says."""
     methods: dict[str, Any] = result["methods"]
@@ -308,6 +374,50 @@ def compare_summary(result: dict[str, Any]) -> list[str]:
     if result["agree"]:
         lines.append("all methods agree on the identifiable parameters within their uncertainty")
     return lines
+
+
+def identifiability_summary(result: dict[str, Any]) -> list[str]:
+    """Lines that tell a person what a `yid-identifiability/1` result says."""
+    if not result["parameters"]:
+        return [f"{result['status']}: {result['message']}; there is no point at which to judge"]
+    words = {"identifiable": "identifiable", "weak": "weak", "not_identifiable": "not identifiable"}
+    rows: Rows = [("parameter", "value", "±", "± if start and grasps were known", "95 % interval", "unit", "verdict")]
+    for name, entry in result["parameters"].items():
+        spread = (_percent(entry["std_relative"]), _percent(entry["std_relative_known"]))
+        interval = "" if entry["interval"] is None else _interval(*entry["interval"])
+        rows.append((name, f"{entry['value']:.4g}", *spread, interval, entry["unit"], words[entry["verdict"]]))
+    lines = [*table(rows), ""]
+    hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"]
+    lines += [*hidden, ""] if hidden else []
+    lines += [f"{name}: {note}" for name, entry in result["profiles"].items() for note in entry["notes"]]
+    asked = result["what_if"]
+    if asked is not None:
+        total = len(result["parameters"])
+        rows = [("what if", "identifiable", "gain [nat]", "")]
+        for entry in [asked["base"], *asked["singles"]]:
+            gain = "" if entry["gain"] is None else f"{entry['gain']:.1f}"
+            rows.append((entry["words"], f"{entry['identifiable']} of {total}", gain, entry["message"]))
+        lines += [*table(rows), ""]
+        best = asked["smallest"][0]["words"] if asked["smallest"] else ""
+        if not asked["smallest"]:
+            lines.append("no set of up to three changes makes all of them identifiable")
+        else:
+            lines.append(f"fewest changes that make all of them identifiable: {best}")
+    found = sum(entry["verdict"] == "identifiable" for entry in result["parameters"].values())
+    lines.append(f"{found or 'none'} of {len(result['parameters'])} parameters identifiable from these recordings")
+    return lines
+
+
+def _percent(value: float | None) -> str:
+    return "unknown" if value is None else f"{100 * value:.2g} %" if value < 10 else f"{value:.2g} times"
+
+
+def _interval(lower: float | None, upper: float | None) -> str:
+    if lower is None and upper is None:
+        return "open"
+    if lower is None:
+        return f"below {upper:.4g}"
+    return f"above {lower:.4g}" if upper is None else f"{lower:.4g} to {upper:.4g}"
 
 
 def diagnose_summary(result: dict[str, Any]) -> list[str]:
@@ -435,11 +545,21 @@ def _load(arguments: argparse.Namespace) -> Run:
 class _PlainProgress:
     """A line for every stage and iterate, for logs and pipes."""
 
+    def __init__(self) -> None:
+        self._tenths = 0
+
     def stage(self, text: str) -> None:
+        self._tenths = 0
         print(f"{text} ...", file=sys.stderr, flush=True)
 
     def iterate(self, entry: Iterate) -> None:
         print(f"  {_iterate_words(entry)}", file=sys.stderr, flush=True)
+
+    def advance(self, done: int, total: int, text: str) -> None:
+        tenths = 10 * done // max(total, 1)
+        if tenths > self._tenths:  # a line for every frame would be too many
+            self._tenths = tenths
+            print(f"  {done} of {total}, {text}", file=sys.stderr, flush=True)
 
 
 class _BarProgress:
@@ -458,6 +578,10 @@ class _BarProgress:
     def iterate(self, entry: Iterate) -> None:
         if self._task is not None:
             self._bars.update(self._task, description=f"{self._text}: {_iterate_words(entry)}")
+
+    def advance(self, done: int, total: int, text: str) -> None:
+        if self._task is not None:
+            self._bars.update(self._task, description=f"{self._text}: {text}", completed=done, total=total)
 
     def close(self) -> None:
         """Mark the running stage as done."""

@@ -7,11 +7,12 @@ import pytest
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.effects import make_effect
-from yid_ocp.errors import DataError
+from yid_ocp.errors import DataError, SolverError
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.inputs import Grid, camera_pose, held_torque, held_torque_slope, sensors_present
 from yid_ocp.sensors import sensor_function
+from yid_ocp.solvers.formulation import Transcription
 
 H, STEPS = 0.01, 24
 NAMES = ("left_a", "left_b", "left_c")
@@ -74,6 +75,12 @@ def test_neutral_readings_change_nothing(mode, feedback, benches) -> None:
     assert other.residual == pytest.approx(one.residual, rel=1e-9, abs=1e-9)
     assert not plain.readings.active
     assert full.readings.active
+    assert plain.as_recorded
+    assert full.with_free(["T1.bend", "kelvin_voigt@T3.tau", "clock_scale@clock.scale"]).as_recorded
+    assert not full.with_free(["effort_delay@left.delay"]).as_recorded or mode == "prescribed"
+    assert not full.with_free(["camera_latency@camera.delay"]).as_recorded
+    with pytest.raises(SolverError, match="gauss_newton"):
+        Transcription(full, 1)
 
 
 @pytest.mark.parametrize(("mode", "feedback"), CASES)

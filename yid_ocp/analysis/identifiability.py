@@ -12,7 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.analysis.combinations import Component, combination_words, sparse_basis
 from yid_ocp.analysis.profile import Profile, best_fit, profile_likelihood
+from yid_ocp.effects import make_effect
 from yid_ocp.errors import ConfigError, SolverError, nearest
+from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.problem import Evaluation
 from yid_ocp.solvers.base import IDENTIFIABLE, WEAK, Solution, uncertainty, verdict
@@ -20,7 +22,8 @@ from yid_ocp.solvers.base import IDENTIFIABLE, WEAK, Solution, uncertainty, verd
 Array = NDArray[np.float64]
 StartKnowledge = Literal["known", "unknown"]
 
-GRASP_NUISANCE = "grasp_offset@"
+GRASP_EFFECT = "grasp_offset"
+GRASP_NUISANCE = f"{GRASP_EFFECT}@"
 GRASP_STD = 0.01  # prior of where a grasp sits [m]
 # A column this much smaller than the largest counts as zero where nuisances are eliminated.
 RANK_TOLERANCE = 1e-10
@@ -145,8 +148,8 @@ def identifiability(
     start : "unknown" or "known"
         Whether every recording's initial state is estimated along, with the problem's prior about what it presumes.
     grasp_std : float, optional
-        Prior deviation of the fixed `grasp_offset@...` parameters of a system that has any, which are estimated along
-        [m]; None for grasps that are known.
+        Prior deviation of the fixed `grasp_offset@...` parameters of a system that has any (`with_grasp_offsets`), which
+        are estimated along [m]; None for grasps that are known.
     intervals : iterable of str, or "all"
         Parameters whose interval by profile likelihood is wanted.
 
@@ -235,6 +238,13 @@ def lowered(said: str, interval: tuple[float | None, float | None] | None) -> st
 
 
 # -- nuisances --------------------------------------------------------------------------------------------------------
+
+
+def with_grasp_offsets(system: System) -> System:
+    """The system with a `grasp_offset` effect, at its neutral value, on every grasp that has none."""
+    there = {effect.location for effect in system.effects if effect.kind == GRASP_EFFECT}
+    places = [grasp.name for grasp in system.grasps if grasp.name not in there]
+    return system.with_effects([make_effect(GRASP_EFFECT, place, system) for place in places])
 
 
 def unknown_vector(problem: EstimationProblem, solution: Solution | ArrayLike | None) -> Array:

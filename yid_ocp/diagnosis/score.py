@@ -5,7 +5,7 @@ amplitudes of candidate j and P = I - J_theta J_theta^+:
 
     G_j = J_j' P J_j,  s_j = -J_j' P r,  LM_j = s_j' S_j^-1 s_j,
 
-S_j = G_j for white noise of unit deviation, and the sum of the scores' autocovariances for a coloured residual, taken as
+S_j = G_j for white noise of unit deviation, and the sum of the scores' autocovariances for a coloured one, taken as
 it would be with the candidate's step done (Bartlett's weights, Newey and West 1987, doi:10.2307/1913610). The decrease
 of r'r that the linear model promises is s_j' G_j^-1 s_j, less where the amplitude would leave its bounds.
 

@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.diagnosis.hypotheses import Composed, sample_times
+from yid_ocp.diagnosis.hypotheses import Composed, residual_series, sample_times
+from yid_ocp.diagnosis.score import robust
 from yid_ocp.effects import EffectBase, Reported
 from yid_ocp.problem.problem import Evaluation
 from yid_ocp.solvers import GaussNewton
@@ -68,7 +69,7 @@ class Fit:
     values : dict of str to float
         Unknowns.
     std : dict of str to float
-        Their deviations, scaled by the residual where that is more than noise.
+        Their deviations; see `deviations`.
     cost : float
     evaluation : Evaluation
     loss : Loss
@@ -134,11 +135,28 @@ def refit(problem: Composed, effects: Sequence[EffectBase], start: Mapping[str, 
     finish = own.evaluate(outcome.x)
     if not finish.ok:
         return None
-    covariance, _ = uncertainty(own, finish)
-    deviation = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    deviation = deviations(own, finish)
     std = dict(zip(own.names, map(float, deviation), strict=True))
     loss = held_out_loss(own, outcome.x)
     return Fit(tuple(effects), own, own.named(outcome.x), std, finish.cost, finish, loss, outcome.message)
+
+
+def deviations(problem: Composed, finish: Evaluation) -> Array:
+    """Standard deviation of every unknown, shape (nx,): the larger of two.
+
+    The first scales (J'J)^-1 by chi2 per degree of freedom; the second is the sandwich (J'J)^-1 S (J'J)^-1 with the
+    scores' autocovariances in S, which knows that samples of a coloured residual repeat each other.
+    """
+    covariance, _ = uncertainty(problem, finish)
+    plain = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    if finish.jacobian is None or not plain.size:
+        return plain
+    rows = len(finish.residual) - problem.tie_break_rows
+    scale = problem.scales
+    jacobian = finish.jacobian[:rows] * scale
+    inverse = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-10, hermitian=True)
+    middle = robust(jacobian, finish.residual[:rows], residual_series(problem))
+    return np.maximum(plain, scale * np.sqrt(np.maximum(np.diag(inverse @ middle @ inverse), 0.0)))
 
 
 def refit_all(

@@ -346,6 +346,17 @@ def _figures(effect: EffectBase, fit: Fit) -> str:
     return ", ".join(parts)
 
 
+def _out_of_range(effect: EffectBase, fit: Fit) -> list[str]:
+    """Amplitudes beyond the range that an engineer would expect."""
+    found = []
+    for name in effect.amplitudes:
+        low, high = effect.prior_range[name]
+        room = 0.25 * (high - low)
+        if not low - room <= fit.values[name] <= high + room and effect.neutral[name] != fit.values[name]:
+            found.append(f"{name} = {fit.values[name]:.3g} (range {low:.3g} to {high:.3g})")
+    return found
+
+
 def sentences(finding: Finding) -> str:
     """The report in words."""
     held, first = finding.held_out_before, finding.before
@@ -378,6 +389,11 @@ def sentences(finding: Finding) -> str:
             others = [r.label for r in entry.rivals if r.label != entry.effect.label]
             if others:
                 text.append(f"Not separable from {entry.effect.label}: {', '.join(others)}.")
+        odd = [text for effect in finding.effects for text in _out_of_range(effect, last)]
+        if odd:
+            text.append(
+                f"Beyond what one would expect, and so perhaps standing in for something else: {', '.join(odd)}."
+            )
         rest = finding.remaining
         if rest.chi2_per_dof > 1 and rest.p_value < 0.01:
             place = f", most of it in {finding.remaining_where[0].location}" if finding.remaining_where else ""

@@ -245,7 +245,7 @@ def discrete_equations(system: System, force_split: ForceSplit = "symmetric") ->
     total: ClosedForce | None = None
     if closed:
         total = ClosedForce(
-            *(placed(sum(parts[1:], parts[0])) for parts in zip(*((c.force, c.A, c.T) for c in closed)))
+            *(placed(sum((getattr(c, name) for c in closed[1:]), getattr(closed[0], name))) for name in ("force", "A", "T"))
         )
         balance += viscous_share * h * scale * sum((c.force for c in closed), ca.SX(n, 1))
         p1 += (1 - viscous_share) * h * scale * sum((c.force for c in closed), ca.SX(n, 1))

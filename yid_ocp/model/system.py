@@ -303,8 +303,8 @@ class System:
         Coordinates held by a spring of this compliance [rad/(N m)], zero meaning rigid; their equations and momentum
         are multiplied by it so that they stay regular at zero.
     relaxing : mapping of joint name to float
-        Relaxation time T of some compliant coordinates [s]: q + T dq/dt = compliance x torque. A massless one needs it to
-        forget a start that does not fit its load.
+        Relaxation time T of some compliant coordinates [s]: q + T dq/dt = compliance x torque. A massless one needs it
+        to forget a start that does not fit its load.
     segments : tuple of SegmentLayout
     points : tuple of str
         Frames that a sensor may see.

@@ -55,7 +55,7 @@ class Grid:
     @property
     def times(self) -> Array:
         """Times of all nodes, shape (steps + 1,) [s]."""
-        return self.start + self.time_step * np.arange(self.steps + 1)
+        return np.asarray(self.start + self.time_step * np.arange(self.steps + 1), dtype=float)
 
     def locate(self, t: ArrayLike) -> tuple[NDArray[np.int64], Array]:
         """Node before each time and the fraction of a step beyond it; a time within 1e-6 of a node is that node."""
@@ -197,7 +197,9 @@ def columns(joints: JointGroup, names: tuple[str, ...], where: str) -> list[int]
     for name in names:
         if name not in joints.names:
             raise DataError(
-                f"joint '{name}' of the model is not recorded", where=f"{where}: joints", hint=nearest(name, joints.names)
+                f"joint '{name}' of the model is not recorded",
+                where=f"{where}: joints",
+                hint=nearest(name, joints.names),
             )
     return [joints.names.index(name) for name in names]
 
@@ -310,7 +312,8 @@ def point_course(recording: Recording, point: str, grid: Grid, smoother: Smoothe
             seen = group.position[:, group.names.index(point)]
             good = np.all(np.isfinite(seen), axis=1)
             if good.sum() < 4:
-                raise DataError(f"point '{point}' is seen {good.sum()} times", where=recording.name, allowed="4 or more")
+                what = f"point '{point}' is seen {good.sum()} times"
+                raise DataError(what, where=recording.name, allowed="4 or more")
             values = smoother(group.t[good], seen[good])
             spline = scipy.interpolate.CubicSpline(group.t[good], values, axis=0)
             return np.asarray(spline(np.clip(grid.times, group.t[good][0], group.t[good][-1])))

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,151 +16,17 @@ from yid_ocp.integrator.codegen import Mapped
 from yid_ocp.integrator.feedback import lqr_filter, proportional_filter
 from yid_ocp.integrator.rollout import Rest, Statics, adjoint_gradient, simulate
 from yid_ocp.integrator.step import Directions, Feedback, Step, Sweep, check_shape
+from yid_ocp.problem.episodes import Episode as Episode
+from yid_ocp.problem.episodes import apparent_inertia, prepare_episode
 from yid_ocp.problem.initial import FittedStart, StartFit
-from yid_ocp.problem.inputs import (
-    ClampPath,
-    Grid,
-    Smoother,
-    camera_pose,
-    columns,
-    held_torque,
-    joint_loads,
-    make_grid,
-    prescribed_path,
-)
+from yid_ocp.problem.inputs import Smoother
+from yid_ocp.problem.options import ProblemOptions as ProblemOptions
+from yid_ocp.problem.options import SensorOptions as SensorOptions
 from yid_ocp.problem.readings import Inputs, Readings
-from yid_ocp.problem.residuals import Samples, Weighting, huber, make_samples, paper_weighting, point_samples
-from yid_ocp.sensors import EffortSensor, PointSensor, Sensor, sensor_function
+from yid_ocp.problem.residuals import Samples, huber
+from yid_ocp.sensors import Sensor, sensor_function
 
 Array = NDArray[np.float64]
-InitialState = Literal["equilibrium", "estimated", "given"]
-
-
-@dataclass(frozen=True)
-class SensorOptions:
-    """How one group of a recording is used.
-
-    Attributes
-    ----------
-    use : bool
-        Whether the estimation sees it at all.
-    std : float or mapping of name to float, optional
-        Noise deviation in the group's unit, instead of the recorded one.
-    frames : mapping of point to frame
-        Frame that a point marks where the two have different names.
-    points : tuple of str, optional
-        Points to use; all that the model has when absent.
-    position_std : float or mapping of joint to float, optional
-        Deviation of the encoders that give a prescribed motion, instead of the recorded one [rad]; the accelerations
-        worked out from it add to the deviation of predicted efforts.
-    """
-
-    use: bool = True
-    std: float | Mapping[str, float] | None = None
-    frames: Mapping[str, str] = field(default_factory=dict)
-    points: tuple[str, ...] | None = None
-    position_std: float | Mapping[str, float] | None = None
-
-
-@dataclass(frozen=True)
-class ProblemOptions:
-    """Everything about an estimation problem that is neither the model nor the data.
-
-    Attributes
-    ----------
-    initial_state : "equilibrium", "estimated" or "given"
-        Rest at the first posture (depends on theta); that plus a free deviation with a prior; or fixed at the
-        configuration that fits the first measured points.
-    feedback : "none", "proportional" or "lqr"
-        Tracking filter of driven arms.
-    gains : sequence of float
-        Proportional gains of one arm or of all driven joints [N m/rad].
-    weighting : "whitened" or "paper"
-    robust_scale : float
-        Huber scale in standard deviations; infinite for squares.
-    path_cutoff : float
-        Low-pass cutoff of prescribed paths and of the efforts compared with them [Hz].
-    sensors : mapping of group to SensorOptions
-    clamps : tuple of ClampPath
-    local : tuple of str
-        Free parameters with a value of their own in every recording.
-    priors : mapping of parameter to deviation
-        Gaussian priors about the initial value, in the parameter's unit.
-    tie_break : float
-        Every other free parameter that is positive by nature gets a prior that calls this factor up or down one
-        standard deviation (log-normal about its start), so that one that the data do not inform stays near its start;
-        zero for none. Not used with the paper's weighting.
-    configuration_std, velocity_std : float
-        Prior of an estimated initial state [rad], [rad/s].
-    duration : float, optional
-        Use only the first seconds of every recording [s].
-    start_window : float
-        How long the measured points that fix a `given` start may reach [s].
-    start_std : float, optional
-        Noise deviation of the points in the fit of a `given` start, where the sensors' one stands for the model's error
-        as well [m].
-    start_parameters : tuple of str
-        Parameters that are fitted along with a `given` start in every recording, held-out ones included, from these
-        first points alone; none of them may be free.
-    recording_values : mapping of recording to mapping of parameter to value
-        Known values of parameters that differ from recording to recording, such as where markers sit.
-    known_start : mapping of recording to array_like, shape (nx,)
-        State (q, p, z) in which a recording starts, in place of rest or of the fit; an `estimated` start deviates from it.
-    """
-
-    initial_state: InitialState = "equilibrium"
-    feedback: Literal["none", "proportional", "lqr"] = "lqr"
-    gains: tuple[float, ...] = (80.0, 80.0, 60.0, 60.0, 15.0, 15.0, 8.0)
-    weighting: Weighting = "whitened"
-    robust_scale: float = float("inf")
-    path_cutoff: float = 10.0
-    sensors: Mapping[str, SensorOptions] = field(default_factory=dict)
-    clamps: tuple[ClampPath, ...] = ()
-    local: tuple[str, ...] = ()
-    priors: Mapping[str, float] = field(default_factory=dict)
-    tie_break: float = 10.0
-    configuration_std: float = 0.05
-    velocity_std: float = 0.2
-    duration: float | None = None
-    start_window: float = 0.02
-    start_std: float | None = None
-    start_parameters: tuple[str, ...] = ()
-    recording_values: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    known_start: Mapping[str, ArrayLike] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Episode:
-    """One recording placed on the nodes of a rollout.
-
-    Attributes
-    ----------
-    recording : Recording
-    grid : Grid
-    torque : ndarray, shape (N, nu)
-    path : ndarray, shape (N + 1, nc)
-    posture : ndarray, shape (nk,)
-        Known coordinates (driven, then prescribed) at node 0.
-    measured_arm : ndarray, shape (N + 1, nu)
-        Measured angles of the driven joints at every node.
-    samples : tuple of Samples
-    load : ndarray, shape (N + 1, nk)
-        Recorded effort of driven, then prescribed joints, where an effect makes their true angle depend on it.
-    """
-
-    recording: Recording
-    grid: Grid
-    torque: Array
-    path: Array
-    posture: Array
-    measured_arm: Array
-    samples: tuple[Samples, ...]
-    load: Array
-
-    @property
-    def name(self) -> str:
-        """Name of the recording."""
-        return self.recording.name
 
 
 @dataclass(frozen=True)
@@ -339,112 +204,8 @@ class EstimationProblem:
 
     def prepare(self, recording: Recording) -> Episode:
         """Place a recording on the nodes: torques, paths, posture, samples."""
-        system, options = self.system, self.options
-        grid = make_grid(recording, self.step.time_step, options.duration)
-        if system.driven and recording.joints is None:
-            raise DataError("the model's arms are driven but the recording has no joints", where=recording.name)
-        smoother = Smoother(options.path_cutoff)
-        path = prescribed_path(recording, system, grid, smoother, options.clamps)
-        if recording.joints is not None and system.driven:
-            joints = recording.joints
-            torque = held_torque(joints, system.driven, grid, recording.name)
-            angles = joints.position[:, columns(joints, system.driven, recording.name)]
-            arm = np.stack([np.interp(grid.times, joints.t, column) for column in angles.T], axis=1)
-        else:
-            torque, arm = np.zeros((grid.steps, 0)), np.zeros((grid.steps + 1, 0))
-        posture = np.concatenate([arm[0], path[0]])
-        samples = tuple(self._samples(recording, grid, smoother))
-        if not any(np.any(s.weight > 0) for s in samples):
-            raise DataError(
-                "the recording holds no measurement that the model could be compared with",
-                where=recording.name,
-                hint="check `sensors` and the names of the recorded points",
-            )
-        if options.weighting == "paper":
-            samples = tuple(paper_weighting(s, grid) for s in samples)
-        known = (*system.driven, *system.prescribed)
-        load = np.zeros((grid.steps + 1, len(known)))
-        if self.readings.angles_need_effort:
-            load = joint_loads(recording, known, grid, smoother)
-        return Episode(recording, grid, torque, path, posture, arm, samples, load)
-
-    def _samples(self, recording: Recording, grid: Grid, smoother: Smoother) -> list[Samples]:
-        system, options = self.system, self.options
-        found: list[Samples] = []
-        for group in recording.points:
-            choice = options.sensors.get(group.name, SensorOptions())
-            if not choice.use:
-                continue
-            wanted = choice.points if choice.points is not None else group.names
-            frames = {p: choice.frames.get(p, p) for p in wanted}
-            known = tuple(p for p in wanted if frames[p] in system.mechanism.frames)
-            if not known:
-                raise DataError(
-                    f"none of the points of group '{group.name}' is a frame of the model",
-                    where=recording.name,
-                    allowed=", ".join(system.points),
-                    hint=f"name them under sensors.{group.name}.frames, or switch the group off",
-                )
-            sensor = PointSensor(group.name, known, tuple(frames[p] for p in known), camera_pose(group))
-            std = choice.std
-            if isinstance(std, Mapping):
-                raise ConfigError("a group of points takes one std", where=f"sensors.{group.name}.std")
-            found.append(point_samples(recording, group, sensor, known, grid, std))
-        choice = options.sensors.get("joints.effort", SensorOptions())
-        joints = recording.joints
-        if joints is not None and joints.effort is not None and choice.use:
-            names = tuple(name for name in system.prescribed if name in joints.names)
-            if names:
-                found.append(self._effort_samples(recording, grid, smoother, names, choice))
-        return found
-
-    def _effort_samples(
-        self, recording: Recording, grid: Grid, smoother: Smoother, names: tuple[str, ...], choice: SensorOptions
-    ) -> Samples:
-        joints = recording.joints
-        assert joints is not None
-        assert joints.effort is not None
-        at = columns(joints, names, recording.name)
-        effort = smoother(joints.t, joints.effort[:, at])
-        measured = np.stack([np.interp(grid.times, joints.t, column) for column in effort.T], axis=1)
-        given = choice.std if choice.std is not None else joints.effort_std
-        if given is None:
-            raise DataError(
-                "the noise level of the joint efforts is neither recorded nor given",
-                where=recording.name,
-                hint="set sensors.joints.effort.std [N m], from a stretch at rest or the data sheet",
-            )
-        std = _by_joint(given, joints.names, names, "sensors.joints.effort.std")
-        step = float(np.median(np.diff(joints.t)))
-        value_gain, _, second_gain = smoother.gains(step)
-        known = choice.position_std if choice.position_std is not None else joints.position_std
-        angle = _by_joint(0.0 if known is None else known, joints.names, names, "sensors.joints.effort.position_std")
-        inertia = self._apparent_inertia(names)
-        total = np.sqrt((std * value_gain) ** 2 + (inertia * angle * second_gain) ** 2)
-        # the impulse at node 0 depends on the motion before the recording, that at the last node on the motion after it
-        inner = slice(1, grid.steps)
-        deviation = np.broadcast_to(total, measured.shape)[inner]
-        return make_samples(
-            EffortSensor(names),
-            grid.times[inner],
-            measured[inner],
-            deviation,
-            grid,
-            f"{recording.name}: joints.effort",
-            (1, grid.steps - 1),
-        )
-
-    def _apparent_inertia(self, names: tuple[str, ...]) -> Array:
-        e = self.step.equations
-        sizes = self.step.sizes
-        n, zero = sizes["n"], np.zeros
-        state = [zero(n), zero(n), zero(n), zero(sizes["nz"]), zero(sizes["nz"]), zero(sizes["m"]), zero(sizes["nu"])]
-        pairs = np.array(self.step.functions.linear(*state, self.theta, self.step.time_step)[0]).ravel()
-        plus, _, lower, upper = (pairs[6 * n * i : 6 * n * (i + 1)].reshape(6, n) for i in range(4))
-        h = self.step.time_step
-        mass = np.sum(plus * (upper - lower), axis=0) * h / 2
-        del e
-        return mass[[self.system.mechanism.joint_index(name) for name in names]]
+        loads = self.readings.angles_need_effort
+        return prepare_episode(self.step, recording, self.options, self.theta, loads)
 
     # -- evaluation ---------------------------------------------------------------------------------------------------
 
@@ -526,7 +287,7 @@ class EstimationProblem:
 
     @property
     def start_rows(self) -> tuple[int, ...]:
-        """Rows of the initial state that are estimated: q and p of the coordinates that are neither driven nor known."""
+        """Rows of the initial state that are estimated: q and p of coordinates neither driven nor prescribed."""
         if not self._start_size:
             return ()
         return (*self._start_rows, *(self.system.size + row for row in self._start_rows))
@@ -663,6 +424,19 @@ class EstimationProblem:
         found = self.readings.sensor_delay(samples.sensor, theta, wanted)
         return None if found is None else (found[0] / self.step.time_step, found[1] / self.step.time_step)
 
+    @property
+    def as_recorded(self) -> bool:
+        """Whether no effect on recorded inputs or times is at work: none is free, and all others are neutral."""
+        for episode in self.episodes:
+            inputs = self.inputs(episode, self.theta, self._columns)
+            pairs = ((inputs.torque, episode.torque), (inputs.path, episode.path), (inputs.arm, episode.measured_arm))
+            slopes = [x for x in (inputs.by_torque, inputs.by_path, inputs.by_arm) if x is not None]
+            for samples in episode.samples:
+                slopes += self.lateness(samples, self.theta, self._columns) or ()
+            if any(np.any(x) for x in slopes) or not all(np.array_equal(a, b) for a, b in pairs):
+                return False
+        return True
+
     def inputs(self, episode: Episode, theta: Array, wanted: tuple[str, ...]) -> Inputs:
         """What drives an episode's rollout: the recording, as far as no effect says that it reads something else.
 
@@ -746,7 +520,7 @@ class EstimationProblem:
             if base.startswith("start.q."):
                 deviations.append(options.configuration_std)
             elif base.startswith("start.p."):
-                inertia = float(self._apparent_inertia((base.removeprefix("start.p."),))[0])
+                inertia = float(apparent_inertia(self.step, self.theta, (base.removeprefix("start.p."),))[0])
                 deviations.append(options.velocity_std * max(inertia, 1e-9))
             else:
                 deviations.append(float(options.priors.get(base, np.inf)))
@@ -795,6 +569,7 @@ class EstimationProblem:
         return float(np.sqrt(np.mean(np.concatenate(found) ** 2)))
 
     def prior(self, x: Array) -> tuple[Array, Array]:
+        """Rows of the priors and of the tie-break, and their derivative by the unknowns."""
         stated, tied = np.flatnonzero(np.isfinite(self._prior_deviations)), self._tied
         rows = np.zeros((len(stated) + len(tied), len(x)))
         weight = 1.0 / self._prior_deviations[stated]
@@ -877,7 +652,9 @@ class EstimationProblem:
 
     # -- reports ------------------------------------------------------------------------------------------------------
 
-    def channel_errors(self, results: Sequence[EpisodeResult], episodes: Sequence[Episode]) -> dict[str, dict[str, float]]:
+    def channel_errors(
+        self, results: Sequence[EpisodeResult], episodes: Sequence[Episode]
+    ) -> dict[str, dict[str, float]]:
         """Root mean square error of every channel: {channel: {rmse, unit, n}}.
 
         For points the error of a sample is the Euclidean distance.
@@ -952,16 +729,3 @@ class EstimationProblem:
                     allowed="lower below upper",
                     hint="fix the parameter instead of closing its bounds",
                 )
-
-
-def _by_joint(
-    given: float | Array | Mapping[str, float], recorded: Sequence[str], names: Sequence[str], key: str
-) -> Array:
-    """One number for each of `names` from one for all, one for each recorded joint, or a mapping."""
-    if isinstance(given, Mapping):
-        for name in names:
-            if name not in given:
-                raise ConfigError(f"joint '{name}' has no value", where=key, hint=nearest(name, given))
-        return np.array([float(given[name]) for name in names])
-    wide = np.broadcast_to(np.asarray(given, float), (len(recorded),))
-    return wide[[list(recorded).index(name) for name in names]]

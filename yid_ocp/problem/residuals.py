@@ -173,7 +173,10 @@ def make_samples(
     seen = np.isfinite(value)
     if np.any(seen & ~(std > 0)):
         raise DataError(
-            "a noise level is zero or missing", where=where, allowed="a positive deviation", hint="set it under `sensors`"
+            "a noise level is zero or missing",
+            where=where,
+            allowed="a positive deviation",
+            hint="set it under `sensors`",
         )
     weight = np.where(seen, 1.0 / np.where(std > 0, std, 1.0), 0.0)
     node, fraction = grid.locate(t)

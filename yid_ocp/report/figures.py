@@ -130,6 +130,21 @@ def estimates(values: Mapping[str, tuple[float, float | None, float, bool]], uni
     return figure
 
 
+def profiles(curves: Mapping[str, tuple[Sequence[float], Sequence[float]]], level: float) -> plotly.graph_objects.Figure:
+    """Chi2 above the best along each parameter, over its value relative to that of the best fit: (ratio, delta chi2)."""
+    import plotly.graph_objects as go
+
+    figure = go.Figure()
+    for i, (name, (ratio, delta)) in enumerate(curves.items()):
+        line = {"color": COLORS[i % len(COLORS)], "dash": "solid" if i < len(COLORS) else "dash"}
+        figure.add_scatter(x=list(ratio), y=list(delta), mode="lines+markers", name=name, line=line)
+    figure.add_hline(y=level, line={"color": INK, "dash": "dot"}, annotation_text="95 %")
+    figure = _styled(figure, 380, "value over best value", "chi2 above the best")
+    figure.update_xaxes(type="log", range=[-1.0, 1.0])
+    figure.update_yaxes(range=[-0.2, 2.5 * level])
+    return figure
+
+
 def _thinned(count: int) -> NDArray[np.int64]:
     if count <= LONGEST:
         return np.arange(count)

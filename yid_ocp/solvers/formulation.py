@@ -81,6 +81,13 @@ class Transcription:
                 where="multiple shooting",
                 hint="use gauss_newton for problems with local parameters",
             )
+        if not problem.as_recorded:
+            raise SolverError(
+                "an effect changes recorded inputs or times",
+                where="multiple shooting",
+                allowed="effects of the mechanics and of what sensors read",
+                hint="use gauss_newton",
+            )
         self.problem = problem
         self.step = problem.step
         self.interval = interval

@@ -37,6 +37,10 @@ class Monitor(Protocol):
         """A solver accepted a point."""
         ...
 
+    def advance(self, done: int, total: int, text: str) -> None:
+        """So many of so many parts of the stage are done, and what comes next."""
+        ...
+
 
 class Silent:
     """A monitor that tells nobody."""
@@ -45,6 +49,9 @@ class Silent:
         """Nothing."""
 
     def iterate(self, entry: Iterate) -> None:
+        """Nothing."""
+
+    def advance(self, done: int, total: int, text: str) -> None:
         """Nothing."""
 
 

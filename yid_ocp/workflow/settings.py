@@ -21,6 +21,7 @@ from yid_ocp.errors import ConfigError
 from yid_ocp.integrator.discrete import ForceSplit
 from yid_ocp.solvers import SOLVERS, GaussNewton
 from yid_ocp.solvers.base import Solver
+from yid_ocp.vision.track import TrackOptions
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,7 @@ class About:
 
 
 Triple = tuple[float, float, float]
+Quadruple = tuple[float, float, float, float]
 Interval = tuple[float, float]
 FilePath = Annotated[str, About("a file, relative to the configuration", path=True)]
 RecordingPath = Annotated[str, About("a recording, relative to the configuration, or default:NAME.h5", path=True)]
@@ -294,6 +296,47 @@ class CompareSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class VirtualFilmSettings:
+    """A virtual experiment in MuJoCo and the virtual depth camera that films it, where there are no frames."""
+
+    seed: Annotated[int, Ge(0), About("of motion, noise and camera")] = 0
+    duration: Annotated[float, Gt(0), Le(600), About("of the experiment", "s")] = 5.0
+    travel: Annotated[float, Gt(0), Le(1), About("largest distance of a gripper from its start", "m")] = 0.11
+    offsets: Annotated[
+        Mapping[str, Triple], About("by grasp: where it starts beside the end of the undeformed object", "m")
+    ] = field(default_factory=dict)
+    eye: Annotated[Triple, About("where the camera stands", "m")] = (2.6, 0.0, 0.45)
+    target: Annotated[Triple, About("where it looks", "m")] = (0.85, 0.0, -0.1)
+    rate: Annotated[float, Gt(0), Le(60), About("mean rate of frames", "Hz")] = 3.0
+    dropped: Annotated[float, Ge(0), Lt(1), About("share of frames that are lost")] = 0.0
+    latency: Annotated[float, About("stamp minus time of the picture", "s")] = 0.0
+    latency_std: Annotated[float, Ge(0), About("deviation of the latency", "s")] = 0.0
+    outliers: Annotated[float, Ge(0), Lt(1), About("share of pixels with a wrong depth")] = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackSettings:
+    """How points are measured in a depth camera's frames."""
+
+    frames: Annotated[FilePath | None, About("folder of clouds or depth images; a virtual camera films when absent")] = (
+        None
+    )
+    pose: Annotated[
+        tuple[Quadruple, Quadruple, Quadruple, Quadruple] | None,
+        About("camera (x right, y down, z ahead) in the world, row by row, instead of the folder's", "m"),
+    ] = None
+    unit: Annotated[Literal["m", "mm"] | None, About("of the clouds, instead of the folder's")] = None
+    virtual: Annotated[VirtualFilmSettings, About("what is filmed without frames")] = field(
+        default_factory=VirtualFilmSettings
+    )
+    keep_frames: Annotated[bool, About("whether a virtual film's frames are written to the run folder")] = False
+    pictures: Annotated[int, Ge(0), Le(1000), About("frames of which every stage is drawn")] = 2
+    options: Annotated[TrackOptions, About("filters, skeleton, fit, clock and what counts as good")] = field(
+        default_factory=TrackOptions
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class OutputSettings:
     """Where results go."""
 
@@ -323,6 +366,7 @@ class Run:
     solver: Annotated[SolverSettings, About("how the cost is lowered")] = field(default_factory=SolverSettings)
     compare: Annotated[CompareSettings, About("which methods are compared")] = field(default_factory=CompareSettings)
     diagnosis: Annotated[DiagnosisSettings, About("how a gap is diagnosed")] = field(default_factory=DiagnosisSettings)
+    track: Annotated[TrackSettings, About("how a camera's frames are tracked")] = field(default_factory=TrackSettings)
     output: Annotated[OutputSettings, About("where results go")] = field(default_factory=OutputSettings)
     name: str = field(default="run", metadata={"internal": True})
     file: str = field(default="", metadata={"internal": True}, compare=False)

@@ -15,7 +15,7 @@ WORDS = {"identifiable": "found", "weak": "weakly determined", "not_identifiable
 def prepare(findings: Findings) -> Mapping[str, Any] | None:
     """Free parameters with deviations and verdicts."""
     result = findings.result
-    if "parameters" not in result:
+    if not any("free" in entry for entry in result.get("parameters", {}).values()):
         return None
     free = {name: entry for name, entry in result["parameters"].items() if entry.get("free")}
     by_unit: dict[str, dict[str, tuple[float, float | None, float, bool]]] = {}

@@ -1,0 +1,225 @@
+"""The command `track`: points measured in a depth camera's frames, written into a recording that `solve` reads."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.data.recording import Recording, file_sha256, read_recording, write_recording
+from yid_ocp.errors import ConfigError
+from yid_ocp.model.system import System
+from yid_ocp.vision.camera import DepthCamera, Shutter, VirtualFilm, film
+from yid_ocp.vision.fit import ShapeFit
+from yid_ocp.vision.frames import Film, look_at, read_film, write_film
+from yid_ocp.vision.pictures import draw_stages, draw_track
+from yid_ocp.vision.track import Track, track
+from yid_ocp.workflow.build import build_system, located, recording_file
+from yid_ocp.workflow.folder import Monitor, Silent, input_hashes, new_run_folder, versions
+from yid_ocp.workflow.settings import Run, VirtualFilmSettings, dump_config
+
+FORMAT = "yid-track/1"
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TrackOutcome:
+    """What `run_track` leaves.
+
+    Attributes
+    ----------
+    folder : Path
+        With recording.h5, result.json, track.png and the pictures.
+    result : dict
+        Contents of result.json.
+    track : Track
+    recording : Recording
+        The joints' recording with the group `points_camera`.
+    """
+
+    folder: Path
+    result: dict[str, Any]
+    track: Track
+    recording: Recording
+
+
+def run_track(run: Run, out: str | Path | None = None, monitor: Monitor | None = None) -> TrackOutcome:
+    """Track the frames of `track.frames`, or of a virtual camera where there are none.
+
+    The joint angles are those of the first recording under `recordings.estimate`; a virtual film has its own.
+
+    Parameters
+    ----------
+    run : Run
+    out : str or Path, optional
+    monitor : Monitor, optional
+
+    Returns
+    -------
+    TrackOutcome
+
+    Raises
+    ------
+    ConfigError, DataError, ModelError, OutputError
+    """
+    watcher, settings = monitor or Silent(), run.track
+    with new_run_folder(run, out, "track") as folder:
+        folder.write("config.yaml", dump_config(run))
+        inputs = input_hashes(run)
+        system = build_system(run)
+        made: VirtualFilm | None = None
+        if settings.frames is None:
+            watcher.stage("simulating a virtual experiment in MuJoCo")
+            recording, made = virtual_film(run, system, settings.virtual)
+            seen = made.film
+            if settings.keep_frames:
+                write_film(seen, folder.path / "frames")
+        else:
+            recording, seen = _recorded(run, settings.frames)
+            inputs |= {settings.frames: file_sha256(Path(settings.frames))}
+        folder.log("start", command="track", versions=versions(), inputs=inputs)
+        watcher.stage("tracking")
+        drawn = sorted({int(i) for i in np.linspace(0, len(seen) - 1, settings.pictures + 2)[1:-1]})
+        with located(run, "track"):
+            found = track(
+                system,
+                recording,
+                seen,
+                urdf=run.model.robot,
+                options=settings.options,
+                stages=drawn,
+                progress=watcher.advance,
+            )
+        watcher.stage("drawing")
+        for stages in found.stages:
+            draw_stages(stages, folder.path / "pictures")
+        draw_track(found, folder.path / "track.png")
+        tracked = found.recording(recording)
+        write_recording(tracked, folder.path / "recording.h5")
+        result = track_result(found) | {"truth_errors": {} if made is None else truth_errors(system, found, made)}
+        written = folder.write_json("result.json", result | {"inputs": inputs, "versions": versions()})
+    return TrackOutcome(folder.path, written, found, tracked)
+
+
+def track_result(found: Track) -> dict[str, Any]:
+    """`yid-track/1` without the errors of a virtual film, inputs and versions."""
+    seen = np.isfinite(found.position).all(axis=2)
+    spent = [frame.seconds for frame in found.frames if frame.fit is not None]
+    clock = found.clock
+    return {
+        "format": FORMAT,
+        "clock": {
+            "offset": clock.offset,
+            "std": clock.std if clock.estimated else None,
+            "estimated": clock.estimated,
+            "shift": clock.shift,
+            "message": clock.message,
+        },
+        "points": {
+            name: {
+                "frames": int(seen[:, i].sum()),
+                "std": float(np.median(found.std[seen[:, i], i])) if seen[:, i].any() else None,
+            }
+            for i, name in enumerate(found.names)
+        },
+        "dropped": found.dropped,
+        "fit_seconds": float(np.mean(spent)),
+        "frames": [
+            {
+                "name": frame.name,
+                "stamp": frame.stamp,
+                "t": frame.t,
+                "reason": frame.reason,
+                "raw_points": frame.raw,
+                "object_points": frame.filtered,
+                "nodes": frame.nodes,
+                "delay": None if np.isnan(frame.delay) else frame.delay,
+                "distance": None if frame.fit is None else frame.fit.distance,
+                "inliers": None if frame.fit is None else frame.fit.inliers,
+                "seconds": frame.seconds,
+            }
+            for frame in found.frames
+        ],
+    }
+
+
+def truth_errors(system: System, found: Track, made: VirtualFilm) -> Mapping[str, Mapping[str, float]]:
+    """Median and largest distance of every point from where it really was in the picture [m]."""
+    shape = ShapeFit(system)
+    columns = [system.points.index(name) for name in found.names]
+    good = [frame.index for frame in found.frames if frame.good]
+    truth = np.array([shape.place(made.q[i])[columns] for i in good])
+    apart = np.linalg.norm(found.position - truth, axis=2)
+    return {
+        name: {"median": float(np.nanmedian(apart[:, i])), "largest": float(np.nanmax(apart[:, i]))}
+        for i, name in enumerate(found.names)
+        if np.isfinite(apart[:, i]).any()
+    }
+
+
+def virtual_film(run: Run, system: System, settings: VirtualFilmSettings) -> tuple[Recording, VirtualFilm]:
+    """A virtual experiment with the parameters' initial values as the truth, and a virtual camera's film of it.
+
+    Raises
+    ------
+    ConfigError, DataError, ModelError
+    """
+    from yid_ocp.data.synthetic import INNER_STEP, Motion, initial_posture, simulate_in_mujoco, virtual_experiment
+
+    for name in settings.offsets:
+        if name not in [grasp.name for grasp in system.grasps]:
+            known = ", ".join(grasp.name for grasp in system.grasps)
+            raise run.refuse(f"there is no grasp '{name}'", "track", "virtual", "offsets", name, allowed=known)
+    with located(run, "track", "virtual"):
+        posture = initial_posture(system, offsets=settings.offsets)
+        duration = settings.duration
+        motion = Motion.multisine(
+            system, seed=settings.seed, posture=posture, travel=settings.travel, duration=duration
+        )
+        recording = virtual_experiment(
+            system,
+            motion=motion,
+            duration=duration,
+            seed=settings.seed,
+            vision=False,
+            posture=posture,
+            name=run.name,
+            description=run.description,
+        )
+        # the same once more, for the shape that a recording does not hold
+        truth = simulate_in_mujoco(system, None, motion, duration=duration, posture=posture, time_step=INNER_STEP)
+        made = film(
+            system,
+            truth.t,
+            truth.q,
+            look_at(settings.eye, settings.target),
+            urdf=run.model.robot,
+            camera=DepthCamera(outliers=settings.outliers),
+            shutter=Shutter(
+                settings.rate,
+                dropped=settings.dropped,
+                latency=settings.latency,
+                latency_std=settings.latency_std,
+            ),
+            seed=settings.seed,
+        )
+    return recording, made
+
+
+def _recorded(run: Run, frames: str) -> tuple[Recording, Film]:
+    if not run.recordings.estimate:
+        raise ConfigError(
+            "there is no recording with the joint angles",
+            where=run.where("recordings", "estimate"),
+            hint="list the recording that was made with the frames",
+        )
+    with located(run, "recordings", "estimate", 0):
+        path = recording_file(run.recordings.estimate[0])
+        recording = read_recording(path, allow_nan_effort=True)
+    with located(run, "track", "frames"):
+        seen = read_film(frames, pose=run.track.pose, unit=run.track.unit)
+    return replace(recording, name=path.stem), seen
