@@ -90,6 +90,8 @@ CASES: Mapping[str, Case] = {
     "damped_trunk": Case("kelvin_voigt@T1", "T1", damped("T1", 0.05)),
     "damped_branch": Case("kelvin_voigt@T2", "T2", damped("T2", 0.05)),
     "heavy_trunk": Case("density@T1", "T1", {"T1.mass": 0.064 * 1.3}),
+    "heavy_branch": Case("density@T2", "T2", {"T2.mass": 0.015 * 2.0}),
+    "heavy_free_branch": Case("density@T3", "T3", {"T3.mass": 0.016 * 2.0}),
     "stiff_gear": Case("joint_viscous@left_e1", "left_e1", {"left_e1.damping": NOMINAL_DAMPING + 1.0}),
     "moved_camera": Case("camera_translation@camera", "camera", change=moved_camera),
     "late_camera": Case("camera_latency@camera", "camera", change=late_camera),

@@ -86,7 +86,19 @@ class Bench:
             for _ in range(50)
         ]
         return Bench(
-            size, recording, system, step, theta, rest.state, torque, path, feedback, swept, model, model.createData(), points
+            size,
+            recording,
+            system,
+            step,
+            theta,
+            rest.state,
+            torque,
+            path,
+            feedback,
+            swept,
+            model,
+            model.createData(),
+            points,
         )
 
     def directions(self, key: str, names: tuple[str, ...], everything: bool) -> Directions:

@@ -330,7 +330,8 @@ def track_summary(result: dict[str, Any]) -> list[str]:
         rows.append((name, str(entry["frames"]), *cells))
     lines = [*table(rows), ""]
     good = sum(not frame["reason"] for frame in result["frames"])
-    lines.append(f"{good} of {len(result['frames'])} frames are good, the fit took {1e3 * result['fit_seconds']:.0f} ms each")
+    spent = 1e3 * result["fit_seconds"]
+    lines.append(f"{good} of {len(result['frames'])} frames are good, the fit took {spent:.0f} ms each")
     lines += [f"dropped {number}: {reason}" for reason, number in result["dropped"].items()]
     lines.append(result["clock"]["message"])
     return lines

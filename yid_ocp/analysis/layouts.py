@@ -21,7 +21,7 @@ from yid_ocp.model.mechanism import Frame, Placement
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem, SensorOptions
 from yid_ocp.problem.inputs import Grid, camera_pose
-from yid_ocp.problem.problem import Episode
+from yid_ocp.problem.episodes import Episode
 
 Array = NDArray[np.float64]
 

@@ -26,7 +26,7 @@ from yid_ocp.analysis.layouts import (
 from yid_ocp.errors import SolverError
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.problem import Episode
+from yid_ocp.problem.episodes import Episode
 from yid_ocp.solvers.base import WEAK, Solution, verdict
 
 Array = NDArray[np.float64]

@@ -244,9 +244,8 @@ def discrete_equations(system: System, force_split: ForceSplit = "symmetric") ->
 
     total: ClosedForce | None = None
     if closed:
-        total = ClosedForce(
-            *(placed(sum((getattr(c, name) for c in closed[1:]), getattr(closed[0], name))) for name in ("force", "A", "T"))
-        )
+        parts = ([getattr(c, name) for c in closed] for name in ("force", "A", "T"))
+        total = ClosedForce(*(placed(sum(rest, first)) for first, *rest in parts))
         balance += viscous_share * h * scale * sum((c.force for c in closed), ca.SX(n, 1))
         p1 += (1 - viscous_share) * h * scale * sum((c.force for c in closed), ca.SX(n, 1))
     relaxation = system.constraint_relaxation()

@@ -142,10 +142,10 @@ class Statics:
         theta = check_shape("theta", theta, (len(system.parameters),))
         stiffness = HOLD_STIFFNESS if torque is None else HOLD_STIFFNESS_WITH_TORQUE
         held = np.zeros(step.sizes["nu"]) if torque is None else check_shape("torque", torque, (step.sizes["nu"],))
-        arguments = [given, held, stiffness, theta, step.time_step]
+        arguments: list[Array | float] = [given, held, stiffness, theta, step.time_step]
         best: tuple[bool, float, float, Array] | None = None
         for start in self._guesses(given, guess):
-            w, error, converged = _damped_newton(lambda x: self._residual(x, *arguments), start, tolerance)
+            w, error, converged = _damped_newton(lambda x: self._residual.call([x, *arguments]), start, tolerance)
             energy = float(self._outcome(w, *arguments)[2])
             found = (not converged, energy if converged else error, error, w)
             if best is None or found[:2] < best[:2]:
@@ -220,7 +220,7 @@ class Statics:
 
 
 def _damped_newton(
-    function: Callable[[Array], tuple[ca.DM, ca.DM]], w: Array, tolerance: float
+    function: Callable[[Array], Sequence[ca.DM]], w: Array, tolerance: float
 ) -> tuple[Array, float, bool]:
     """Newton with step control: the natural monotonicity test (Deuflhard 2011, section 3.3) or a smaller residual."""
     if len(w) == 0:
@@ -398,8 +398,9 @@ def momentum_of(step: Step, q: ArrayLike, v: ArrayLike, theta: ArrayLike) -> Arr
     middle = np.atleast_2d(np.asarray(q, float))
     function = ca.Function("momentum", e.arguments, [e.row_scale * e.rigid.by_v])
     none = [np.zeros(s[key]) for key in ("n", "nz", "nz", "m", "nu")]
+    values = np.asarray(theta, float)
     rows = [
-        np.array(function(m - d, m + d, *none, theta, step.time_step)).ravel()
+        np.array(function(m - d, m + d, *none, values, step.time_step)).ravel()
         for m, d in zip(middle, half, strict=True)
     ]
     return np.array(rows).reshape(np.shape(q))

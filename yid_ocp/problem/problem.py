@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -654,7 +655,7 @@ class EstimationProblem:
 
     def channel_errors(
         self, results: Sequence[EpisodeResult], episodes: Sequence[Episode]
-    ) -> dict[str, dict[str, float]]:
+    ) -> dict[str, dict[str, Any]]:
         """Root mean square error of every channel: {channel: {rmse, unit, n}}.
 
         For points the error of a sample is the Euclidean distance.
@@ -670,7 +671,7 @@ class EstimationProblem:
                     squares.setdefault(channel, []).extend(square[np.isfinite(square)].tolist())
                     units[channel] = samples.sensor.unit
         return {
-            channel: {"rmse": float(np.sqrt(np.mean(values))), "unit": units[channel], "n": len(values)}  # type: ignore[dict-item]
+            channel: {"rmse": float(np.sqrt(np.mean(values))), "unit": units[channel], "n": len(values)}
             for channel, values in squares.items()
             if values
         }

@@ -101,7 +101,7 @@ class Solution:
     x : ndarray, shape (nx,)
         Best point so far.
     covariance : ndarray, shape (nx, nx)
-        From the data and stated priors (the tie-break excluded), scaled by chi2 per degree of freedom where that exceeds one.
+        From the data and stated priors (the tie-break excluded), scaled by chi2 per degree of freedom above one.
     parameters : dict of str to Estimate
         Free parameters shared by all recordings, and the fixed ones that the problem's model has.
     cost : float

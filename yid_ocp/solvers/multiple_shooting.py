@@ -27,8 +27,8 @@ SUCCESS = {"Solve_Succeeded", "Solved_To_Acceptable_Level"}
 class MultipleShooting:
     """Solve  min 1/2 |r(w)|^2  subject to the DEL equations of every step (or of every interval) and bounds.
 
-    The start is a rollout under the tracking filter; defects are scaled to order one, the cost by its initial value, and
-    IPOPT's own scaling is off.
+    The start is a rollout under the tracking filter; defects are scaled to order one, the cost by its initial value,
+    and IPOPT's own scaling is off.
 
     Attributes
     ----------
@@ -113,7 +113,9 @@ class MultipleShooting:
             status, message = Status.CONVERGED, f"IPOPT: {stats['return_status']}, largest defect {defect:.1e}"
         elif stats["return_status"] == "Maximum_Iterations_Exceeded":
             status = Status.ITERATION_LIMIT
-            message = f"IPOPT stopped after {self.iterations} iterations, largest defect {defect:.1e}; raise solver.iterations"
+            message = (
+                f"IPOPT stopped after {self.iterations} iterations, largest defect {defect:.1e}; raise solver.iterations"
+            )
         else:
             status = Status.STALLED
             message = (
@@ -243,7 +245,7 @@ class _Nlp:
         return [value, self._g.filled(jacobian)]
 
     def _curvature(self, w: Array, _: Array, lam_f: Array, lam_g: Array) -> list:
-        _, slope, _ = self.transcription.residual(w, True)
+        slope = self.transcription.residual(w, True)[1]
         assert slope is not None
         problem = self.transcription.problem
         count = len(problem.shared)

@@ -12,7 +12,7 @@ Khoshelham & Elberink (2012), Sensors 12:1437, doi:10.3390/s120201437, equations
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -188,12 +188,15 @@ class VirtualFilm:
         Configuration in every picture.
     depth : sequence of ndarray
         `depth[i]` is the measured depth image of frame i, made when asked for [m].
+    course : callable
+        From a time to the configuration then, shape (n,).
     """
 
     film: Film
     taken: Array
     q: Array
     depth: Sequence[Array]
+    course: Callable[[float], Array]
 
 
 @dataclass(frozen=True)
@@ -292,7 +295,8 @@ def film(
     times, path = np.asarray(t, float), np.asarray(q, float)
     rng = np.random.default_rng(seed)
     taken, stamps = when.times(float(times[0]), float(times[-1]), rng)
-    configuration = np.asarray(CubicSpline(times, path, axis=0)(taken))
+    course = CubicSpline(times, path, axis=0)
+    configuration = np.asarray(course(taken))
     tree = numeric_mechanism(system, values)
     meshes = tube_meshes(system, values)
     fixed = [] if room is None and urdf is None else [(room or Room()).mesh()]
@@ -307,4 +311,4 @@ def film(
     images = _Images(Surfaces(tree, meshes), sensor, matrix, configuration, seed)
     names = tuple(f"frame {i}" for i in range(len(taken)))
     made = Film(stamps, names, matrix, lambda i: sensor.pinhole.cloud(images[i]), sensor.pinhole, "virtual camera")
-    return VirtualFilm(made, taken, configuration, images)
+    return VirtualFilm(made, taken, configuration, images, lambda at: np.asarray(course(at)))

@@ -147,10 +147,10 @@ def refine(run: Run, problem: EstimationProblem | None, warnings: list[str]) -> 
     if own.message:
         return {"links": [], "time_step": [], "message": own.message}
     if own.growing:
-        other = "solver.force_split: left_damping, " if split == "symmetric" else ""
+        remedy = "solver.force_split: left_damping, " if split == "symmetric" else ""
         warnings.append(
             f"{own.growing} modes grow from step to step about the first posture: take a shorter solver.time_step, "
-            f"{other}or more damping"
+            f"{remedy}or more damping"
         )
     values = dict(zip(system.parameters.names, theta, strict=True))
     steps = [_row(h, own)]

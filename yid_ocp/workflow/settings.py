@@ -318,9 +318,7 @@ class VirtualFilmSettings:
 class TrackSettings:
     """How points are measured in a depth camera's frames."""
 
-    frames: Annotated[FilePath | None, About("folder of clouds or depth images; a virtual camera films when absent")] = (
-        None
-    )
+    frames: Annotated[FilePath | None, About("folder of clouds or depth images; a virtual film when absent")] = None
     pose: Annotated[
         tuple[Quadruple, Quadruple, Quadruple, Quadruple] | None,
         About("camera (x right, y down, z ahead) in the world, row by row, instead of the folder's", "m"),

@@ -107,7 +107,7 @@ def run_track(run: Run, out: str | Path | None = None, monitor: Monitor | None =
 
 def track_result(found: Track) -> dict[str, Any]:
     """`yid-track/1` without the errors of a virtual film, inputs and versions."""
-    seen = np.isfinite(found.position).all(axis=2)
+    seen = np.asarray(np.isfinite(found.position).all(axis=2))
     spent = [frame.seconds for frame in found.frames if frame.fit is not None]
     clock = found.clock
     return {
@@ -148,11 +148,10 @@ def track_result(found: Track) -> dict[str, Any]:
 
 
 def truth_errors(system: System, found: Track, made: VirtualFilm) -> Mapping[str, Mapping[str, float]]:
-    """Median and largest distance of every point from where it really was in the picture [m]."""
+    """Median and largest distance of every point from where it really was at the time written down [m]."""
     shape = ShapeFit(system)
     columns = [system.points.index(name) for name in found.names]
-    good = [frame.index for frame in found.frames if frame.good]
-    truth = np.array([shape.place(made.q[i])[columns] for i in good])
+    truth = np.array([shape.place(made.course(t))[columns] for t in found.t])
     apart = np.linalg.norm(found.position - truth, axis=2)
     return {
         name: {"median": float(np.nanmedian(apart[:, i])), "largest": float(np.nanmax(apart[:, i]))}

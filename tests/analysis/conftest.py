@@ -1,0 +1,139 @@
+"""Small experiments to be judged, and the paper's four as the golden trajectories have them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from yid_ocp.config import load_problem
+from yid_ocp.data import Recording
+from yid_ocp.data.recording import JointGroup, PointGroup
+from yid_ocp.integrator.step import compile_step
+from yid_ocp.model import Grasp, Mechanism, Segment, System, flexible_object
+from yid_ocp.model.system import Spring
+from yid_ocp.problem import EstimationProblem, ProblemOptions
+
+STIFFNESSES = ("T1.bend", "T1.twist", "T2.bend", "T2.twist", "T3.bend", "T3.twist")
+PENDULUM = {"elbow.stiffness": 4.0, "elbow.damping": 0.15, "elbow.rest": 0.3}
+
+
+@pytest.fixture(scope="session")
+def golden_problem(golden, paper_systems, single_step, dual_step):
+    """golden_problem("single", vision): arm points 1 mm at 100 Hz, vision 5 mm at every 33rd step, start known."""
+    steps = {"single": single_step, "dual": dual_step}
+
+    def build(name: str, vision: bool) -> EstimationProblem:
+        trep, system = golden(name), paper_systems[name]
+        count = len(system.driven)
+        t = 0.01 * np.arange(len(trep.q))
+        joints = JointGroup(system.driven, t, trep.q[:, :count], effort=np.vstack([trep.u, trep.u[-1:]]))
+        held = [1] if name == "single" else [1, 2]
+        free = [i for i in range(3) if i not in held]
+        groups = [PointGroup("points_arm", [f"w_T{i + 1}" for i in held], t[1:], trep.w[:, held], 1e-3, sensor="arm")]
+        if vision:
+            at = np.arange(33, len(t), 33)
+            names, seen = [f"w_T{i + 1}" for i in free], trep.w[at - 1][:, free]
+            groups.append(PointGroup("points_camera", names, t[at], seen, 5e-3, sensor="camera", pose=np.eye(4)))
+        start = np.concatenate([trep.q[0], trep.p[0]])
+        options = ProblemOptions(feedback="proportional", known_start={"golden": start}, path_cutoff=math.inf)
+        values = dict(zip(STIFFNESSES, map(float, trep.rho), strict=True))
+        recording = Recording(joints, tuple(groups), name="golden")
+        return EstimationProblem(steps[name], [recording], STIFFNESSES, options, values)
+
+    return build
+
+
+@pytest.fixture(scope="session")
+def springs(repository):
+    """springs(name, *settings): problem of a spring example."""
+
+    def build(name: str, *settings: str) -> EstimationProblem:
+        return load_problem(repository / "configs" / f"springs_{name}.yaml", settings)
+
+    return build
+
+
+@pytest.fixture(scope="session")
+def twin():
+    """twin(problem, x, seed): the problem's recording as the model itself would measure it, with the sensors' noise."""
+
+    def make(problem: EstimationProblem, x: np.ndarray, seed: int) -> Recording:
+        rng = np.random.default_rng(seed)
+        evaluation = problem.evaluate(x, derivatives=False)
+        assert evaluation.ok, evaluation.message
+        recording = problem.episodes[0].recording
+        groups = []
+        for group, predicted in zip(recording.points, evaluation.episodes[0].predicted, strict=True):
+            count = len(predicted)
+            position, std = group.position[:count], group.std[:count]
+            seen = predicted.reshape(position.shape) + std * rng.standard_normal(position.shape)
+            seen[~np.isfinite(position)] = np.nan
+            groups.append(replace(group, t=group.t[:count], position=seen, std=std))
+        return replace(recording, points=tuple(groups))
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def pendulum(urdf_folder):
+    """pendulum(recording=None): a shoulder moved as measured, a springy elbow, the tip seen to 2 mm at 25 Hz."""
+    robot = Mechanism.from_urdf(urdf_folder / "double_pendulum.urdf")
+    system = System.build(
+        robot, prescribed=["shoulder"], springs={"elbow": Spring(3.0, 0.0)}, damping=0.1, points=["tip"]
+    )
+    step = compile_step(system, 0.01)
+    t = 0.01 * np.arange(201)
+    path = 0.6 * np.sin(2 * np.pi * 0.7 * t) * np.sin(np.pi * t / 2) ** 2
+    camera = PointGroup("points_camera", ["tip"], t[::4], np.zeros((51, 1, 3)), 2e-3, sensor="camera", pose=np.eye(4))
+    empty = Recording(JointGroup(["shoulder"], t, path[:, None], position_std=0.0), (camera,), name="twin")
+
+    def build(recording: Recording | None = None, values: dict[str, float] | None = None) -> EstimationProblem:
+        options = ProblemOptions(path_cutoff=math.inf)
+        return EstimationProblem(step, [recording or empty], tuple(PENDULUM), options, values or PENDULUM)
+
+    return build
+
+
+@pytest.fixture(scope="session")
+def held_tube():
+    """A tube of three links that stands on the ground, its tip held by a hand of three motors that move it slowly.
+
+    The hand measures the tip at 100 Hz, a camera sees the middle; nothing turns the tube about its axis.
+    """
+    urdf = """<robot name="hand"><link name="wall"/>
+    <joint name="x" type="prismatic"><parent link="wall"/><child link="a"/><axis xyz="1 0 0"/>
+      <limit lower="-1" upper="1" effort="100" velocity="5"/></joint>
+    <link name="a"><inertial><mass value="0.5"/><inertia ixx="1e-3" ixy="0" ixz="0" iyy="1e-3" iyz="0" izz="1e-3"/>
+      </inertial></link>
+    <joint name="z" type="prismatic"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>
+      <limit lower="-1" upper="1" effort="100" velocity="5"/></joint>
+    <link name="b"><inertial><mass value="0.5"/><inertia ixx="1e-3" ixy="0" ixz="0" iyy="1e-3" iyz="0" izz="1e-3"/>
+      </inertial></link>
+    <joint name="turn" type="continuous"><parent link="b"/><child link="hand"/><axis xyz="0 0 1"/></joint>
+    <link name="hand"><inertial><mass value="0.5"/>
+      <inertia ixx="1e-3" ixy="0" ixz="0" iyy="1e-3" iyz="0" izz="1e-3"/></inertial></link></robot>"""
+    import tempfile
+    from pathlib import Path
+
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "hand.urdf"
+        file.write_text(urdf)
+        robot = Mechanism.from_urdf(file, joints=["x", "z", "turn"])
+    tube = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=3, bend=4.0, twist=3.0)])
+    # a hand without a y motor meets the tip all the same: the tube bends in one plane
+    grasps = [Grasp("hand", "hand", "w_T1", "point")]
+    system = System.build(robot, objects=[(tube, None, None)], grasps=grasps, prescribed=["x", "z", "turn"], damping=0.05)
+    step = compile_step(system, 0.02, use_compiler=False)
+    t = 0.02 * np.arange(101)
+    ramp = np.sin(np.pi * t / 4) ** 2
+    path = np.stack([0.15 * ramp, 0.58 - 0.06 * ramp, 0.8 * np.sin(np.pi * t / 2) * ramp], axis=1)
+    camera = PointGroup(
+        "points_camera", ["T1_0_tip"], t[::5], np.zeros((21, 1, 3)), 2e-3, sensor="camera", pose=np.eye(4)
+    )
+    joints = JointGroup(["x", "z", "turn"], t, path, position_std=0.0)
+    recording = Recording(joints, (camera,), name="tube")
+    options = ProblemOptions(path_cutoff=math.inf, initial_state="equilibrium")
+    return EstimationProblem(step, [recording], ("T1.bend", "T1.twist"), options)
