@@ -125,7 +125,8 @@ def held_tube():
     tube = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=3, bend=4.0, twist=3.0)])
     # a hand without a y motor meets the tip all the same: the tube bends in one plane
     grasps = [Grasp("hand", "hand", "w_T1", "point")]
-    system = System.build(robot, objects=[(tube, None, None)], grasps=grasps, prescribed=["x", "z", "turn"], damping=0.05)
+    names = ["x", "z", "turn"]
+    system = System.build(robot, objects=[(tube, None, None)], grasps=grasps, prescribed=names, damping=0.05)
     step = compile_step(system, 0.02, use_compiler=False)
     t = 0.02 * np.arange(101)
     ramp = np.sin(np.pi * t / 4) ** 2
@@ -133,7 +134,7 @@ def held_tube():
     camera = PointGroup(
         "points_camera", ["T1_0_tip"], t[::5], np.zeros((21, 1, 3)), 2e-3, sensor="camera", pose=np.eye(4)
     )
-    joints = JointGroup(["x", "z", "turn"], t, path, position_std=0.0)
+    joints = JointGroup(names, t, path, position_std=0.0)
     recording = Recording(joints, (camera,), name="tube")
     options = ProblemOptions(path_cutoff=math.inf, initial_state="equilibrium")
     return EstimationProblem(step, [recording], ("T1.bend", "T1.twist"), options)

@@ -103,7 +103,12 @@ def test_sights_of_the_y(single_arm):
 @pytest.fixture(scope="module")
 def short_run(repository):
     """One arm on a coarse Y, half a second."""
-    settings = ("model.object.links=1", "solver.duration=0.5", "solver.compiler=false", "parameters={T*.bend: {free: true, initial: 15}, T*.twist: {free: true, initial: 10}}")
+    settings = (
+        "model.object.links=1",
+        "solver.duration=0.5",
+        "solver.compiler=false",
+        "parameters={T*.bend: {free: true, initial: 15}, T*.twist: {free: true, initial: 10}}",
+    )
     return load_problem(repository / "configs" / "single_arm_vision.yaml", settings)
 
 

@@ -48,7 +48,12 @@ class Form:
 
 
 FORMS: tuple[Form, ...] = (
-    Form("1/{a} + 1/{b}, as springs in series are", lambda a, b: (a, -b), lambda a, b, n: 1 / (1 / a + 1 / b - 1 / n), True),
+    Form(
+        "1/{a} + 1/{b}, as springs in series are",
+        lambda a, b: (a, -b),
+        lambda a, b, n: 1 / (1 / a + 1 / b - 1 / n),
+        True,
+    ),
     Form("{a} + {b}, as springs side by side are", lambda a, b: (b, -a), lambda a, b, n: a + b - n, True),
     Form("the ratio {a} / {b}", lambda a, b: (1.0, 1.0), lambda a, b, n: b * n / a, False),
     Form("the product {a} x {b}", lambda a, b: (1.0, -1.0), lambda a, b, n: b * a / n, False),

@@ -148,8 +148,8 @@ def identifiability(
     start : "unknown" or "known"
         Whether every recording's initial state is estimated along, with the problem's prior about what it presumes.
     grasp_std : float, optional
-        Prior deviation of the fixed `grasp_offset@...` parameters of a system that has any (`with_grasp_offsets`), which
-        are estimated along [m]; None for grasps that are known.
+        Prior deviation of the fixed `grasp_offset@...` parameters of a system that has any (see `with_grasp_offsets`),
+        which are estimated along [m]; None for grasps that are known.
     intervals : iterable of str, or "all"
         Parameters whose interval by profile likelihood is wanted.
 
@@ -248,7 +248,7 @@ def with_grasp_offsets(system: System) -> System:
 
 
 def unknown_vector(problem: EstimationProblem, solution: Solution | ArrayLike | None) -> Array:
-    """A problem's unknowns from a solution, an array or, when absent, its start; `SolverError` where they do not fit."""
+    """A problem's unknowns from a solution, an array or, when absent, its start; `SolverError` where one does not fit."""
     if solution is None:
         return problem.start
     if isinstance(solution, Solution):

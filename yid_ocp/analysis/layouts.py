@@ -1,4 +1,4 @@
-"""Experiments that were not made: other grasps, arms and motions, every sensor that could look on, and their information."""
+"""Experiments that were not made: other grasps, arms, motions, every sensor that could look on; their information."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Frame, Placement
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem, SensorOptions
-from yid_ocp.problem.inputs import Grid, camera_pose
 from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.inputs import Grid, camera_pose
 
 Array = NDArray[np.float64]
 
@@ -154,7 +154,7 @@ class Sight:
 
 
 def sights(system: System) -> list[Sight]:
-    """Tips and middles of segments and markers beside tubes; of a mechanism without any its links and markers on them."""
+    """Tips and middles of segments and markers beside them; of a mechanism without any its links and markers on them."""
     tree = system.mechanism
     held = {grasp.held for grasp in system.grasps}
     found: list[Sight] = []
@@ -396,7 +396,7 @@ class Workshop:
         return replace(system, grasps=tuple(turned))
 
     def _moved(self, system: System, episode: Episode, seed: int, twice: bool) -> tuple[Recording, list[str]]:
-        """A motion of the driven joints in MuJoCo, from the recording's posture, and what a robot could not do of it."""
+        """A motion of the driven joints in MuJoCo, from the recording's posture; what of it a robot could not do."""
         setting = self.setting
         base = setting.problem
         values = {name: v for name, v in setting.values.items() if name in system.parameters}
@@ -446,16 +446,15 @@ class Workshop:
         feel += [sight.name for sight in seen if sight.arm and sight.name not in feel]
         held = {grasp.held for grasp in (setting.second_arm or base.system).grasps}
         feel += [frame for frame in held if frame not in feel]
-        groups = tuple(
-            PointGroup(
-                name, tuple(frames), times, np.zeros((len(times), len(frames), 3)), 1.0, sensors[name], pose=poses[name]
-            )
-            for name, frames in wanted.items()
-            if frames
-        )
+        groups = []
+        for name, frames in wanted.items():
+            shape = (len(times), len(frames), 3)
+            if frames:
+                blank = (np.zeros(shape), np.ones(shape))
+                groups.append(PointGroup(name, tuple(frames), times, *blank, sensors[name], pose=poses[name]))
         if torque and joints is not None and joints.effort is None:
             joints = replace(joints, effort=np.zeros_like(joints.position))
-        return replace(recording, joints=joints, points=groups)
+        return replace(recording, joints=joints, points=tuple(groups))
 
     def _torque_options(self) -> SensorOptions:
         joints = self.setting.problem.episodes[0].recording.joints
@@ -498,5 +497,3 @@ def _pushed_together(system: System, values: Mapping[str, float]) -> dict[str, A
             inward = middle - held[grasp.held]
             offsets[grasp.name] = TOGETHER * inward / max(float(np.linalg.norm(inward)), 1e-9) + FORWARD * away
     return offsets
-
-

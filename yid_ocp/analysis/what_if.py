@@ -1,4 +1,4 @@
-"""Which single change of an experiment would make which parameters identifiable, and the smallest set that does for all."""
+"""Which change of an experiment would make which parameters identifiable, and the fewest changes that do for all."""
 
 from __future__ import annotations
 
@@ -181,7 +181,8 @@ def what_if(
     if not base.verdicts:
         raise SolverError(base.message)
     wanted = None if only is None else set(only)
-    changes = [change for change in possible_changes(setting, judge.workshop) if wanted is None or change.name in wanted]
+    known = possible_changes(setting, judge.workshop)
+    changes = [change for change in known if wanted is None or change.name in wanted]
     singles = ranked([judge((change,)) for change in changes])
     greedy = _greedy(judge, changes, base, largest)
     smallest: list[Outcome] = []
@@ -213,9 +214,8 @@ def possible_changes(setting: Setting, workshop: Workshop) -> list[Change]:
             changes.append(Change(f"arm:{sight.name}", f"{sight.words}, seen by the arm", arm=(sight.name,)))
     if camera is not None:
         now = 1.0 / float(np.median(np.diff(camera.t))) if len(camera.t) > 1 else 0.0
-        changes += [
-            Change(f"rate:{rate:g}", f"the camera at {rate:g} Hz without gaps", rate=rate) for rate in FASTER if rate > now
-        ]
+        faster = [rate for rate in FASTER if rate > now]
+        changes += [Change(f"rate:{r:g}", f"the camera at {r:g} Hz without gaps", rate=r) for r in faster]
     return changes
 
 
@@ -297,7 +297,7 @@ def judged(layout: Layout, information: Array) -> tuple[dict[str, float], float]
     information : ndarray, shape (nx, nx)
     """
     problem, x = layout.problem, layout.x
-    chosen = [problem.names.index(name) for name in layout.names]
+    chosen = np.array([problem.names.index(name) for name in layout.names])
     others = np.setdiff1d(np.arange(len(x)), chosen)
     scale = problem.scales.copy()
     scale[chosen] = np.where(x[chosen] != 0, np.abs(x[chosen]), scale[chosen])

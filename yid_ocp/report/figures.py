@@ -130,8 +130,10 @@ def estimates(values: Mapping[str, tuple[float, float | None, float, bool]], uni
     return figure
 
 
-def profiles(curves: Mapping[str, tuple[Sequence[float], Sequence[float]]], level: float) -> plotly.graph_objects.Figure:
-    """Chi2 above the best along each parameter, over its value relative to that of the best fit: (ratio, delta chi2)."""
+def profiles(
+    curves: Mapping[str, tuple[Sequence[float], Sequence[float]]], level: float
+) -> plotly.graph_objects.Figure:
+    """Chi2 above the best along each parameter, over its value relative to that of the fit: (ratio, delta chi2)."""
     import plotly.graph_objects as go
 
     figure = go.Figure()

@@ -114,7 +114,8 @@ class MultipleShooting:
         elif stats["return_status"] == "Maximum_Iterations_Exceeded":
             status = Status.ITERATION_LIMIT
             message = (
-                f"IPOPT stopped after {self.iterations} iterations, largest defect {defect:.1e}; raise solver.iterations"
+                f"IPOPT stopped after {self.iterations} iterations, largest defect {defect:.1e}; "
+                "raise solver.iterations"
             )
         else:
             status = Status.STALLED

@@ -198,7 +198,8 @@ def identifiability_result(
     if information is None or known is None:
         return result
     for name, entry in information.parameters.items():
-        own = {"std_relative_known": known.parameters[name].std_relative, "verdict_known": known.parameters[name].verdict}
+        sure = known.parameters[name]
+        own = {"std_relative_known": sure.std_relative, "verdict_known": sure.verdict}
         result["parameters"][name] = asdict(entry) | own
     result["correlations"] = {"names": information.names, "matrix": information.correlations}
     result["directions"] = [asdict(direction) for direction in information.directions]
