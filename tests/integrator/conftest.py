@@ -22,6 +22,7 @@ from yid_ocp.model import (
     flexible_object,
     forward_kinematics,
 )
+from yid_ocp.model.kinematics import force_cross, motion_cross
 from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import ClosedForce, floating_clamp
 
@@ -130,7 +131,7 @@ def growing_link(joint: str, length: float, time: float) -> Added:
 
 
 def thick_air(joint: str, coefficient: float, viscosity: float, buoyancy: float) -> Added:
-    """A cubic drag with given slopes, a viscous drag, and one link that weighs less than its mass."""
+    """A cubic drag on one link with given slopes, a viscous drag, and this link weighs less than its mass."""
     parameters = _parameters("air", joint, coefficient=coefficient, viscosity=viscosity, buoyancy=buoyancy)
 
     def change(effect, system):
@@ -141,11 +142,25 @@ def thick_air(joint: str, coefficient: float, viscosity: float, buoyancy: float)
         return replace(system, mechanism=replace(system.mechanism, joints=tuple(joints)))
 
     def add(effect, state):
-        c, b = effect.parameters.symbols[0], effect.parameters.symbols[1]
-        q, v = state.q, state.v
-        stretch = 1 + ca.sumsqr(q)
-        force = -c * stretch * v**3
-        closed = ClosedForce(force, -2 * c * (v**3) @ q.T, ca.diag(-3 * c * stretch * v**2))
+        c, b, v = effect.parameters.symbols[0], effect.parameters.symbols[1], state.v
+        tree, kinematics = state.system.mechanism, state.kinematics
+        chain, screws = tree.ancestors(tree.joint_index(joint)), kinematics.screws
+        along = {-1: ca.SX(ca.DM.zeros(6))}
+        for j in chain:
+            along[j] = along[tree.joints[j].parent] + screws[j] * v[j]
+        link = chain[-1]
+        com = kinematics.rotations[link] @ tree.joints[link].bodies[0].com + kinematics.origins[link]
+        reach = ca.horzcat(-ca.skew(com), ca.SX.eye(3))
+        speed = reach @ along[link]
+        wrench = reach.T @ (-c * ca.sumsqr(speed) * speed)
+        slope = reach.T @ (-c * (ca.sumsqr(speed) * ca.SX.eye(3) + 2 * speed @ speed.T)) @ reach
+        force, by_rate, by_turn = ca.SX(len(screws), 1), ca.SX(6, len(screws)), ca.SX(6, len(screws))
+        for j in chain:
+            added = motion_cross(along[tree.joints[j].parent], screws[j])
+            force[j] = ca.dot(screws[j], wrench)
+            by_rate[:, j] = slope @ screws[j]
+            by_turn[:, j] = slope @ added + force_cross(screws[j], wrench)
+        closed = ClosedForce(force, by_rate, by_turn)
         return Terms(viscous=-b * v, closed=closed)
 
     return Added("air", joint, parameters, change=change, add=add)

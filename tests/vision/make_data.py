@@ -26,7 +26,7 @@ def main() -> None:
     posture = initial_posture(system)
     motion = Motion.multisine(system, seed=1, posture=posture, travel=0.15)
     run = simulate_in_mujoco(system, None, motion, posture=posture, duration=1.5, time_step=2.5e-4)
-    made = film(system, run.t, run.q, look_at([2.6, 0.0, 0.45], [0.85, 0.0, -0.1]), shutter=Shutter(rate=2.0), seed=5)
+    made = film(system, run.t, run.q, look_at([2.6, 0.0, 0.45], [0.85, 0.0, -0.1]), shutter=Shutter(rate=2.7), seed=5)
     tree = numeric_mechanism(system)
     robot = Surfaces(tree, robot_meshes("package:baxter", tree))
     region = ObjectRegion(system, FilterOptions())

@@ -248,7 +248,7 @@ def with_grasp_offsets(system: System) -> System:
 
 
 def unknown_vector(problem: EstimationProblem, solution: Solution | ArrayLike | None) -> Array:
-    """A problem's unknowns from a solution, an array or, when absent, its start; `SolverError` where one does not fit."""
+    """A problem's unknowns from a solution, an array or, when absent, its start; `SolverError` for a wrong shape."""
     if solution is None:
         return problem.start
     if isinstance(solution, Solution):

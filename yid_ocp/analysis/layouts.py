@@ -154,7 +154,7 @@ class Sight:
 
 
 def sights(system: System) -> list[Sight]:
-    """Tips and middles of segments and markers beside them; of a mechanism without any its links and markers on them."""
+    """Tips and middles of segments and markers beside them; of a mechanism without any, its links and markers there."""
     tree = system.mechanism
     held = {grasp.held for grasp in system.grasps}
     found: list[Sight] = []

@@ -1,0 +1,126 @@
+"""The command `identifiability` on the spring examples: table, run folder, report, bad requests."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import jsonschema
+import pytest
+
+from yid_ocp.config import load_config
+from yid_ocp.workflow.build import build_system
+from yid_ocp.workflow.identifiability import second_arm
+
+OUTCOME = {
+    "type": "object",
+    "required": ["changes", "words", "std_relative", "verdicts", "identifiable", "gain", "message"],
+}
+RESULT = {
+    "type": "object",
+    "required": ["format", "status", "parameters", "directions", "what_if", "inputs", "versions", "correlations"],
+    "properties": {
+        "format": {"const": "yid-identifiability/1"},
+        "parameters": {
+            "additionalProperties": {
+                "required": ["value", "unit", "std_relative", "verdict", "interval", "std_alone", "std_relative_known"],
+                "properties": {
+                    "verdict": {"enum": ["identifiable", "weak", "not_identifiable"]},
+                    "interval": {"type": ["array", "null"], "items": {"type": ["number", "null"]}},
+                },
+            }
+        },
+        "directions": {"items": {"required": ["singular_value", "components", "words", "verdict"]}},
+        "what_if": {
+            "type": ["object", "null"],
+            "required": ["base", "singles", "smallest", "greedy", "searched"],
+            "properties": {"base": OUTCOME, "singles": {"items": OUTCOME}, "smallest": {"items": OUTCOME}},
+        },
+    },
+}
+
+
+def read(folder):
+    return json.loads((folder / "result.json").read_text(), parse_constant=pytest.fail)
+
+
+def test_springs_that_cannot_be_told_apart(cli, repository, tmp_path):
+    done = cli("identifiability", repository / "configs" / "springs_torsion.yaml", "--out", tmp_path / "run", "--what-if")
+    assert done.code == 0, done.err
+    assert "none of 2 parameters identifiable" in done.out
+    assert "1/spring_1.stiffness + 1/spring_2.stiffness, as springs in series are" in done.out
+    assert "fewest changes that make all of them identifiable: coupling_marker, seen by the camera" in done.out
+    result = read(tmp_path / "run")
+    jsonschema.validate(result, RESULT)
+    assert result["start"] == "unknown"
+    assert result["nuisances"] == 4
+    for entry in result["parameters"].values():
+        lower, upper = entry["interval"]
+        assert lower == pytest.approx(1.2, rel=0.02)
+        assert upper is None
+    report = (tmp_path / "run" / "report.html").read_text()
+    assert "What another experiment would tell" in report
+    assert "not identifiable" in report
+    assert {"config.yaml", "log.jsonl"} <= {entry.name for entry in (tmp_path / "run").iterdir()}
+
+
+def test_springs_that_can(cli, repository, tmp_path):
+    file = repository / "configs" / "springs_series_joint.yaml"
+    options = ("--intervals", "spring_1.stiffness", "--known-start", "--known-grasp", "--set", "output.report=false")
+    done = cli("identifiability", file, "--out", tmp_path / "run", *options)
+    assert done.code == 0, done.err
+    assert "2 of 2 parameters identifiable" in done.out
+    result = read(tmp_path / "run")
+    jsonschema.validate(result, RESULT)
+    assert result["what_if"] is None
+    assert result["nuisances"] == 0
+    assert result["parameters"]["spring_2.stiffness"]["interval"] is None
+    lower, upper = result["parameters"]["spring_1.stiffness"]["interval"]
+    assert lower < 200.0 < upper
+
+
+def test_judged_at_the_initial_values_without_solving(cli, repository, tmp_path):
+    file = repository / "configs" / "springs_series_ends.yaml"
+    options = ("--initial", "--intervals", "none", "--set", "output.report=false")
+    done = cli("identifiability", file, "--out", tmp_path / "run", *options)
+    assert done.code == 0, done.err
+    result = read(tmp_path / "run")
+    assert result["status"] == "not_solved"
+    assert {entry["value"] for entry in result["parameters"].values()} == {100.0}
+
+
+def test_a_pendulum_moved_as_measured(cli, pendulum, tmp_path):
+    done = cli("identifiability", pendulum, "--out", tmp_path / "run", "--set", "output.report=false")
+    assert done.code == 0, done.err
+    result = read(tmp_path / "run")
+    assert {entry["verdict"] for entry in result["parameters"].values()} == {"identifiable"}
+
+
+def test_an_interval_of_an_unknown_parameter(cli, repository, tmp_path, left_nothing):
+    file = repository / "configs" / "springs_series_ends.yaml"
+    done = cli("identifiability", file, "--out", tmp_path / "run", "--intervals", "spring_1.stifness")
+    assert done.code == 2
+    assert "did you mean 'spring_1.stiffness'?" in done.err
+    left_nothing()
+
+
+def test_a_failed_solve_is_no_point_to_judge_at(cli, repository, tmp_path):
+    file = repository / "configs" / "springs_series_ends.yaml"
+    settings = ("--set", "solver.initial_state=given", "--set", "solver.start_window=1e-9")
+    assert cli("identifiability", file, "--out", tmp_path / "a", *settings).code in (0, 1, 2)
+
+
+def test_the_other_arm_of_a_robot(repository):
+    run = load_config(repository / "configs" / "single_arm_vision.yaml")
+    system = build_system(run)
+    both = second_arm(run, system)
+    assert both is not None
+    assert both.driven[:7] == system.driven
+    assert both.driven[7:] == tuple(name.replace("left_", "right_") for name in system.driven)
+    assert [(grasp.name, grasp.holder, grasp.held) for grasp in both.grasps] == [
+        ("left", "left_gripper", "w_T2"),
+        ("right", "right_gripper", "w_T3"),
+    ]
+    assert second_arm(load_config(repository / "configs" / "dual_arm_vision.yaml"), both) is None
+    moved = replace(run, model=replace(run.model, arms=replace(run.model.arms, mode="prescribed")))
+    assert second_arm(moved, system) is None

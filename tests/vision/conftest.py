@@ -1,0 +1,100 @@
+"""A virtual film of one arm moving the foam Y, its joints' recording, its tracks, and a small film from disk."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from yid_ocp.data.recording import JointGroup, Recording, read_recording
+from yid_ocp.errors import DataError
+from yid_ocp.vision import DepthCamera, Shutter, TrackOptions, film, look_at, read_film, track
+from yid_ocp.vision.fit import ShapeFit
+from yid_ocp.vision.frames import open3d_module
+
+DATA = Path(__file__).parent / "data"
+TRUTH = {
+    "T1.bend": 22.0,
+    "T1.twist": 13.6,
+    "T2.bend": 10.7,
+    "T2.twist": 8.2,
+    "T3.bend": 11.5,
+    "T3.twist": 9.7,
+}
+POSE = look_at([2.6, 0.0, 0.45], [0.85, 0.0, -0.1])
+LATENCY = 0.06
+
+
+@pytest.fixture(scope="session", autouse=True)
+def open3d():
+    try:
+        return open3d_module()
+    except DataError as error:
+        pytest.skip(f"vision is not installed: {error.what}")
+
+
+@pytest.fixture(scope="session")
+def system(single_arm):
+    return single_arm
+
+
+@pytest.fixture(scope="session")
+def shape(system):
+    return ShapeFit(system)
+
+
+@pytest.fixture(scope="session")
+def run(system):
+    """Three seconds in MuJoCo."""
+    pytest.importorskip("mujoco", reason="virtual films need MuJoCo")
+    from yid_ocp.data.synthetic import Motion, initial_posture, simulate_in_mujoco
+
+    posture = initial_posture(system, TRUTH)
+    motion = Motion.multisine(system, TRUTH, seed=1, posture=posture, travel=0.15)
+    return simulate_in_mujoco(system, TRUTH, motion, posture=posture, duration=3.0, time_step=2.5e-4)
+
+
+@pytest.fixture(scope="session")
+def recording(system, run):
+    rng = np.random.default_rng(5)
+    position = run.q[:, list(system.driven_indices)]
+    noisy = position + 2e-4 * rng.standard_normal(position.shape)
+    return Recording(JointGroup(system.driven, run.t, noisy, position_std=2e-4), source="test", name="virtual")
+
+
+@pytest.fixture(scope="session")
+def tracked(system, run, recording, shape):
+    """tracked(options, **camera and shutter): a film, its track and the errors of all points in the good frames [m]."""
+
+    def make(options=None, outliers=0.0, seed=0, frames=None, stages=(), **shutter):
+        when = Shutter(**{"rate": 4.0, "latency": LATENCY, **shutter})
+        made = film(system, run.t, run.q, POSE, camera=DepthCamera(outliers=outliers), shutter=when, seed=seed)
+        seen = made.film if frames is None else made.film.select(frames)
+        chosen = replace(options or TrackOptions(), points=system.points)
+        found = track(system, recording, seen, urdf="package:baxter", options=chosen, stages=stages)
+        truth = np.array([shape.place(made.course(t)) for t in found.t])
+        return SimpleNamespace(made=made, track=found, errors=np.linalg.norm(found.position - truth, axis=2))
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def clean(tracked):
+    return tracked(stages=[3])
+
+
+@pytest.fixture(scope="session")
+def small(system):
+    """Three small clouds from disk, the joints' recording and where the points really were."""
+    truth = json.loads((DATA / "truth.json").read_text())
+    assert tuple(truth["points"]) == system.points
+    return SimpleNamespace(
+        film=read_film(DATA / "frames"),
+        recording=read_recording(DATA / "joints.h5"),
+        truth=np.array(truth["position"]),
+        clouds=[read_film(DATA / "frames").load(i) for i in range(3)],
+    )

@@ -1,0 +1,79 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from yid_ocp.errors import ConfigError
+from yid_ocp.vision import FilterOptions
+from yid_ocp.vision.filters import Cloud, ObjectRegion, voxel_grid, weighted_median, without_outliers, without_robot
+from yid_ocp.vision.meshes import Surfaces, numeric_mechanism, robot_meshes
+
+CAMERA = np.array([2.6, 0.0, 0.45])
+
+
+def test_voxels_keep_weight_and_centroid():
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.3, 0.3, (5000, 3))
+    cloud = voxel_grid(points, 0.05)
+    assert cloud.weight.sum() == 5000
+    assert np.allclose(np.average(cloud.points, axis=0, weights=cloud.weight), points.mean(0))
+    assert len(cloud) <= 13**3
+    assert len(voxel_grid(points, 1e-5)) == 5000
+    assert len(voxel_grid(np.empty((0, 3)), 0.05)) == 0
+
+
+def test_weighted_median():
+    assert weighted_median(np.array([3.0, 1.0, 2.0]), np.array([1.0, 1.0, 1.0])) == 2.0
+    assert weighted_median(np.array([3.0, 1.0, 2.0]), np.array([5.0, 1.0, 1.0])) == 3.0
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2])
+def test_outliers_go_and_the_surface_stays(share):
+    rng = np.random.default_rng(1)
+    count = 8000
+    plane = np.column_stack([rng.uniform(-0.5, 0.5, (count, 2)), 0.004 * rng.standard_normal(count)])
+    wrong = rng.uniform(-0.6, 0.6, (round(count * share / (1 - share)), 3))
+    cloud = voxel_grid(np.concatenate([plane, wrong]), 0.008)
+    far = np.abs(cloud.points[:, 2]) > 0.05
+    stays = without_outliers(cloud, 12, 4.0)
+    assert stays[~far].mean() > 0.85
+    assert share == 0 or stays[far].mean() < 0.05
+    assert not without_outliers(cloud.keep(np.arange(5)), 12, 4.0).any()
+
+
+def test_the_robot_goes_with_its_padding(system, run):
+    tree = numeric_mechanism(system)
+    meshes = robot_meshes("package:baxter", tree)
+    robot = Surfaces(tree, meshes)
+    wrist = system.mechanism.joint_index("left_w1")
+    for q in (run.q[0], run.q[-1]):
+        pose = robot.poses(q)[robot.joints.index(wrist)]
+        surface = meshes[wrist].moved(pose).vertices[::20]
+        assert not without_robot(Cloud(surface, np.ones(len(surface))), robot, q, 0.01).any()
+        away = surface + [0.0, 0.0, 3.0]
+        assert without_robot(Cloud(away, np.ones(len(away))), robot, q, 0.01).all()
+    tip = run.points[0][system.points.index("w_T1")][None]
+    assert without_robot(Cloud(tip, np.ones(1)), robot, run.q[0], 0.03).all()
+
+
+def test_where_the_object_can_be(system, run):
+    region = ObjectRegion(system, FilterOptions()).at(run.q[0], CAMERA)
+    foot = np.array([0.85, 0.0, -0.93])
+    inside = {
+        "floor": foot + [0.3, 0.0, 0.02],
+        "behind": np.array([-0.2, 0.0, 0.3]),
+        "beyond reach": foot + [0.0, 1.2, 1.4],
+    }
+    for reason, point in inside.items():
+        assert not region.contains(point[None])[0], reason
+    assert region.contains(run.points.reshape(-1, 3)).all()
+    assert region.contains((foot + [0.0, 0.0, 0.1])[None]).all()
+    box = FilterOptions(lower=(0.5, -2.0, -2.0), upper=(2.0, 2.0, 0.0), floor=-0.9, behind=None)
+    region = ObjectRegion(system, box).at(run.q[0], CAMERA)
+    points = np.array([[0.85, 0.0, -0.1], [0.4, 0.0, -0.1], [0.85, 0.0, 0.1], [0.85, 0.0, -0.91]])
+    assert region.contains(points).tolist() == [True, False, False, False]
+
+
+def test_options_are_checked():
+    with pytest.raises(ConfigError, match="padding = -1"):
+        FilterOptions(padding=-1.0)

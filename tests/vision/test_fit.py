@@ -1,0 +1,184 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from yid_ocp.errors import ConfigError, DataError
+from yid_ocp.model.system import System
+from yid_ocp.model.y_object import flexible_object
+from yid_ocp.vision import FitOptions, ShapeFit
+from yid_ocp.vision.fit import NODE_FACTOR, Sight, _Task
+
+CAMERA = np.array([2.6, 0.0, 0.45])
+
+
+@pytest.fixture(scope="module")
+def alone():
+    """The Y without a robot."""
+    return System.build(objects=[(flexible_object(), None, None)])
+
+
+def bent(system, seed, size=0.12):
+    rng = np.random.default_rng(seed)
+    q = np.zeros(system.size)
+    q[list(ShapeFit(system).free)] = size * rng.standard_normal(len(ShapeFit(system).free))
+    return q
+
+
+def seen(shape, q, count=250, noise=0.0, seed=0):
+    """Points on the visible side of every link, and nodes where the visible half's mean is."""
+    rng = np.random.default_rng(seed)
+    points, nodes = [], []
+    corners = np.array(shape._corners(q)[0]).reshape(-1, 2, 3)
+    for (start, end), radius in zip(corners, shape.radius, strict=True):
+        axis = (end - start) / np.linalg.norm(end - start)
+        middle = 0.5 * (start + end)
+        front = CAMERA - middle
+        front = front - (front @ axis) * axis
+        front /= np.linalg.norm(front)
+        side = np.cross(axis, front)
+        across = rng.uniform(-1, 1, count)
+        around = radius * (across[:, None] * side + np.sqrt(1 - across**2)[:, None] * front)
+        points.append(start + rng.uniform(0, 1, count)[:, None] * (end - start) + around)
+        for t in (0.25, 0.75):
+            nodes.append(start + t * (end - start) + NODE_FACTOR * radius * front)
+    cloud = np.concatenate(points)
+    sight = cloud - CAMERA
+    cloud = cloud + noise * rng.standard_normal(len(cloud))[:, None] * sight / np.linalg.norm(sight, axis=1)[:, None]
+    return Sight(cloud, np.ones(len(cloud)), np.zeros(len(cloud), dtype=np.int64), np.array(nodes), CAMERA)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_shape_is_found_again(alone, seed):
+    shape = ShapeFit(alone)
+    q = bent(alone, seed)
+    fit = shape.solve(seen(shape, q), np.zeros(alone.size))
+    assert np.linalg.norm(fit.points - shape.place(q), axis=1).max() < 0.002
+    assert fit.distance < 0.001
+    assert fit.inliers == 1.0
+    assert (fit.coverage > 0.9).all()
+    assert fit.seen.all()
+
+
+def test_twists_stay_at_rest_and_cost_nothing(alone):
+    shape = ShapeFit(alone)
+    q = bent(alone, 1)
+    twists = [i for i, name in enumerate(alone.mechanism.joint_names) if name.endswith("_z")]
+    q[twists] = 0.1
+    fit = shape.solve(seen(shape, q), np.zeros(alone.size))
+    assert np.array_equal(fit.q[twists], np.zeros(len(twists)))
+    assert np.linalg.norm(fit.points - shape.place(q), axis=1).max() < 0.002
+
+
+def test_nodes_alone_are_the_papers_fit(alone):
+    shape = ShapeFit(alone, FitOptions(scales=(0.15, 0.05, 0.02), surface_scales=()))
+    q = bent(alone, 2, 0.08)
+    fit = shape.solve(seen(shape, q), np.zeros(alone.size))
+    assert np.linalg.norm(fit.points - shape.place(q), axis=1).max() < 0.01
+
+
+def test_surface_and_centre_line_are_told_apart(alone):
+    shape = ShapeFit(alone)
+    q = np.zeros(alone.size)
+    sight = seen(shape, q)
+    # with tubes of no thickness the fit would lie on the surface, on the camera's side
+    thin = ShapeFit(alone, values={"T1.radius": 1e-4, "T2.radius": 1e-4, "T3.radius": 1e-4})
+    flat = thin.solve(sight, q).points - shape.place(q)
+    assert 0.012 < flat[0, 0] < 0.04
+    assert np.linalg.norm(shape.solve(sight, q).points - shape.place(q), axis=1).max() < 0.001
+
+
+def test_wrong_points_hardly_matter(alone):
+    shape = ShapeFit(alone)
+    q = bent(alone, 3)
+    clean = seen(shape, q, noise=0.006)
+    rng = np.random.default_rng(0)
+    wrong = rng.uniform(clean.points.min(0) - 0.1, clean.points.max(0) + 0.1, (len(clean.points) // 4, 3))
+    points = np.concatenate([clean.points, wrong])
+    nodes = np.concatenate([clean.nodes, wrong[:6]])
+    mixed = replace(
+        clean, points=points, weight=np.ones(len(points)), part=np.zeros(len(points), dtype=np.int64), nodes=nodes
+    )
+    fit = shape.solve(mixed, np.zeros(alone.size))
+    assert np.linalg.norm(fit.points - shape.place(q), axis=1).max() < 0.006
+    assert fit.inliers == pytest.approx(0.85, abs=0.06)
+
+
+def test_foreign_parts_do_not_count_against_the_fit(alone):
+    shape = ShapeFit(alone)
+    clean = seen(shape, np.zeros(alone.size))
+    heap = np.random.default_rng(0).normal([1.3, 0.5, -0.5], 0.02, (200, 3))
+    points = np.concatenate([clean.points, heap])
+    part = np.concatenate([clean.part, np.ones(200, dtype=np.int64)])
+    both = replace(clean, points=points, weight=np.ones(len(points)), part=part)
+    assert shape.solve(both, np.zeros(alone.size)).inliers == 1.0
+    one = replace(both, part=np.zeros(len(points), dtype=np.int64))
+    assert shape.solve(one, np.zeros(alone.size)).inliers < 0.95
+
+
+def test_a_hidden_branch_is_not_seen(alone):
+    shape = ShapeFit(alone)
+    q = bent(alone, 0, 0.05)
+    sight = seen(shape, q)
+    keep = np.repeat(np.arange(12) < 8, 250)
+    hidden = replace(
+        sight, points=sight.points[keep], weight=sight.weight[keep], part=sight.part[keep], nodes=sight.nodes[:16]
+    )
+    fit = shape.solve(hidden, np.zeros(alone.size))
+    assert dict(zip(alone.points, fit.seen.tolist(), strict=True)) == {"w_T1": True, "w_T2": True, "w_T3": False}
+    assert np.linalg.norm(fit.std[2]) > 3 * np.linalg.norm(fit.std[1])
+
+
+def test_the_gripper_tells_where_the_end_is(system, shape, run):
+    q = run.q[150]
+    sight = seen(shape, q)
+    keep = np.repeat(~np.isin(np.arange(12), (5, 6, 7)), 250)
+    nodes = sight.nodes[np.repeat(~np.isin(np.arange(12), (5, 6, 7)), 2)]
+    part = replace(sight, points=sight.points[keep], weight=sight.weight[keep], part=sight.part[keep], nodes=nodes)
+    fit = shape.solve(part, q)
+    held = system.points.index("w_T2")
+    assert np.linalg.norm(fit.points[held] - shape.place(q)[held]) < 0.006
+    assert fit.seen[held]
+
+
+def test_it_starts_from_where_it_was(alone):
+    shape = ShapeFit(alone)
+    q = bent(alone, 5, 0.3)
+    sight = seen(shape, q)
+    fit = shape.solve(sight, np.zeros(alone.size), [q + 0.02])
+    assert np.linalg.norm(fit.points - shape.place(q), axis=1).max() < 0.004
+    slow = shape.solve(sight, np.zeros(alone.size), [q], (np.zeros(alone.size), 1e-4))
+    assert np.abs(slow.q - 0).max() < 0.1, "no time has passed, so nothing can have moved"
+
+
+def test_derivatives_agree_with_differences(system, shape, run):
+    q = run.q[200].copy()
+    sight = seen(shape, q, 20, noise=0.005)
+    task = _Task(sight.points, sight.weight / 0.006**2, 1.0, 0.03, CAMERA, (q + 0.01, 0.2))
+    q[list(shape.free)] += 0.01 * np.random.default_rng(0).standard_normal(len(shape.free))
+    _, gradient, hessian = shape._system(q, task)
+    step, differences = 1e-6, []
+    for index in shape.free:
+        ahead, behind = q.copy(), q.copy()
+        ahead[index] += step
+        behind[index] -= step
+        differences.append((shape._system(ahead, task)[0] - shape._system(behind, task)[0]) / (2 * step))
+    assert np.allclose(gradient, differences, rtol=1e-4, atol=1e-4 * np.abs(gradient).max())
+    assert np.linalg.eigvalsh(hessian).min() > 0
+
+
+def test_what_cannot_be_fitted_is_said(alone, urdf_folder):
+    from yid_ocp.model import Mechanism
+
+    with pytest.raises(DataError, match="no object"):
+        ShapeFit(System.build(Mechanism.from_urdf(urdf_folder / "double_pendulum.urdf", parametric=False)))
+    nothing = np.empty((0, 3))
+    sight = Sight(nothing, np.empty(0), np.empty(0, dtype=np.int64), nothing, CAMERA)
+    with pytest.raises(DataError, match="no point"):
+        ShapeFit(alone).solve(sight, np.zeros(alone.size))
+    with pytest.raises(ConfigError, match="noise = 0"):
+        FitOptions(noise=0.0)
+    with pytest.raises(ConfigError, match="no pass"):
+        FitOptions(scales=(), surface_scales=())

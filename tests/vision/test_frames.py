@@ -1,0 +1,145 @@
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from yid_ocp.errors import DataError, OutputError
+from yid_ocp.vision import XTION, Film, Pinhole, look_at, read_film, write_film
+
+CLOUD = np.array([[0.1, -0.2, 2.0], [0.0, 0.3, 1.5], [-0.4, 0.1, 2.25]])
+POSE = look_at([2.0, 0.5, 0.3], [0.0, 0.0, 0.0])
+
+
+@pytest.fixture
+def folder(tmp_path):
+    write_film(Film.of([0.5, 0.9], [CLOUD, CLOUD[:2]], POSE), tmp_path / "film")
+    return tmp_path / "film"
+
+
+def changed(folder, **entries):
+    head = json.loads((folder / "camera.json").read_text())
+    head |= entries
+    (folder / "camera.json").write_text(json.dumps({key: value for key, value in head.items() if value is not None}))
+
+
+def test_xtion_is_58_degrees_wide():
+    left, right = XTION.rays[240, 0], XTION.rays[240, -1]
+    cosine = left @ right / np.linalg.norm(left) / np.linalg.norm(right)
+    assert np.degrees(np.arccos(cosine)) == pytest.approx(58.0, abs=0.2)
+    assert (XTION.width, XTION.height) == (640, 480)
+
+
+def test_depth_to_cloud():
+    camera = Pinhole(4, 3, 2.0, 4.0, 1.0, 1.0)
+    depth = np.full((3, 4), np.nan)
+    depth[2, 3] = 2.0
+    depth[0, 0] = 0.0
+    assert np.allclose(camera.cloud(depth), [[2.0, 0.5, 2.0]])
+    with pytest.raises(DataError, match="shape"):
+        camera.cloud(np.ones((4, 3)))
+
+
+def test_look_at_puts_the_target_ahead():
+    assert np.allclose(np.linalg.inv(POSE) @ [0, 0, 0, 1], [0, 0, np.linalg.norm([2.0, 0.5, 0.3]), 1])
+    assert POSE[2, 1] < 0  # y points down
+
+
+def test_a_film_survives_the_disk(folder):
+    film = read_film(folder)
+    assert np.array_equal(film.t, [0.5, 0.9])
+    assert np.allclose(film.pose, POSE)
+    assert np.allclose(film.load(0), CLOUD, atol=1e-6)
+    assert np.allclose(film.world(1), CLOUD[:2] @ POSE[:3, :3].T + POSE[:3, 3], atol=1e-6)
+    assert film.select([1]).names == ("000001.ply",)
+
+
+@pytest.mark.parametrize("ending", [".pcd", ".ply"])
+def test_both_formats_of_clouds(open3d, folder, ending):
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(CLOUD))
+    open3d.io.write_point_cloud(str(folder / f"other{ending}"), cloud)
+    (folder / "timestamps.csv").write_text(f"file,t\nother{ending},3.5\n")
+    assert np.allclose(read_film(folder).load(0), CLOUD, atol=1e-6)
+
+
+def test_units_and_frames_of_clouds(folder):
+    changed(folder, unit="mm")
+    assert np.allclose(read_film(folder).load(0), 1e-3 * CLOUD)
+    assert np.allclose(read_film(folder, unit="m").load(0), CLOUD, atol=1e-6)
+    changed(folder, unit="m", frame="world")
+    assert np.allclose(read_film(folder).world(0), CLOUD, atol=1e-6)
+
+
+def test_depth_images(tmp_path):
+    camera = Pinhole(8, 6, 10.0, 10.0, 3.5, 2.5)
+    depth = np.linspace(1.0, 2.0, 48).reshape(6, 8)
+    depth[0, :3] = np.nan
+    film = Film(np.array([0.1]), ("a",), POSE, lambda i: camera.cloud(depth), camera)
+    write_film(film, tmp_path / "film", depth=[depth])
+    again = read_film(tmp_path / "film")
+    assert again.intrinsics == camera
+    assert np.allclose(again.load(0), film.load(0), atol=1e-3)
+    changed(tmp_path / "film", intrinsics=None)
+    with pytest.raises(DataError, match="intrinsics are missing"):
+        read_film(tmp_path / "film")
+    with pytest.raises(OutputError, match="intrinsics"):
+        write_film(Film.of([0.1], [CLOUD], POSE), tmp_path / "other", depth=[depth])
+
+
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        ({"pose": None}, "pose of the camera is missing"),
+        ({"pose": [[1, 0], [0, 1]]}, "not a rigid transform"),
+        ({"pose": (2 * np.eye(4)).tolist()}, "not a rigid transform"),
+        ({"pose": "north"}, "not a matrix"),
+        ({"unit": "cm"}, "unit is 'cm'"),
+        ({"frame": "base"}, "frame of the clouds is 'base'"),
+        ({"posse": 1}, "unknown key 'posse'"),
+        ({"format": "yid-frames/7"}, "format of the frames"),
+        ({"intrinsics": {"width": 3}}, "intrinsics are not complete"),
+        ({"depth_unit": -1}, "depth_unit is -1"),
+    ],
+)
+def test_what_is_wrong_with_the_camera_is_said(folder, entries, message):
+    changed(folder, **entries)
+    with pytest.raises(DataError, match=message) as caught:
+        read_film(folder)
+    assert "camera.json" in caught.value.where
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        (None, "no time stamps"),
+        ([["file", "t"]], "no frame"),
+        ([["name", "time"], ["000000.ply", "1"]], "the columns are"),
+        ([["file", "t"], ["000000.ply", "noon"]], "the time is 'noon'"),
+        ([["file", "t"], ["000000.xyz", "1"]], "neither a cloud nor a depth image"),
+    ],
+)
+def test_what_is_wrong_with_the_stamps_is_said(folder, rows, message):
+    path = folder / "timestamps.csv"
+    path.unlink()
+    if rows is not None:
+        with path.open("w", newline="") as file:
+            csv.writer(file).writerows(rows)
+    with pytest.raises(DataError, match=message):
+        read_film(folder)
+
+
+def test_broken_files_fail_when_loaded(folder, capfd):
+    (folder / "000000.ply").write_bytes(b"ply\nformat nonsense")
+    (folder / "000001.ply").unlink()
+    film = read_film(folder)
+    with pytest.raises(DataError, match="empty or cannot be read"):
+        film.load(0)
+    with pytest.raises(DataError, match="missing"):
+        film.load(1)
+    assert "ply" not in capfd.readouterr().out.lower()
+    shutil.rmtree(folder)
+    with pytest.raises(DataError, match="no such folder"):
+        read_film(folder)
