@@ -38,6 +38,11 @@ def open3d():
 
 
 @pytest.fixture(scope="session")
+def truth():
+    return dict(TRUTH)
+
+
+@pytest.fixture(scope="session")
 def system(single_arm):
     return single_arm
 
@@ -76,8 +81,9 @@ def tracked(system, run, recording, shape):
         seen = made.film if frames is None else made.film.select(frames)
         chosen = replace(options or TrackOptions(), points=system.points)
         found = track(system, recording, seen, urdf="package:baxter", options=chosen, stages=stages)
-        truth = np.array([shape.place(made.course(t)) for t in found.t])
-        return SimpleNamespace(made=made, track=found, errors=np.linalg.norm(found.position - truth, axis=2))
+        were = np.array([shape.place(made.course(t)) for t in found.t])
+        errors = np.linalg.norm(found.position - were, axis=2)
+        return SimpleNamespace(made=made, track=found, latency=when.latency, errors=errors)
 
     return make
 

@@ -12,6 +12,7 @@ from yid_ocp.vision import FitOptions, ShapeFit
 from yid_ocp.vision.fit import NODE_FACTOR, Sight, _Task
 
 CAMERA = np.array([2.6, 0.0, 0.45])
+NODES = 4  # of every link
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +43,7 @@ def seen(shape, q, count=250, noise=0.0, seed=0):
         across = rng.uniform(-1, 1, count)
         around = radius * (across[:, None] * side + np.sqrt(1 - across**2)[:, None] * front)
         points.append(start + rng.uniform(0, 1, count)[:, None] * (end - start) + around)
-        for t in (0.25, 0.75):
+        for t in (np.arange(NODES) + 0.5) / NODES:
             nodes.append(start + t * (end - start) + NODE_FACTOR * radius * front)
     cloud = np.concatenate(points)
     sight = cloud - CAMERA
@@ -76,7 +77,7 @@ def test_nodes_alone_are_the_papers_fit(alone):
     shape = ShapeFit(alone, FitOptions(scales=(0.15, 0.05, 0.02), surface_scales=()))
     q = bent(alone, 2, 0.08)
     fit = shape.solve(seen(shape, q), np.zeros(alone.size))
-    assert np.linalg.norm(fit.points - shape.place(q), axis=1).max() < 0.01
+    assert np.linalg.norm(fit.points - shape.place(q), axis=1).max() < 0.015
 
 
 def test_surface_and_centre_line_are_told_apart(alone):
@@ -87,7 +88,7 @@ def test_surface_and_centre_line_are_told_apart(alone):
     thin = ShapeFit(alone, values={"T1.radius": 1e-4, "T2.radius": 1e-4, "T3.radius": 1e-4})
     flat = thin.solve(sight, q).points - shape.place(q)
     assert 0.012 < flat[0, 0] < 0.04
-    assert np.linalg.norm(shape.solve(sight, q).points - shape.place(q), axis=1).max() < 0.001
+    assert np.linalg.norm(shape.solve(sight, q).points - shape.place(q), axis=1).max() < 0.003
 
 
 def test_wrong_points_hardly_matter(alone):
@@ -124,7 +125,7 @@ def test_a_hidden_branch_is_not_seen(alone):
     sight = seen(shape, q)
     keep = np.repeat(np.arange(12) < 8, 250)
     hidden = replace(
-        sight, points=sight.points[keep], weight=sight.weight[keep], part=sight.part[keep], nodes=sight.nodes[:16]
+        sight, points=sight.points[keep], weight=sight.weight[keep], part=sight.part[keep], nodes=sight.nodes[: 8 * NODES]
     )
     fit = shape.solve(hidden, np.zeros(alone.size))
     assert dict(zip(alone.points, fit.seen.tolist(), strict=True)) == {"w_T1": True, "w_T2": True, "w_T3": False}
@@ -135,7 +136,7 @@ def test_the_gripper_tells_where_the_end_is(system, shape, run):
     q = run.q[150]
     sight = seen(shape, q)
     keep = np.repeat(~np.isin(np.arange(12), (5, 6, 7)), 250)
-    nodes = sight.nodes[np.repeat(~np.isin(np.arange(12), (5, 6, 7)), 2)]
+    nodes = sight.nodes[np.repeat(~np.isin(np.arange(12), (5, 6, 7)), NODES)]
     part = replace(sight, points=sight.points[keep], weight=sight.weight[keep], part=sight.part[keep], nodes=nodes)
     fit = shape.solve(part, q)
     held = system.points.index("w_T2")

@@ -413,14 +413,15 @@ class Workshop:
         run = simulate_in_mujoco(system, values, motion, duration=duration, posture=posture)
         driven = list(system.driven_indices)
         joints = JointGroup(system.driven, run.t, run.q[:, driven], effort=run.effort, position_std=0.0, effort_std=0.0)
-        notes = []
+        beyond: dict[str, list[str]] = {"range": [], "torque": []}
         for k, name in enumerate(system.driven):
             joint = system.mechanism.joints[driven[k]]
             q, effort = run.q[:, driven[k]], run.effort[:, k]
             if q.min() < joint.lower or q.max() > joint.upper:
-                notes.append(f"{name} would leave its range")
+                beyond["range"].append(name)
             if np.abs(effort).max() > joint.effort_limit:
-                notes.append(f"{name} would need more than its torque")
+                beyond["torque"].append(name)
+        notes = [f"beyond the {what} of {', '.join(names)}" for what, names in beyond.items() if names]
         return Recording(joints, source="what if", name=episode.name), notes
 
     def _dense(self, recording: Recording, index: int, seen: Sequence[Sight], torque: bool) -> Recording:

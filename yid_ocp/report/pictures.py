@@ -33,6 +33,7 @@ def draw_convergence(path: Path, comparison: Comparison) -> None:
     for axes, label in ((by_iteration, "iteration"), (by_time, "wall time [s]")):
         axes.set_xscale("symlog", linthresh=1.0)
         axes.set_yscale("log")
+        axes.set_xlim(left=0.0)
         axes.set_xlabel(label)
         axes.grid(alpha=0.3)
     by_iteration.set_ylabel("cost over its lowest value, less one")

@@ -110,6 +110,8 @@ class Fit:
         Share of each link's length along which there are points.
     seen : ndarray of bool, shape (np,)
         Whether there are points enough about each of the system's points, or a gripper that holds it.
+    gap : ndarray, shape (grasps, 3)
+        From what each gripper holds to the gripper [m].
     iterations : int
     centre_line : ndarray, shape (K, 2, 3)
         Start and end of every link [m].
@@ -122,6 +124,7 @@ class Fit:
     inliers: float
     coverage: Array
     seen: NDArray[np.bool_]
+    gap: Array
     iterations: int
     centre_line: Array
 
@@ -212,6 +215,9 @@ class ShapeFit:
             if grasp.kind != "point":  # the first column of a weld is a roll, which stays unknown
                 rows.append(alignment[-3:] / self.options.direction_std)
         held = ca.substitute(ca.vertcat(*rows), symbols, ca.SX(ca.DM(theta)))
+        gaps = [grasp.residual(kinematics)[:3] for grasp in system.grasps]
+        gap = ca.substitute(ca.vertcat(ca.SX(0, 1), *gaps), symbols, ca.SX(ca.DM(theta)))
+        self._gap = ca.Function("gap", [q], [ca.densify(gap)])
         self._held = ca.Function("held", [q], ca.cse([held, ca.densify(ca.jacobian(held, q)[:, columns])]))
 
     def solve(
@@ -287,6 +293,7 @@ class ShapeFit:
             float(np.average(share_in[own], weights=weight[own])),
             coverage,
             self._seen_points(corners, places, coverage),
+            np.array(self._gap(q)).reshape(-1, 3),
             iterations,
             corners,
         )

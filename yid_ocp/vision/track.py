@@ -50,6 +50,9 @@ class TrackOptions:
         As is one whose shape has a joint that is bent further [rad].
     worse : float
         As is one where this distance is so many times the median of all good frames.
+    gap_max : float
+        As is one where an end is further from the gripper that holds it than usual by more [m]: its time is not what
+        its stamp says.
     least_inliers : float
         As is one of which a smaller share of the points lies on the shape.
     point_std_max : float
@@ -73,6 +76,7 @@ class TrackOptions:
     d_max: float = 0.012
     largest_bend: float = 1.2
     worse: float = 1.7
+    gap_max: float = 0.008
     least_inliers: float = 0.6
     point_std_max: float = 0.02
     std_floor: float = 0.003
@@ -82,7 +86,7 @@ class TrackOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("d_max", "point_std_max", "std_floor"):
+        for name in ("d_max", "worse", "gap_max", "largest_bend", "point_std_max", "std_floor"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"{name} = {getattr(self, name)}", where="track options", allowed="a positive number")
 
@@ -332,8 +336,11 @@ class _Tracker:
             if stage is not None and report.good:
                 kept.append(stage)
         self.tell(2 * total, 2 * total, "done")
-        usual = float(np.median([f.fit.distance for f in frames if f.good and f.fit is not None] or [0.0]))
-        frames = [self._compared(frame, usual) for frame in frames]
+        fits = [frame.fit for frame in frames if frame.good and frame.fit is not None]
+        if fits:
+            usual = float(np.median([fit.distance for fit in fits]))
+            gap = np.median([fit.gap for fit in fits], axis=0)
+            frames = [self._compared(frame, usual, gap) for frame in frames]
         return self._track(frames, clock, kept)
 
     def _check_clock(self, usable: Sequence[int]) -> None:
@@ -434,11 +441,17 @@ class _Tracker:
             return f"the shape does not fit: only {100 * fit.inliers:.0f} % of the points lie on it"
         return ""
 
-    def _compared(self, frame: FrameReport, usual: float) -> FrameReport:
-        if not frame.good or frame.fit is None or frame.fit.distance <= self.options.worse * usual:
+    def _compared(self, frame: FrameReport, usual: float, gap: Array) -> FrameReport:
+        if not frame.good or frame.fit is None:
             return frame
-        off = f"{1e3 * frame.fit.distance:.1f} mm off on average, {1e3 * usual:.1f} mm are usual"
-        return replace(frame, reason=f"the shape fits worse than in other frames: {off}")
+        if frame.fit.distance > self.options.worse * usual:
+            off = f"{1e3 * frame.fit.distance:.1f} mm off on average, {1e3 * usual:.1f} mm are usual"
+            return replace(frame, reason=f"the shape fits worse than in other frames: {off}")
+        apart = float(np.linalg.norm(frame.fit.gap - gap, axis=1).max(initial=0.0))
+        if apart > self.options.gap_max:
+            off = f"{1e3 * apart:.0f} mm more than usual (a late stamp?)"
+            return replace(frame, reason=f"an end is not where its gripper is: {off}")
+        return frame
 
     def _track(self, frames: Sequence[FrameReport], clock: Clock, kept: Sequence[Stages]) -> Track:
         good = [frame for frame in frames if frame.good]

@@ -1,0 +1,73 @@
+"""Several methods on one problem: prices, agreement, and what is said of parameters that nothing informs."""
+
+from __future__ import annotations
+
+import json
+from importlib import resources
+
+import pytest
+
+from yid_ocp.analysis.compare import PUBLISHED, compare
+from yid_ocp.cli import main
+from yid_ocp.data import read_recording
+from yid_ocp.integrator.step import compile_step
+from yid_ocp.problem import EstimationProblem, ProblemOptions
+from yid_ocp.solvers import GaussNewton, SingleShooting, SteepestDescent
+
+
+@pytest.fixture(scope="module")
+def problem(paper_systems):
+    folder = resources.files("yid_ocp.data") / "defaults"
+    step = compile_step(paper_systems["single"], 0.01, "left_damping")
+    recording = read_recording(folder / "single_arm_vision_estimate.h5")
+    held_out = read_recording(folder / "single_arm_vision_held_out.h5")
+    free = ("T1.bend", "T2.bend", "T3.twist")
+    return EstimationProblem(step, [recording], free, ProblemOptions(duration=1.5), None, [held_out])
+
+
+def test_methods_agree_on_what_the_data_inform(problem):
+    told = []
+    found = compare(problem, [GaussNewton(), SingleShooting()], {"T3.twist": 9.7}, lambda name, _: told.append(name))
+    assert found.agree
+    assert {run.method for run in found.runs} == set(told) == {"gauss_newton", "single_shooting"}
+    assert any("T3.twist (truth 9.7) is not identifiable" in sentence for sentence in found.explained)
+    for run in found.runs:
+        assert run.wall_seconds > 0
+        assert run.peak_memory > 10
+        assert len(run.held_out) == 1
+
+
+def test_a_method_that_stops_early_is_said_to_differ(problem):
+    found = compare(problem, [GaussNewton(), SteepestDescent(iterations=2)])
+    assert found.reference == "gauss_newton"
+    assert not found.agree
+    assert any("iteration_limit" in sentence for sentence in found.agreement["steepest_descent"])
+
+
+def test_published_answers_are_the_papers():
+    assert PUBLISHED["dual_arm_vision"]["T1.twist"] == 0.0
+    assert set(PUBLISHED) == {f"{arms}_arm_{eyes}" for arms in ("single", "dual") for eyes in ("vision", "no_vision")}
+
+
+def test_command(repository, tmp_path, capsys):
+    config = repository / "configs" / "single_arm_no_vision.yaml"
+    settings = ["solver.duration=0.5", "compare.methods={gauss_newton: {}, single_shooting: {}}"]
+    arguments = [part for setting in settings for part in ("--set", setting)]
+    assert main(["compare", str(config), "--out", str(tmp_path / "run"), *arguments]) == 0
+    text = capsys.readouterr().out
+    assert "published" in text
+    assert "truth" in text
+    result = json.loads((tmp_path / "run" / "result.json").read_text(encoding="utf-8"))
+    assert result["format"] == "yid-compare/1"
+    assert set(result["methods"]) == {"gauss_newton", "single_shooting"}
+    assert result["methods"]["gauss_newton"]["format"] == "yid-solve/1"
+    assert (tmp_path / "run" / "convergence.png").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("methods", ["{newton: {}}", "{gauss_newton: {iteration: 3}}", "{}"])
+def test_wrong_methods_are_refused(repository, tmp_path, capsys, methods):
+    config = repository / "configs" / "single_arm_no_vision.yaml"
+    arguments = ["compare", str(config), "--out", str(tmp_path / "run"), "--set", f"compare.methods={methods}"]
+    assert main(arguments) == 2
+    assert "compare.methods" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
