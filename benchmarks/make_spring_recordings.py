@@ -81,9 +81,9 @@ def recording(name: str, motor: str, points: tuple[str, ...], truth: dict[str, f
 
 
 def make(folder: Path) -> None:
-    series = recording("springs_series", "tilt", ("joint", "end"), SERIES_TRUTH, 1)
+    series = recording("springs_series", "tilt", ("joint", "end"), SERIES_TRUTH, 2)
     names = ("pointer", "shaft_end", "coupling", "coupling_marker")
-    torsion = recording("springs_torsion", "motor", names, TORSION_TRUTH, 2)
+    torsion = recording("springs_torsion", "motor", names, TORSION_TRUTH, 3)
     for entry in (series, torsion):
         path = folder / f"{entry.name}.h5"
         write_recording(entry, path)

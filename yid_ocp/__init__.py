@@ -9,6 +9,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from yid_ocp.analysis.identifiability import identifiability as identifiability
+    from yid_ocp.analysis.what_if import what_if as what_if
     from yid_ocp.config import load_config as load_config
     from yid_ocp.config import load_problem as load_problem
     from yid_ocp.config import load_system as load_system
@@ -44,6 +46,8 @@ if TYPE_CHECKING:
 # One row for each module; what a later part of the package offers (identifiability, diagnose, compare) is entered
 # here and imported above.
 _HOMES: dict[str, tuple[str, ...]] = {
+    "analysis.identifiability": ("identifiability",),
+    "analysis.what_if": ("what_if",),
     "config": ("load_config", "load_problem", "load_system"),
     "data": ("Recording", "read_any", "read_recording", "write_recording"),
     "diagnosis": ("Finding", "diagnose"),
@@ -88,6 +92,7 @@ __all__ = [
     "compile_step",
     "diagnose",
     "flexible_object",
+    "identifiability",
     "load_config",
     "load_problem",
     "load_system",
@@ -95,6 +100,7 @@ __all__ = [
     "read_recording",
     "simulate",
     "solve",
+    "what_if",
     "write_recording",
 ]
 

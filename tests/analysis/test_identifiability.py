@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -60,8 +61,6 @@ def test_the_independent_figures_leave_the_unseen_twists_out(golden_problem):
 
 def test_a_start_that_nothing_is_known_of(golden_problem):
     """The independent computation's 254 to 345 % stand for a start without a prior, the arms' momenta included."""
-    from dataclasses import replace
-
     problem = golden_problem("single", False)
     problem.options = replace(problem.options, configuration_std=10.0, velocity_std=50.0)
     assert 2.0 < identifiability(problem).parameters["T3.bend"].std_relative < 3.5
@@ -210,8 +209,6 @@ def test_where_the_grasp_sits_is_a_nuisance(held_tube):
 
 
 def test_an_estimated_start_can_be_judged_as_known(held_tube):
-    from dataclasses import replace
-
     estimated = EstimationProblem(
         held_tube.step,
         [episode.recording for episode in held_tube.episodes],
@@ -274,5 +271,11 @@ def test_bad_requests_say_what_is_wrong(held_tube):
         identifiability(held_tube, intervals=["T1.bendd"])
     with pytest.raises(SolverError, match="shape"):
         identifiability(held_tube, [1.0])
-    with pytest.raises(SolverError, match="cannot be rolled out"):
+    with pytest.raises(SolverError, match=r"T1\.bend is not finite"):
         identifiability(held_tube, [math.nan, 1.0])
+    episode = held_tube.episodes[0]
+    far = replace(episode.recording.joints, position=episode.recording.joints.position + np.array([1.0, 0.0, 0.0]))
+    recording = replace(episode.recording, joints=far)
+    unreachable = EstimationProblem(held_tube.step, [recording], held_tube.free, held_tube.options)
+    with pytest.raises(SolverError, match=r"cannot be rolled out.*out of reach"):
+        identifiability(unreachable)

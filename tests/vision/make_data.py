@@ -1,6 +1,6 @@
 """Make the small film in tests/vision/data: three clouds of the foam Y in one arm's hand, and the joints' recording.
 
-    PYTHONPATH=. python tests/vision/make_data.py
+PYTHONPATH=. python tests/vision/make_data.py
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ def test_the_robot_goes_with_its_padding(system, run):
         pose = robot.poses(q)[robot.joints.index(wrist)]
         surface = meshes[wrist].moved(pose).vertices[::20]
         assert not without_robot(Cloud(surface, np.ones(len(surface))), robot, q, 0.01).any()
-        away = surface + [0.0, 0.0, 3.0]
+        away = surface + np.array([0.0, 0.0, 3.0])
         assert without_robot(Cloud(away, np.ones(len(away))), robot, q, 0.01).all()
     tip = run.points[0][system.points.index("w_T1")][None]
     assert without_robot(Cloud(tip, np.ones(1)), robot, run.q[0], 0.03).all()
@@ -60,14 +60,14 @@ def test_where_the_object_can_be(system, run):
     region = ObjectRegion(system, FilterOptions()).at(run.q[0], CAMERA)
     foot = np.array([0.85, 0.0, -0.93])
     inside = {
-        "floor": foot + [0.3, 0.0, 0.02],
+        "floor": foot + np.array([0.3, 0.0, 0.02]),
         "behind": np.array([-0.2, 0.0, 0.3]),
-        "beyond reach": foot + [0.0, 1.2, 1.4],
+        "beyond reach": foot + np.array([0.0, 1.2, 1.4]),
     }
     for reason, point in inside.items():
         assert not region.contains(point[None])[0], reason
     assert region.contains(run.points.reshape(-1, 3)).all()
-    assert region.contains((foot + [0.0, 0.0, 0.1])[None]).all()
+    assert region.contains((foot + np.array([0.0, 0.0, 0.1]))[None]).all()
     box = FilterOptions(lower=(0.5, -2.0, -2.0), upper=(2.0, 2.0, 0.0), floor=-0.9, behind=None)
     region = ObjectRegion(system, box).at(run.q[0], CAMERA)
     points = np.array([[0.85, 0.0, -0.1], [0.4, 0.0, -0.1], [0.85, 0.0, 0.1], [0.85, 0.0, -0.91]])

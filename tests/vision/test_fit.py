@@ -125,7 +125,11 @@ def test_a_hidden_branch_is_not_seen(alone):
     sight = seen(shape, q)
     keep = np.repeat(np.arange(12) < 8, 250)
     hidden = replace(
-        sight, points=sight.points[keep], weight=sight.weight[keep], part=sight.part[keep], nodes=sight.nodes[: 8 * NODES]
+        sight,
+        points=sight.points[keep],
+        weight=sight.weight[keep],
+        part=sight.part[keep],
+        nodes=sight.nodes[: 8 * NODES],
     )
     fit = shape.solve(hidden, np.zeros(alone.size))
     assert dict(zip(alone.points, fit.seen.tolist(), strict=True)) == {"w_T1": True, "w_T2": True, "w_T3": False}

@@ -52,8 +52,9 @@ def test_closest_points_give_the_way_out(ball):
 def test_rays_meet_a_ball_where_it_is(ball):
     q = [0.4, -0.1]
     middle = centre(ball, q)
+    eye = middle + np.array([1.2, 0.3, 0.1])
     camera = Pinhole(41, 31, 60.0, 60.0, 20.0, 15.0)
-    depth, cosine = ball.cast(camera, look_at(middle + [1.2, 0.3, 0.1], middle), q)
+    depth, cosine = ball.cast(camera, look_at(eye, middle), q)
     away = np.linalg.norm([1.2, 0.3, 0.1])
     assert depth[15, 20] == pytest.approx(away - 0.1, abs=1e-3)
     assert cosine[15, 20] == pytest.approx(1.0, abs=0.01)
@@ -61,7 +62,7 @@ def test_rays_meet_a_ball_where_it_is(ball):
     miss = away * np.sqrt(1 - rays[..., 2] ** 2)
     assert np.isfinite(depth[miss < 0.097]).all()
     assert np.isinf(depth[miss > 0.103]).all()
-    behind, _ = ball.cast(camera, look_at(middle + [1.2, 0.3, 0.1], middle + [2.4, 0.6, 0.2]), q)
+    behind, _ = ball.cast(camera, look_at(eye, 2 * eye - middle), q)
     assert np.isinf(behind).all()
 
 

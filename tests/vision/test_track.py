@@ -42,7 +42,7 @@ def test_errors_are_within_the_stated_deviations(clean, system):
 
 def test_the_seed_hardly_matters(tracked, clean):
     """The same film, other random points in the walk: within the noise."""
-    frames = [2, 5, 8]
+    frames = [2, 6]
     clock = ClockOptions(offset=clean.track.clock.offset, search=0.0)
     runs = [tracked(TrackOptions(seed=seed, clock=clock), frames=frames).track.position for seed in (1, 2)]
     assert np.abs(runs[0] - runs[1]).max() < 2 * MILLIMETRE
@@ -180,7 +180,7 @@ def spoilt(small, **changes):
         (lambda points: points[:0], "the cloud is empty"),
         (lambda points: np.full_like(points, np.nan), "the cloud is empty"),
         (lambda points: 1000 * points, "not in metres"),
-        (lambda points: points + [30.0, 0.0, 0.0], "no point lies where the object can be"),
+        (lambda points: points + np.array([30.0, 0.0, 0.0]), "no point lies where the object can be"),
         (lambda points: points[:60], "too few points of the object"),
         (lambda points: points * [1.0, 1.0, 1.05], "the shape fits worse"),
     ],
@@ -205,7 +205,7 @@ def test_random_points_are_no_object(system, small):
     [
         (lambda points: points[:0], "the cloud is empty"),
         (lambda points: 1000 * points, "metres"),
-        (lambda points: points + [30.0, 0.0, 0.0], "camera's pose"),
+        (lambda points: points + np.array([30.0, 0.0, 0.0]), "camera's pose"),
     ],
 )
 def test_nothing_but_bad_clouds_is_an_error(system, small, cloud, message):

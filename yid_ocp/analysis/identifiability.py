@@ -260,6 +260,8 @@ def unknown_vector(problem: EstimationProblem, solution: Solution | ArrayLike | 
     x = np.array(solution, float)
     if x.shape != (len(problem.names),):
         raise SolverError(f"the point has shape {x.shape}", allowed=f"({len(problem.names)},), as problem.names")
+    if not np.all(np.isfinite(x)):
+        raise SolverError(f"{problem.names[int(np.argmin(np.isfinite(x)))]} is not finite at the point")
     return x
 
 

@@ -30,6 +30,7 @@ _COARSE = 0.02  # [s]
 _FEWEST = 40  # points that tell anything of a frame
 _CONTRAST = 0.05  # by which a minimum must be lower than the highest sum, of that
 _NARROWING = (1.0, 0.7, 0.5, 0.35, 0.35)  # of the reach, from iteration to iteration
+_SHARE = 0.3  # of a frame's points must lie on the arm, or they are something else
 _CLEARLY = 0.8  # of the misfit at the common offset, below which a frame's own minimum elsewhere is believed
 _LEAST_LATE = 0.02  # [s]; a stamp that is off by less is like the others
 _SHIFT = 1e-2  # weight, against that of the points, that keeps a shift that they do not tell small
@@ -169,6 +170,8 @@ def estimate_clock(
             reach = share * chosen.reach
             rows = [_rows(robot, samples[i] + shift, float(stamps[i]) - offset, posture, reach) for i in usual]
             stacked = np.concatenate(rows)
+            if len(stacked) < _FEWEST:
+                return taken("the arm is not in view")
             held = np.diag([1e-9, *[len(stacked) * _SHIFT] * 3])
             gradient = stacked[:, :4].T @ stacked[:, 4] + held @ np.append(0.0, shift)
             change = np.linalg.solve(stacked[:, :4].T @ stacked[:, :4] + held, -gradient)
@@ -181,12 +184,18 @@ def estimate_clock(
                 other = _own(robot, points + shift, float(stamps[i]), lowest, posture, chosen.reach, _NARROWING[1:])
                 trial = other if other[0] < _CLEARLY * trial[0] else trial
             _, own[i], information[i] = trial
+        if np.linalg.norm(shift) > chosen.reach:
+            return taken("what the camera sees does not lie on the arm")
+        told = information > 0
+        usual = [i for i in samples if told[i]]
+        if len(usual) < 2:
+            return taken("the arm is hardly in view")
         # frames that were stamped late must not pull the others
         offset = weighted_median(own[usual], information[usual])
         deviation = own - offset
         variance = float(np.median((information * deviation**2)[usual])) / _MEDIAN_SQUARE
         limit = np.maximum(_LEAST_LATE, 4 * np.sqrt(variance / np.maximum(information, 1e-12)))
-        usual = [i for i in samples if abs(deviation[i]) < limit[i]]
+        usual = [i for i in usual if abs(deviation[i]) < limit[i]]
         if len(usual) < 2:
             return taken("the frames do not agree on one")
     return _summary(own, information, usual, offset, shift, chosen)
@@ -266,7 +275,8 @@ def _own(
     distance = np.full(len(points), reach)
     last = _rows(robot, points, stamp - offset, posture, reach)[:, 4]
     distance[: len(last)] = last
-    return float(np.mean(distance**2)), offset, information
+    lies = np.count_nonzero(last < narrowing[-1] * reach)
+    return float(np.mean(distance**2)), offset, information if lies >= _SHARE * len(points) else 0.0
 
 
 def _rows(robot: Surfaces, points: Array, t: float, posture: Callable[[float], Array], reach: float) -> Array:

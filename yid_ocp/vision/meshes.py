@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -287,7 +288,6 @@ def robot_meshes(urdf: str | Path, mechanism: Mechanism, kind: MeshKind = "visua
     ModelError
         No such file, a mesh that is missing or cannot be read, or no mesh at all.
     """
-    import trimesh
     import yourdfpy
 
     text = str(urdf)
@@ -299,7 +299,6 @@ def robot_meshes(urdf: str | Path, mechanism: Mechanism, kind: MeshKind = "visua
     except Exception as error:  # yourdfpy and lxml raise many kinds for a malformed file
         raise ModelError(f"the URDF cannot be read: {error}", where=str(path)) from error
     parts: dict[int, list[Mesh]] = {}
-    cache: dict[Path, Mesh] = {}
     for link in robot.robot.links:
         if link.name not in mechanism.frames:
             continue
@@ -316,21 +315,26 @@ def robot_meshes(urdf: str | Path, mechanism: Mechanism, kind: MeshKind = "visua
             elif geometry.sphere is not None:
                 mesh = Mesh.sphere(geometry.sphere.radius)
             elif geometry.mesh is not None:
-                file = mesh_file(geometry.mesh.filename, path)
-                if file not in cache:
-                    try:
-                        loaded: Any = trimesh.load(file, force="mesh")
-                        cache[file] = Mesh(np.asarray(loaded.vertices, float), np.asarray(loaded.faces, np.int64))
-                    except Exception as error:  # trimesh's readers raise many kinds
-                        raise ModelError(f"the mesh cannot be read: {error}", where=str(file)) from error
                 scale = np.ones(3) if geometry.mesh.scale is None else np.asarray(geometry.mesh.scale, float)
-                mesh = replace(cache[file], vertices=cache[file].vertices * scale)
+                loaded = _loaded(mesh_file(geometry.mesh.filename, path))
+                mesh = replace(loaded, vertices=loaded.vertices * scale)
             else:
                 continue
             parts.setdefault(frame.joint, []).append(mesh.moved(placement @ origin))
     if not parts:
         raise ModelError(f"the URDF has no {kind} meshes", where=str(path), hint="choose the other kind")
     return {joint: Mesh.joined(entries) for joint, entries in parts.items()}
+
+
+@lru_cache(maxsize=64)
+def _loaded(file: Path) -> Mesh:
+    import trimesh
+
+    try:
+        loaded: Any = trimesh.load(file, force="mesh")
+        return Mesh(np.asarray(loaded.vertices, float), np.asarray(loaded.faces, np.int64))
+    except Exception as error:  # trimesh's readers raise many kinds
+        raise ModelError(f"the mesh cannot be read: {error}", where=str(file)) from error
 
 
 def mesh_file(name: str, urdf: Path) -> Path:

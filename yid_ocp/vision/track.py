@@ -477,6 +477,14 @@ class _Tracker:
             std = np.hypot(std, np.abs(velocity) * uncertain)
         unseen = np.linalg.norm(std, axis=2) > math.sqrt(3.0) * self.options.point_std_max
         unseen |= ~np.array([fit.seen[columns] for fit in fits])
+        if unseen.all():
+            best = 1e3 * float(np.sqrt((std**2).mean(axis=2)).min())
+            raise DataError(
+                f"no point is known well enough in any frame: the best within {best:.0f} mm,"
+                f" point_std_max is {1e3 * self.options.point_std_max:g} mm",
+                where=self.film.source,
+                hint=f"check the camera's pose and clock ({clock.message}), or look at the pictures of a frame",
+            )
         return Track(
             self.names,
             t,

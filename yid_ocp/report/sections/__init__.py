@@ -90,4 +90,5 @@ def written_sections(findings: Findings, environment: jinja2.Environment) -> lis
     return result
 
 
-from yid_ocp.report.sections import diagnosis, fit, inputs, search, summary  # noqa: E402, F401  (they register themselves)
+# the sections register themselves
+from yid_ocp.report.sections import diagnosis, fit, identifiability, inputs, search, summary  # noqa: E402, F401

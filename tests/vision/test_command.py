@@ -1,0 +1,102 @@
+from __future__ import annotations
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from yid_ocp.cli import main
+from yid_ocp.data.recording import read_recording
+from yid_ocp.vision.pictures import STAGES
+
+CONFIG = """\
+model:
+  robot: package:baxter
+  arms:
+    joints: [left_s0, left_s1, left_e0, left_e1, left_w0, left_w1, left_w2]
+  object: {{kind: y}}
+  grasp:
+    left: {{holder: left_gripper, held: w_T2}}
+recordings:
+  estimate: [{data}/joints.h5]
+track:
+  frames: {data}/frames
+  pictures: 1
+"""
+
+
+@pytest.fixture
+def cli(capsys):
+    def run(*arguments):
+        code = main([str(argument) for argument in arguments])
+        captured = capsys.readouterr()
+        return SimpleNamespace(code=code, out=captured.out, err=captured.err)
+
+    return run
+
+
+@pytest.fixture
+def config(repository, tmp_path):
+    file = tmp_path / "small.yaml"
+    file.write_text(CONFIG.format(data=repository / "tests" / "vision" / "data"))
+    return file
+
+
+def test_track_makes_a_recording_that_solve_reads(cli, config, tmp_path, small, system):
+    done = cli("track", config, "--out", tmp_path / "run")
+    assert done.code == 0, done.err
+    assert "3 of 3 frames are good" in done.out
+    assert "w_T1" in done.out
+    assert "tracking" in done.err
+    made = read_recording(tmp_path / "run" / "recording.h5")
+    group = next(group for group in made.points if group.name == "points_camera")
+    assert group.names == ("w_T1", "w_T3")
+    truth = small.truth[:, [system.points.index(name) for name in group.names]]
+    assert np.linalg.norm(group.position - truth, axis=2).max() < 0.008
+    assert made.joints is not None
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert result["format"] == "yid-track/1"
+    assert [frame["reason"] for frame in result["frames"]] == ["", "", ""]
+    assert result["clock"]["estimated"] is False  # the clouds hold no arm
+    assert len(result["inputs"]) == 4
+    pictures = sorted(path.stem.rpartition("_")[2] for path in (tmp_path / "run" / "pictures").glob("*.png"))
+    assert pictures == sorted(STAGES)
+    assert (tmp_path / "run" / "track.png").is_file()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (["track.frames=nowhere"], "no such folder of frames"),
+        (["track.unit=mm"], "not one frame could be used"),
+        (["recordings.estimate=[]"], "no recording with the joint angles"),
+        (["track.options.clock.offset=50"], "their clocks are not the same"),
+        (["track.pose=[[1,0,0,0],[0,1,0,0],[0,0,2,0],[0,0,0,1]]"], "not a rigid transform"),
+        (["track.options.d_mix=0.02"], "did you mean 'd_max'"),
+        (["track.options.filters.padding=-1"], "padding = -1"),
+    ],
+)
+def test_wrong_input_is_said_and_leaves_nothing(cli, config, tmp_path, settings, message):
+    arguments = [part for setting in settings for part in ("--set", setting)]
+    done = cli("track", config, "--out", tmp_path / "run", *arguments)
+    assert done.code == 2
+    assert message in done.err
+    assert "Traceback" not in done.err
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("name", ["track_single_arm", "track_dual_arm"])
+def test_the_examples_run(cli, repository, tmp_path, name):
+    pytest.importorskip("mujoco", reason="virtual films need MuJoCo")
+    file = repository / "configs" / f"{name}.yaml"
+    short = ("duration=1.2", "rate=2.5", "dropped=0.0")
+    arguments = [part for setting in short for part in ("--set", f"track.virtual.{setting}")]
+    quick = ("--quiet", "--set", "track.pictures=0", "--set", "track.keep_frames=true")
+    done = cli("track", file, "--out", tmp_path / "run", *arguments, *quick)
+    assert done.code == 0, done.err
+    assert done.out.strip() == str(tmp_path / "run")
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert all(entry["largest"] < 0.015 for entry in result["truth_errors"].values())
+    assert set(result["truth_errors"]) == ({"w_T1", "w_T3"} if name == "track_single_arm" else {"w_T1"})
+    assert len(list((tmp_path / "run" / "frames").glob("*.ply"))) == len(result["frames"])
