@@ -323,7 +323,8 @@ def solve_summary(result: dict[str, Any]) -> list[str]:
 def track_summary(result: dict[str, Any]) -> list[str]:
     """Lines that tell a person what a `yid-track/1` result says."""
     truth = result["truth_errors"]
-    rows: Rows = [("point", "frames", "± std [mm]", "error, median [mm]", "error, largest [mm]")]
+    heads = ("error, median [mm]", "error, largest [mm]") if truth else ("", "")
+    rows: Rows = [("point", "frames", "± std [mm]", *heads)]
     for name, entry in result["points"].items():
         cells = ["" if entry["std"] is None else f"{1e3 * entry['std']:.1f}"]
         cells += [f"{1e3 * truth[name][key]:.1f}" if name in truth else "" for key in ("median", "largest")]

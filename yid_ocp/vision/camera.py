@@ -274,7 +274,7 @@ def film(
         An Asus Xtion Pro Live where absent.
     shutter : Shutter, optional
     room : Room, optional
-        A floor under the paper's Y and a wall behind Baxter where absent.
+        A floor under the paper's Y and a wall behind Baxter where absent; nothing where there is no robot either.
     values : mapping of str to float, optional
         Parameter values (lengths, radii); nominal where absent.
     seed : int
