@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -44,7 +46,7 @@ def test_history_falls_and_is_told(short):
     solution = solve(short, GaussNewton(), callback=told.append)
     costs = [entry.cost for entry in solution.history]
     assert told == list(solution.history)
-    assert all(after <= before * (1 + 1e-12) for before, after in zip(costs, costs[1:], strict=False))
+    assert all(after <= before * (1 + 1e-12) for before, after in itertools.pairwise(costs))
     assert solution.cost == pytest.approx(costs[-1], rel=1e-9)
 
 

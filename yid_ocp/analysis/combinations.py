@@ -12,6 +12,7 @@ Array = NDArray[np.float64]
 
 MISMATCH = 0.05  # of a direction against that of a plain combination, both of unit length
 STRETCH = 1.3  # factor on the first parameter in the test of a combination at a finite change
+MOST_NAMES = 4  # in a sentence
 NOTHING = 0.1  # a combination holds when the data then move by less than this share of what one change alone does
 
 
@@ -74,14 +75,23 @@ def combination_words(parts: Sequence[Component], moved: Callable[[Mapping[str, 
     if len(parts) == 1:
         return f"{parts[0].name} is not seen"
     names = [part.name for part in parts]
-    listed = f"{', '.join(names[:-1])} and {names[-1]}"
+    listed = listed_names(names)
     if len(parts) == 2 and moved is not None:
         form = _form(parts[0], parts[1], moved)
         if form is not None:
             return f"{listed} are seen only as {form.words.format(a=names[0], b=names[1])}"
     largest = max(abs(part.part) for part in parts)
-    trade = " with ".join(f"{part.name} {10 * part.part / largest:+.2g} %" for part in parts)
-    return f"{listed} are seen only together: {trade} changes nothing that is measured"
+    shown = parts if len(parts) <= MOST_NAMES else sorted(parts, key=lambda part: -abs(part.part))[:MOST_NAMES]
+    trade = " with ".join(f"{part.name} {10 * part.part / largest:+.2g} %" for part in shown)
+    rest = " and the others to match" if len(shown) < len(parts) else ""
+    return f"{listed} are seen only together: {trade}{rest} changes nothing that is measured"
+
+
+def listed_names(names: Sequence[str]) -> str:
+    """Names in a row, all but the first few counted only."""
+    if len(names) > MOST_NAMES:
+        return f"{', '.join(names[:MOST_NAMES])} and {len(names) - MOST_NAMES} more"
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 def _form(first: Component, second: Component, moved: Callable[[Mapping[str, float]], float]) -> Form | None:

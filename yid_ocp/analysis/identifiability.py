@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from yid_ocp.analysis.combinations import Component, combination_words, sparse_basis
+from yid_ocp.analysis.combinations import Component, combination_words, listed_names, sparse_basis
 from yid_ocp.analysis.profile import Profile, best_fit, profile_likelihood
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ConfigError, SolverError, nearest
@@ -41,7 +41,7 @@ class ParameterInformation:
     std : float
         Standard deviation with all other unknowns free; infinite where nothing informs it.
     std_relative : float
-        The same over the value.
+        The same over the value, over its typical size where the value is zero.
     std_alone : float
         Relative deviation if everything else were known.
     verdict : str
@@ -195,8 +195,7 @@ def identifiability(
     information = sensitivity.T @ sensitivity
 
     deviation = np.sqrt(np.diag(covariance)[chosen])
-    limit = 1e6 * np.maximum(np.abs(x[chosen]), np.maximum(np.abs(wide.start[chosen]), 1e-12))
-    deviation = np.where(deviation < limit, deviation, np.inf)
+    deviation = np.where(deviation < 1e6 * np.maximum(scale, np.abs(wide.start[chosen])), deviation, np.inf)
     profiles = {}
     if wanted:
         best, there = best_fit(wide, x)
@@ -216,7 +215,7 @@ def identifiability(
             std,
             std / float(scale[i]),
             1.0 / float(alone[i]) if alone[i] > 0 else math.inf,
-            lowered(verdict(value, std), interval),
+            lowered(verdict(float(scale[i]), std), interval),
             interval,
         )
     known = np.isfinite(deviation)
@@ -454,7 +453,12 @@ class _Seer:
     def _strength(self, size: float, vector: Array) -> str:
         parts = self._components(vector)
         how = "is seen" if size * IDENTIFIABLE >= 1.0 else "is seen only weakly"
-        what = parts[0].name if len(parts) == 1 else "a joint change of " + _listed([part.name for part in parts])
+        what = (
+            parts[0].name
+            if len(parts) == 1
+            else "a joint change of "
+            + listed_names([part.name for part in sorted(parts, key=lambda part: -abs(part.part))])
+        )
         return f"{what} {how} (± {100 / size:.2g} %)"
 
 
@@ -465,7 +469,3 @@ def _completed(wide: Array, rest: Sequence[int], blind: NDArray[np.bool_]) -> Ar
     result = np.zeros((int(blind.sum()), wide.shape[1]))
     result[:, rest] = vectors.T
     return result
-
-
-def _listed(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
