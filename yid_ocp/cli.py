@@ -105,7 +105,7 @@ def _identifiability(arguments: argparse.Namespace) -> int:
         at="initial" if arguments.initial else "solution",
         start="known" if arguments.known_start else "unknown",
         grasp_std=None if arguments.known_grasp else Question().grasp_std,
-        intervals="all" if arguments.intervals == "all" else () if arguments.intervals == "none" else names,
+        intervals={"auto": "auto", "all": "all", "none": ()}.get(arguments.intervals, names),
         what_if=arguments.what_if,
     )
     with _progress(arguments.quiet) as monitor:
@@ -119,9 +119,8 @@ def _identifiability(arguments: argparse.Namespace) -> int:
 def _identifiability_arguments(parser: argparse.ArgumentParser) -> None:
     configured()(parser)
     parser.add_argument("--what-if", action="store_true", help="rank changes of the experiment; takes a few minutes")
-    parser.add_argument(
-        "--intervals", metavar="NAMES", default="all", help="profile likelihood of: all (default), none, or NAME,NAME"
-    )
+    text = "95 %% intervals by profile likelihood of: all, none, or NAME,NAME; by default all if they are few"
+    parser.add_argument("--intervals", metavar="NAMES", default="auto", help=text)
     parser.add_argument("--initial", action="store_true", help="judge at the initial values, without solving")
     parser.add_argument("--known-start", action="store_true", help="take initial states as known, not estimated along")
     parser.add_argument("--known-grasp", action="store_true", help="take the places of grasps as known")
@@ -390,7 +389,11 @@ def identifiability_summary(result: dict[str, Any]) -> list[str]:
         rows.append((name, f"{entry['value']:.4g}", *spread, interval, entry["unit"], words[entry["verdict"]]))
     lines = [*table(rows), ""]
     hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"]
+    if len(hidden) > 8:
+        hidden = [*hidden[:8], f"and {len(hidden) - 8} more directions, in result.json"]
     lines += [*hidden, ""] if hidden else []
+    if not result["profiles"]:
+        lines.append("intervals of parameters are worked out on request: --intervals NAME,NAME or --intervals all")
     lines += [f"{name}: {note}" for name, entry in result["profiles"].items() for note in entry["notes"]]
     asked = result["what_if"]
     if asked is not None:

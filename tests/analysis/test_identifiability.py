@@ -220,6 +220,19 @@ def test_an_estimated_start_can_be_judged_as_known(held_tube):
     assert identifiability(estimated, start="known").nuisances == ()
 
 
+def test_a_start_fitted_to_points_becomes_the_centre_of_a_prior(pendulum, twin):
+    empty = pendulum()
+    made = pendulum(twin(empty, empty.start, 3))
+    recordings = [episode.recording for episode in made.episodes]
+    options = replace(made.options, initial_state="given", start_window=0.05)
+    given = EstimationProblem(made.step, recordings, made.free, options)
+    known, unknown = identifiability(given, start="known"), identifiability(given)
+    assert known.nuisances == ()
+    assert unknown.nuisances == ("start.q.elbow[twin]", "start.p.elbow[twin]")
+    for name, entry in known.parameters.items():
+        assert entry.std < unknown.parameters[name].std
+
+
 # -- words ------------------------------------------------------------------------------------------------------------
 
 
@@ -253,6 +266,13 @@ def test_other_combinations_are_described():
     words = "k1 and k2 are seen only together: k1 +10 % with k2 -7.5 % changes nothing that is measured"
     assert combination_words(parts, moved_by(lambda a, b: a**0.6 * b**0.8)) == words
     assert combination_words(parts, None) == words
+
+
+def test_many_parameters_are_counted():
+    parts = [Component(f"k{i}", 0.1 * (i + 1), 1.0, "N/m") for i in range(7)]
+    words = combination_words(parts, None)
+    assert words.startswith("k0, k1, k2, k3 and 3 more are seen only together: k6 +10 % with k5 +8.6 % with")
+    assert words.endswith("and the others to match changes nothing that is measured")
 
 
 def test_sparse_basis_separates_pairs():

@@ -106,6 +106,15 @@ def test_an_interval_of_an_unknown_parameter(cli, repository, tmp_path, left_not
     left_nothing()
 
 
+def test_a_passive_joint_that_is_none(cli, repository, tmp_path, left_nothing):
+    file = repository / "configs" / "springs_series_ends.yaml"
+    settings = ("--set", "model.arms.passive=[spring_1, spring_9]")
+    done = cli("identifiability", file, "--out", tmp_path / "run", *settings)
+    assert done.code == 2
+    assert "there is no joint 'spring_9'" in done.err
+    left_nothing()
+
+
 def test_a_failed_solve_leaves_no_point_to_judge_at(cli, repository, tmp_path, monkeypatch):
     from yid_ocp.solvers import GaussNewton, Status, solve
     from yid_ocp.workflow import identifiability

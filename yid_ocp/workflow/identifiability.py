@@ -26,6 +26,7 @@ from yid_ocp.workflow.folder import Monitor, Silent, both, input_hashes, new_run
 from yid_ocp.workflow.settings import GraspSettings, Run, dump_config
 
 FORMAT = "yid-identifiability/1"
+MOST_INTERVALS, MOST_UNKNOWNS = 12, 300  # beyond, profiles take long and are worked out only where asked for
 OTHER_SIDE = {"left": "right", "right": "left"}
 
 
@@ -41,8 +42,9 @@ class Question:
         Whether initial states are estimated along.
     grasp_std : float or None
         Prior deviation of where the grasps sit [m]; None for grasps that are known.
-    intervals : "all" or sequence of str
-        Parameters whose interval by profile likelihood is wanted.
+    intervals : "auto", "all" or sequence of str
+        Parameters whose interval by profile likelihood is wanted; `auto` for all of a small problem, none of a large
+        one.
     what_if : bool
         Whether to rank changes of the experiment.
     """
@@ -50,7 +52,7 @@ class Question:
     at: Literal["solution", "initial"] = "solution"
     start: StartKnowledge = "unknown"
     grasp_std: float | None = GRASP_STD
-    intervals: Literal["all"] | Sequence[str] = "all"
+    intervals: Literal["auto", "all"] | Sequence[str] = "auto"
     what_if: bool = False
 
 
@@ -111,11 +113,15 @@ def run_identifiability(
 
             solution = solve(problem, run.solver.method, callback=both(note, watcher.iterate))
         if solution is None or solution.status != Status.FAILED:
-            watcher.stage("Fisher information" + (" and intervals" if asked.intervals else ""))
-            information = identifiability(
-                problem, solution, start=asked.start, grasp_std=asked.grasp_std, intervals=asked.intervals
-            )
+            watcher.stage("Fisher information")
             known = identifiability(problem, solution, start="known", grasp_std=None)
+            information = identifiability(problem, solution, start=asked.start, grasp_std=asked.grasp_std)
+            wanted = _wanted(information, asked)
+            if wanted:
+                watcher.stage(f"intervals of {len(wanted)} parameters by profile likelihood")
+                information = identifiability(
+                    problem, solution, start=asked.start, grasp_std=asked.grasp_std, intervals=wanted
+                )
         if information is not None and asked.what_if:
             other = second_arm(run, system)
             ranking = what_if(
@@ -137,6 +143,15 @@ def run_identifiability(
             findings = Findings(run.name, run.description, written, solution=solution)
             write_report(folder.path / "report.html", findings)
     return IdentifiabilityOutcome(folder.path, written, information)
+
+
+def _wanted(information: Identifiability, asked: Question) -> Sequence[str]:
+    """Parameters whose intervals are worked out."""
+    if asked.intervals not in ("auto", "all"):
+        return asked.intervals
+    count = len(information.names)
+    small = count <= MOST_INTERVALS and count + len(information.nuisances) <= MOST_UNKNOWNS
+    return information.names if small or asked.intervals == "all" else ()
 
 
 def _nuisanced(system: System, asked: Question) -> System:
