@@ -72,27 +72,33 @@ def configured(optional: bool = False) -> Callable[[argparse.ArgumentParser], No
 # -- commands ---------------------------------------------------------------------------------------------------------
 
 
+def _carry_out(
+    arguments: argparse.Namespace,
+    run: Run,
+    command: Callable[..., Any],
+    summary: Callable[[dict[str, Any]], list[str]],
+    *extra: Any,
+) -> Any:
+    """Run a command of the workflow under a progress bar, tell a person its result, and say where it is."""
+    with _progress(arguments.quiet) as monitor:
+        outcome = command(run, arguments.out, monitor, *extra)
+    if not arguments.quiet:
+        _print(summary(outcome.result))
+    _say_folder(outcome.folder, arguments.quiet)
+    return outcome
+
+
 def _solve(arguments: argparse.Namespace) -> int:
     from yid_ocp.workflow.solve import run_solve
 
-    run = _load(arguments)
-    with _progress(arguments.quiet) as monitor:
-        outcome = run_solve(run, arguments.out, monitor)
-    if not arguments.quiet:
-        _print(solve_summary(outcome.result))
-    _say_folder(outcome.folder, arguments.quiet)
+    outcome = _carry_out(arguments, _load(arguments), run_solve, solve_summary)
     return DONE if outcome.ok else FAILED
 
 
 def _compare(arguments: argparse.Namespace) -> int:
     from yid_ocp.workflow.compare import run_compare
 
-    run = _load(arguments)
-    with _progress(arguments.quiet) as monitor:
-        outcome = run_compare(run, arguments.out, monitor)
-    if not arguments.quiet:
-        _print(compare_summary(outcome.result))
-    _say_folder(outcome.folder, arguments.quiet)
+    outcome = _carry_out(arguments, _load(arguments), run_compare, compare_summary)
     return DONE if outcome.ok else FAILED
 
 
@@ -108,11 +114,7 @@ def _identifiability(arguments: argparse.Namespace) -> int:
         intervals={"auto": "auto", "all": "all", "none": ()}.get(arguments.intervals, names),
         what_if=arguments.what_if,
     )
-    with _progress(arguments.quiet) as monitor:
-        outcome = run_identifiability(run, arguments.out, monitor, question)
-    if not arguments.quiet:
-        _print(identifiability_summary(outcome.result))
-    _say_folder(outcome.folder, arguments.quiet)
+    outcome = _carry_out(arguments, run, run_identifiability, identifiability_summary, question)
     return DONE if outcome.ok else FAILED
 
 
@@ -131,11 +133,7 @@ def _diagnose(arguments: argparse.Namespace) -> int:
     from yid_ocp.workflow.diagnose import run_diagnose
 
     run = load_config(arguments.config, arguments.overrides, DIAGNOSIS_DEFAULT)
-    with _progress(arguments.quiet) as monitor:
-        outcome = run_diagnose(run, arguments.out, monitor)
-    if not arguments.quiet:
-        _print(diagnose_summary(outcome.result))
-    _say_folder(outcome.folder, arguments.quiet)
+    _carry_out(arguments, run, run_diagnose, diagnose_summary)
     return DONE
 
 
@@ -165,36 +163,21 @@ def _simulate_arguments(parser: argparse.ArgumentParser) -> None:
 def _check(arguments: argparse.Namespace) -> int:
     from yid_ocp.workflow.check import run_check
 
-    run = _load(arguments)
-    with _progress(arguments.quiet) as monitor:
-        outcome = run_check(run, arguments.out, monitor)
-    if not arguments.quiet:
-        _print(check_summary(outcome.result))
-    _say_folder(outcome.folder, arguments.quiet)
+    _carry_out(arguments, _load(arguments), run_check, check_summary)
     return DONE
 
 
 def _track(arguments: argparse.Namespace) -> int:
     from yid_ocp.workflow.track import run_track
 
-    run = _load(arguments)
-    with _progress(arguments.quiet) as monitor:
-        outcome = run_track(run, arguments.out, monitor)
-    if not arguments.quiet:
-        _print(track_summary(outcome.result))
-    _say_folder(outcome.folder, arguments.quiet)
+    _carry_out(arguments, _load(arguments), run_track, track_summary)
     return DONE
 
 
 def _inspect(arguments: argparse.Namespace) -> int:
     from yid_ocp.workflow.inspect import run_inspect
 
-    run = _load(arguments)
-    with _progress(arguments.quiet) as monitor:
-        outcome = run_inspect(run, arguments.out, monitor)
-    if not arguments.quiet:
-        _print(inspect_summary(outcome.result))
-    _say_folder(outcome.folder, arguments.quiet)
+    _carry_out(arguments, _load(arguments), run_inspect, inspect_summary)
     return DONE
 
 

@@ -341,15 +341,37 @@ class EstimationProblem:
         predicted : ndarray, shape (M, k)
         sensitivities : ndarray, shape (M, k, d)
         """
+        effort = np.zeros((len(samples.nodes), self.system.size))
+        y, total = self._read(samples, state, by_state, effort, None, theta, self._columns)
+        return samples.interpolate(y), samples.interpolate(total)
+
+    def _read(
+        self,
+        samples: Samples,
+        state: Array,
+        by_state: Array | None,
+        effort: Array,
+        by_effort: Array | None,
+        theta: Array,
+        wanted: tuple[str, ...],
+    ) -> tuple[Array, Array]:
+        """Readings at the samples' nodes, (nodes, k), and their derivatives by d directions, (nodes, k, d).
+
+        `effort` has a row for every node of the samples; `by_effort` is that of prescribed joints along the rollout.
+        """
         n, nodes = self.system.size, samples.nodes
-        effort = np.zeros((len(nodes), n))
         q, z = state[nodes, :n], state[nodes, 2 * n :]
-        y, by_q, by_z, _, by_theta = self.sensor(samples.sensor, self._columns)(q, z, effort, theta)
+        y, by_q, by_z, by_load, by_theta = self.sensor(samples.sensor, wanted)(q, z, effort, theta)
+        if by_state is None:
+            return y[:, :, 0], np.zeros((*y.shape[:2], 0))
         total = by_q @ by_state[nodes, :n]
         if z.shape[1]:
             total += by_z @ by_state[nodes, 2 * n :]
-        total[:, :, : len(self._columns)] += by_theta
-        return samples.interpolate(y[:, :, 0]), samples.interpolate(total)
+        fixed = list(self.system.prescribed_indices)
+        if fixed and by_effort is not None and np.any(by_load):
+            total += by_load[:, :, fixed] @ by_effort[np.minimum(nodes, len(by_effort) - 1)]
+        total[:, :, : len(wanted)] += by_theta
+        return y[:, :, 0], total
 
     def sensor(self, sensor: Sensor, wanted: tuple[str, ...]) -> Mapped:
         """Compiled readings of a sensor, with derivatives by the named parameters."""
@@ -401,23 +423,12 @@ class EstimationProblem:
         unmoved, late = samples, self.lateness(samples, theta, wanted)
         if late is not None:
             samples = samples.late(late[0])
-        n, nodes = self.system.size, samples.nodes
-        q, z = sweep.state[nodes, :n], sweep.state[nodes, 2 * n :]
-        effort = self._efforts(sweep)[nodes]
-        y, by_q, by_z, by_effort, by_theta = self.sensor(samples.sensor, wanted)(q, z, effort, theta)
-        predicted = samples.interpolate(y[:, :, 0])
-        if not derivatives or sweep.by_state is None:
-            return predicted, np.zeros((*predicted.shape, 0))
-        total = by_q @ sweep.by_state[nodes, :n]
-        if z.shape[1]:
-            total += by_z @ sweep.by_state[nodes, 2 * n :]
-        fixed = list(self.system.prescribed_indices)
-        if fixed and sweep.by_effort is not None and np.any(by_effort):
-            total += by_effort[:, :, fixed] @ sweep.by_effort[np.minimum(nodes, len(sweep.effort) - 1)]
-        total[:, :, : len(wanted)] += by_theta
-        slopes = samples.interpolate(total)
-        if late is not None:
-            slopes[:, :, : len(wanted)] -= samples.slope(y[:, :, 0], unmoved, late[0])[:, :, None] * late[1]
+        by_state = sweep.by_state if derivatives else None
+        effort = self._efforts(sweep)[samples.nodes]
+        y, total = self._read(samples, sweep.state, by_state, effort, sweep.by_effort, theta, wanted)
+        predicted, slopes = samples.interpolate(y), samples.interpolate(total)
+        if late is not None and by_state is not None:
+            slopes[:, :, : len(wanted)] -= samples.slope(y, unmoved, late[0])[:, :, None] * late[1]
         return predicted, slopes
 
     def lateness(self, samples: Samples, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array] | None:
