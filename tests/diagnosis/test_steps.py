@@ -10,7 +10,6 @@ import scipy.stats
 
 from yid_ocp.diagnosis import closure, confusability, linearise, null_test, refit, residual_series, scores, visibility
 from yid_ocp.diagnosis.hypotheses import Composed, Series, chosen_effects, smoothed_colour
-from yid_ocp.diagnosis.localise import by_effort
 from yid_ocp.diagnosis.score import robust, shape_grid
 from yid_ocp.diagnosis.select import Loss, gain, within_reach
 from yid_ocp.effects import make_effect
@@ -159,17 +158,3 @@ def test_the_simplest_within_one_standard_error_wins(screened):
     two = refit(composed, (effects["joint_coulomb@elbow"], effects["effort_offset@shoulder"]), nominal.values)
     assert within_reach([two, one])[0] is one
     assert nominal not in within_reach([nominal, one])
-
-
-def test_effort_residuals_say_which_joint():
-    rng = np.random.default_rng(10)
-    series = [
-        Series("run", f"joints.effort.{joint}", "joints.effort", "N m", 0.01 * np.arange(500), rows, np.ones(1))
-        for joint, rows in (("a", np.arange(500)), ("b", np.arange(500, 1000)))
-    ]
-    r = rng.standard_normal(1000)
-    r[500:] *= 3
-    places = by_effort(series, r, ())
-    assert [p.location for p in places] == ["b", "a"]
-    assert places[0].share > 0.95
-    assert sum(p.share for p in places) == pytest.approx(1)

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.hypotheses import Choice, Composed, Series, chosen_effects, residual_series
-from yid_ocp.diagnosis.localise import Place, localise
+from yid_ocp.diagnosis.localise import attributed, localise, merged
 from yid_ocp.diagnosis.null_test import NullTest, noise_floor, null_test
 from yid_ocp.diagnosis.score import (
     Confusability,
-    Linearisation,
     Score,
     Visibility,
     confusability,
@@ -24,6 +23,7 @@ from yid_ocp.diagnosis.score import (
 )
 from yid_ocp.diagnosis.score import scores as score_all
 from yid_ocp.diagnosis.select import Closure, Fit, closure, gain, refit, refit_all, within_reach
+from yid_ocp.diagnosis.smoother import Smoothed, smooth
 from yid_ocp.diagnosis.verdict import Absorbed, Added, Finding, Thresholds, decide, has_gap, next_experiment
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import DataError, SolverError
@@ -100,23 +100,33 @@ def diagnose(
     seen = visibility(point)
     ranked = score_all(point, series, seen)
     alike = confusability(point, ranked)
-    where = localise(series, nominal.evaluation.residual, before, ranked, seen)
     clock.lap("screening")
     enough = before.degrees >= limits.samples_per_unknown * len(nominal.values)
     gap = has_gap(before, held, limits)
     fits: tuple[Fit, ...] = ()
     added: tuple[Added, ...] = ()
+    smoothed = None
+    if gap and enough:
+        say("locating the gap")
+        smoothed = smooth_fit(nominal)
+    clock.lap("localisation")
     if gap and enough and ranked:
         fits, added = compose(composed, nominal, ranked, alike, limits, say)
     clock.lap("refits")
     total = closure(nominal.loss, added[-1].fit.loss) if added else Closure(np.nan, np.nan, np.nan)
-    verdict = decide(gap, seen, added, total, limits, enough)
+    explainable = 1.0 if smoothed is None else smoothed.explainable
+    verdict = decide(gap, seen, added, total, limits, enough, explainable)
     accepted = added if verdict in ("effect", "confusable") else ()
     last = accepted[-1].fit if accepted else nominal
+    where = () if smoothed is None else localise(smoothed)
     remaining, rest_where = held, where
     if accepted:
         remaining = held_out_test(last, limits.level)
-        rest_where = _remaining_where(composed, accepted, series, limits)
+        after = null_test(series, last.evaluation.residual, len(last.values), limits.level)
+        rest_where = localise(smooth_fit(last)) if has_gap(after, remaining, limits) else ()
+        where = attributed(
+            where, _closed(accepted), rest_where, merged([(w.begin, w.end) for w in before.windows if w.flagged])
+        )
     clock.lap("remaining")
     unseen = [entry.effect.label for entry in seen if not entry.visible]
     return Finding(
@@ -127,6 +137,7 @@ def diagnose(
         seen,
         alike,
         ranked,
+        smoothed,
         where,
         nominal,
         fits,
@@ -289,15 +300,19 @@ def _pruned(composed: Composed, nominal: Fit, added: tuple[Added, ...], say: Pro
     return tuple(kept)
 
 
-def _remaining_where(
-    composed: Composed, added: Sequence[Added], series: Sequence[Series], limits: Thresholds
-) -> tuple[Place, ...]:
-    fit = added[-1].fit
-    residual = fit.evaluation.residual
-    test = null_test(series, residual, len(fit.values), limits.level)
-    point: Linearisation = linearise(composed, [entry.effect for entry in added], fit.values, 2)
-    seen: tuple[Visibility, ...] = visibility(point)
-    return localise(series, residual, test, score_all(point, series, seen), seen)
+def smooth_fit(fit: Fit) -> Smoothed:
+    """The weak-constraint smoother about a fitted model."""
+    return smooth(fit.problem, fit.problem.unknowns(fit.values), fit.evaluation)
+
+
+def _closed(added: Sequence[Added]) -> dict[str, float]:
+    """What the effects at every location close, of the whole gap, each by what it adds to those before it."""
+    closed: dict[str, float] = {}
+    before = 0.0
+    for entry in added:
+        closed[entry.effect.location] = closed.get(entry.effect.location, 0.0) + max(entry.closure.value - before, 0.0)
+        before = max(entry.closure.value, before)
+    return closed
 
 
 def absorption(before: Fit, after: Fit) -> tuple[Absorbed, ...]:

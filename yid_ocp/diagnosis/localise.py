@@ -1,9 +1,4 @@
-"""Step four: where the gap lies.
-
-Efforts of prescribed joints need no inference: the discrete inverse dynamics makes the residual of a joint the
-generalized force that the model lacks there. Anywhere else the promised decreases of all candidates are compared place
-by place; a place that no visible candidate reaches is not observable.
-"""
+"""Step four: where the gap lies, by the weak-constraint smoother and, once effects are added, by what they close."""
 
 from __future__ import annotations
 
@@ -13,13 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.diagnosis.hypotheses import Series
-from yid_ocp.diagnosis.null_test import NullTest, Window
-from yid_ocp.diagnosis.score import Score, Visibility
+from yid_ocp.diagnosis.smoother import Smoothed, Source
 
 Array = NDArray[np.float64]
 
-EFFORT = "joints.effort."
+SURE = 3.0
+"""Deviations that an unknown must be away from zero to say when the gap is there."""
+MAPPED = 0.5
+"""1 - posterior/prior variance from which an unknown's value is informed by the data."""
 
 
 @dataclass(frozen=True)
@@ -43,59 +39,100 @@ class Place:
     windows: tuple[tuple[float, float], ...]
 
 
-def localise(
-    series: Sequence[Series],
-    residual: Array,
-    test: NullTest,
-    scores: Sequence[Score],
-    visible: Sequence[Visibility],
-) -> tuple[Place, ...]:
-    """Locations by their share of the gap, largest first."""
-    if series and all(s.channel.startswith(EFFORT) for s in series):
-        return by_effort(series, residual, test.windows)
-    return by_scores(scores, visible, test.windows)
+def localise(smoothed: Smoothed) -> tuple[Place, ...]:
+    """Places by their share of the log evidence, largest first; places without a share where a gap would have shown.
 
-
-def by_effort(series: Sequence[Series], residual: Array, windows: Sequence[Window]) -> tuple[Place, ...]:
-    """Shares of prescribed joints in the excess of the whitened effort residual over noise."""
-    excess: dict[str, float] = {}
-    for s in series:
-        joint = s.channel.removeprefix(EFFORT)
-        excess[joint] = excess.get(joint, 0.0) + float(np.sum(residual[s.rows] ** 2)) - len(s.rows)
-    flagged = {
-        joint: _merged([w for w in windows if w.flagged and w.channel == f"{EFFORT}{joint}"]) for joint in excess
-    }
-    return _ranked({joint: max(value, 0.0) for joint, value in excess.items()}, set(excess), flagged)
-
-
-def by_scores(scores: Sequence[Score], visible: Sequence[Visibility], windows: Sequence[Window]) -> tuple[Place, ...]:
-    """Shares of places in the decrease of r'r that the best candidate of each promises."""
-    places = dict.fromkeys(entry.effect.location for entry in visible)
-    seen = {entry.effect.location for entry in visible if entry.visible}
-    best = dict.fromkeys(places, 0.0)
-    for score in scores:
-        best[score.effect.location] = max(best[score.effect.location], score.decrease)
-    when = _merged([w for w in windows if w.flagged])
-    return _ranked(best, seen, dict.fromkeys(places, when))
-
-
-def _ranked(
-    amounts: Mapping[str, float], observable: set[str], windows: Mapping[str, tuple[tuple[float, float], ...]]
-) -> tuple[Place, ...]:
-    total = sum(amounts.values())
+    Parameters
+    ----------
+    smoothed : Smoothed
+    """
+    weight: dict[str, float] = {}
+    observable: dict[str, bool] = {}
+    for source, value in smoothed.weight.items():
+        weight[source.location] = weight.get(source.location, 0.0) + value
+        noticed = smoothed.detectable[source] < 1.0
+        observable[source.location] = observable.get(source.location, False) or noticed or value > 0
+    total = sum(weight.values())
     found = [
-        Place(location, amount / total if total > 0 else 0.0, location in observable, windows[location])
-        for location, amount in amounts.items()
+        Place(
+            location,
+            value / total if total > 0 else 0.0,
+            observable[location],
+            _windows(smoothed, [s for s in smoothed.weight if s.location == location and smoothed.variance[s]]),
+        )
+        for location, value in weight.items()
     ]
-    return tuple(sorted(found, key=lambda place: -place.share))
+    return tuple(sorted(found, key=lambda place: (-place.share, not place.observable)))
 
 
-def _merged(windows: Sequence[Window]) -> tuple[tuple[float, float], ...]:
-    """Stretches of time that flagged windows cover."""
+def _windows(smoothed: Smoothed, sources: Sequence[Source]) -> tuple[tuple[float, float], ...]:
+    spans = []
+    for trace in smoothed.traces:
+        own = [i for i, source in enumerate(trace.sources) if source in sources]
+        if own:
+            sure = np.any(np.abs(trace.mean[:, own]) > SURE * np.maximum(trace.std[:, own], 1e-12), axis=1)
+            spans += [(float(trace.edges[j]), float(trace.edges[j + 1])) for j in np.flatnonzero(sure)]
+    return merged(spans)
+
+
+def merged(spans: Sequence[tuple[float, float]]) -> tuple[tuple[float, float], ...]:
+    """Stretches of time that overlapping or touching spans cover."""
     joined: list[list[float]] = []
-    for begin, end in sorted((w.begin, w.end) for w in windows):
+    for begin, end in sorted(spans):
         if joined and begin <= joined[-1][1] + 1e-9:
             joined[-1][1] = max(joined[-1][1], end)
         else:
             joined.append([begin, end])
     return tuple((a, b) for a, b in joined)
+
+
+def attributed(
+    before: Sequence[Place],
+    closed: Mapping[str, float],
+    rest: Sequence[Place],
+    windows: tuple[tuple[float, float], ...],
+) -> tuple[Place, ...]:
+    """Places of a gap that effects explain: their locations by what each closes, then those of what is left.
+
+    Parameters
+    ----------
+    before : sequence of Place
+        Of the nominal model.
+    closed : mapping of location to float
+        Part of the gap that the effects there close.
+    rest : sequence of Place
+        Of the model with the effects.
+    windows : tuple of (float, float)
+        When the residual was more than noise, for locations that the smoother has no unknown for (`world`, `clock`).
+    """
+    known = {place.location: place for place in before}
+    left = max(1.0 - sum(closed.values()), 0.0)
+    share = dict(closed)
+    for place in rest:
+        share[place.location] = share.get(place.location, 0.0) + left * place.share
+    total = sum(share.values())
+    found = []
+    for location in dict.fromkeys([*share, *known]):
+        first = known.get(location)
+        when = first.windows if first is not None and first.windows else windows if location in closed else ()
+        part = share.get(location, 0.0) / total if total > 0 else 0.0
+        found.append(Place(location, part, location in closed or (first is not None and first.observable), when))
+    return tuple(sorted(found, key=lambda place: (-place.share, not place.observable)))
+
+
+def informed_map(smoothed: Smoothed, recording: int = 0) -> tuple[Array, tuple[str, ...], Array]:
+    """Unknowns of one recording in deviations of their posterior, NaN where the data do not inform them.
+
+    Returns
+    -------
+    edges : ndarray, shape (J + 1,)
+        [s]
+    names : tuple of str, length nd
+    values : ndarray, shape (J, nd)
+    """
+    trace = smoothed.traces[recording]
+    prior = np.array([smoothed.variance[source] for source in trace.sources])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        informed = 1 - trace.std**2 / prior
+        values = np.where((prior > 0) & (informed > MAPPED), trace.mean / trace.std, np.nan)
+    return trace.edges, trace.unknowns, values

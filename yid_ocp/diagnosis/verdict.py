@@ -11,6 +11,7 @@ from yid_ocp.diagnosis.localise import Place
 from yid_ocp.diagnosis.null_test import Floor, NullTest
 from yid_ocp.diagnosis.score import Confusability, Score, Visibility
 from yid_ocp.diagnosis.select import Closure, Fit, closure
+from yid_ocp.diagnosis.smoother import Smoothed
 from yid_ocp.effects import EffectBase
 
 FORMAT = "yid-diagnosis/1"
@@ -97,6 +98,8 @@ class Finding:
     confusability : Confusability
     scores : tuple of Score
         First pass, best first.
+    smoothed : Smoothed or None
+        Unknown forces, offsets and biases about the nominal model; None where there is no gap to locate.
     where : tuple of Place
     nominal : Fit
     fits : tuple of Fit
@@ -124,6 +127,7 @@ class Finding:
     visibility: tuple[Visibility, ...]
     confusability: Confusability
     scores: tuple[Score, ...]
+    smoothed: Smoothed | None
     where: tuple[Place, ...]
     nominal: Fit
     fits: tuple[Fit, ...]
@@ -172,6 +176,9 @@ class Finding:
                 if self.effects and len(entry.rivals) > 1
             ],
             "next_experiment": self.next_experiment,
+            "side": None if self.smoothed is None else self.smoothed.side,
+            "evidence": {} if self.smoothed is None else dict(self.smoothed.evidence),
+            "explainable": None if self.smoothed is None else self.smoothed.explainable,
             "summary": sentences(self),
             "message": self.message,
             "held_out_in_blocks": self.in_blocks,
@@ -258,7 +265,13 @@ def has_gap(before: NullTest, held_out: NullTest, limits: Thresholds) -> bool:
 
 
 def decide(
-    gap: bool, visible: Sequence[Visibility], added: Sequence[Added], total: Closure, limits: Thresholds, enough: bool
+    gap: bool,
+    visible: Sequence[Visibility],
+    added: Sequence[Added],
+    total: Closure,
+    limits: Thresholds,
+    enough: bool,
+    explainable: float = 1.0,
 ) -> str:
     """The verdict of step eight.
 
@@ -273,12 +286,14 @@ def decide(
     limits : Thresholds
     enough : bool
         Whether there are samples enough for the unknowns.
+    explainable : float
+        Part of the gap that unknown forces, offsets and biases explain.
     """
     if not enough or not any(entry.visible for entry in visible):
         return "insufficient_data"
     if not gap:
         return "no_gap"
-    if not added or not total.low > limits.closure or total.value < limits.explained:
+    if not added or not total.low > limits.closure or total.value < limits.explained * explainable:
         return "unknown"
     return "confusable" if len(added[0].rivals) > 1 else "effect"
 
@@ -357,6 +372,9 @@ def _out_of_range(effect: EffectBase, fit: Fit) -> list[str]:
     return found
 
 
+SIDES = {"plant": ", in the mechanics rather than in what sensors read", "sensor": ", in what sensors read"}
+
+
 def sentences(finding: Finding) -> str:
     """The report in words."""
     held, first = finding.held_out_before, finding.before
@@ -375,7 +393,8 @@ def sentences(finding: Finding) -> str:
         )
         main = [p for p in finding.where if p.share > 0.1] or list(finding.where[:1])
         named = " and ".join(f"{p.location} ({100 * p.share:.0f} %)" for p in main[:3])
-        text.append(f"It lies in {named}." if named else "")
+        side = "" if finding.smoothed is None else SIDES.get(finding.smoothed.side, "")
+        text.append(f"It lies in {named}{side}." if named else "")
     if finding.effects:
         last = finding.last
         names = "; ".join(f"{e.label} with {_figures(e, last)}" for e in finding.effects)
