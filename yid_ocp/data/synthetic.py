@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import ModuleType
-from typing import Any
+from typing import Any, Protocol
 
 import casadi as ca
 import numpy as np
@@ -286,6 +286,22 @@ class Motion:
         return Motion(system.driven, amplitude, frequency, phase, ramp)
 
 
+class ForeignTerms(Protocol):
+    """Terms that the simulator has and the system's description has not."""
+
+    def prepare(self, model: Any) -> None:
+        """Edit the compiled `mujoco.MjModel`."""
+        ...
+
+    def begin(self, data: Any) -> None:
+        """Told when the motion begins, at rest."""
+        ...
+
+    def force(self, model: Any, data: Any) -> None:
+        """Add generalized forces to `data.qfrc_passive`; called at every inner step."""
+        ...
+
+
 @dataclass(frozen=True)
 class SimulatedRun:
     """What happened in the simulator, free of noise.
@@ -328,6 +344,7 @@ def simulate_in_mujoco(
     time_step: float = INNER_STEP,
     posture: Mapping[str, float] | None = None,
     frame_times: ArrayLike = (),
+    foreign: ForeignTerms | None = None,
 ) -> SimulatedRun:
     """Let the controller follow a motion in MuJoCo, from static equilibrium at the initial posture.
 
@@ -351,6 +368,8 @@ def simulate_in_mujoco(
         Initial angles; `initial_posture` where absent.
     frame_times : array_like, shape (M,)
         When a camera looks [s], increasing, in [0, duration].
+    foreign : ForeignTerms, optional
+        What is at work beside the system's description.
 
     Returns
     -------
@@ -379,6 +398,32 @@ def simulate_in_mujoco(
         )
     mujoco = mujoco_module()
     model = compiled_model(mujoco_xml(system, values, time_step=time_step))
+    if foreign is None:
+        return _followed(mujoco, model, system, values, motion, duration, rate, time_step, posture, frame_times, None)
+    foreign.prepare(model)
+    mujoco.set_mjcb_passive(foreign.force)
+    try:
+        return _followed(
+            mujoco, model, system, values, motion, duration, rate, time_step, posture, frame_times, foreign
+        )
+    finally:
+        mujoco.set_mjcb_passive(None)
+
+
+def _followed(
+    mujoco: ModuleType,
+    model: Any,
+    system: System,
+    values: Mapping[str, float] | None,
+    motion: Motion,
+    duration: float,
+    rate: float,
+    time_step: float,
+    posture: Mapping[str, float] | None,
+    frame_times: ArrayLike,
+    foreign: ForeignTerms | None,
+) -> SimulatedRun:
+    inner = round(1.0 / (rate * time_step))
     data = mujoco.MjData(model)
     # Every joint has one coordinate, so positions, velocities and joints share their addresses.
     order = np.array([model.joint(name).id for name in system.mechanism.joint_names])
@@ -387,6 +432,8 @@ def simulate_in_mujoco(
     data.qpos[:] = model.qpos_spring
     data.qpos[[model.joint(name).id for name in start]] = list(start.values())
     balance = _settle(mujoco, model, data, driven)
+    if foreign is not None:
+        foreign.begin(data)
 
     free = copy.copy(model)
     free.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
@@ -467,6 +514,7 @@ def virtual_experiment(
     camera_pose: ArrayLike | None = None,
     time_step: float = INNER_STEP,
     posture: Mapping[str, float] | None = None,
+    foreign: ForeignTerms | None = None,
     name: str = "virtual",
     description: str = "",
 ) -> Recording:
@@ -505,6 +553,8 @@ def virtual_experiment(
         Of the simulator [s].
     posture : mapping of str to float, optional
         Initial angles; `initial_posture` where absent.
+    foreign : ForeignTerms, optional
+        What is at work beside the system's description.
     name, description : str
         Of the recording; how it was made is appended to the description.
 
@@ -530,7 +580,15 @@ def virtual_experiment(
             raise ConfigError(f"the camera cannot see '{point}'", allowed=", ".join(system.points))
     times = _frame_times(streams[4], duration, camera_rate, camera_gaps) if vision and visible else np.empty(0)
     run = simulate_in_mujoco(
-        system, values, motion, duration=duration, rate=rate, time_step=time_step, posture=start, frame_times=times
+        system,
+        values,
+        motion,
+        duration=duration,
+        rate=rate,
+        time_step=time_step,
+        posture=start,
+        frame_times=times,
+        foreign=foreign,
     )
 
     driven = list(system.driven_indices)

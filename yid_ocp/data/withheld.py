@@ -1,0 +1,422 @@
+"""Effects done to a virtual experiment in the other engine's own terms, for a diagnosis that is not told of them.
+
+Whatever MuJoCo has a term of its own for (joint damping and springs, armature, gravity compensation, inertias, sites)
+is set in its model; other forces are worked out here in NumPy at every inner step; errors of sensors and clocks are
+done to the finished recording. None of the equations of `yid_ocp.effects` take part, but for effects that only change
+the description of the system (masses, lengths, rest angles, gravity, where a grasp sits).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from yid_ocp.data.mjcf import Evaluator, mujoco_module
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.data.synthetic import virtual_experiment
+from yid_ocp.effects import make_effect
+from yid_ocp.effects.base import arms, object_joints
+from yid_ocp.errors import ConfigError, nearest
+from yid_ocp.model.system import System
+
+Array = NDArray[np.float64]
+Force = Callable[[Any, Any], None]
+
+AIR_DENSITY = 1.2
+"""[kg/m^3]"""
+SMOOTHING = 0.02
+"""v_s of dry friction [rad/s]."""
+
+DESCRIBED: tuple[str, ...] = (
+    "density",
+    "point_mass",
+    "length_scale",
+    "link_mass",
+    "rest_curvature",
+    "bend_anisotropy",
+    "gravity_tilt",
+    "grasp_offset",
+)
+MODELLED: tuple[str, ...] = ("kelvin_voigt", "joint_viscous", "joint_spring", "rotor_inertia")
+FORCED: tuple[str, ...] = (
+    "cubic_stiffness",
+    "standard_linear_solid",
+    "hysteresis",
+    "aerodynamic_drag",
+    "gravity_scale",
+    "joint_coulomb",
+    "joint_stribeck",
+)
+READ: tuple[str, ...] = (
+    "effort_gain",
+    "effort_offset",
+    "effort_delay",
+    "encoder_offset",
+    "series_elasticity",
+    "backlash",
+    "camera_translation",
+    "camera_rotation",
+    "camera_scale",
+    "camera_latency",
+    "surface_offset",
+)
+KINDS = (*DESCRIBED, *MODELLED, *FORCED, *READ)
+"""Kinds of the vocabulary that can be done in the other engine."""
+OUTSIDE = ("torque_ripple", "cross_stiffness", "quadratic_stiffness", "gusts")
+"""Effects that are in no library: torque that ripples with the joint's angle, a spring that couples the two bends, one
+that is stiffer one way than the other, wind that comes and goes."""
+
+
+@dataclass(frozen=True)
+class Withheld:
+    """An effect that the data have and the model has not.
+
+    Attributes
+    ----------
+    kind : str
+        Of `KINDS` or `OUTSIDE`.
+    location : str
+    values : mapping of quantity to float
+        As in the vocabulary; for those outside it `size`, in the unit of the force that it makes.
+    """
+
+    kind: str
+    location: str
+    values: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def label(self) -> str:
+        """`kind@location`."""
+        return f"{self.kind}@{self.location}"
+
+
+def withheld_experiment(
+    system: System, values: Mapping[str, float], withheld: Sequence[Withheld], **settings: Any
+) -> Recording:
+    """A virtual experiment with effects that are not in the system's description.
+
+    Parameters
+    ----------
+    system : System
+        Nominal, with driven joints.
+    values : mapping of str to float
+        True parameter values.
+    withheld : sequence of Withheld
+    settings
+        Of `virtual_experiment`.
+
+    Returns
+    -------
+    Recording
+        `truth` is that of the nominal parameters.
+
+    Raises
+    ------
+    ConfigError
+        A kind that cannot be done here.
+    ConfigError, ModelError, DataError
+        As `virtual_experiment`.
+    """
+    known = (*KINDS, *OUTSIDE)
+    for effect in withheld:
+        if effect.kind not in known:
+            raise ConfigError(
+                f"{effect.kind} cannot be done in MuJoCo here",
+                where=effect.label,
+                allowed=", ".join(known),
+                hint=nearest(effect.kind, known),
+            )
+    described = [make_effect(e.kind, e.location, system, e.values) for e in withheld if e.kind in DESCRIBED]
+    changed = system.with_effects(described) if described else system
+    inner = [e for e in withheld if e.kind not in DESCRIBED and e.kind not in READ]
+    foreign = Foreign(changed, values, inner) if inner else None
+    made = virtual_experiment(changed, values, foreign=foreign, **settings)
+    for effect in withheld:
+        if effect.kind in READ:
+            made = misread(made, system, effect)
+    return made
+
+
+class Foreign:
+    """Terms of effects inside MuJoCo: `prepare` edits its model, `force` is called by it at every step.
+
+    Parameters
+    ----------
+    system : System
+    values : mapping of str to float
+    effects : sequence of Withheld
+        Of `MODELLED`, `FORCED` or `OUTSIDE`.
+    """
+
+    def __init__(self, system: System, values: Mapping[str, float], effects: Sequence[Withheld]) -> None:
+        self._system, self._effects = system, tuple(effects)
+        value = Evaluator(system, values)
+        self._stiffness = {s.joint: float(value(s.stiffness)[0]) for s in system.elastic}
+        self._rest = {s.joint: float(value(s.rest)[0]) for s in system.elastic}
+        self._shape = {
+            s.name: (float(value(s.radius)[0]), [float(value(x)[0]) for x in s.lengths]) for s in system.segments
+        }
+        self._forces: list[Force] = []
+        self._running = False
+
+    def prepare(self, model: Any) -> None:
+        """Edit a compiled `mujoco.MjModel` and get ready to push."""
+        for effect in self._effects:
+            size, place = effect.values, effect.location
+            if effect.kind == "kelvin_voigt":
+                for joint in self._joints(place):
+                    model.dof_damping[model.joint(joint).id] += size["tau"] * self._stiffness[joint]
+            elif effect.kind == "joint_viscous":
+                model.dof_damping[model.joint(place).id] += size["b"]
+            elif effect.kind == "rotor_inertia":
+                model.dof_armature[model.joint(place).id] += size["armature"]
+            elif effect.kind == "joint_spring":
+                # MuJoCo has one spring for each joint; arms have none of their own
+                model.jnt_stiffness[model.joint(place).id] = size["stiffness"]
+                model.qpos_spring[model.joint(place).id] = size["rest_angle"]
+            else:
+                self._forces.append(getattr(self, f"_{effect.kind}")(model, place, size))
+
+    def begin(self, data: Any) -> None:
+        """The motion begins; what has a memory has none of what was before."""
+        self._running = True
+
+    def force(self, model: Any, data: Any) -> None:
+        """Add the forces to `qfrc_passive`."""
+        for push in self._forces:
+            push(model, data)
+
+    def _joints(self, segment: str) -> list[str]:
+        return [joint for link in self._system.segment(segment).links for joint in link if joint in self._stiffness]
+
+    def _springs(self, model: Any, segment: str) -> tuple[Array, Array, Array]:
+        joints = self._joints(segment)
+        return (
+            np.array([model.joint(j).id for j in joints]),
+            np.array([self._stiffness[j] for j in joints]),
+            np.array([self._rest[j] for j in joints]),
+        )
+
+    # -- effects of the vocabulary ------------------------------------------------------------------------------------
+
+    def _cubic_stiffness(self, model: Any, place: str, size: Mapping[str, float]) -> Force:
+        at, _, rest = self._springs(model, place)
+        k3 = size["k3"]
+
+        def push(_: Any, data: Any) -> None:
+            data.qfrc_passive[at] -= k3 * (data.qpos[at] - rest) ** 3
+
+        return push
+
+    def _standard_linear_solid(self, model: Any, place: str, size: Mapping[str, float]) -> Force:
+        at, stiffness, _ = self._springs(model, place)
+        branch, time = size["ratio"] * stiffness, size["relaxation_time"]
+        state: dict[str, Any] = {"z": None, "t": 0.0}
+
+        def push(_: Any, data: Any) -> None:
+            if not self._running:
+                return
+            q = np.array(data.qpos[at])
+            if state["z"] is None:
+                state["z"], state["t"] = q.copy(), float(data.time)
+            step = float(data.time) - state["t"]
+            if step > 0:
+                state["z"] = q + (state["z"] - q) * math.exp(-step / time)
+                state["t"] = float(data.time)
+            data.qfrc_passive[at] -= branch * (q - state["z"])
+
+        return push
+
+    def _hysteresis(self, model: Any, place: str, size: Mapping[str, float]) -> Force:
+        at, _, _ = self._springs(model, place)
+        stiffness, angle = size["stiffness"], size["yield_angle"]
+        state: dict[str, Any] = {"z": np.zeros(len(at)), "t": 0.0}
+
+        def push(_: Any, data: Any) -> None:
+            if not self._running:
+                return
+            v = np.array(data.qvel[at])
+            step = float(data.time) - state["t"]
+            if step > 0:
+                state["z"] = state["z"] + step * (v - np.abs(v) * state["z"] / angle)
+                state["t"] = float(data.time)
+            data.qfrc_passive[at] -= stiffness * state["z"]
+
+        return push
+
+    def _aerodynamic_drag(self, model: Any, place: str, size: Mapping[str, float]) -> Force:
+        mujoco = mujoco_module()
+        segment = self._system.segment(place)
+        bodies = [int(model.jnt_bodyid[model.joint(link[-1]).id]) for link in segment.links]
+        radius, lengths = self._shape[place]
+        factor = [AIR_DENSITY * size["cd"] * radius * length for length in lengths]
+        found = np.zeros(6)
+
+        def push(model: Any, data: Any) -> None:
+            for body, scale in zip(bodies, factor, strict=True):
+                mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, found, 0)
+                along = data.xmat[body].reshape(3, 3)[:, 2]
+                normal = found[3:] - along * (along @ found[3:])
+                drag = -scale * np.linalg.norm(normal) * normal
+                mujoco.mj_applyFT(model, data, drag, np.zeros(3), data.xipos[body], body, data.qfrc_passive)
+
+        return push
+
+    def _gravity_scale(self, model: Any, place: str, size: Mapping[str, float]) -> Force:
+        mujoco = mujoco_module()
+        bodies = sorted({int(model.jnt_bodyid[model.joint(joint).id]) for joint in object_joints(self._system)})
+        weights = [size["fraction"] * model.body_mass[body] * np.array(model.opt.gravity) for body in bodies]
+
+        def push(model: Any, data: Any) -> None:
+            for body, weight in zip(bodies, weights, strict=True):
+                mujoco.mj_applyFT(model, data, weight, np.zeros(3), data.xipos[body], body, data.qfrc_passive)
+
+        return push
+
+    def _joint_coulomb(self, model: Any, place: str, size: Mapping[str, float]) -> Force:
+        at = model.joint(place).id
+
+        def push(_: Any, data: Any) -> None:
+            data.qfrc_passive[at] -= size["tau_c"] * math.tanh(data.qvel[at] / SMOOTHING)
+
+        return push
+
+    def _joint_stribeck(self, model: Any, place: str, size: Mapping[str, float]) -> Force:
+        at = model.joint(place).id
+
+        def push(_: Any, data: Any) -> None:
+            v = float(data.qvel[at])
+            fall = math.exp(-((v / size["v_stribeck"]) ** 2))
+            data.qfrc_passive[at] -= size["tau_s"] * fall * math.tanh(v / SMOOTHING)
+
+        return push
+
+    # -- effects outside it -------------------------------------------------------------------------------------------
+
+    def _torque_ripple(self, model: Any, place: str, size: Mapping[str, float]) -> Force:
+        at = model.joint(place).id
+
+        def push(_: Any, data: Any) -> None:
+            data.qfrc_passive[at] += size["size"] * math.sin(60.0 * data.qpos[at])
+
+        return push
+
+    def _bends(self, model: Any, place: str) -> tuple[Array, Array]:
+        links = self._system.segment(place).links
+        return (
+            np.array([model.joint(link[0]).id for link in links]),
+            np.array([model.joint(link[1]).id for link in links]),
+        )
+
+    def _cross_stiffness(self, model: Any, place: str, size: Mapping[str, float]) -> Force:
+        x, y = self._bends(model, place)
+
+        def push(_: Any, data: Any) -> None:
+            qx, qy = np.array(data.qpos[x]), np.array(data.qpos[y])
+            data.qfrc_passive[x] -= size["size"] * qy
+            data.qfrc_passive[y] -= size["size"] * qx
+
+        return push
+
+    def _quadratic_stiffness(self, model: Any, place: str, size: Mapping[str, float]) -> Force:
+        both = np.concatenate(self._bends(model, place))
+
+        def push(_: Any, data: Any) -> None:
+            data.qfrc_passive[both] -= size["size"] * data.qpos[both] ** 2
+
+        return push
+
+    def _gusts(self, model: Any, place: str, size: Mapping[str, float]) -> Force:
+        mujoco = mujoco_module()
+        links = self._system.segment(place).links
+        bodies = [int(model.jnt_bodyid[model.joint(link[-1]).id]) for link in links]
+        rng = np.random.default_rng(int(1e6 * abs(size["size"])) % 2**32)
+        rates, phases = rng.uniform(0.4, 1.6, 3), rng.uniform(0, 2 * math.pi, 3)
+
+        def push(model: Any, data: Any) -> None:
+            if not self._running:
+                return
+            gust = size["size"] * float(np.sum(np.sin(2 * math.pi * rates * data.time + phases)))
+            for body in bodies:
+                wind = np.array([gust, 0.5 * gust, 0.0]) / len(bodies)
+                mujoco.mj_applyFT(model, data, wind, np.zeros(3), data.xipos[body], body, data.qfrc_passive)
+
+        return push
+
+
+# -- sensors and clocks -----------------------------------------------------------------------------------------------
+
+
+def misread(recording: Recording, system: System, effect: Withheld) -> Recording:
+    """The recording as sensors with an error would have made it.
+
+    Parameters
+    ----------
+    recording : Recording
+    system : System
+    effect : Withheld
+        Of `READ`.
+    """
+    if effect.kind.startswith("camera") or effect.kind == "surface_offset":
+        points = tuple(
+            g if g.pose is None else _misseen(g, system, effect, recording.duration) for g in recording.points
+        )
+        return replace(recording, points=points)
+    joints = recording.joints
+    assert joints is not None
+    assert joints.effort is not None
+    return replace(recording, joints=_misfelt(joints, system, effect))
+
+
+def _misfelt(joints: JointGroup, system: System, effect: Withheld) -> JointGroup:
+    assert joints.effort is not None
+    position, effort = joints.position.copy(), joints.effort.copy()
+    size = effect.values
+    if effect.kind == "effort_delay":
+        # what is recorded now acts only after the delay
+        for name in arms(system)[effect.location]:
+            column = joints.names.index(name)
+            effort[:, column] = np.interp(joints.t + size["delay"], joints.t, joints.effort[:, column])
+        return replace(joints, effort=effort)
+    at = joints.names.index(effect.location)
+    if effect.kind == "effort_gain":
+        effort[:, at] *= size["scale"]
+    elif effect.kind == "effort_offset":
+        effort[:, at] += size["offset"]
+    elif effect.kind == "encoder_offset":
+        position[:, at] += size["offset"]
+    elif effect.kind == "series_elasticity":
+        position[:, at] += joints.effort[:, at] / size["stiffness"]
+    elif effect.kind == "backlash":
+        position[:, at] += size["width"] / 2 * np.tanh(joints.effort[:, at] / 0.2)
+    return replace(joints, position=position, effort=effort)
+
+
+def _misseen(group: PointGroup, system: System, effect: Withheld, duration: float) -> PointGroup:
+    assert group.pose is not None
+    size, position = effect.values, group.position
+    centre = np.asarray(group.pose)[:3, 3]
+    if effect.kind == "camera_translation":
+        return replace(group, position=position + np.array([size["x"], size["y"], size["z"]]))
+    if effect.kind == "camera_rotation":
+        turn = Rotation.from_euler("xyz", [size["rx"], size["ry"], size["rz"]]).as_matrix()
+        return replace(group, position=centre + (position - centre) @ turn.T)
+    if effect.kind == "camera_scale":
+        return replace(group, position=centre + size["scale"] * (position - centre))
+    if effect.kind == "camera_latency":
+        late = group.t + size["delay"]
+        inside = late <= duration
+        std = None if group.std is None else group.std[inside]
+        return replace(group, t=late[inside], position=position[inside], std=std)
+    value = Evaluator(system, {})
+    radius = {s.name: float(value(s.radius)[0]) for s in system.segments}
+    own = np.array([radius.get(name.removeprefix("w_"), 0.0) for name in group.names])
+    ray = centre - position
+    away = ray / np.linalg.norm(ray, axis=2, keepdims=True)
+    return replace(group, position=position + size["fraction"] * own[:, None] * away)
