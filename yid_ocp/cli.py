@@ -137,6 +137,26 @@ def _diagnose(arguments: argparse.Namespace) -> int:
     return DONE
 
 
+def _blind(arguments: argparse.Namespace) -> int:
+    from yid_ocp.config import DIAGNOSIS_DEFAULT, load_config
+    from yid_ocp.workflow.blind import run_blind, summary_lines
+
+    run = load_config(arguments.config, arguments.overrides, DIAGNOSIS_DEFAULT)
+    out = arguments.out or f"{run.name}-blind-{arguments.seed}"
+    with _progress(arguments.quiet) as monitor:
+        outcome = run_blind(run, out, arguments.cases, arguments.seed, monitor)
+    if not arguments.quiet:
+        _print(summary_lines(outcome.result))
+    _say_folder(outcome.folder, arguments.quiet)
+    return DONE
+
+
+def _blind_arguments(parser: argparse.ArgumentParser) -> None:
+    configured(optional=True)(parser)
+    parser.add_argument("--cases", type=int, default=20, help="size of the ensemble")
+    parser.add_argument("--seed", type=int, default=1, help="from which it is drawn")
+
+
 def _simulate(arguments: argparse.Namespace) -> int:
     from yid_ocp.workflow.simulate import run_simulate
 
@@ -248,6 +268,12 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command(
         "diagnose", "find the gap between model and recordings, and what makes it", _diagnose, configured(optional=True)
+    ),
+    Command(
+        "blind",
+        "prove the diagnosis on virtual recordings whose effect is withheld; goes on where it was interrupted",
+        _blind,
+        _blind_arguments,
     ),
     Command("simulate", "write what the model says would be recorded", _simulate, _simulate_arguments),
     Command("check", "validate a configuration, its recordings and the model before a long run", _check, configured()),

@@ -1,0 +1,514 @@
+"""The blind proof: recordings whose effect is withheld, answers given without it, labels opened only by the scorer.
+
+An ensemble of virtual experiments is drawn at random: some clean, some with one effect at one, three or ten times its
+detectable size, some with two, some with an effect that is in no library or that the library was robbed of, some with
+twice as many links as the model. Labels are written apart from the recordings and their hash is published before any
+recording is looked at.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.data.recording import Recording
+from yid_ocp.data.synthetic import Motion
+from yid_ocp.data.withheld import KINDS, OUTSIDE, Withheld, withheld_experiment
+from yid_ocp.diagnosis.diagnose import diagnose, nominal_fit
+from yid_ocp.diagnosis.hypotheses import Choice, Composed, chosen_effects
+from yid_ocp.diagnosis.score import DETECTION, Linearisation, linearise
+from yid_ocp.diagnosis.select import closure, refit
+from yid_ocp.diagnosis.verdict import Finding, Thresholds
+from yid_ocp.effects import EFFECTS
+from yid_ocp.effects.base import Quantity, segment_springs
+from yid_ocp.errors import ConfigError, DataError, ModelError
+from yid_ocp.model.system import System
+from yid_ocp.problem import EstimationProblem
+
+Array = NDArray[np.float64]
+Progress = Callable[[str], None]
+
+FORMAT = "yid-blind/1"
+SIZES = (1.0, 3.0, 10.0)
+"""Multiples of the detectable size."""
+SHARES: Mapping[str, float] = {"null": 0.2, "single": 0.5, "outside": 0.15, "left_out": 0.05, "pair": 0.05}
+"""What an ensemble is made of; the rest has a finer chain."""
+SPREAD = 1.5
+"""Factor by which true stiffnesses lie above or below the problem's start, at most."""
+TRAVEL = 0.15
+"""How far the grippers go [m]."""
+
+
+@dataclass(frozen=True)
+class Label:
+    """What is true of a case; sealed until it is scored.
+
+    Attributes
+    ----------
+    case : str
+    category : str
+        null, single, pair, outside, left_out or finer_chain.
+    withheld : tuple of Withheld
+    multiple : float
+        Of the detectable size, as made; NaN where that has no meaning.
+    truth : dict of str to float
+        Nominal parameters.
+    """
+
+    case: str
+    category: str
+    withheld: tuple[Withheld, ...]
+    multiple: float
+    truth: Mapping[str, float]
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON."""
+        return asdict(self) | {"withheld": [asdict(e) for e in self.withheld]}
+
+    @staticmethod
+    def from_dict(data: Mapping[str, Any]) -> Label:
+        """From JSON."""
+        withheld = tuple(Withheld(**entry) for entry in data["withheld"])
+        return Label(data["case"], data["category"], withheld, float(data["multiple"]), data["truth"])
+
+
+@dataclass(frozen=True)
+class Case:
+    """What a diagnosis is given of a case.
+
+    Attributes
+    ----------
+    name : str
+    estimate, held_out : Recording
+    without : tuple of str
+        Kinds that the library is robbed of; always one, mostly one that has nothing to do with the case.
+    """
+
+    name: str
+    estimate: Recording
+    held_out: Recording
+    without: tuple[str, ...]
+
+
+def seal(labels: Sequence[Label]) -> tuple[str, str]:
+    """Labels as text, and the hash by which they are committed to before the run."""
+    text = json.dumps([label.to_dict() for label in labels], indent=1, sort_keys=True)
+    return text, hashlib.sha256(text.encode()).hexdigest()
+
+
+def opened(text: str, commitment: str) -> list[Label]:
+    """Labels from their text.
+
+    Raises
+    ------
+    DataError
+        The text is not the one that was committed to.
+    """
+    if hashlib.sha256(text.encode()).hexdigest() != commitment:
+        raise DataError("the labels are not those that were committed to", where="sealed labels")
+    return [Label.from_dict(entry) for entry in json.loads(text)]
+
+
+# -- the ensemble -----------------------------------------------------------------------------------------------------
+
+
+class Ensemble:
+    """Draws cases of one experiment.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+        Its system, options and free parameters are every case's; its first recording gives the initial posture.
+    seed : int
+    finer : callable, optional
+        The system with so many times its links.
+    candidates : "all" or sequence of str
+        The library.
+
+    Raises
+    ------
+    ConfigError
+        A system without driven joints, which MuJoCo could not be made to move.
+    """
+
+    def __init__(
+        self,
+        problem: EstimationProblem,
+        seed: int,
+        finer: Callable[[int], System] | None = None,
+        candidates: Choice = "all",
+    ) -> None:
+        if not problem.system.driven or problem.system.prescribed:
+            raise ConfigError(
+                "a blind proof moves driven arms",
+                where="model",
+                allowed="a robot whose arms are driven, nothing prescribed",
+            )
+        self.problem, self.seed, self._finer = problem, seed, finer
+        self._candidates = candidates
+        recording = problem.episodes[0].recording
+        assert recording.joints is not None
+        names = list(recording.joints.names)
+        self.posture = {j: float(recording.joints.position[0, names.index(j)]) for j in problem.system.driven}
+        self.vision = any(group.pose is not None for group in recording.points)
+        self._point: Linearisation | None = None
+
+    def _rng(self, *path: int) -> np.random.Generator:
+        return np.random.default_rng([self.seed, *path])
+
+    def truth(self, rng: np.random.Generator) -> dict[str, float]:
+        """True values of the free parameters, log-uniform about their start."""
+        start = dict(zip(self.problem.system.parameters.names, self.problem.theta, strict=True))
+        return {name: float(start[name] * SPREAD ** rng.uniform(-1, 1)) for name in self.problem.free}
+
+    def record(
+        self,
+        truth: Mapping[str, float],
+        withheld: Sequence[Withheld],
+        rng: np.random.Generator,
+        name: str,
+        links: int = 1,
+    ) -> Recording:
+        """One recording, without a word on what is in it."""
+        system = self.problem.system
+        if links > 1:
+            assert self._finer is not None
+            system = self._finer(links)
+        motion = Motion.multisine(
+            self.problem.system, truth, seed=int(rng.integers(2**31)), posture=self.posture, travel=TRAVEL
+        )
+        made = withheld_experiment(
+            system,
+            truth if links == 1 else finer_values(system, truth, links),
+            withheld,
+            motion=motion,
+            seed=int(rng.integers(2**31)),
+            posture=self.posture,
+            vision=self.vision,
+        )
+        return replace(made, name=name, description="", source="", truth={})
+
+    def point(self) -> Linearisation:
+        """The candidates' signatures on a clean recording: what of each would be detectable."""
+        if self._point is None:
+            rng = self._rng(0)
+            clean = self.record(self.truth(rng), (), rng, "clean")
+            problem = self.of(clean)
+            effects = chosen_effects(problem.system, [clean], self._candidates)
+            composed = Composed.of(problem, effects, [self.record(self.truth(rng), (), rng, "other")])
+            self._point = linearise(composed, (), nominal_fit(problem, composed).values)
+        return self._point
+
+    def of(self, recording: Recording) -> EstimationProblem:
+        """The nominal problem of a recording."""
+        nominal = self.problem
+        values = dict(zip(nominal.system.parameters.names, map(float, nominal.theta), strict=True))
+        return EstimationProblem(nominal.step, [recording], nominal.free, nominal.options, values)
+
+    def draw(self, number: int, count: int) -> tuple[Case, Label]:
+        """Case `number` of `count`; the same for the same seed, whatever was drawn before.
+
+        Raises
+        ------
+        ModelError
+            None of several draws could be simulated.
+        """
+        for attempt in range(8):
+            rng = self._rng(1, number, attempt)
+            category = self._category(number, count)
+            truth = self.truth(rng)
+            withheld, multiple = self._withheld(category, rng)
+            links = 2 if category == "finer_chain" else 1
+            name = f"case_{number:03d}"
+            try:
+                estimate, held_out = (
+                    self.record(truth, withheld, rng, f"{name}_{purpose}", links)
+                    for purpose in ("estimate", "held_out")
+                )
+            except ModelError:
+                continue  # the motion throws the object about; draw another
+            robbed = withheld[0].kind if category == "left_out" else self._other_kind(withheld, rng)
+            return Case(name, estimate, held_out, (robbed,)), Label(name, category, withheld, multiple, truth)
+        raise ModelError("no motion of this experiment can be simulated", where=f"case {number}")
+
+    def _category(self, number: int, count: int) -> str:
+        edges = np.cumsum(list(SHARES.values()))
+        # an even spread over the ensemble, in an order that the seed decides
+        order = self._rng(2).permutation(count)
+        position = (float(order[number]) + 0.5) / count
+        place = int(np.searchsorted(edges, position))
+        category = [*SHARES, "finer_chain"][place]
+        return "single" if category == "finer_chain" and self._finer is None else category
+
+    def _other_kind(self, withheld: Sequence[Withheld], rng: np.random.Generator) -> str:
+        at_work = {effect.kind for effect in withheld}
+        kinds = sorted({s.effect.kind for s in self.point().signatures} - at_work)
+        return str(rng.choice(kinds))
+
+    def _withheld(self, category: str, rng: np.random.Generator) -> tuple[tuple[Withheld, ...], float]:
+        if category in ("null", "finer_chain"):
+            return (), math.nan
+        if category == "outside":
+            return (self._outside(rng),), math.nan
+        if category == "pair":
+            (one, size), (two, _) = self._inside(rng, SIZES[-1]), self._inside(rng, SIZES[-1])
+            return ((one, two) if one.label != two.label else (one,)), size
+        size = SIZES[-1] if category == "left_out" else float(rng.choice(SIZES))
+        effect, multiple = self._inside(rng, size)
+        return (effect,), multiple
+
+    def _inside(self, rng: np.random.Generator, wanted: float) -> tuple[Withheld, float]:
+        """An effect of the library at so many times its detectable size, or as near as its range lets it come."""
+        groups: dict[str, dict[str, list[int]]] = {}
+        for i, signature in enumerate(self.point().signatures):
+            if signature.effect.kind in KINDS:
+                places = groups.setdefault(signature.effect.kind, {})
+                places.setdefault(signature.effect.location, []).append(i)
+        best: tuple[Withheld, float] | None = None
+        for _ in range(40):
+            kind = str(rng.choice(sorted(groups)))
+            place = str(rng.choice(sorted(groups[kind])))
+            signature = self.point().signatures[int(rng.choice(groups[kind][place]))]
+            effect = signature.effect
+            quantities: dict[str, Quantity] = {f"{effect.label}.{q.name}": q for q in effect.quantities}
+            room = {n: effect.prior_range[n] for n in effect.amplitudes}
+            neutral = np.array([quantities[n].neutral for n in effect.amplitudes])
+            low, high = (np.array([room[n][side] for n in effect.amplitudes]) - neutral for side in (0, 1))
+            way = rng.uniform(low, high)
+            seen = float(np.linalg.norm(signature.columns @ way))
+            if seen <= 0:
+                continue
+            factor = wanted * DETECTION / seen
+            # as far as the range allows along this way
+            reach = np.min(np.where(way > 0, high, low)[way != 0] / way[way != 0])
+            factor = min(factor, float(reach))
+            values = dict(zip(effect.amplitudes, neutral + factor * way, strict=True)) | signature.shape
+            made = Withheld(kind, place, {n: r.value for n, r in effect.reported(values).items()})
+            multiple = factor * seen / DETECTION
+            if multiple > 0.9 * wanted:
+                return made, wanted
+            if best is None or multiple > best[1]:
+                best = made, multiple
+        assert best is not None
+        return best
+
+    def _outside(self, rng: np.random.Generator) -> Withheld:
+        system = self.problem.system
+        kind = str(rng.choice(OUTSIDE))
+        if kind == "torque_ripple":
+            joint = str(rng.choice(system.driven[: max(len(system.driven) // 2, 1)]))
+            return Withheld(kind, joint, {"size": float(rng.uniform(0.5, 2.0))})
+        segment = str(rng.choice([s.name for s in system.segments]))
+        start = dict(zip(system.parameters.names, self.problem.theta, strict=True))
+        springs = [s for s in segment_springs(system, segment) if s.kind == "bend"]
+        stiffness = float(start.get(f"{segment}.bend", 10.0)) if springs else 10.0
+        sizes = {
+            "cross_stiffness": stiffness * rng.uniform(0.3, 0.6),
+            "quadratic_stiffness": stiffness * rng.uniform(2.0, 5.0),
+            "gusts": rng.uniform(0.05, 0.15),
+        }
+        return Withheld(kind, segment, {"size": float(sizes[kind])})
+
+
+def finer_values(system: System, truth: Mapping[str, float], links: int) -> dict[str, float]:
+    """Values that make the same tube of so many times the links: springs and dampers as many times as strong."""
+    nominal = dict(zip(system.parameters.names, map(float, system.parameters.vector()), strict=True)) | dict(truth)
+    scaled = {f"{s.name}.{what}" for s in system.segments for what in ("bend", "twist", "damping", "twist_damping")}
+    return {name: nominal[name] * links for name in scaled & set(nominal)}
+
+
+# -- answers and score ------------------------------------------------------------------------------------------------
+
+
+def answer(
+    ensemble: Ensemble,
+    case: Case,
+    candidates: Choice = "all",
+    thresholds: Thresholds | None = None,
+    progress: Progress | None = None,
+) -> Finding:
+    """The diagnosis of a case, from its recordings alone."""
+    problem = ensemble.of(case.estimate)
+    choice = library(problem.system, case, candidates)
+    return diagnose(problem, choice, [case.held_out], thresholds=thresholds, progress=progress)
+
+
+def library(system: System, case: Case, candidates: Choice) -> list[str]:
+    """Candidates of a case, as `kind@location`."""
+    effects = chosen_effects(system, [case.estimate], candidates)
+    return [effect.label for effect in effects if effect.kind not in case.without]
+
+
+def best_closure(ensemble: Ensemble, case: Case, label: Label, candidates: Choice = "all") -> float:
+    """Held-out closure of the true effects, refitted: the most that a diagnosis could reach."""
+    problem = ensemble.of(case.estimate)
+    effects = chosen_effects(problem.system, [case.estimate], candidates)
+    composed = Composed.of(problem, effects, [case.held_out])
+    nominal = nominal_fit(problem, composed)
+    true = {entry.label: entry for entry in label.withheld}
+    chosen = [effect for effect in effects if effect.label in true]
+    start = {}
+    for effect in chosen:
+        start.update(_internal(effect.label, true[effect.label].values, effect.quantities))
+    fit = refit(composed, chosen, {**nominal.values, **start})
+    return math.nan if fit is None or len(chosen) < len(true) else closure(nominal.loss, fit.loss).value
+
+
+def _internal(label: str, values: Mapping[str, float], quantities: Sequence[Quantity]) -> dict[str, float]:
+    """Reported values in the parameters' own unit."""
+    found = {}
+    for quantity in quantities:
+        name, _ = quantity.reported
+        if name in values:
+            value = values[name]
+            found[f"{label}.{quantity.name}"] = 1 / value if quantity.reciprocal else value
+    return found
+
+
+@dataclass(frozen=True)
+class Mark:
+    """How one answer compares with its label.
+
+    Attributes
+    ----------
+    case, category, truth, verdict, answer : str
+    multiple : float
+    gap : bool
+        Whether a gap was reported.
+    kind_first, kind_second, location_first : bool
+        The true kind at the true place is first, or among the first two, of the candidates; the true place comes first.
+    confusable : tuple of str
+        Set that was named as not separable.
+    right : bool
+        As the verdict asks: no_gap of a clean one, the true effect alone or in a set of at most three, unknown at the
+        right place outside the library.
+    closure, best : float
+        Held out, of what was added and of the true effects refitted.
+    errors : dict of str to (float, bool)
+        Relative error of every parameter of the true effect where it was added, and whether its 95 % interval has it.
+    seconds : float
+    """
+
+    case: str
+    category: str
+    truth: str
+    verdict: str
+    answer: str
+    multiple: float
+    gap: bool
+    kind_first: bool
+    kind_second: bool
+    location_first: bool
+    confusable: tuple[str, ...]
+    right: bool
+    closure: float
+    best: float
+    errors: Mapping[str, tuple[float, bool]] = field(default_factory=dict)
+    seconds: float = math.nan
+
+
+def mark(label: Label, result: Mapping[str, Any], best: float = math.nan, seconds: float = math.nan) -> Mark:
+    """Compare a `yid-diagnosis/1` result with its label.
+
+    Parameters
+    ----------
+    label : Label
+    result : mapping
+    best : float
+        Of `best_closure`.
+    seconds : float
+    """
+    verdict = str(result["verdict"])
+    named = [f"{e['kind']}@{e['location']}" for e in result["effects"]]
+    listed = [f"{e['kind']}@{e['location']}" for e in result["which"]]
+    alike = tuple(f"{e['kind']}@{e['location']}" for group in result["confusable"][:1] for e in group)
+    true = [effect.label for effect in label.withheld]
+    places = [p["location"] for p in result["where"]]
+    gap = verdict not in ("no_gap", "insufficient_data")
+    located = bool(true) and bool(places) and places[0] in {effect.location for effect in label.withheld}
+    if label.category in ("null",):
+        right = verdict == "no_gap"
+    elif label.category in ("outside", "left_out"):
+        right = verdict == "unknown" and located
+    elif label.category == "pair":
+        right = set(true) <= {*named, *alike}
+    else:
+        right = bool(true) and (named[:1] == true or (true[0] in alike and len(alike) <= 3))
+    errors: dict[str, tuple[float, bool]] = {}
+    for effect in label.withheld:
+        if effect.label not in named or effect.kind not in EFFECTS:
+            continue
+        entry = result["which"][listed.index(effect.label)]
+        for name, value in effect.values.items():
+            found = entry["parameters"].get(name, {})
+            if found.get("value") is None or found.get("std") is None or not math.isfinite(value):
+                continue
+            miss = found["value"] - value
+            errors[f"{effect.label}.{name}"] = (abs(miss) / max(abs(value), 1e-9), abs(miss) <= 1.96 * found["std"])
+    closed = result["gap"]["closure"]
+    return Mark(
+        label.case,
+        label.category,
+        " + ".join(true) or "-",
+        verdict,
+        " + ".join(named) or "-",
+        label.multiple,
+        gap,
+        bool(true) and listed[:1] == true[:1],
+        bool(true) and true[0] in listed[:2],
+        located,
+        alike,
+        right,
+        math.nan if closed is None else float(closed),
+        best,
+        errors,
+        seconds,
+    )
+
+
+def score(marks: Sequence[Mark]) -> dict[str, Any]:
+    """Rates over an ensemble; None where there was no case of the sort."""
+
+    def rate(values: Sequence[bool | float]) -> float | None:
+        return float(np.mean(values)) if len(values) else None
+
+    singles = [m for m in marks if m.category == "single"]
+    seen = [m for m in singles if m.gap]
+    named = [m for m in seen if m.confusable]
+    strange = [m for m in marks if m.category in ("outside", "left_out")]
+    errors = [entry for m in singles for entry in m.errors.values()]
+    relative = [m.closure / m.best for m in singles if m.best > 0 and math.isfinite(m.closure)]
+    sizes = sorted({m.multiple for m in singles if math.isfinite(m.multiple)})
+    return {
+        "format": FORMAT,
+        "cases": len(marks),
+        "false_alarms": rate([m.gap for m in marks if m.category == "null"]),
+        "detection": {
+            f"{size:.3g}": {
+                "cases": sum(m.multiple == size for m in singles),
+                "gap": rate([m.gap for m in singles if m.multiple == size]),
+                "right": rate([m.right for m in singles if m.multiple == size]),
+            }
+            for size in sizes
+        },
+        "kind_first": rate([m.kind_first for m in seen]),
+        "kind_in_two": rate([m.kind_second for m in seen]),
+        "location_first": rate([m.location_first for m in seen]),
+        "confusable_covers": rate([m.truth in m.confusable for m in named]),
+        "confusable_size": rate([len(m.confusable) for m in named]),
+        "unknown_recall": rate([m.verdict == "unknown" for m in strange]),
+        "unknown_location": rate([m.location_first for m in strange if m.gap]),
+        "pairs_right": rate([m.right for m in marks if m.category == "pair"]),
+        "closure_of_best": rate(relative),
+        "parameter_error": None if not errors else float(np.median([e for e, _ in errors])),
+        "interval_coverage": rate([inside for _, inside in errors]),
+        "seconds": rate([m.seconds for m in marks if math.isfinite(m.seconds)]),
+        "marks": [asdict(m) for m in marks],
+    }
