@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
+import threadpoolctl
 from numpy.typing import NDArray
 
 from yid_ocp.data.recording import Recording
@@ -73,8 +74,19 @@ def diagnose(
     SolverError
         The nominal model cannot be rolled out, or is not whitened.
     """
-    limits = thresholds or Thresholds()
-    say = progress or log.info
+    # the matrices are small: threads of the linear algebra library cost more than they give
+    with threadpoolctl.threadpool_limits(1):
+        return _diagnosed(problem, candidates, held_out, thresholds or Thresholds(), solution, progress or log.info)
+
+
+def _diagnosed(
+    problem: EstimationProblem,
+    candidates: Choice,
+    held_out: Sequence[Recording],
+    limits: Thresholds,
+    solution: Solution | None,
+    say: Progress,
+) -> Finding:
     clock = _Clock()
     if problem.options.weighting != "whitened":
         raise SolverError(

@@ -11,6 +11,7 @@ from enum import Enum
 from typing import Protocol, runtime_checkable
 
 import numpy as np
+import threadpoolctl
 from numpy.typing import NDArray
 
 from yid_ocp.errors import SolverError
@@ -215,6 +216,14 @@ def solve(
     Solution
         Never raises for non-convergence: the status and the best point so far tell.
     """
+    # the matrices are small: threads of the linear algebra library cost more than they give
+    with threadpoolctl.threadpool_limits(1):
+        return _solved(problem, solver, start, callback)
+
+
+def _solved(
+    problem: EstimationProblem, solver: Solver, start: Sequence[float] | None, callback: Callback | None
+) -> Solution:
     begun = time.perf_counter()
     lower, upper = problem.bounds
     first = np.clip(problem.start if start is None else np.asarray(start, float), lower, upper)
