@@ -1,6 +1,6 @@
 """Time to solution of every method from the same start, as ratios to Gauss-Newton in the same run.
 
-    python benchmarks/methods.py [--arms N] [--json FILE]
+python benchmarks/methods.py [--arms N] [--json FILE]
 """
 
 from __future__ import annotations

@@ -1,0 +1,208 @@
+"""Effects as the other engine does them, against the vocabulary's equations as the library has them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.data.synthetic import Motion, mujoco_xml, paper_system
+from yid_ocp.data.withheld import (
+    FORCED,
+    KINDS,
+    MODELLED,
+    OUTSIDE,
+    READ,
+    Foreign,
+    Withheld,
+    misread,
+    withheld_experiment,
+)
+from yid_ocp.effects import EFFECTS, make_effect
+from yid_ocp.errors import ConfigError
+from yid_ocp.model.kinematics import forward_kinematics
+from yid_ocp.model.system import MidpointState
+
+mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
+
+SYSTEM = paper_system(1)
+TRUTH = {"T1.bend": 22.0, "T1.twist": 13.6, "T2.bend": 10.7, "T2.twist": 8.2, "T3.bend": 11.5, "T3.twist": 9.7}
+SIZES = {
+    "kelvin_voigt@T1": {"tau": 0.05},
+    "joint_viscous@left_s1": {"b": 1.3},
+    "joint_spring@left_s1": {"stiffness": 20.0, "rest_angle": -0.4},
+    "cubic_stiffness@T2": {"k3": 40.0},
+    "aerodynamic_drag@T3": {"cd": 2.0},
+    "gravity_scale@object": {"fraction": -0.4},
+    "joint_coulomb@left_e1": {"tau_c": 0.7},
+    "joint_stribeck@left_e1": {"tau_s": 0.7, "v_stribeck": 1.0},
+}
+
+
+def passive(effects, q, v):
+    """MuJoCo's passive forces and joint inertias with effects, in configuration order."""
+    model = mujoco.MjModel.from_xml_string(mujoco_xml(SYSTEM, TRUTH))
+    order = [model.joint(name).id for name in SYSTEM.mechanism.joint_names]
+    data = mujoco.MjData(model)
+    foreign = Foreign(SYSTEM, TRUTH, effects)
+    foreign.prepare(model)
+    foreign.begin(data)
+    data.qpos[order], data.qvel[order] = q, v
+    mujoco.set_mjcb_passive(foreign.force)
+    try:
+        mujoco.mj_forward(model, data)
+    finally:
+        mujoco.set_mjcb_passive(None)
+    return np.array(data.qfrc_passive[order]), np.array(model.dof_armature[order])
+
+
+def symbolic(kind, location, values, q, v):
+    """The library's generalized force."""
+    effect = make_effect(kind, location, SYSTEM, values)
+    changed = SYSTEM.with_effects([effect])
+    sq, sv = ca.SX.sym("q", SYSTEM.size), ca.SX.sym("v", SYSTEM.size)
+    none = ca.SX(0, 1)
+    u, reaction = ca.SX.sym("u", len(SYSTEM.driven)), ca.SX.sym("r", SYSTEM.constraint_count)
+    state = MidpointState(changed, forward_kinematics(changed.mechanism, sq), sq, sv, none, none, u, reaction, {})
+    terms = effect.terms(state)
+    total = ca.gradient(terms.lagrangian, sq)
+    for force in (terms.force, terms.viscous, None if terms.closed is None else terms.closed.force):
+        total = total if force is None else total + force
+    function = ca.Function("f", [sq, sv, changed.parameters.symbols], [total])
+    return np.array(ca.densify(function(q, v, changed.parameters.vector(TRUTH)))).ravel()
+
+
+@pytest.mark.parametrize("label", sorted(set(SIZES) - {"gravity_scale@object"}))
+def test_forces_are_those_of_the_library(label):
+    kind, _, place = label.partition("@")
+    rng = np.random.default_rng(3)
+    q, v = rng.uniform(-0.4, 0.4, SYSTEM.size), rng.uniform(-1, 1, SYSTEM.size)
+    with_it, _ = passive([Withheld(kind, place, SIZES[label])], q, v)
+    without, _ = passive([], q, v)
+    expected = symbolic(kind, place, SIZES[label], q, v)
+    assert np.abs(expected).max() > 1e-4
+    # the library rounds the drag off below a millimetre a second
+    assert with_it - without == pytest.approx(expected, rel=1e-4, abs=1e-6)
+
+
+def test_weight_is_taken_away_without_the_inertia():
+    rng = np.random.default_rng(4)
+    q, v = rng.uniform(-0.4, 0.4, SYSTEM.size), np.zeros(SYSTEM.size)
+    lifted = passive([Withheld("gravity_scale", "object", {"fraction": -1.0})], q, v)[0] - passive([], q, v)[0]
+    effect = make_effect("gravity_scale", "object", SYSTEM, {"fraction": -1.0})
+    weightless, heavy = (
+        mujoco.MjModel.from_xml_string(mujoco_xml(replace(SYSTEM, gravity=g), TRUTH))
+        for g in (ca.SX(ca.DM.zeros(3)), SYSTEM.gravity)
+    )
+    order = [heavy.joint(name).id for name in SYSTEM.mechanism.joint_names]
+    bias = []
+    for model in (heavy, weightless):
+        data = mujoco.MjData(model)
+        data.qpos[order] = q
+        mujoco.mj_forward(model, data)
+        bias.append(np.array(data.qfrc_bias[order]))
+    on_object = [i for i, name in enumerate(SYSTEM.mechanism.joint_names) if not name.startswith("left")]
+    assert lifted[on_object] == pytest.approx((bias[0] - bias[1])[on_object], abs=1e-9)
+    assert effect.label == "gravity_scale@object"
+
+
+def test_a_rotor_is_an_armature():
+    q = np.zeros(SYSTEM.size)
+    _, armature = passive([Withheld("rotor_inertia", "left_e1", {"armature": 0.3})], q, q)
+    assert armature[SYSTEM.mechanism.joint_index("left_e1")] == 0.3
+
+
+def reading(duration=1.0) -> Recording:
+    t = np.linspace(0, duration, 101)
+    names = tuple(SYSTEM.driven)
+    position = np.sin(t)[:, None] * np.ones(len(names))
+    effort = np.cos(3 * t)[:, None] * np.arange(1, len(names) + 1)
+    pose = np.eye(4)
+    pose[:3, 3] = [2.0, 0.0, 0.0]
+    camera = PointGroup(
+        "points_camera", ("w_T1",), t, np.tile([0.5, 0.1, 0.2], (101, 1, 1)), sensor="camera", pose=pose
+    )
+    return Recording(JointGroup(names, t, position, effort=effort), (camera,), name="r")
+
+
+@pytest.mark.parametrize(
+    ("label", "values", "channel", "expected"),
+    [
+        ("effort_gain@left_s1", {"scale": 1.1}, "effort", lambda r: r.joints.effort[:, 1] * 1.1),
+        ("effort_offset@left_s1", {"offset": 0.2}, "effort", lambda r: r.joints.effort[:, 1] + 0.2),
+        ("encoder_offset@left_s1", {"offset": 0.01}, "position", lambda r: r.joints.position[:, 1] + 0.01),
+        (
+            "series_elasticity@left_s1",
+            {"stiffness": 500.0},
+            "position",
+            lambda r: r.joints.position[:, 1] + r.joints.effort[:, 1] / 500,
+        ),
+        (
+            "backlash@left_s1",
+            {"width": 0.01},
+            "position",
+            lambda r: r.joints.position[:, 1] + 0.005 * np.tanh(r.joints.effort[:, 1] / 0.2),
+        ),
+    ],
+)
+def test_joints_are_misread_as_the_table_says(label, values, channel, expected):
+    kind, _, place = label.partition("@")
+    recording = reading()
+    wrong = misread(recording, SYSTEM, Withheld(kind, place, values))
+    assert getattr(wrong.joints, channel)[:, 1] == pytest.approx(expected(recording))
+    other = getattr(wrong.joints, channel)[:, 2]
+    assert other == pytest.approx(getattr(recording.joints, channel)[:, 2])
+
+
+def test_what_is_recorded_late_acts_later():
+    recording = reading()
+    wrong = misread(recording, SYSTEM, Withheld("effort_delay", "left", {"delay": 0.05}))
+    assert wrong.joints.effort[:-6] == pytest.approx(recording.joints.effort[5:-1], abs=1e-9)
+
+
+def test_cameras_misplace_points_as_the_table_says():
+    recording = reading()
+    true = recording.points[0].position
+
+    def seen(kind, **values):
+        return misread(recording, SYSTEM, Withheld(kind, "camera", values)).points[0]
+
+    assert seen("camera_translation", x=0.01, y=0.0, z=-0.01).position == pytest.approx(true + np.array([0.01, 0.0, -0.01]))
+    centre = np.array([2.0, 0.0, 0.0])
+    assert seen("camera_scale", scale=1.02).position == pytest.approx(centre + 1.02 * (true - centre))
+    turned = seen("camera_rotation", rx=0.0, ry=0.0, rz=0.1).position - centre
+    assert np.linalg.norm(turned, axis=2) == pytest.approx(np.linalg.norm(true - centre, axis=2))
+    assert seen("camera_latency", delay=0.1).t[0] == pytest.approx(0.1)
+    shift = seen("surface_offset", fraction=1.0).position - true
+    assert np.linalg.norm(shift, axis=2) == pytest.approx(0.032)
+
+
+def test_an_effect_acts_on_a_whole_recording_and_leaves_no_trace_of_itself():
+    motion = Motion.multisine(SYSTEM, TRUTH, seed=1)
+    settings = {"motion": motion, "seed": 2, "duration": 0.3, "time_step": 2e-4}
+    clean = withheld_experiment(SYSTEM, TRUTH, (), **settings)
+    pushed = withheld_experiment(
+        SYSTEM, TRUTH, [Withheld("hysteresis", "T1", {"stiffness": 9.0, "yield_angle": 0.1})], **settings
+    )
+    again = withheld_experiment(SYSTEM, TRUTH, (), **settings)
+    assert np.abs(pushed.joints.effort - clean.joints.effort).max() > 1e-3
+    assert again.joints.effort == pytest.approx(clean.joints.effort, abs=0)
+
+
+def test_every_kind_is_done_once_and_what_is_outside_is_not_in_the_library():
+    assert len(set(KINDS)) == len(KINDS)
+    assert set(KINDS) <= set(EFFECTS)
+    assert not set(OUTSIDE) & set(EFFECTS)
+    assert {label.partition("@")[0] for label in SIZES} | {"rotor_inertia", "standard_linear_solid", "hysteresis"} == {
+        *MODELLED,
+        *FORCED,
+    }
+    assert set(READ) <= set(KINDS)
+
+
+def test_a_kind_that_cannot_be_done_is_refused():
+    with pytest.raises(ConfigError, match="grasp_slip"):
+        withheld_experiment(SYSTEM, TRUTH, [Withheld("grasp_slip", "left", {})])
