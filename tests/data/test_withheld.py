@@ -170,7 +170,9 @@ def test_cameras_misplace_points_as_the_table_says():
     def seen(kind, **values):
         return misread(recording, SYSTEM, Withheld(kind, "camera", values)).points[0]
 
-    assert seen("camera_translation", x=0.01, y=0.0, z=-0.01).position == pytest.approx(true + np.array([0.01, 0.0, -0.01]))
+    assert seen("camera_translation", x=0.01, y=0.0, z=-0.01).position == pytest.approx(
+        true + np.array([0.01, 0.0, -0.01])
+    )
     centre = np.array([2.0, 0.0, 0.0])
     assert seen("camera_scale", scale=1.02).position == pytest.approx(centre + 1.02 * (true - centre))
     turned = seen("camera_rotation", rx=0.0, ry=0.0, rz=0.1).position - centre

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,6 +110,26 @@ def prepare_episode(
     if with_loads:
         load = joint_loads(recording, known, grid, smoother)
     return Episode(recording, grid, torque, path, posture, arm, samples, load)
+
+
+def beginning(episode: Episode, steps: int) -> Episode:
+    """The first steps of an episode, with what was measured in them."""
+    steps = min(steps, episode.grid.steps)
+    samples = []
+    for entry in episode.samples:
+        last = min(entry.span[1], steps - (episode.grid.steps - entry.span[1]))
+        early = entry.node + entry.fraction <= last + 1e-9
+        parts = {name: getattr(entry, name)[early] for name in ("node", "fraction", "value", "weight", "std")}
+        samples.append(replace(entry, **parts, span=(entry.span[0], last)))
+    return replace(
+        episode,
+        grid=replace(episode.grid, steps=steps),
+        torque=episode.torque[:steps],
+        path=episode.path[: steps + 1],
+        measured_arm=episode.measured_arm[: steps + 1],
+        samples=tuple(samples),
+        load=episode.load[: steps + 1],
+    )
 
 
 def _samples(

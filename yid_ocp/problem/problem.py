@@ -18,7 +18,7 @@ from yid_ocp.integrator.feedback import lqr_filter, proportional_filter
 from yid_ocp.integrator.rollout import Rest, Statics, adjoint_gradient, simulate
 from yid_ocp.integrator.step import Directions, Feedback, Step, Sweep, check_shape
 from yid_ocp.problem.episodes import Episode as Episode
-from yid_ocp.problem.episodes import apparent_inertia, prepare_episode
+from yid_ocp.problem.episodes import apparent_inertia, beginning, prepare_episode
 from yid_ocp.problem.initial import FittedStart, StartFit
 from yid_ocp.problem.inputs import Smoother
 from yid_ocp.problem.options import ProblemOptions as ProblemOptions
@@ -28,6 +28,11 @@ from yid_ocp.problem.residuals import Samples, huber
 from yid_ocp.sensors import Sensor, sensor_function
 
 Array = NDArray[np.float64]
+
+HELD_OUT_START = 0.2
+"""Time from which the start of a held-out recording is estimated, where starts are [s]."""
+HELD_OUT_ITERATIONS = 3
+"""Gauss-Newton steps of that estimate, which is nearly linear."""
 
 
 @dataclass(frozen=True)
@@ -137,6 +142,7 @@ class EstimationProblem:
         self._feedback: dict[int, Feedback | None] = {}
         self._starts: dict[int, Array] = {}
         self._fitted: dict[int, FittedStart] = {}
+        self._beginnings: dict[int, Episode] = {}
         self._start_fit: StartFit | None = None
 
     # -- the unknown vector -------------------------------------------------------------------------------------------
@@ -682,12 +688,45 @@ class EstimationProblem:
         }
 
     def validate(self, x: ArrayLike) -> list[tuple[Episode, EpisodeResult | str]]:
-        """Predict the held-out recordings with the shared parameters of `x`; local ones stay at their initial value."""
+        """Predict the held-out recordings with the shared parameters of `x`; local ones stay at their initial value.
+
+        An `estimated` start is found from each recording's first `HELD_OUT_START` seconds and its prior.
+        """
         theta, _ = self.split(x, 0)
         for name in self.local:
             theta[self.system.parameters.index(name)] = self.theta[self.system.parameters.index(name)]
-        none = np.zeros(self._start_size)
-        return [(episode, self.run(episode, theta, none, derivatives=False)) for episode in self.held_out]
+        return [
+            (episode, self.run(episode, theta, self._held_out_start(episode, theta), derivatives=False))
+            for episode in self.held_out
+        ]
+
+    def _held_out_start(self, episode: Episode, theta: Array) -> Array:
+        """Deviation of a held-out recording's start from rest, shape (number of estimated rows,)."""
+        deviation = np.zeros(self._start_size)
+        if not self._start_size:
+            return deviation
+        key = id(episode)
+        if key not in self._beginnings:
+            short = beginning(episode, max(round(HELD_OUT_START / self.step.time_step), 2))
+            self._beginnings[key] = short
+            whole = self.feedback(episode)
+            steps = short.grid.steps
+            self._feedback[id(short)] = (
+                None if whole is None else Feedback(whole.index, whole.gain[:steps], whole.reference[:steps])
+            )
+        short, weight = self._beginnings[key], 1.0 / self.start_deviations
+        for _ in range(HELD_OUT_ITERATIONS):
+            result = self.run(short, theta, deviation, derivatives=True)
+            if isinstance(result, str) or result.sensitivities is None:
+                return np.zeros(self._start_size)
+            rows, slopes = [weight * deviation], [np.diag(weight)]
+            for k, samples in enumerate(short.samples):
+                seen = samples.weight > 0
+                rows.append((samples.weight * np.where(seen, result.predicted[k] - samples.value, 0.0))[seen])
+                by_start = result.sensitivities[k][:, :, len(self._columns) :]
+                slopes.append((samples.weight[:, :, None] * by_start)[seen])
+            deviation = deviation - np.linalg.lstsq(np.vstack(slopes), np.concatenate(rows), rcond=None)[0]
+        return deviation
 
     def with_options(self, options: ProblemOptions) -> EstimationProblem:
         """The same problem with other options; recordings, step and free parameters are shared."""
