@@ -1,0 +1,121 @@
+"""A bare arm with efforts from Pinocchio's inverse dynamics: an effect is found at whatever joint it sits."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from yid_ocp.data.recording import JointGroup, Recording
+from yid_ocp.diagnosis import Thresholds, diagnose
+from yid_ocp.integrator.step import compile_step
+from yid_ocp.model import Mechanism, System
+from yid_ocp.model.mechanism import robot_description_file
+from yid_ocp.problem import EstimationProblem, ProblemOptions
+
+pin = pytest.importorskip("pinocchio", reason="the other engine is Pinocchio: pip install pin")
+
+JOINTS = ("s0", "s1", "e0", "e1", "w0", "w1", "w2")
+CENTRE = np.array([0.1, -0.5, 0.2, 1.0, -0.1, 0.8, 0.0])
+DAMPING, NOISE, TIME_STEP = 0.3, 0.05, 0.01
+CANDIDATES = (
+    "joint_spring",
+    "joint_viscous",
+    "joint_coulomb",
+    "effort_gain",
+    "effort_offset",
+    "link_mass",
+    "gravity_tilt",
+)
+
+
+@lru_cache(maxsize=2)
+def robot(side: str):
+    names = tuple(f"{side}_{joint}" for joint in JOINTS)
+    system = System.build(Mechanism.from_urdf("package:baxter", joints=names), prescribed=names, damping=0.05)
+    model = pin.buildModelFromUrdf(str(robot_description_file("baxter")))
+    locked = [j for j in range(1, model.njoints) if model.names[j] not in names]
+    return names, compile_step(system, TIME_STEP), pin.buildReducedModel(model, locked, pin.neutral(model))
+
+
+def recording(side: str, seed: int, extra) -> Recording:
+    """A multi-sine motion with the efforts of inverse dynamics, viscous friction and whatever `extra` adds."""
+    names, _, model = robot(side)
+    data, rng = model.createData(), np.random.default_rng(seed)
+    t = TIME_STEP * np.arange(601)
+    frequency = rng.uniform([0.1, 0.3, 0.7], [0.25, 0.6, 1.2], (7, 3))
+    phase = rng.uniform(0, 2 * np.pi, (7, 3))
+    amplitude = 0.12 / frequency**0.7
+    angle = 2 * np.pi * frequency * t[:, None, None] + phase
+    mirror = np.array([-1, 1, -1, 1, -1, 1, -1]) if side == "right" else np.ones(7)
+    q = mirror * (CENTRE + np.sum(amplitude * np.sin(angle), axis=2))
+    v = mirror * np.sum(2 * np.pi * frequency * amplitude * np.cos(angle), axis=2)
+    a = -mirror * np.sum((2 * np.pi * frequency) ** 2 * amplitude * np.sin(angle), axis=2)
+    column = [model.joints[model.getJointId(name)].idx_v for name in names]
+    effort = np.zeros_like(q)
+    for k in range(len(t)):
+        full = [np.zeros(model.nv) for _ in range(3)]
+        for target, source in zip(full, (q[k], v[k], a[k]), strict=True):
+            target[column] = source
+        effort[k] = pin.rnea(model, data, *full)[column]
+    effort += DAMPING * v + extra(names, q, v, effort) + NOISE * rng.standard_normal(q.shape)
+    joints = JointGroup(names, t, q, velocity=v, effort=effort, effort_std=NOISE, position_std=0.0)
+    return Recording(joints, name=f"{side}_{seed}")
+
+
+def spring(joint: str, stiffness: float, rest: float):
+    def extra(names, q, v, effort):
+        added = np.zeros_like(q)
+        at = names.index(joint)
+        added[:, at] = stiffness * (q[:, at] - rest)
+        return added
+
+    return extra
+
+
+def dry(joint: str, size: float):
+    def extra(names, q, v, effort):
+        added = np.zeros_like(q)
+        at = names.index(joint)
+        added[:, at] = size * np.tanh(v[:, at] / 0.02)
+        return added
+
+    return extra
+
+
+def diagnosed(side: str, extra):
+    names, step, _ = robot(side)
+    free = tuple(f"{name}.damping" for name in names)
+    problem = EstimationProblem(
+        step,
+        [recording(side, 1, extra)],
+        free,
+        ProblemOptions(path_cutoff=float("inf")),
+        held_out=[recording(side, 2, extra)],
+    )
+    return diagnose(problem, CANDIDATES, thresholds=Thresholds(effects=2))
+
+
+@pytest.mark.parametrize(
+    ("side", "joint", "stiffness"), [("left", "left_s1", 20.0), ("left", "left_e1", 8.0), ("right", "right_w1", 3.0)]
+)
+def test_a_spring_is_found_at_any_joint_of_either_arm(side, joint, stiffness):
+    finding = diagnosed(side, spring(joint, stiffness, -0.4))
+    assert finding.verdict in ("effect", "confusable")
+    assert finding.effects[0].label == f"joint_spring@{joint}"
+    assert finding.where[0].location == joint
+    assert finding.closure.value > 0.95
+    found = finding.last.reported(finding.effects[0])
+    assert found["stiffness"].value == pytest.approx(stiffness, rel=0.05)
+
+
+def test_dry_friction_is_told_from_a_spring():
+    finding = diagnosed("left", dry("left_e1", 1.5))
+    assert finding.effects[0].label == "joint_coulomb@left_e1"
+    assert finding.where[0].location == "left_e1"
+
+
+def test_an_arm_as_the_model_says_has_no_gap():
+    finding = diagnosed("left", lambda names, q, v, effort: np.zeros_like(q))
+    assert finding.verdict == "no_gap"
