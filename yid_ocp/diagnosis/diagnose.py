@@ -126,8 +126,7 @@ def _diagnosed(
         fits, added = compose(composed, nominal, ranked, alike, limits, say)
     clock.lap("refits")
     total = closure(nominal.loss, added[-1].fit.loss) if added else Closure(np.nan, np.nan, np.nan)
-    explainable = 1.0 if smoothed is None else smoothed.explainable
-    verdict = decide(gap, seen, added, total, limits, enough, explainable)
+    verdict = decide(gap, seen, added, total, limits, enough, explained_part(nominal, added, smoothed))
     accepted = added if verdict in ("effect", "confusable") else ()
     last = accepted[-1].fit if accepted else nominal
     where = () if smoothed is None else localise(smoothed)
@@ -315,6 +314,19 @@ def _pruned(composed: Composed, nominal: Fit, added: tuple[Added, ...], say: Pro
 def smooth_fit(fit: Fit) -> Smoothed:
     """The weak-constraint smoother about a fitted model."""
     return smooth(fit.problem, fit.problem.unknowns(fit.values), fit.evaluation)
+
+
+def explained_part(nominal: Fit, added: Sequence[Added], smoothed: Smoothed | None) -> float:
+    """Fall of r'r by the effects over that by the smoother, each less what it takes of the noise.
+
+    Both are on the recordings to estimate on, so that the same noise stands in both.
+    """
+    if smoothed is None or not added:
+        return 1.0
+    last = added[-1].fit
+    by_effects = 2 * (nominal.cost - last.cost) - last.size
+    by_smoother = smoothed.before - smoothed.after - (smoothed.degrees_before - smoothed.degrees_after)
+    return float(by_effects / by_smoother) if by_smoother > 0 else 1.0
 
 
 def _closed(added: Sequence[Added]) -> dict[str, float]:

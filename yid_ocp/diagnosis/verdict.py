@@ -30,7 +30,7 @@ class Thresholds:
     closure : float
         A held-out closure whose lower end is below this is no improvement.
     explained : float
-        Part of the gap that can be explained which an effect has to explain.
+        Part of what the smoother explains of the residual which effects have to explain.
     alike : float
         Part of a signature explained by another candidate from which both are refitted.
     refits : int
@@ -271,7 +271,7 @@ def decide(
     total: Closure,
     limits: Thresholds,
     enough: bool,
-    explainable: float = 1.0,
+    explained: float = 1.0,
 ) -> str:
     """The verdict of step eight.
 
@@ -286,14 +286,14 @@ def decide(
     limits : Thresholds
     enough : bool
         Whether there are samples enough for the unknowns.
-    explainable : float
-        Part of the gap that unknown forces, offsets and biases explain.
+    explained : float
+        What the effects explain over what unknown forces, offsets and biases explain.
     """
     if not enough or not any(entry.visible for entry in visible):
         return "insufficient_data"
     if not gap:
         return "no_gap"
-    if not added or not total.low > limits.closure or total.value < limits.explained * explainable:
+    if not added or not total.low > limits.closure or explained < limits.explained:
         return "unknown"
     return "confusable" if len(added[0].rivals) > 1 else "effect"
 
