@@ -407,6 +407,8 @@ class EstimationProblem:
             values, by_all = self._predict(samples, sweep, theta, wanted, derivatives)
             predicted.append(values)
             sensitivities.append(by_all)
+        # states by all directions are the largest arrays of all, and what samples need of them has been taken
+        sweep = replace(sweep, by_state=None, by_multipliers=None, by_effort=None)
         return EpisodeResult(sweep, rest, tuple(predicted), tuple(sensitivities) if derivatives else None)
 
     def _efforts(self, sweep: Sweep) -> Array:
@@ -505,6 +507,7 @@ class EstimationProblem:
                 if derivatives and result.sensitivities is not None:
                     slope = (factor * samples.weight)[:, :, None] * result.sensitivities[k]
                     jacobians.append(self._placed(slope.reshape(-1, slope.shape[2])[keep], i, len(x)))
+        done = tuple(replace(result, sensitivities=None) for result in done)
         prior_residual, prior_jacobian = self.prior(x)
         residual = np.concatenate([*residuals, prior_residual])
         cost += 0.5 * float(prior_residual @ prior_residual)
