@@ -202,6 +202,8 @@ class Composed(EstimationProblem):
         made._everything = everything
         made.readings = _SlicedReadings(system, joint.compiled, everything)
         made._statics = _SlicedStatics(joint, everything)
+        if joint.system.driven and problem.options.feedback == "lqr":
+            _ = made._reference_momentum  # built once, before copies are made
         if not held:
             made.held_out = tuple(_masked(episode, 1) for episode in made.episodes)
             made.episodes = tuple(_masked(episode, 0) for episode in made.episodes)

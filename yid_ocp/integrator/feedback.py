@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import ModelError
+from yid_ocp.integrator.codegen import Mapped
 from yid_ocp.integrator.step import Feedback, Step, compile_step
 from yid_ocp.model.system import System
 
@@ -102,6 +104,62 @@ def lqr_filter(
     n = system.size
     index = np.concatenate([np.array(system.driven_indices), n + np.array(system.driven_indices)])
     return Feedback(index.astype(np.int32), gain, np.hstack([reference[:-1], momenta[:-1]]))
+
+
+class ReferenceMomentum:
+    """Momentum of driven joints along a measured motion as the whole model has it, effects on the arms included.
+
+    `lqr_filter` works the reference out once, without effects; an armature or a heavier link changes what the same
+    motion's momentum is, and the filter would otherwise pull at the difference.
+
+    Parameters
+    ----------
+    step : Step
+
+    Attributes
+    ----------
+    parameters : tuple of str
+        Those on which the momentum depends.
+    """
+
+    def __init__(self, step: Step) -> None:
+        e, system = step.equations, step.system
+        driven = list(system.driven_indices)
+        nu = len(driven)
+        before, now = ca.SX.sym("before", nu), ca.SX.sym("now", nu)
+        whole = []
+        for arm in (before, now):
+            q = ca.SX(ca.DM.zeros(system.size))
+            q[driven] = arm
+            whole.append(q)
+        zero = ca.SX(ca.DM.zeros(e.z0.numel()))
+        [momentum] = ca.substitute([ca.densify(e.p1[driven])], [e.q0, e.q1, e.z0, e.z1], [*whole, zero, zero])
+        pattern = np.array(ca.DM(ca.jacobian_sparsity(momentum, e.theta), 1)).any(axis=0)
+        columns = np.flatnonzero(pattern)
+        self.parameters = tuple(system.parameters.names[i] for i in columns)
+        slope = ca.jacobian(momentum, e.theta)[:, [int(i) for i in columns]]
+        function = ca.Function("momentum", [before, now, e.u, e.theta, e.time_step], [momentum, ca.densify(slope)])
+        self._map = Mapped(function, shared=(3, 4), use_compiler=step.compiled)
+        self._time_step = np.array([step.time_step])
+
+    def along(self, measured: Array, torque: Array, theta: Array, names: Sequence[str]) -> tuple[Array, Array]:
+        """Momentum at every node but the last, shape (N, nu), and its derivative by named parameters, (N, nu, d).
+
+        Parameters
+        ----------
+        measured : ndarray, shape (N + 1, nu)
+        torque : ndarray, shape (N, nu)
+        theta : ndarray, shape (ntheta,)
+        names : sequence of str
+        """
+        before = np.vstack([measured[:1], measured[:-2]])
+        held = np.vstack([torque[:1], torque[:-1]])
+        value, slopes = self._map(before, measured[:-1], held, theta, self._time_step)
+        wide = np.zeros((*value.shape[:2], len(names)))
+        for column, name in enumerate(names):
+            if name in self.parameters:
+                wide[:, :, column] = slopes[:, :, self.parameters.index(name)]
+        return value[:, :, 0], wide
 
 
 def _arms_only(system: System) -> System:

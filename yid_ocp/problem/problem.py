@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import ConfigError, DataError, nearest
 from yid_ocp.integrator.codegen import Mapped
-from yid_ocp.integrator.feedback import lqr_filter, proportional_filter
+from yid_ocp.integrator.feedback import ReferenceMomentum, lqr_filter, proportional_filter
 from yid_ocp.integrator.rollout import Rest, Statics, adjoint_gradient, simulate
 from yid_ocp.integrator.step import Directions, Feedback, Step, Sweep, check_shape
 from yid_ocp.problem.episodes import Episode as Episode
@@ -143,6 +143,7 @@ class EstimationProblem:
         self._starts: dict[int, Array] = {}
         self._fitted: dict[int, FittedStart] = {}
         self._beginnings: dict[int, Episode] = {}
+        self._smoothed: dict[int, Array] = {}
         self._start_fit: StartFit | None = None
 
     # -- the unknown vector -------------------------------------------------------------------------------------------
@@ -231,8 +232,7 @@ class EstimationProblem:
             if system.driven and options.feedback == "proportional":
                 result = proportional_filter(self.step, episode.measured_arm, options.gains)
             elif system.driven and options.feedback == "lqr":
-                smooth = Smoother(options.path_cutoff)(episode.grid.times, episode.measured_arm)
-                result = lqr_filter(self.step, smooth, episode.torque, self.theta)
+                result = lqr_filter(self.step, self._smooth_arm(episode), episode.torque, self.theta)
             self._feedback[key] = result
         return self._feedback[key]
 
@@ -444,7 +444,9 @@ class EstimationProblem:
         for episode in self.episodes:
             inputs = self.inputs(episode, self.theta, self._columns)
             pairs = ((inputs.torque, episode.torque), (inputs.path, episode.path), (inputs.arm, episode.measured_arm))
-            slopes = [x for x in (inputs.by_torque, inputs.by_path, inputs.by_arm) if x is not None]
+            slopes = [x for x in (inputs.by_torque, inputs.by_path, inputs.by_arm, inputs.by_momentum) if x is not None]
+            if inputs.momentum is not None:
+                return False
             for samples in episode.samples:
                 slopes += self.lateness(samples, self.theta, self._columns) or ()
             if any(np.any(x) for x in slopes) or not all(np.array_equal(a, b) for a, b in pairs):
@@ -461,7 +463,27 @@ class EstimationProblem:
         wanted : tuple of str
             Parameters by which to differentiate.
         """
-        return self.readings.inputs(episode, theta, wanted)
+        inputs = self.readings.inputs(episode, theta, wanted)
+        if not self.system.driven or self.options.feedback != "lqr":
+            return inputs
+        reference = self._reference_momentum
+        moving = [self.system.parameters.index(name) for name in reference.parameters]
+        swept = not set(wanted).isdisjoint(reference.parameters)
+        if not swept and np.array_equal(theta[moving], self.system.parameters.vector()[moving]):
+            return inputs
+        momentum, slope = reference.along(self._smooth_arm(episode), episode.torque, theta, wanted)
+        return replace(inputs, momentum=momentum, by_momentum=slope if swept else None)
+
+    @cached_property
+    def _reference_momentum(self) -> ReferenceMomentum:
+        return ReferenceMomentum(self.step)
+
+    def _smooth_arm(self, episode: Episode) -> Array:
+        """Measured angles of the driven joints, smooth enough to be differenced, shape (N + 1, nu)."""
+        key = id(episode)
+        if key not in self._smoothed:
+            self._smoothed[key] = Smoother(self.options.path_cutoff)(episode.grid.times, episode.measured_arm)
+        return self._smoothed[key]
 
     def evaluate(self, x: ArrayLike, derivatives: bool = True) -> Evaluation:
         """Residual, cost and, where asked for, Jacobian at an unknown vector.
@@ -714,6 +736,7 @@ class EstimationProblem:
             self._beginnings[key] = short
             whole = self.feedback(episode)
             steps = short.grid.steps
+            self._smoothed[id(short)] = self._smooth_arm(episode)[: steps + 1]
             self._feedback[id(short)] = (
                 None if whole is None else Feedback(whole.index, whole.gain[:steps], whole.reference[:steps])
             )

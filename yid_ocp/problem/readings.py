@@ -36,6 +36,9 @@ class Inputs:
     arm : ndarray, shape (N + 1, nu)
         Angles of the driven joints [rad].
     by_torque, by_first_torque, by_path, by_arm : ndarray, shape (..., d), or None
+    momentum : ndarray, shape (N, nu), or None
+        Of the driven joints along their measured motion, where it is not that of the tracking filter.
+    by_momentum : ndarray, shape (N, nu, d), or None
     """
 
     torque: Array
@@ -46,6 +49,8 @@ class Inputs:
     by_first_torque: Array | None = None
     by_path: Array | None = None
     by_arm: Array | None = None
+    momentum: Array | None = None
+    by_momentum: Array | None = None
 
     @property
     def posture(self) -> Array:
@@ -58,26 +63,37 @@ class Inputs:
         return np.vstack([np.zeros((x.shape[1], width)) if by is None else by[0] for by, x in parts])
 
     def guided(self, feedback: Feedback | None, driven: tuple[int, ...], measured: Array) -> Feedback | None:
-        """The tracking filter with the true angles in place of the measured ones."""
-        if feedback is None or self.by_arm is None:
+        """The tracking filter with the true angles in place of the measured ones, and the model's momenta."""
+        if feedback is None or (self.by_arm is None and self.momentum is None):
             return feedback
         reference = feedback.reference.copy()
-        for column, row in enumerate(feedback.index):
-            if int(row) in driven:
-                at = driven.index(int(row))
+        for column, at in self._followed(feedback, driven, momenta=False):
+            if self.by_arm is not None:
                 reference[:, column] += (self.arm - measured)[: len(reference), at]
+        for column, at in self._followed(feedback, driven, momenta=True):
+            if self.momentum is not None:
+                reference[:, column] = self.momentum[:, at]
         return Feedback(feedback.index, feedback.gain, reference)
 
     def torque_directions(self, feedback: Feedback | None, driven: tuple[int, ...]) -> Array | None:
         """Derivative of the nominal torque, that of the filter's reference included, shape (N, nu, d)."""
         total = self.by_torque
-        if feedback is not None and self.by_arm is not None:
-            total = np.zeros((*self.torque.shape, self.by_arm.shape[2])) if total is None else total.copy()
-            for column, row in enumerate(feedback.index):
-                if int(row) in driven:
-                    moved = self.by_arm[: len(total), driven.index(int(row))]
-                    total += feedback.gain[:, :, column, None] * moved[:, None, :]
+        for slope, momenta in ((self.by_arm, False), (self.by_momentum, True)):
+            if feedback is None or slope is None:
+                continue
+            total = np.zeros((*self.torque.shape, slope.shape[2])) if total is None else total.copy()
+            for column, at in self._followed(feedback, driven, momenta):
+                total += feedback.gain[:, :, column, None] * slope[: len(total), at][:, None, :]
         return total
+
+    def _followed(self, feedback: Feedback, driven: tuple[int, ...], momenta: bool) -> list[tuple[int, int]]:
+        """Columns of a filter that follow angles, or momenta, and the driven joint of each."""
+        rows = [int(row) for row in feedback.index]
+        if not momenta:
+            return [(column, driven.index(row)) for column, row in enumerate(rows) if row in driven]
+        # momenta come after all coordinates, those of driven joints in the same order
+        later = [column for column, row in enumerate(rows) if row not in driven]
+        return list(zip(later, range(len(driven)), strict=False))
 
 
 class Readings:
