@@ -298,33 +298,42 @@ def time_map(edges: Array, rows: Sequence[Row], axis: str) -> plotly.graph_objec
 
     values = np.array([row.values for row in rows])
     seen = np.abs(values[np.isfinite(values)])
+    # even to the eye from one deviation to thousands
     limit = max(3.0, float(np.quantile(seen, 0.98))) if seen.size else 3.0
+    marks = [m for m in (0, 1, 3, 10, 30, 100, 1000, 10000) if m <= limit]
+    marks = sorted({-m for m in marks} | set(marks))
+    bar = {"thickness": 14, "x": 1.2, "tickvals": [float(_even(m)) for m in marks], "ticktext": [str(m) for m in marks]}
     figure = go.Figure()
     figure.add_heatmap(
-        x=edges.tolist(), y=list(range(len(rows))), z=[_listed(row) for row in values],
-        text=[list(row.texts) for row in rows], hoverinfo="text", zmin=-limit, zmax=limit, colorscale=DIVERGING,
-        colorbar={"thickness": 14, "x": 1.14},
+        x=edges.tolist(), y=list(range(len(rows))), z=[_listed(_even(row)) for row in values],
+        text=[list(row.texts) for row in rows], hoverinfo="text", zmin=-_even(limit), zmax=_even(limit),
+        colorscale=DIVERGING, colorbar=bar,
     )  # fmt: skip
-    figure = _styled(figure, 120 + max(17 * len(rows), 80), "time [s]", "")
-    figure.update_layout(plot_bgcolor=PALE, margin={"r": 110, "t": 40})
+    figure = _styled(figure, 120 + max(17 * len(rows), 100), "time [s]", "")
+    figure.update_layout(plot_bgcolor=PALE, margin={"r": 150, "t": 40})
     figure.add_annotation(
         x=0, xref="paper", xanchor="left", y=1, yref="paper", yanchor="bottom", text=f"color: {axis}", showarrow=False
     )
     figure.update_xaxes(showgrid=False, range=[float(edges[0]), float(edges[-1])])
     names = [row.name for row in rows]
     figure.update_yaxes(
-        showgrid=False, autorange="reversed", tickvals=list(range(len(rows))), ticktext=names, automargin=True,
-        tickfont={"size": 11},
+        showgrid=False, range=[len(rows) - 0.5, -0.5], tickvals=list(range(len(rows))), ticktext=names,
+        automargin=True, tickfont={"size": 11},
     )  # fmt: skip
     groups = [row.group for row in rows]
     for group in dict.fromkeys(groups):
         own = [i for i, entry in enumerate(groups) if entry == group]
         figure.add_annotation(
-            x=1.01, xref="paper", y=(own[0] + own[-1]) / 2, text=group, showarrow=False, xanchor="left", align="left"
-        )
+            x=1.01, xref="paper", y=(own[0] + own[-1]) / 2, text=group, showarrow=False, xanchor="left",
+            font={"size": 11},
+        )  # fmt: skip
         if own[0]:
             figure.add_hline(y=own[0] - 0.5, line={"color": INK, "width": 1})
     return figure
+
+
+def _even(value: Any) -> Any:
+    return np.arcsinh(np.asarray(value, float) / 2)
 
 
 @dataclass(frozen=True)

@@ -156,6 +156,9 @@ def _where(finding: Finding) -> Chapter | None:
         f"A gap would have shown at {', '.join(noticed)}." if noticed else "",
         f"It would not have shown at {', '.join(silent)}: these motions and sensors cannot tell." if silent else "",
     ]
+    left = [f"{p.location} ({100 * p.share:.0f} %)" for p in finding.remaining_where if p.share > 0.1]
+    if finding.effects and left:
+        sentences.append(f"What the effects leave lies in {', '.join(left)}.")
     pictures = []
     for i, trace in enumerate(smoothed.traces[:MAPS]):
         kept = [k for k, source in enumerate(trace.sources) if smoothed.variance[source] > 0]
@@ -179,7 +182,7 @@ def _where(finding: Finding) -> Chapter | None:
                 for j in range(len(trace.mean))
             ]
             source = trace.sources[k]
-            group = f"{source.location}<br>{source.kind} [{unit}]"
+            group = f"{source.location} {source.kind} [{unit}]"
             rows.append(Row(trace.unknowns[k], group, values[:, k], texts))
         pictures.append((f"Recording {trace.recording}", figures.html(figures.time_map(trace.edges, rows, axis))))
         if i == 0:
@@ -203,9 +206,9 @@ def _side(smoothed: Smoothed) -> str:
     }
     evidence = smoothed.evidence
     return (
-        f"By evidence the gap lies in {verdicts[smoothed.side]}: the log evidence rises by {evidence['plant']:.0f} "
-        f"with unknown forces and offsets alone, by {evidence['sensor']:.0f} with biases alone, by "
-        f"{evidence['both']:.0f} with both (5 is odds of 150 to 1). They explain {100 * smoothed.explainable:.0f} % of "
+        f"By evidence the gap lies in {verdicts[smoothed.side]}: the log evidence rises by {evidence['plant']:.4g} "
+        f"with unknown forces and offsets alone, by {evidence['sensor']:.4g} with biases alone, by "
+        f"{evidence['both']:.4g} with both (5 is odds of 150 to 1). They explain {100 * smoothed.explainable:.0f} % of "
         "the gap where it was fitted."
     )
 
@@ -284,7 +287,7 @@ def _alike(finding: Finding, result: Mapping[str, Any]) -> Chapter | None:
         for j in range(i + 1, len(names))
     ]
     close = [f"{a} and {b} ({100 * v:.0f} %)" for v, a, b in sorted(pairs, reverse=True) if v >= ALIKE]
-    listed = f"{', '.join(close[:5])}{f' and {len(close) - 5} more pairs' if len(close) > 5 else ''}"
+    listed = f"{', '.join(close[:5])}{f' and {len(close) - 5} more' if len(close) > 5 else ''}"
     v, a, b = max(pairs)
     sentences = [
         "Per cent of the row's trace in the recordings that the column could make as well, beyond what the stiffnesses "
@@ -326,15 +329,20 @@ def _curves(finding: Finding, predicted: Sequence[Prediction]) -> Chapter | None
     if not found:
         return None
     found.sort(key=lambda entry: -entry[0])
+    # the same joint in every recording would say the same thing again
+    best: dict[str, tuple[float, str, Curve, Curve]] = {}
+    for entry in found:
+        best.setdefault(entry[2].title, entry)
+    chosen = list(best.values())[:CURVES]
     pictures = []
-    for recording in dict.fromkeys(entry[1] for entry in found[:CURVES]):
-        curves = [curve for _, name, *pair in found[:CURVES] if name == recording for curve in pair]
+    for recording in dict.fromkeys(entry[1] for entry in chosen):
+        curves = [curve for _, name, *pair in chosen if name == recording for curve in pair]
         pictures.append(
             (f"Recording {recording}, held out", figures.html(figures.over_time(curves, figures.MEASURED, COLORS)))
         )
     what = "change most with the effects" if changed else "the nominal model misses most"
     sentences = [
-        f"The {min(CURVES, len(found))} held-out coordinates or joints that {what}, measured and predicted; below each "
+        f"The {len(chosen)} held-out coordinates or joints that {what}, measured and predicted; below each "
         "the error, with two deviations of the noise shaded: what is right stays within.",
     ]
     return Chapter("Measured and predicted", sentences, pictures)
