@@ -120,7 +120,7 @@ def test_an_interrupted_diagnosis_takes_up_its_finished_refits(rubbing, tmp_path
     assert counted.count == once - done
     assert close(without_times(again.folder), without_times(whole.folder))
     lines = [json.loads(line) for line in (again.folder / "log.jsonl").read_text().splitlines()]
-    assert {"nothing"} < {line["refit"] for line in lines if line["event"] == "taken_up"}
+    assert {"the nominal model"} < {line["refit"] for line in lines if line["event"] == "taken_up"}
     assert any("took up the refit with" in line.get("text", "") for line in lines)
     assert not (tmp_path / "run.partial").exists()
     assert not list(tmp_path.glob(".*"))
