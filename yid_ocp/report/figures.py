@@ -300,7 +300,7 @@ def time_map(edges: Array, rows: Sequence[Row], axis: str) -> plotly.graph_objec
     seen = np.abs(values[np.isfinite(values)])
     # even to the eye from one deviation to thousands
     limit = max(3.0, float(np.quantile(seen, 0.98))) if seen.size else 3.0
-    marks = [m for m in (0, 1, 3, 10, 30, 100, 1000, 10000) if m <= limit]
+    marks = [m for m in ((0, 1, 3, 10) if limit < 20 else (0, 10, 100, 1000, 10000)) if m <= limit]
     marks = sorted({-m for m in marks} | set(marks))
     bar = {"thickness": 14, "x": 1.2, "tickvals": [float(_even(m)) for m in marks], "ticktext": [str(m) for m in marks]}
     figure = go.Figure()
