@@ -26,7 +26,7 @@ def found(tmp_path_factory, urdf_folder):
     """Findings on a pendulum: friction in the elbow that is named, that no candidate explains, and none at all."""
     folder = tmp_path_factory.mktemp("found")
     rng = np.random.default_rng(1)
-    t = 0.01 * np.arange(201)
+    t = 0.01 * np.arange(151)
     recordings = {}
     for name, phase in (("a", 0.0), ("b", 1.0)):
         position = np.stack([0.5 * np.sin(3 * t + phase), 0.4 * np.cos(5 * t + phase)], axis=1)
@@ -41,12 +41,12 @@ def found(tmp_path_factory, urdf_folder):
         "solver: {path_cutoff: .inf, compiler: false}\n"
     )
     nominal = load_problem(folder / "p.yaml")
-    for rub in (0.0, 0.2):
+    for rub in (0.0, 0.05):
         for problem_episodes in (nominal.episodes, nominal.held_out):
             for episode in problem_episodes:
                 theta = nominal.theta
                 swept = nominal.run(episode, theta, np.zeros(0), derivatives=False)
-                effort = np.vstack([swept.sweep.effort, swept.sweep.effort[-1:]])[:201]
+                effort = np.vstack([swept.sweep.effort, swept.sweep.effort[-1:]])[:151]
                 joints = recordings[episode.name].joints
                 effort = effort + rub * np.sign(np.gradient(joints.position, axis=0)) * [0, 1]
                 effort = effort + 0.02 * rng.standard_normal(effort.shape)
@@ -57,7 +57,7 @@ def found(tmp_path_factory, urdf_folder):
         text = (folder / "p.yaml").read_text().replace("[a.h5]", f"[a_{rub}.h5]").replace("[b.h5]", f"[b_{rub}.h5]")
         (folder / f"p_{rub}.yaml").write_text(text)
     limits = Thresholds(effects=1)
-    rubbing, clean = load_problem(folder / "p_0.2.yaml"), load_problem(folder / "p_0.0.yaml")
+    rubbing, clean = load_problem(folder / "p_0.05.yaml"), load_problem(folder / "p_0.0.yaml")
     return {
         "effect": diagnose(rubbing, ["joint_coulomb", "effort_offset"], thresholds=limits),
         "unknown": diagnose(rubbing, ["effort_offset"], thresholds=limits),
