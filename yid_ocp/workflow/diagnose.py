@@ -136,9 +136,9 @@ def write_trajectories(path: Path, finding: Finding, predicted: Sequence[Predict
     attributes `channels`, `unit`.
 
     `where/RECORDING/` for every recording that was estimated on, where there was a gap to locate: `edges` (J + 1,) [s]
-    of the intervals over which unknowns are constant; `mean` and `std` (J, nd) of the unknown forces, offsets and
-    biases about the nominal model and `prior` (nd,), the deviation at the largest evidence, zero where a group was not
-    taken in; the attributes `unknowns`, `locations`, `kinds`, `units` (nd,) each.
+    since its first node, of the intervals over which unknowns are constant; `mean` and `std` (J, nd) of the unknown
+    forces, offsets and biases about the nominal model and `prior` (nd,), the deviation at the largest evidence, zero
+    where a group was not taken in; the attributes `unknowns`, `locations`, `kinds`, `units` (nd,) each.
 
     Raises
     ------
