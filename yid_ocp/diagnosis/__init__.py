@@ -10,6 +10,7 @@ from yid_ocp.diagnosis.score import confusability as confusability
 from yid_ocp.diagnosis.score import linearise as linearise
 from yid_ocp.diagnosis.score import scores as scores
 from yid_ocp.diagnosis.score import visibility as visibility
+from yid_ocp.diagnosis.select import Refitted as Refitted
 from yid_ocp.diagnosis.select import closure as closure
 from yid_ocp.diagnosis.select import refit as refit
 from yid_ocp.diagnosis.verdict import Finding as Finding

@@ -11,7 +11,7 @@ import threadpoolctl
 from numpy.typing import NDArray
 
 from yid_ocp.data.recording import Recording
-from yid_ocp.diagnosis.hypotheses import Choice, Composed, Series, chosen_effects, residual_series
+from yid_ocp.diagnosis.hypotheses import Choice, Composed, Series, chosen_effects, describe, residual_series
 from yid_ocp.diagnosis.localise import attributed, localise, merged
 from yid_ocp.diagnosis.null_test import NullTest, noise_floor, null_test
 from yid_ocp.diagnosis.score import (
@@ -23,7 +23,7 @@ from yid_ocp.diagnosis.score import (
     visibility,
 )
 from yid_ocp.diagnosis.score import scores as score_all
-from yid_ocp.diagnosis.select import Closure, Fit, closure, gain, refit, refit_all, within_reach
+from yid_ocp.diagnosis.select import Closure, Fit, Store, closure, gain, recalled, refit, refit_all, within_reach
 from yid_ocp.diagnosis.smoother import Smoothed, smooth
 from yid_ocp.diagnosis.verdict import Absorbed, Added, Finding, Thresholds, decide, has_gap, next_experiment
 from yid_ocp.effects import EffectBase
@@ -44,6 +44,7 @@ def diagnose(
     thresholds: Thresholds | None = None,
     solution: Solution | None = None,
     progress: Progress | None = None,
+    store: Store | None = None,
 ) -> Finding:
     """Say whether there is a gap between model and recordings, where, which effect makes it, and how far it closes.
 
@@ -60,6 +61,8 @@ def diagnose(
         Of the nominal problem, where it is known.
     progress : callable, optional
         Told in words what is going on.
+    store : Store, optional
+        Of refits that an earlier run of the same diagnosis finished; told of every further one.
 
     Returns
     -------
@@ -76,7 +79,9 @@ def diagnose(
     """
     # the matrices are small: threads of the linear algebra library cost more than they give
     with threadpoolctl.threadpool_limits(1):
-        return _diagnosed(problem, candidates, held_out, thresholds or Thresholds(), solution, progress or log.info)
+        return _diagnosed(
+            problem, candidates, held_out, thresholds or Thresholds(), solution, progress or log.info, store
+        )
 
 
 def _diagnosed(
@@ -86,6 +91,7 @@ def _diagnosed(
     limits: Thresholds,
     solution: Solution | None,
     say: Progress,
+    store: Store | None,
 ) -> Finding:
     clock = _Clock()
     if problem.options.weighting != "whitened":
@@ -100,7 +106,7 @@ def _diagnosed(
     composed = Composed.of(problem, effects, held_out)
     clock.lap("compose")
     say("fitting the nominal model")
-    nominal = nominal_fit(problem, composed, solution)
+    nominal = nominal_fit(problem, composed, solution, store)
     clock.lap("nominal")
     free = composed.freeing(())
     series = residual_series(free)
@@ -123,7 +129,7 @@ def _diagnosed(
         smoothed = smooth_fit(nominal)
     clock.lap("localisation")
     if gap and enough and ranked:
-        fits, added = compose(composed, nominal, ranked, alike, limits, say)
+        fits, added = compose(composed, nominal, ranked, alike, limits, say, store)
     clock.lap("refits")
     total = closure(nominal.loss, added[-1].fit.loss) if added else Closure(np.nan, np.nan, np.nan)
     verdict = decide(gap, seen, added, total, limits, enough, explained_part(nominal, added, smoothed))
@@ -176,7 +182,9 @@ class _Clock:
         self._last = now
 
 
-def nominal_fit(problem: EstimationProblem, composed: Composed, solution: Solution | None = None) -> Fit:
+def nominal_fit(
+    problem: EstimationProblem, composed: Composed, solution: Solution | None = None, store: Store | None = None
+) -> Fit:
     """The nominal model fitted and placed among the hypotheses.
 
     Raises
@@ -185,6 +193,9 @@ def nominal_fit(problem: EstimationProblem, composed: Composed, solution: Soluti
         The nominal model cannot be rolled out.
     """
     start: Mapping[str, float] = {}
+    known = recalled(composed, (), store)
+    if known is not None:
+        return known
     if not composed.blocks:
         found = solution or solve(problem, GaussNewton(iterations=30))
         if found.evaluation is None:
@@ -192,7 +203,7 @@ def nominal_fit(problem: EstimationProblem, composed: Composed, solution: Soluti
         start = dict(zip(found.names, map(float, found.x), strict=True))
     elif solution is not None:
         start = dict(zip(solution.names, map(float, solution.x), strict=True))
-    fit = refit(composed, (), start)
+    fit = refit(composed, (), start, store)
     if fit is None:
         raise SolverError("the nominal model cannot be rolled out at its fit", where="diagnosis")
     return fit
@@ -249,6 +260,7 @@ def compose(
     alike: Confusability,
     limits: Thresholds,
     say: Progress,
+    store: Store | None = None,
 ) -> tuple[tuple[Fit, ...], tuple[Added, ...]]:
     """Add effects one after the other while the held-out gap closes, then try without each.
 
@@ -272,7 +284,7 @@ def compose(
         tried = shortlist([s for s in ranked if s.p_value < limits.level], alike, limits)
         if not tried:
             break
-        fits = refit_all(composed, base, tried, current.values, say)
+        fits = refit_all(composed, base, tried, current.values, say, store)
         if not fits:
             break
         near = within_reach(fits)
@@ -289,10 +301,12 @@ def compose(
         current = chosen
         if current.loss.mean < 1 + limits.smallest_gap:
             break
-    return first, _pruned(composed, nominal, tuple(added), say)
+    return first, _pruned(composed, nominal, tuple(added), say, store)
 
 
-def _pruned(composed: Composed, nominal: Fit, added: tuple[Added, ...], say: Progress) -> tuple[Added, ...]:
+def _pruned(
+    composed: Composed, nominal: Fit, added: tuple[Added, ...], say: Progress, store: Store | None = None
+) -> tuple[Added, ...]:
     """Leave out effects without which held-out recordings are predicted as well."""
     kept = list(added)
     for entry in added[:-1]:
@@ -300,7 +314,9 @@ def _pruned(composed: Composed, nominal: Fit, added: tuple[Added, ...], say: Pro
             break
         rest = [other for other in kept if other is not entry]
         full = kept[-1].fit
-        without = refit(composed, [other.effect for other in rest], full.values)
+        # it begins elsewhere than a refit of the same effects in an earlier round
+        name = f"{describe(full.effects)} without {entry.effect.label}"
+        without = refit(composed, [other.effect for other in rest], full.values, store, name)
         if without is None:
             continue
         gained, error = gain(without.loss, full.loss)

@@ -337,4 +337,4 @@ def smoothed_colour(cutoff: float, step: float) -> Array:
 
 def describe(effects: Sequence[Any]) -> str:
     """`kind@location` of several effects, in words."""
-    return " and ".join(effect.label for effect in effects) if effects else "nothing"
+    return " and ".join(effect.label for effect in effects) if effects else "the nominal model"

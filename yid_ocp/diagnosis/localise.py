@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.diagnosis.smoother import Smoothed, Source
+from yid_ocp.diagnosis.smoother import Smoothed, Source, Trace
+from yid_ocp.model.system import System
 
 Array = NDArray[np.float64]
 
@@ -136,3 +137,12 @@ def informed_map(smoothed: Smoothed, recording: int = 0) -> tuple[Array, tuple[s
         informed = 1 - trace.std**2 / prior
         values = np.where((prior > 0) & (informed > MAPPED), trace.mean / trace.std, np.nan)
     return trace.edges, trace.unknowns, values
+
+
+def units(system: System, trace: Trace) -> tuple[str, ...]:
+    """SI unit of every unknown of a trace: that of a joint's load, of a grasp's offset or of a point's bias."""
+    tree = system.mechanism
+    sliding = {joint.name for joint in tree.joints if joint.kind == "prismatic"}
+    forces = {name: "N" if name in sliding else "N m" for name in tree.joint_names}
+    pairs = zip(trace.unknowns, trace.sources, strict=True)
+    return tuple(forces[name] if source.kind == "force" else "m" for name, source in pairs)

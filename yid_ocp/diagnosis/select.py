@@ -11,11 +11,12 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.diagnosis.hypotheses import Composed, residual_series, sample_times
+from yid_ocp.diagnosis.hypotheses import Composed, describe, residual_series, sample_times
 from yid_ocp.diagnosis.score import robust
 from yid_ocp.effects import EffectBase, Reported
 from yid_ocp.problem.problem import Evaluation
@@ -76,6 +77,8 @@ class Fit:
         Held-out.
     message : str
         Why the solver ended.
+    taken_up : bool
+        Whether it comes from a store instead of the solver.
     """
 
     effects: tuple[EffectBase, ...]
@@ -86,6 +89,7 @@ class Fit:
     evaluation: Evaluation
     loss: Loss
     message: str
+    taken_up: bool = False
 
     @property
     def size(self) -> int:
@@ -98,6 +102,34 @@ class Fit:
 
 
 @dataclass(frozen=True)
+class Refitted:
+    """What a refit found: enough to have its `Fit` again by one evaluation.
+
+    Attributes
+    ----------
+    values, std : dict of str to float
+        Of every unknown.
+    message : str
+    """
+
+    values: dict[str, float]
+    std: dict[str, float]
+    message: str
+
+
+class Store(Protocol):
+    """Keeps finished refits of one diagnosis, so that another run of it need not repeat them; used by two threads."""
+
+    def get(self, name: str) -> Refitted | None:
+        """The refit of this name, None where it is not known."""
+        ...
+
+    def put(self, name: str, refitted: Refitted) -> None:
+        """Keep a refit."""
+        ...
+
+
+@dataclass(frozen=True)
 class Closure:
     """Part of the held-out gap that a model closes, with a 95 % interval; NaN where there was no gap."""
 
@@ -106,7 +138,13 @@ class Closure:
     high: float
 
 
-def refit(problem: Composed, effects: Sequence[EffectBase], start: Mapping[str, float]) -> Fit | None:
+def refit(
+    problem: Composed,
+    effects: Sequence[EffectBase],
+    start: Mapping[str, float],
+    store: Store | None = None,
+    name: str = "",
+) -> Fit | None:
     """Fit the nominal parameters and those of some effects, and predict the held-out recordings.
 
     Parameters
@@ -115,12 +153,19 @@ def refit(problem: Composed, effects: Sequence[EffectBase], start: Mapping[str, 
     effects : sequence of EffectBase
     start : mapping of str to float
         Where unknowns begin; a start that cannot be rolled out is drawn back towards neutral effects.
+    store : Store, optional
+        Asked before the solver is, and told what it finds.
+    name : str
+        In the store; the effects' labels where empty, which do for refits that differ by their effects alone.
 
     Returns
     -------
     Fit or None
         None where the model cannot be rolled out at all.
     """
+    known = recalled(problem, effects, store, name)
+    if known is not None:
+        return known
     own = problem.freeing(effects)
     neutral = {name: value for effect in effects for name, value in effect.neutral.items()}
     x = own.unknowns(start)
@@ -138,7 +183,24 @@ def refit(problem: Composed, effects: Sequence[EffectBase], start: Mapping[str, 
     deviation = deviations(own, finish)
     std = dict(zip(own.names, map(float, deviation), strict=True))
     loss = held_out_loss(own, outcome.x)
-    return Fit(tuple(effects), own, own.named(outcome.x), std, finish.cost, finish, loss, outcome.message)
+    values = own.named(outcome.x)
+    if store is not None:
+        store.put(name or describe(effects), Refitted(values, std, outcome.message))
+    return Fit(tuple(effects), own, values, std, finish.cost, finish, loss, outcome.message)
+
+
+def recalled(problem: Composed, effects: Sequence[EffectBase], store: Store | None, name: str = "") -> Fit | None:
+    """A refit that a store knows, evaluated once; None where it knows none."""
+    known = None if store is None else store.get(name or describe(effects))
+    own = problem.freeing(effects)
+    if known is None or not set(known.values) == set(known.std) == set(own.names):
+        return None
+    x = own.unknowns(known.values)
+    finish = own.evaluate(x)
+    if not finish.ok:
+        return None
+    loss = held_out_loss(own, x)
+    return Fit(tuple(effects), own, known.values, known.std, finish.cost, finish, loss, known.message, True)
 
 
 def deviations(problem: Composed, finish: Evaluation) -> Array:
@@ -165,14 +227,16 @@ def refit_all(
     tried: Sequence[tuple[EffectBase, Mapping[str, float]]],
     values: Mapping[str, float],
     progress: Callable[[str], None] | None = None,
+    store: Store | None = None,
 ) -> list[Fit]:
     """Refit the model with each of several effects added to those of `base`, two at a time; failures are left out."""
 
     def one(entry: tuple[EffectBase, Mapping[str, float]]) -> Fit | None:
         effect, step = entry
-        fit = refit(problem, (*base, effect), {**values, **step})
+        fit = refit(problem, (*base, effect), {**values, **step}, store)
         if progress is not None and fit is not None:
-            progress(f"refitted with {effect.label}: held-out chi2/n {fit.loss.mean:.4g}")
+            done = "took up the refit" if fit.taken_up else "refitted"
+            progress(f"{done} with {effect.label}: held-out chi2/n {fit.loss.mean:.4g}")
         return fit
 
     with ThreadPoolExecutor(max_workers=min(2, os.cpu_count() or 1)) as pool:

@@ -242,6 +242,7 @@ def which(finding: Finding) -> list[dict[str, Any]]:
         else:
             reported = fit.reported(effect)
         own = alone.get(effect.label)
+        closed = None if own is None else closure(finding.nominal.loss, own.loss)
         listed[effect.label] = {
             "kind": effect.kind,
             "location": effect.location,
@@ -250,7 +251,8 @@ def which(finding: Finding) -> list[dict[str, Any]]:
             },
             "score": 0.0 if score is None else score.statistic,
             "p_value": 1.0 if score is None else score.p_value,
-            "closure": None if own is None else _number(closure(finding.nominal.loss, own.loss).value),
+            "closure": None if closed is None else _number(closed.value),
+            "closure_ci": None if closed is None else [_number(closed.low), _number(closed.high)],
         }
     return list(listed.values())
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +16,9 @@ Array = NDArray[np.float64]
 
 INK, PALE = "#22303c", "#d9dee3"
 COLORS = ("#0b6e99", "#c2571a", "#5b8c2a", "#8a4f9e")
+BEFORE, AFTER, MEASURED = COLORS[1], COLORS[0], "#8d99a4"
+DIVERGING = ((0.0, "#2166ac"), (0.25, "#92c5de"), (0.5, "#ffffff"), (0.75, "#f4a582"), (1.0, "#b2182b"))
+WORST = -50.0  # lower end of an axis of closures [%]
 LONGEST = 2000  # points of a curve; beyond this the page grows and the eye sees no more
 
 
@@ -46,6 +50,27 @@ def cost_history(costs: Sequence[float], notes: Sequence[str]) -> plotly.graph_o
     return _styled(figure, 320, "accepted point", "cost", log_y=True)
 
 
+@dataclass(frozen=True)
+class Curve:
+    """Measured dots and the lines that should go through them.
+
+    Attributes
+    ----------
+    title : str
+        Of its axis, with the unit.
+    t, measured : ndarray, shape (M,)
+    lines : mapping of name to (t (K,), value (K,))
+    band : float or None
+        Half the height of what is shaded about zero.
+    """
+
+    title: str
+    t: Array
+    measured: Array
+    lines: Mapping[str, tuple[Array, Array]]
+    band: float | None = None
+
+
 def measured_and_predicted(
     curves: Mapping[str, tuple[Array, Array, Array, Array]], unit: str
 ) -> plotly.graph_objects.Figure:
@@ -56,22 +81,44 @@ def measured_and_predicted(
     curves : mapping of name to (t (M,), measured (M,), t (K,), predicted (K,))
     unit : str
     """
+    rows = [
+        Curve(f"{name} [{unit}]", t, measured, {"predicted": (t_model, predicted)})
+        for name, (t, measured, t_model, predicted) in curves.items()
+    ]
+    return over_time(rows, COLORS[1], {"predicted": COLORS[0]})
+
+
+def over_time(curves: Sequence[Curve], dots: str, lines: Mapping[str, str]) -> plotly.graph_objects.Figure:
+    """Measured dots beside lines, one row for each curve.
+
+    Parameters
+    ----------
+    curves : sequence of Curve
+    dots : str
+        Color of what is measured.
+    lines : mapping of name to str
+        Color of the lines.
+    """
     from plotly.subplots import make_subplots
 
     figure = make_subplots(rows=len(curves), cols=1, shared_xaxes=True, vertical_spacing=min(0.05, 0.3 / len(curves)))
-    for row, (name, (t, measured, t_model, predicted)) in enumerate(curves.items(), start=1):
-        keep = _thinned(len(t))
-        dots = {"color": COLORS[1], "size": 3 if len(t) > 60 else 7}
+    for row, curve in enumerate(curves, start=1):
+        keep = _thinned(len(curve.t))
+        marker = {"color": dots, "size": 3 if len(curve.t) > 60 else 7}
         figure.add_scatter(
-            x=t[keep].tolist(), y=_listed(measured[keep]), mode="markers", marker=dots, name="measured",
+            x=curve.t[keep].tolist(), y=_listed(curve.measured[keep]), mode="markers", marker=marker, name="measured",
             showlegend=row == 1, legendgroup="measured", row=row, col=1,
         )  # fmt: skip
-        keep = _thinned(len(t_model))
-        figure.add_scatter(
-            x=t_model[keep].tolist(), y=_listed(predicted[keep]), mode="lines", line={"color": COLORS[0], "width": 1.5},
-            name="predicted", showlegend=row == 1, legendgroup="predicted", row=row, col=1,
-        )  # fmt: skip
-        figure.update_yaxes(title_text=f"{name} [{unit}]", row=row, col=1)
+        for name, (t, value) in curve.lines.items():
+            keep = _thinned(len(t))
+            figure.add_scatter(
+                x=t[keep].tolist(), y=_listed(value[keep]), mode="lines", name=name, showlegend=row == 1,
+                legendgroup=name, line={"color": lines[name], "width": 1.5}, row=row, col=1,
+            )  # fmt: skip
+        if curve.band is not None:
+            shade = {"fillcolor": PALE, "opacity": 0.7, "line_width": 0, "layer": "below"}
+            figure.add_hrect(y0=-curve.band, y1=curve.band, row=row, col=1, **shade)
+        figure.update_yaxes(title_text=curve.title, row=row, col=1)
     figure = _styled(figure, 90 + 150 * len(curves), "", "")
     figure.update_xaxes(title_text="time [s]", row=len(curves), col=1)
     return figure
@@ -144,6 +191,236 @@ def profiles(
     figure = _styled(figure, 380, "value over best value", "chi2 above the best")
     figure.update_xaxes(type="log", range=[-1.0, 1.0])
     figure.update_yaxes(range=[-0.2, 2.5 * level])
+    return figure
+
+
+@dataclass(frozen=True)
+class Change:
+    """A number before and after something was done, with deviations, and a mark for comparison.
+
+    Attributes
+    ----------
+    before : float
+    after : float or None
+    before_std, after_std : float
+    mark : float or None
+    """
+
+    before: float
+    after: float | None = None
+    before_std: float = 0.0
+    after_std: float = 0.0
+    mark: float | None = None
+
+
+def changes(rows: Mapping[str, Change], axis: str, words: tuple[str, str, str]) -> plotly.graph_objects.Figure:
+    """Numbers before and after, joined by a line, one row each; bars are two standard deviations.
+
+    Parameters
+    ----------
+    rows : mapping of name to Change
+    axis : str
+        What the numbers are, with their unit.
+    words : (str, str, str)
+        For before, after and the marks.
+    """
+    import plotly.graph_objects as go
+
+    figure = go.Figure()
+    names = list(rows)
+    moved = [(name, row) for name, row in rows.items() if row.after is not None]
+    figure.add_scatter(
+        x=[x for _, row in moved for x in (row.before, row.after, None)],
+        y=[y for name, _ in moved for y in (name, name, None)],
+        mode="lines", line={"color": PALE, "width": 6}, hoverinfo="skip", showlegend=False,
+    )  # fmt: skip
+    hollow = {"color": "white", "size": 11, "line": {"color": BEFORE, "width": 2.5}}
+    full = {"color": AFTER, "size": 11}
+    for entries, word, marker, color in (
+        ([(n, r.before, r.before_std) for n, r in rows.items()], words[0], hollow, BEFORE),
+        ([(n, r.after, r.after_std) for n, r in moved], words[1], full, AFTER),
+    ):
+        spread = [2 * std if np.isfinite(std) else 0.0 for _, _, std in entries]
+        bars = {"type": "data", "array": spread, "color": color, "thickness": 1.2} if any(spread) else None
+        if entries:
+            figure.add_scatter(
+                x=[value for _, value, _ in entries], y=[name for name, _, _ in entries], mode="markers", name=word,
+                marker=marker, error_x=bars,
+            )  # fmt: skip
+    marked = [(name, row.mark) for name, row in rows.items() if row.mark is not None]
+    if marked:
+        tick = {"symbol": "line-ns", "size": 16, "line": {"color": INK, "width": 2.5}}
+        x, y = [mark for _, mark in marked], [name for name, _ in marked]
+        figure.add_scatter(x=x, y=y, mode="markers", name=words[2], marker=tick)
+    figure = _styled(figure, 110 + 32 * len(names), axis, "")
+    numbers = [x for row in rows.values() for x in (row.before, row.after, row.mark) if x is not None]
+    if min(numbers) > 0 and max(numbers) > 30 * min(numbers):
+        figure.update_xaxes(type="log", exponentformat="power", dtick="D2" if max(numbers) < 1e3 * min(numbers) else 1)
+    else:
+        # bars of what cannot be told would squeeze all others
+        figure.update_xaxes(range=[min(0.0, 1.1 * min(numbers)), 1.15 * max([*numbers, 1e-12])])
+    figure.update_yaxes(autorange="reversed", categoryorder="array", categoryarray=names, automargin=True)
+    return figure
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of a map over time.
+
+    Attributes
+    ----------
+    name, group : str
+        Rows of one group stand together.
+    values : ndarray, shape (J,)
+        NaN where there is nothing to show.
+    texts : sequence of str, length J
+        Shown under the pointer.
+    """
+
+    name: str
+    group: str
+    values: Array
+    texts: Sequence[str]
+
+
+def time_map(edges: Array, rows: Sequence[Row], axis: str) -> plotly.graph_objects.Figure:
+    """Colors over time, one row for each quantity, grey where there is nothing to show.
+
+    Parameters
+    ----------
+    edges : ndarray, shape (J + 1,)
+        [s]
+    rows : sequence of Row
+    axis : str
+        What the colors are.
+    """
+    import plotly.graph_objects as go
+
+    values = np.array([row.values for row in rows])
+    seen = np.abs(values[np.isfinite(values)])
+    # even to the eye from one deviation to thousands
+    limit = max(3.0, float(np.quantile(seen, 0.98))) if seen.size else 3.0
+    marks = [m for m in ((0, 1, 3, 10) if limit < 20 else (0, 10, 100, 1000, 10000)) if m <= limit]
+    marks = sorted({-m for m in marks} | set(marks))
+    bar = {"thickness": 14, "x": 1.2, "tickvals": [float(_even(m)) for m in marks], "ticktext": [str(m) for m in marks]}
+    figure = go.Figure()
+    figure.add_heatmap(
+        x=edges.tolist(), y=list(range(len(rows))), z=[_listed(_even(row)) for row in values],
+        text=[list(row.texts) for row in rows], hoverinfo="text", zmin=-_even(limit), zmax=_even(limit),
+        colorscale=DIVERGING, colorbar=bar,
+    )  # fmt: skip
+    figure = _styled(figure, 120 + max(17 * len(rows), 100), "time [s]", "")
+    figure.update_layout(plot_bgcolor=PALE, margin={"r": 150, "t": 40})
+    figure.add_annotation(
+        x=0, xref="paper", xanchor="left", y=1, yref="paper", yanchor="bottom", text=f"color: {axis}", showarrow=False
+    )
+    figure.update_xaxes(showgrid=False, range=[float(edges[0]), float(edges[-1])])
+    names = [row.name for row in rows]
+    figure.update_yaxes(
+        showgrid=False, range=[len(rows) - 0.5, -0.5], tickvals=list(range(len(rows))), ticktext=names,
+        automargin=True, tickfont={"size": 11},
+    )  # fmt: skip
+    groups = [row.group for row in rows]
+    for group in dict.fromkeys(groups):
+        own = [i for i, entry in enumerate(groups) if entry == group]
+        figure.add_annotation(
+            x=1.01, xref="paper", y=(own[0] + own[-1]) / 2, text=group, showarrow=False, xanchor="left",
+            font={"size": 11},
+        )  # fmt: skip
+        if own[0]:
+            figure.add_hline(y=own[0] - 0.5, line={"color": INK, "width": 1})
+    return figure
+
+
+def _even(value: Any) -> Any:
+    return np.arcsinh(np.asarray(value, float) / 2)
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """A candidate in a ranking.
+
+    Attributes
+    ----------
+    name : str
+    closed : (float, float, float) or None
+        What it was found to close, and its interval [%].
+    promised : float
+    """
+
+    name: str
+    closed: tuple[float, float, float] | None
+    promised: float
+
+
+def ranking(entries: Sequence[Ranked], closed: str, promised: str) -> plotly.graph_objects.Figure:
+    """Candidates from best to worst: what each was found to close, where one was tried, and what it promises.
+
+    Parameters
+    ----------
+    entries : sequence of Ranked
+    closed, promised : str
+        Titles of the two axes.
+    """
+    from plotly.subplots import make_subplots
+
+    done = [(entry.name, *entry.closed) for entry in entries if entry.closed is not None]
+    last = 2 if done else 1
+    figure = make_subplots(rows=1, cols=last, shared_yaxes=True, horizontal_spacing=0.04)
+    figure.add_bar(
+        x=[entry.promised for entry in entries], y=[entry.name for entry in entries], orientation="h", width=0.55,
+        marker={"color": COLORS[1]}, showlegend=False, row=1, col=last,
+    )  # fmt: skip
+    figure = _styled(figure, 100 + 28 * len(entries), "", "")
+    figure.update_xaxes(title_text=promised, rangemode="tozero", row=1, col=last)
+    if done:
+        bars = {
+            "type": "data",
+            "symmetric": False,
+            "array": [high - value for _, value, _, high in done],
+            "arrayminus": [value - low for _, value, low, _ in done],
+        }
+        figure.add_scatter(
+            x=[value for _, value, _, _ in done], y=[name for name, *_ in done], mode="markers", showlegend=False,
+            marker={"color": COLORS[0], "size": 11}, error_x=bars, row=1, col=1,
+        )  # fmt: skip
+        # what makes a prediction worse can do so without end
+        left = min([0.0, *(max(low, WORST) for _, _, low, _ in done)]) - 6
+        figure.update_xaxes(title_text=closed, range=[left, 108], row=1, col=1)
+        figure.add_vline(x=0, line={"color": INK, "width": 1}, row=1, col=1)
+        for name, value, _, _ in done:
+            if value < left:
+                text = f"◀ {value:.0f}"
+                figure.add_annotation(x=left, y=name, text=text, showarrow=False, xanchor="left", row=1, col=1)
+    names = [entry.name for entry in entries][::-1]
+    figure.update_yaxes(type="category", categoryorder="array", categoryarray=names, automargin=True)
+    figure.update_yaxes(range=[-0.6, len(names) - 0.4])
+    return figure
+
+
+def matrix(names: Sequence[str], values: Array, row: str, column: str) -> plotly.graph_objects.Figure:
+    """Parts of a whole, in per cent, for every pair of names.
+
+    Parameters
+    ----------
+    names : sequence of str
+    values : ndarray, shape (n, n)
+        Between 0 and 1.
+    row, column : str
+        What stands at the side and below.
+    """
+    import plotly.graph_objects as go
+
+    figure = go.Figure()
+    figure.add_heatmap(
+        x=list(names), y=list(names), z=values.tolist(), zmin=0.0, zmax=1.0, showscale=False, xgap=1, ygap=1,
+        colorscale=((0.0, "#ffffff"), (0.5, "#b9d9e6"), (0.9, "#0b6e99"), (1.0, "#06405a")),
+        text=[[f"{100 * v:.0f}" if v >= 0.095 else "" for v in line] for line in values], texttemplate="%{text}",
+        hovertemplate="%{y} explained by %{x}: %{z:.2f}<extra></extra>",
+    )  # fmt: skip
+    figure = _styled(figure, 190 + 27 * len(names), column, row)
+    figure.update_xaxes(showgrid=False, tickangle=-40, automargin=True)
+    figure.update_yaxes(showgrid=False, autorange="reversed", automargin=True)
     return figure
 
 

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import logging
+import os
+import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,14 +14,20 @@ import h5py
 import numpy as np
 
 from yid_ocp.diagnosis import Finding, Thresholds, diagnose
+from yid_ocp.diagnosis.localise import units
 from yid_ocp.errors import OutputError
+from yid_ocp.problem.problem import Episode, EpisodeResult
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import Findings
 from yid_ocp.workflow.build import build_problem
 from yid_ocp.workflow.folder import Monitor, Silent, input_hashes, new_run_folder, versions
+from yid_ocp.workflow.refits import Refits
 from yid_ocp.workflow.settings import Run, dump_config
 
 TRAJECTORIES = "yid-diagnosis-trajectories/1"
+log = logging.getLogger(__name__)
+Prediction = tuple[Episode, EpisodeResult, EpisodeResult]
+"""A held-out recording, its prediction by the nominal model and that with the effects."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +49,7 @@ class DiagnoseOutcome:
 
 
 def run_diagnose(run: Run, out: str | Path | None = None, monitor: Monitor | None = None) -> DiagnoseOutcome:
-    """Diagnose and write the run folder.
+    """Diagnose and write the run folder; refits that an interrupted run of the same kind finished are taken up.
 
     Parameters
     ----------
@@ -59,10 +69,11 @@ def run_diagnose(run: Run, out: str | Path | None = None, monitor: Monitor | Non
     """
     watcher = monitor or Silent()
     with new_run_folder(run, out, "diagnose") as folder:
-        inputs = input_hashes(run)
-        folder.write("config.yaml", dump_config(run))
+        inputs, config = input_hashes(run), dump_config(run)
+        folder.write("config.yaml", config)
         watcher.stage("building the model and its compiled step")
         folder.log("start", command="diagnose", versions=versions(), inputs=inputs)
+        refits = Refits(folder, inputs, config, versions())
         problem = build_problem(run)
 
         def note(text: str) -> None:
@@ -70,50 +81,79 @@ def run_diagnose(run: Run, out: str | Path | None = None, monitor: Monitor | Non
             watcher.stage(text)
 
         said = run.diagnosis
-        finding = diagnose(
-            problem,
-            said.candidates,
-            thresholds=Thresholds(level=said.level, effects=said.effects),
-            progress=note,
-        )
+        try:
+            finding = diagnose(
+                problem,
+                said.candidates,
+                thresholds=Thresholds(level=said.level, effects=said.effects),
+                progress=note,
+                store=refits,
+            )
+        except KeyboardInterrupt:
+            if len(refits):
+                log.warning("%d finished refits are in %s; the same command takes them up", len(refits), refits.file)
+            raise
         folder.log("end", verdict=finding.verdict, effects=[effect.label for effect in finding.effects])
-        write_predictions(folder.path / "trajectories.h5", finding)
-        again = f"yid-ocp diagnose {run.file}" if run.file else "yid-ocp diagnose"
-        result = finding.to_dict() | {"command": again, "inputs": inputs, "versions": versions()}
-        written = folder.write_json("result.json", result)
+        predicted = predictions(finding)
+        write_trajectories(folder.path / "trajectories.h5", finding, predicted)
+        result = finding.to_dict() | {"command": reproducing(run, folder.target)}
+        written = folder.write_json("result.json", result | {"inputs": inputs, "versions": versions()})
         if run.output.report:
             watcher.stage("writing the report")
-            write_report(folder.path / "report.html", Findings(run.name, run.description, written, problem))
+            more = {"finding": finding, "predictions": predicted}
+            write_report(folder.path / "report.html", Findings(run.name, run.description, written, problem, more=more))
+    refits.clear()
     return DiagnoseOutcome(folder.path, written, finding)
 
 
-def write_predictions(path: Path, finding: Finding) -> None:
-    """Held-out measurements beside their prediction before and after, as `yid-diagnosis-trajectories/1` (HDF5).
+def reproducing(run: Run, folder: Path) -> str:
+    """The command that gives a result again; the resolved configuration in its folder, where `--set` changed one."""
+    origins = list(run.places.values())
+    if any(origin.startswith("--set") for origin in origins):
+        near = os.path.relpath(folder)
+        return shlex.join(
+            ["yid-ocp", "diagnose", str((folder if near.startswith("..") else Path(near)) / "config.yaml")]
+        )
+    if any(origin.startswith("embedded default") for origin in origins):
+        return "yid-ocp diagnose"
+    return shlex.join(["yid-ocp", "diagnose", run.file])
 
-    `RECORDING/GROUP/`: `t` (M,) [s], `measured`, `before`, `after`, `std` (M, k) and the attributes `channels`, `unit`.
+
+def predictions(finding: Finding) -> list[Prediction]:
+    """Held-out recordings that can be predicted both before and after."""
+    before, after = (fit.problem.validate(fit.problem.unknowns(fit.values)) for fit in (finding.nominal, finding.last))
+    return [
+        (episode, first, last)
+        for (episode, first), (_, last) in zip(before, after, strict=True)
+        if not isinstance(first, str) and not isinstance(last, str)
+    ]
+
+
+def write_trajectories(path: Path, finding: Finding, predicted: Sequence[Prediction]) -> None:
+    """Predictions and what the smoother found, as `yid-diagnosis-trajectories/1` (HDF5).
+
+    `RECORDING/GROUP/` for every held-out recording: `t` (M,) [s], `measured`, `before`, `after`, `std` (M, k) and the
+    attributes `channels`, `unit`.
+
+    `where/RECORDING/` for every recording that was estimated on, where there was a gap to locate: `edges` (J + 1,) [s]
+    since its first node, of the intervals over which unknowns are constant; `mean` and `std` (J, nd) of the unknown
+    forces, offsets and biases about the nominal model and `prior` (nd,), the deviation at the largest evidence, zero
+    where a group was not taken in; the attributes `unknowns`, `locations`, `kinds`, `units` (nd,) each.
 
     Raises
     ------
     OutputError
     """
-    runs = []
-    for fit in (finding.nominal, finding.last):
-        x = fit.problem.unknowns(fit.values)
-        runs.append(dict(enumerate(fit.problem.validate(x))))
     try:
         with h5py.File(path, "w") as file:
             file.attrs["format"] = TRAJECTORIES
-            for i, (episode, before) in runs[0].items():
-                after = runs[1][i][1]
-                if isinstance(before, str) or isinstance(after, str):
-                    continue
+            for episode, before, after in predicted:
                 for k, samples in enumerate(episode.samples):
                     group = file.create_group(f"{episode.name}/{samples.sensor.group}")
                     group.attrs["channels"] = np.array(samples.sensor.channels, dtype=h5py.string_dtype())
                     group.attrs["unit"] = samples.sensor.unit
-                    t = episode.grid.start + episode.grid.time_step * (samples.node + samples.fraction)
                     arrays = {
-                        "t": t,
+                        "t": episode.grid.start + episode.grid.time_step * (samples.node + samples.fraction),
                         "measured": samples.value,
                         "before": before.predicted[k],
                         "after": after.predicted[k],
@@ -121,5 +161,30 @@ def write_predictions(path: Path, finding: Finding) -> None:
                     }
                     for name, array in arrays.items():
                         group.create_dataset(name, data=array, compression="gzip", shuffle=True)
+            _write_unknowns(file, finding)
     except OSError as error:
-        raise OutputError(f"the predictions cannot be written: {error}", where=str(path)) from error
+        raise OutputError(f"the trajectories cannot be written: {error}", where=str(path)) from error
+
+
+def _write_unknowns(file: h5py.File, finding: Finding) -> None:
+    if finding.smoothed is None:
+        return
+    for trace in finding.smoothed.traces:
+        group = file.create_group(f"where/{trace.recording}")
+        texts = {
+            "unknowns": trace.unknowns,
+            "locations": [source.location for source in trace.sources],
+            "kinds": [source.kind for source in trace.sources],
+            "units": units(finding.nominal.problem.system, trace),
+        }
+        for name, values in texts.items():
+            group.attrs[name] = np.array(values, dtype=h5py.string_dtype())
+        variance = np.array([finding.smoothed.variance[source] for source in trace.sources])
+        arrays = {
+            "edges": trace.edges,
+            "mean": trace.mean * trace.reference,
+            "std": trace.std * trace.reference,
+            "prior": np.sqrt(variance) * trace.reference,
+        }
+        for name, array in arrays.items():
+            group.create_dataset(name, data=array, compression="gzip", shuffle=True)

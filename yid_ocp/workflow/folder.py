@@ -65,10 +65,13 @@ class RunFolder:
         Its name when complete.
     path : Path
         Where it is now; the same as `target` in the end.
+    partial : Path
+        Where an interrupted run may leave what the next one with the same name, or none, can use; not made here.
     """
 
     target: Path
     path: Path
+    partial: Path
     _log: TextIO = field(repr=False)
     _begun: float = field(default_factory=time.perf_counter, repr=False)
 
@@ -161,7 +164,8 @@ def new_run_folder(run: Run, out: str | Path | None = None, command: str = "") -
             where=str(target),
             hint="choose a writable folder with --out",
         ) from error
-    folder = RunFolder(target, temporary, log)
+    partial = target.with_name(f"{_stem(run, command) if out is None else target.name}.partial")
+    folder = RunFolder(target, temporary, partial, log)
     lines, logger = _Lines(folder), logging.getLogger("yid_ocp")
     level = logger.level
     logger.addHandler(lines)
@@ -204,9 +208,13 @@ def _target(run: Run, out: str | Path | None, command: str) -> Path:
             raise OutputError("the run folder's name is that of a file", where=str(target), hint="choose another --out")
         return target
     parent = Path(run.output.folder) if run.output.folder is not None else Path.cwd() / "runs"
-    stem = "-".join(part for part in (run.name, command, time.strftime("%Y%m%d-%H%M%S")) if part)
+    stem = _stem(run, command, time.strftime("%Y%m%d-%H%M%S"))
     names = (stem, *(f"{stem}-{i}" for i in range(2, 1000)))
     return next(parent / name for name in names if not (parent / name).exists())
+
+
+def _stem(run: Run, *parts: str) -> str:
+    return "-".join(part for part in (run.name, *parts) if part)
 
 
 def _clear(temporary: Path, made: list[Path]) -> None:

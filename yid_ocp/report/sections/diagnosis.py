@@ -1,26 +1,375 @@
-"""What a diagnosis says: in words first, then the gap, the places and the candidates."""
+"""What a diagnosis says: in words first, then the gap, the places and the candidates, each as a picture."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.diagnosis import Finding, residual_series
+from yid_ocp.diagnosis.localise import informed_map, units
+from yid_ocp.diagnosis.smoother import Smoothed
+from yid_ocp.problem.problem import Episode, EpisodeResult
+from yid_ocp.report import figures
+from yid_ocp.report.figures import Change, Curve, Ranked, Row
 from yid_ocp.report.sections import Findings, section
 
-LISTED = 12  # candidates; the rest is in result.json
+Array = NDArray[np.float64]
+
+LISTED = 15  # candidates; the rest is in result.json
+MAPS = 3  # recordings of which a map is drawn; trajectories.h5 has them all
+CURVES = 3  # held-out channels
+ALIKE = 0.9  # part of a signature from which a pair is named in words
+NOMINAL, EXTENDED = "nominal model", "with the effects"
+COLORS = {NOMINAL: figures.BEFORE, EXTENDED: figures.AFTER}
+Prediction = tuple[Episode, EpisodeResult, EpisodeResult]
+
+
+@dataclass(frozen=True)
+class Chapter:
+    """A part of the page: what is seen, and the pictures.
+
+    Attributes
+    ----------
+    title : str
+    sentences : sequence of str
+    pictures : sequence of (str, str)
+        Heading, which may be empty, and HTML.
+    """
+
+    title: str
+    sentences: Sequence[str]
+    pictures: Sequence[tuple[str, str]] = ()
 
 
 @section("diagnosis", 5, "The gap and what makes it")
 def prepare(findings: Findings) -> Mapping[str, Any] | None:
-    """Words, held-out errors before and after each effect, places, candidates."""
+    """Words, then the gap, the places, the candidates, curves and where stiffnesses go; tables beside them."""
     result = findings.result
     if result.get("format") != "yid-diagnosis/1":
         return None
+    finding: Finding | None = findings.more.get("finding")
+    chapters: dict[str, Chapter | None] = {}
+    if finding is not None:
+        chapters = {
+            "gap": _gap(finding),
+            "where": _where(finding),
+            "which": _which(finding, result),
+            "alike": _alike(finding, result),
+            "curves": _curves(finding, findings.more["predictions"]),
+            "absorbed": _absorbed(finding),
+        }
     return {
         "result": result,
+        "chapters": chapters,
         "channels": list(result["gap"]["before"]["rmse"]),
         "which": result["which"][:LISTED],
         "more": max(len(result["which"]) - LISTED, 0),
         "places": [place for place in result["where"] if place["share"] > 0.005],
-        "hidden": [place["location"] for place in result["where"] if not place["observable"]],
     }
+
+
+# -- the gap ----------------------------------------------------------------------------------------------------------
+
+
+def _gap(finding: Finding) -> Chapter:
+    before, after = finding.nominal.loss.channels, finding.last.loss.channels
+    floor = _floor(finding)
+    by_unit: dict[str, dict[str, Change]] = {}
+    for channel, (error, unit) in before.items():
+        later = after[channel][0] if finding.effects and channel in after else None
+        by_unit.setdefault(unit, {})[channel] = Change(error, later, mark=floor.get(channel))
+    pictures = []
+    for unit, rows in by_unit.items():
+        factor, shown = _readable(unit, [row.before for row in rows.values()])
+        scaled = {
+            name: Change(
+                factor * row.before,
+                None if row.after is None else factor * row.after,
+                mark=None if row.mark is None else factor * row.mark,
+            )
+            for name, row in rows.items()
+        }
+        words = (NOMINAL, EXTENDED, "noise alone")
+        pictures.append(("", figures.html(figures.changes(scaled, f"held-out error (rms) [{shown}]", words))))
+    first, last = finding.held_out_before.chi2_per_dof, finding.remaining.chi2_per_dof
+    sentences = [
+        "Errors on recordings that no fit has touched, channel by channel; the tick is what noise alone gives."
+    ]
+    if finding.effects:
+        names = " and ".join(effect.label for effect in finding.effects)
+        falls = {c: 1 - after[c][0] / e for c, (e, _) in before.items() if c in after and e > 0}
+        sentences.append(
+            f"With {names}, chi² per degree of freedom goes from {first:.3g} to {last:.3g} (one is noise alone)."
+        )
+        if falls:
+            most, least = max(falls, key=lambda c: falls[c]), min(falls, key=lambda c: falls[c])
+            said = f"The error of {most} changes most, from {_amount(*before[most])} to {_amount(*after[most])}"
+            worse = f"; {least} gets worse by {-100 * falls[least]:.0f} %" if falls[least] < -0.02 else ""
+            sentences.append(f"{said}{worse}.")
+    else:
+        sentences.append(
+            f"No effect was added, so there is no error after it; chi² per degree of freedom is {first:.3g} "
+            "(one is noise alone)."
+        )
+    return Chapter("How large the gap is", sentences, pictures)
+
+
+def _floor(finding: Finding) -> dict[str, float]:
+    """Error of every channel that noise alone gives; for points that of a distance."""
+    width = {
+        channel: samples.sensor.width
+        for episode in finding.nominal.problem.held_out
+        for samples in episode.samples
+        for channel in samples.sensor.channels
+    }
+    return {entry.channel: math.sqrt(width.get(entry.channel, 1)) * entry.std for entry in finding.floor}
+
+
+def _readable(unit: str, values: Sequence[float]) -> tuple[float, str]:
+    """Factor and unit in which lengths of some millimetres are not all zeros."""
+    return (1e3, "mm") if unit == "m" and max(map(abs, values), default=1.0) < 0.1 else (1.0, unit)
+
+
+def _amount(value: float, unit: str) -> str:
+    factor, shown = _readable(unit, [value])
+    return f"{factor * value:.3g} {shown}"
+
+
+# -- where ------------------------------------------------------------------------------------------------------------
+
+
+def _where(finding: Finding) -> Chapter | None:
+    smoothed = finding.smoothed
+    if smoothed is None:
+        return None
+    noticed = [place.location for place in finding.where if place.observable]
+    silent = [place.location for place in finding.where if not place.observable]
+    sentences = [
+        "Every coordinate was given an unknown force, every grasp an unknown offset and every measured point an "
+        "unknown bias, free to change in time; the fewest groups of them that explain the residual were kept.",
+        _side(smoothed),
+        f"A gap would have shown at {', '.join(noticed)}." if noticed else "",
+        f"It would not have shown at {', '.join(silent)}: these motions and sensors cannot tell." if silent else "",
+    ]
+    left = [f"{p.location} ({100 * p.share:.0f} %)" for p in finding.remaining_where if p.share > 0.1]
+    if finding.effects and left:
+        sentences.append(f"What the effects leave lies in {', '.join(left)}.")
+    pictures = []
+    for i, trace in enumerate(smoothed.traces[:MAPS]):
+        kept = [k for k, source in enumerate(trace.sources) if smoothed.variance[source] > 0]
+        kept.sort(key=lambda k: (-smoothed.weight[trace.sources[k]], trace.sources[k].location, trace.sources[k].kind))
+        if not kept:
+            break
+        _, _, values = informed_map(smoothed, i)
+        shown = units(finding.nominal.problem.system, trace)
+        axis = "value in its standard deviations"
+        blank = not np.any(np.isfinite(values))
+        if blank:
+            prior = np.sqrt([smoothed.variance[source] for source in trace.sources])
+            values = trace.mean / np.where(prior > 0, prior, np.nan)
+            axis = "value in deviations expected beforehand"
+        rows = []
+        for k in kept:
+            size, unit = trace.reference[k], shown[k]
+            texts = [
+                f"{trace.unknowns[k]}, {trace.edges[j]:.2f} to {trace.edges[j + 1]:.2f} s: "
+                f"{trace.mean[j, k] * size:.3g} ± {trace.std[j, k] * size:.2g} {unit}"
+                for j in range(len(trace.mean))
+            ]
+            source = trace.sources[k]
+            group = f"{source.location} {source.kind} [{unit}]"
+            rows.append(Row(trace.unknowns[k], group, values[:, k], texts))
+        pictures.append((f"Recording {trace.recording}", figures.html(figures.time_map(trace.edges, rows, axis))))
+        if i == 0:
+            sentences.append(_surest(smoothed, shown, blank))
+    if pictures:
+        sentences.append("Red is a force, offset or bias in the positive direction, blue in the negative one.")
+    else:
+        sentences.append("No group of unknowns explains the residual better than chance, so there is no map.")
+    if len(smoothed.traces) > MAPS:
+        sentences.append(f"{len(smoothed.traces) - MAPS} more recordings are in trajectories.h5.")
+    return Chapter("Where it is, and when", [text for text in sentences if text], pictures)
+
+
+def _side(smoothed: Smoothed) -> str:
+    """Plant or sensor, with what speaks for it."""
+    verdicts = {
+        "plant": "the mechanics, not what sensors read",
+        "sensor": "what sensors read, not the mechanics",
+        "both": "both the mechanics and what sensors read",
+        "none": "neither the mechanics nor the sensors' biases, as far as these unknowns can tell",
+    }
+    evidence = smoothed.evidence
+    return (
+        f"By evidence the gap lies in {verdicts[smoothed.side]}: the log evidence rises by {evidence['plant']:.4g} "
+        f"with unknown forces and offsets alone, by {evidence['sensor']:.4g} with biases alone, by "
+        f"{evidence['both']:.4g} with both (5 is odds of 150 to 1). They explain {100 * smoothed.explainable:.0f} % of "
+        "the gap where it was fitted."
+    )
+
+
+def _surest(smoothed: Smoothed, shown: Sequence[str], blank: bool) -> str:
+    trace = smoothed.traces[0]
+    if blank:
+        return (
+            "Nowhere do the data say more than half of what can be said of a single value, so that values are shown in "
+            "units of the deviation expected beforehand: take the picture for a hint only."
+        )
+    ratio = informed_map(smoothed)[2]
+    j, k = divmod(int(np.nanargmax(np.abs(ratio))), ratio.shape[1])
+    value, std = (array[j, k] * trace.reference[k] for array in (trace.mean, trace.std))
+    return (
+        f"Grey is where the data do not say; the surest value is that of {trace.unknowns[k]} between "
+        f"{trace.edges[j]:.2f} and {trace.edges[j + 1]:.2f} s, {value:.3g} ± {std:.2g} {shown[k]}."
+    )
+
+
+# -- which ------------------------------------------------------------------------------------------------------------
+
+
+def _which(finding: Finding, result: Mapping[str, Any]) -> Chapter | None:
+    promised, percent = _promised(finding)
+    entries = []
+    for entry in result["which"][:LISTED]:
+        name = f"{entry['kind']}@{entry['location']}"
+        closed = None
+        if entry["closure"] is not None and None not in entry["closure_ci"]:
+            closed = (100 * entry["closure"], 100 * entry["closure_ci"][0], 100 * entry["closure_ci"][1])
+        entries.append(Ranked(name, closed, promised.get(name, 0.0)))
+    if not entries:
+        return None
+    done = sorted((e for e in entries if e.closed is not None), key=lambda e: -(e.closed or (0.0,))[0])
+    unit = "as a part of the excess over noise" if percent else "as a fall of the sum of squares; 7 is chance at 1 %"
+    promise = f"hat each promises to first order where the model was fitted, {unit}."
+    if done:
+        said = [
+            f"{e.name} {e.closed[0]:.3g} % ({e.closed[1]:.3g} to {e.closed[2]:.3g} %)" for e in done[:3] if e.closed
+        ]
+        sentences = [
+            "Left: refitted together with the stiffnesses, each alone, and judged on held-out motions, with the 95 % "
+            f"interval; 100 % closes the gap, less than zero predicts worse. Closed by {', '.join(said)}.",
+            f"Right: w{promise}",
+        ]
+    else:
+        sentences = [f"W{promise}", "No candidate promised enough to be refitted."]
+    axis = "promised where fitted [%]" if percent else "promised fall of r'r [1]"
+    picture = figures.html(figures.ranking(entries, "closed on held-out motions [%]", axis))
+    title = "What each effect could explain" if finding.verdict == "no_gap" else "Which effect makes it"
+    return Chapter(title, sentences, [("", picture)])
+
+
+def _promised(finding: Finding) -> tuple[dict[str, float], bool]:
+    """Promised decrease of r'r: in per cent of its excess over noise, or as it is where there is hardly an excess."""
+    fit = finding.nominal
+    rows = np.concatenate([series.rows for series in residual_series(fit.problem)])
+    excess = float(np.sum(fit.evaluation.residual[rows] ** 2)) - (len(rows) - len(fit.values))
+    percent = finding.verdict != "no_gap" and excess > 0
+    factor = 100 / excess if percent else 1.0
+    return {score.effect.label: factor * score.decrease for score in finding.scores}, percent
+
+
+def _alike(finding: Finding, result: Mapping[str, Any]) -> Chapter | None:
+    labels = finding.confusability.labels
+    names = [f"{entry['kind']}@{entry['location']}" for entry in result["which"][:LISTED]]
+    names = [name for name in names if name in labels]
+    if len(names) < 2:
+        return None
+    at = [labels.index(name) for name in names]
+    values = finding.confusability.matrix[np.ix_(at, at)]
+    pairs = [
+        (min(values[i, j], values[j, i]), names[i], names[j])
+        for i in range(len(names))
+        for j in range(i + 1, len(names))
+    ]
+    close = [f"{a} and {b} ({100 * v:.0f} %)" for v, a, b in sorted(pairs, reverse=True) if v >= ALIKE]
+    listed = f"{', '.join(close[:5])}{f' and {len(close) - 5} more' if len(close) > 5 else ''}"
+    v, a, b = max(pairs)
+    sentences = [
+        "Per cent of the row's trace in the recordings that the column could make as well, beyond what the stiffnesses "
+        "can; 100 % cannot be told apart by these motions and sensors, whatever the residual is.",
+        f"Alike: {listed}." if close else f"No two of them are alike; the closest are {a} and {b} ({100 * v:.0f} %).",
+    ]
+    picture = figures.matrix(names, values, "trace of", "explained by [%]")
+    return Chapter("What could be mistaken for what", sentences, [("", figures.html(picture))])
+
+
+# -- curves and parameters --------------------------------------------------------------------------------------------
+
+
+def _curves(finding: Finding, predicted: Sequence[Prediction]) -> Chapter | None:
+    changed = bool(finding.effects)
+    found: list[tuple[float, str, Curve, Curve]] = []
+    for episode, before, after in predicted:
+        for k, samples in enumerate(episode.samples):
+            sensor = samples.sensor
+            t = episode.grid.start + episode.grid.time_step * (samples.node + samples.fraction)
+            for column, channel in enumerate(samples.channel_of_column):
+                y, std = samples.value[:, column], samples.std[:, column]
+                lines = {NOMINAL: before.predicted[k][:, column]}
+                if changed:
+                    lines[EXTENDED] = after.predicted[k][:, column]
+                seen = np.isfinite(y) & np.isfinite(std)
+                if not seen.any():
+                    continue
+                squares = [float(np.sum(((line - y)[seen] / std[seen]) ** 2)) for line in lines.values()]
+                name = channel if sensor.width == 1 else f"{channel}, {'xyz'[column % 3]}"
+                factor, unit = _readable(
+                    sensor.unit, [float(np.max(np.abs((line - y)[seen]))) for line in lines.values()]
+                )
+                noise = float(np.median(std[seen])) * factor
+                course = Curve(f"{name}<br>[{sensor.unit}]", t, y, {n: (t, line) for n, line in lines.items()})
+                errors = {n: _in_pieces(t[seen], factor * (line - y)[seen]) for n, line in lines.items()}
+                error = Curve(f"error [{unit}]", t[:0], y[:0], errors, 2 * noise)
+                found.append((squares[0] - (squares[1] if changed else 0.0), episode.name, course, error))
+    if not found:
+        return None
+    found.sort(key=lambda entry: -entry[0])
+    # the same joint in every recording would say the same thing again
+    best: dict[str, tuple[float, str, Curve, Curve]] = {}
+    for entry in found:
+        best.setdefault(entry[2].title, entry)
+    chosen = list(best.values())[:CURVES]
+    pictures = []
+    for recording in dict.fromkeys(entry[1] for entry in chosen):
+        curves = [curve for _, name, *pair in chosen if name == recording for curve in pair]
+        pictures.append(
+            (f"Recording {recording}, held out", figures.html(figures.over_time(curves, figures.MEASURED, COLORS)))
+        )
+    what = "change most with the effects" if changed else "the nominal model misses most"
+    sentences = [
+        f"The {len(chosen)} held-out coordinates or joints that {what}, measured and predicted; below each "
+        "the error, with two deviations of the noise shaded: what is right stays within.",
+    ]
+    return Chapter("Measured and predicted", sentences, pictures)
+
+
+def _in_pieces(t: Array, values: Array) -> tuple[Array, Array]:
+    """A line that is broken where nothing was measured for long."""
+    steps = np.diff(t)
+    breaks = np.flatnonzero(steps > 5 * np.median(steps)) + 1 if len(steps) else np.zeros(0, int)
+    return np.insert(t, breaks, t[breaks]), np.insert(values, breaks, np.nan)
+
+
+def _absorbed(finding: Finding) -> Chapter | None:
+    if not finding.effects or not finding.absorbed:
+        return None
+    by_unit: dict[str, dict[str, Change]] = {}
+    for entry in finding.absorbed:
+        std = finding.nominal.std.get(entry.name, 0.0)
+        by_unit.setdefault(entry.unit, {})[entry.name] = Change(entry.before, entry.after, std, entry.std)
+    words = ("fitted without the effects", EXTENDED, "")
+    pictures = [("", figures.html(figures.changes(rows, f"value [{unit}]", words))) for unit, rows in by_unit.items()]
+    moved = [e for e in finding.absorbed if abs(e.after - e.before) > 0.1 * max(abs(e.before), 1e-9)]
+    moved.sort(key=lambda e: -abs(e.after - e.before) / max(abs(e.before), 1e-9))
+    said = ", ".join(f"{e.name} goes from {e.before:.3g} to {e.after:.3g} {e.unit}" for e in moved[:4])
+    sentences = [
+        "A missing effect hides in the parameters that are free: this is how they move when it is added. Bars are two "
+        "standard deviations, cut where they leave the picture.",
+        f"{said}." if said else "None of them moves by more than a tenth.",
+    ]
+    return Chapter("What the stiffnesses had absorbed", sentences, pictures)

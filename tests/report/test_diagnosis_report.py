@@ -1,0 +1,171 @@
+"""The report of a diagnosis: every chapter of every verdict, in words and pictures."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from yid_ocp.config import load_problem
+from yid_ocp.data import JointGroup, Recording, write_recording
+from yid_ocp.diagnosis import Thresholds, diagnose
+from yid_ocp.report import figures
+from yid_ocp.report.figures import Change, Curve, Ranked, Row
+from yid_ocp.report.html import write_report
+from yid_ocp.report.sections import Findings
+from yid_ocp.workflow.diagnose import predictions
+
+CHAPTERS = ("gap", "where", "which", "alike", "curves", "absorbed")
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory, urdf_folder):
+    """Findings on a pendulum: friction in the elbow that is named, that no candidate explains, and none at all."""
+    folder = tmp_path_factory.mktemp("found")
+    rng = np.random.default_rng(1)
+    t = 0.01 * np.arange(151)
+    recordings = {}
+    for name, phase in (("a", 0.0), ("b", 1.0)):
+        position = np.stack([0.5 * np.sin(3 * t + phase), 0.4 * np.cos(5 * t + phase)], axis=1)
+        recordings[name] = Recording(
+            JointGroup(("shoulder", "elbow"), t, position, effort=0 * position, effort_std=0.02), name=name
+        )
+        write_recording(recordings[name], folder / f"{name}.h5")
+    (folder / "p.yaml").write_text(
+        f"model: {{robot: {urdf_folder / 'double_pendulum.urdf'}, arms: {{mode: prescribed}}}}\n"
+        "recordings: {estimate: [a.h5], held_out: [b.h5]}\n"
+        "parameters: {elbow.damping: {free: true}}\n"
+        "solver: {path_cutoff: .inf, compiler: false}\n"
+    )
+    nominal = load_problem(folder / "p.yaml")
+    for rub in (0.0, 0.05):
+        for problem_episodes in (nominal.episodes, nominal.held_out):
+            for episode in problem_episodes:
+                theta = nominal.theta
+                swept = nominal.run(episode, theta, np.zeros(0), derivatives=False)
+                effort = np.vstack([swept.sweep.effort, swept.sweep.effort[-1:]])[:151]
+                joints = recordings[episode.name].joints
+                effort = effort + rub * np.sign(np.gradient(joints.position, axis=0)) * [0, 1]
+                effort = effort + 0.02 * rng.standard_normal(effort.shape)
+                write_recording(
+                    replace(recordings[episode.name], joints=replace(joints, effort=effort)),
+                    folder / f"{episode.name}_{rub}.h5",
+                )
+        text = (folder / "p.yaml").read_text().replace("[a.h5]", f"[a_{rub}.h5]").replace("[b.h5]", f"[b_{rub}.h5]")
+        (folder / f"p_{rub}.yaml").write_text(text)
+    limits = Thresholds(effects=1)
+    rubbing, clean = load_problem(folder / "p_0.05.yaml"), load_problem(folder / "p_0.0.yaml")
+    return {
+        "effect": diagnose(rubbing, ["joint_coulomb", "effort_offset"], thresholds=limits),
+        "unknown": diagnose(rubbing, ["effort_offset"], thresholds=limits),
+        "no_gap": diagnose(clean, ["joint_coulomb", "effort_offset"], thresholds=limits),
+    }
+
+
+def page_of(finding, file) -> str:
+    result = json.loads(json.dumps(finding.to_dict() | {"command": "yid-ocp diagnose 'a b.yaml'"}))
+    more = {"finding": finding, "predictions": predictions(finding)}
+    assert write_report(file, Findings("run", "", result, more=more))
+    return file.read_text(encoding="utf-8").split("<body>")[1]
+
+
+def text_of(page: str) -> str:
+    bare = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
+    return re.sub(r"\s+", " ", re.sub(r"<[^>]+>", "", bare))
+
+
+@pytest.mark.parametrize(
+    ("verdict", "chapters"),
+    [
+        ("effect", CHAPTERS),
+        ("unknown", ("gap", "where", "which", "alike", "curves")),
+        ("no_gap", ("gap", "which", "alike", "curves")),
+    ],
+)
+def test_every_verdict_has_its_chapters(found, verdict, chapters, tmp_path):
+    finding = found[verdict]
+    assert finding.verdict == verdict
+    page = page_of(finding, tmp_path / "r.html")
+    assert tuple(re.findall(r'<h3 id="(\w+)">', page)) == chapters
+    text = text_of(page)
+    assert text.index("Verdict") < text.index("This result again: yid-ocp diagnose &#39;a b.yaml&#39;")
+    assert text.index("This result again") < text.index("How large the gap is")
+    assert page.count("Plotly.newPlot(") >= len(chapters)
+    assert "nan" not in text
+
+
+def test_the_words_beside_the_pictures_say_what_is_seen(found, tmp_path):
+    text = text_of(page_of(found["effect"], tmp_path / "r.html"))
+    assert "The error of joints.effort.elbow changes most" in text
+    assert "A gap would have shown at" in text
+    assert "By evidence the gap lies in the mechanics, not what sensors read" in text
+    assert "Closed by joint_coulomb@elbow" in text
+    assert "the surest value is that of elbow" in text
+    assert "elbow.damping goes from" in text
+
+
+def test_a_map_without_a_sure_value_shows_what_was_expected_beforehand(found, tmp_path):
+    finding = found["effect"]
+    smoothed = finding.smoothed
+    trace = smoothed.traces[0]
+    prior = np.sqrt([smoothed.variance[source] for source in trace.sources])
+    vague = replace(trace, std=np.broadcast_to(0.9 * prior, trace.std.shape))
+    page = page_of(replace(finding, smoothed=replace(smoothed, traces=(vague,))), tmp_path / "r.html")
+    assert "value in deviations expected beforehand" in page
+    assert "take the picture for a hint only" in text_of(page)
+
+
+def test_a_result_alone_gives_words_and_tables(found, tmp_path):
+    result = found["effect"].to_dict() | {"command": "yid-ocp diagnose"}
+    assert write_report(tmp_path / "r.html", Findings("run", "", result))
+    page = (tmp_path / "r.html").read_text(encoding="utf-8").split("<body>")[1]
+    assert "joint_coulomb@elbow" in page
+    assert "Plotly.newPlot(" not in page
+
+
+# -- figures ----------------------------------------------------------------------------------------------------------
+
+
+def test_changes_of_very_different_sizes_get_a_logarithmic_axis():
+    close = figures.changes({"a": Change(2.0, 1.0), "b": Change(3.0, None, mark=1.0)}, "x [m]", ("1", "2", "3"))
+    far = figures.changes({"a": Change(20.0, 0.1), "b": Change(3.0, 1.0)}, "x [m]", ("1", "2", "3"))
+    assert (close.layout.xaxis.type, far.layout.xaxis.type) == (None, "log")
+    assert [trace.name for trace in close.data[1:]] == ["1", "2", "3"]
+
+
+def test_bars_of_what_cannot_be_told_do_not_widen_the_axis():
+    figure = figures.changes({"a": Change(2.0, 1.0, float("inf"), 1e7)}, "x", ("1", "2", ""))
+    assert figure.layout.xaxis.range[1] < 3.0
+    assert figure.data[1].error_x.array is None
+    assert figure.data[2].error_x.array == (2e7,)
+
+
+def test_a_map_keeps_its_groups_together_and_its_gaps_empty():
+    values = np.array([1.0, np.nan, -4000.0])
+    rows = [Row(name, group, values, ["", "", ""]) for name, group in (("x", "a"), ("y", "a"), ("z", "b"))]
+    figure = figures.time_map(np.array([0.0, 0.1, 0.2, 0.3]), rows, "deviations")
+    heat = figure.data[0]
+    assert heat.z[0][1] is None
+    assert heat.zmax == -heat.zmin > 0
+    assert len(heat.x) == 4
+    assert "1000" in heat.colorbar.ticktext
+    assert [a.text for a in figure.layout.annotations] == ["color: deviations", "a", "b"]
+    assert len(figure.layout.shapes) == 1
+
+
+def test_a_ranking_says_what_lies_beyond_its_axis():
+    entries = [Ranked("good", (90.0, 80.0, 95.0), 88.0), Ranked("bad", (-900.0, -2000.0, -100.0), 1.0)]
+    figure = figures.ranking([*entries, Ranked("untried", None, 0.5)], "closed [%]", "promised [%]")
+    assert [a.text for a in figure.layout.annotations] == ["◀ -900"]
+    assert figure.layout.yaxis.categoryarray == ("untried", "bad", "good")
+    alone = figures.ranking([Ranked("untried", None, 0.5)], "closed", "promised")
+    assert [trace.type for trace in alone.data] == ["bar"]
+
+
+def test_a_band_is_shaded_about_the_noise():
+    t = np.linspace(0.0, 1.0, 5)
+    figure = figures.over_time([Curve("error", t[:0], t[:0], {"line": (t, t)}, 0.2)], "red", {"line": "blue"})
+    assert (figure.layout.shapes[0].y0, figure.layout.shapes[0].y1) == (-0.2, 0.2)

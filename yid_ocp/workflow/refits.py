@@ -1,0 +1,94 @@
+"""Finished refits of a diagnosis, kept beside its run folder so that an interrupted one does not begin again."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import logging
+import math
+import os
+import secrets
+import threading
+from collections.abc import Mapping
+
+from yid_ocp.diagnosis import Refitted
+from yid_ocp.workflow.folder import RunFolder
+
+FORMAT = "yid-refits/1"
+log = logging.getLogger(__name__)
+
+
+class Refits:
+    """A store of refits in one JSON file: {format, key, refits: {name: {values, std, message}}}.
+
+    The file is replaced as a whole after every refit. One that was made from other inputs, by another configuration or
+    by another version is passed over with a notice.
+
+    Attributes
+    ----------
+    file : Path
+    """
+
+    def __init__(self, folder: RunFolder, *made_from: Mapping[str, str] | str) -> None:
+        self.file = folder.partial / "refits.json"
+        self._folder = folder
+        self._key = hashlib.sha256(json.dumps(made_from, sort_keys=True).encode()).hexdigest()
+        self._lock = threading.Lock()
+        self._known = self._read()
+
+    def __len__(self) -> int:
+        return len(self._known)
+
+    def get(self, name: str) -> Refitted | None:
+        """See `yid_ocp.diagnosis.select.Store`; what is taken up is said in the log."""
+        found = self._known.get(name)
+        if found is not None:
+            self._folder.log("taken_up", refit=name)
+        return found
+
+    def put(self, name: str, refitted: Refitted) -> None:
+        """See `yid_ocp.diagnosis.select.Store`."""
+        with self._lock:
+            self._known[name] = refitted
+            refits = {
+                key: {"values": _texts(fit.values), "std": _texts(fit.std), "message": fit.message}
+                for key, fit in self._known.items()
+            }
+            self.file.parent.mkdir(parents=True, exist_ok=True)
+            fresh = self.file.with_name(f"{self.file.name}.{secrets.token_hex(4)}")
+            text = json.dumps({"format": FORMAT, "key": self._key, "refits": refits}, indent=1, allow_nan=False)
+            fresh.write_text(text + "\n", encoding="utf-8")
+            os.replace(fresh, self.file)
+
+    def clear(self) -> None:
+        """Remove the file, what a killed run left of it, and its folder where nothing else is in it."""
+        with contextlib.suppress(OSError):
+            for file in self.file.parent.glob(f"{self.file.name}*"):
+                file.unlink()
+            self.file.parent.rmdir()
+
+    def _read(self) -> dict[str, Refitted]:
+        try:
+            held = json.loads(self.file.read_text(encoding="utf-8"))
+            if (held["format"], held["key"]) == (FORMAT, self._key):
+                return {
+                    name: Refitted(_numbers(fit["values"]), _numbers(fit["std"]), str(fit["message"]))
+                    for name, fit in held["refits"].items()
+                }
+            reason = "other inputs, another configuration or another version"
+        except FileNotFoundError:
+            return {}
+        except (OSError, ValueError, LookupError, TypeError, AttributeError):
+            reason = "something that cannot be read"
+        log.warning("the refits in %s are from %s and are not taken up", self.file, reason)
+        return {}
+
+
+def _texts(values: Mapping[str, float]) -> dict[str, float | str]:
+    """JSON has no infinities: what is not finite is kept as text."""
+    return {name: value if math.isfinite(value) else str(value) for name, value in values.items()}
+
+
+def _numbers(values: Mapping[str, float | str]) -> dict[str, float]:
+    return {name: float(value) for name, value in values.items()}
