@@ -299,9 +299,7 @@ class EstimationProblem:
         at = len(self.shared) + len(self.local)
         return self._prior_deviations[at : at + self._start_size]
 
-    def start_state(
-        self, episode: Episode, theta: Array, deviation: Array | None = None
-    ) -> tuple[Array, Array, str]:
+    def start_state(self, episode: Episode, theta: Array, deviation: Array | None = None) -> tuple[Array, Array, str]:
         """Initial state of an episode, its derivative by (free parameters, deviation), and what went wrong.
 
         Parameters
@@ -323,9 +321,7 @@ class EstimationProblem:
         state, by_all, _, message = self._begin(episode, own, none, self._columns)
         return state, by_all, message
 
-    def predict_along(
-        self, samples: Samples, state: Array, by_state: Array, theta: Array
-    ) -> tuple[Array, Array]:
+    def predict_along(self, samples: Samples, state: Array, by_state: Array, theta: Array) -> tuple[Array, Array]:
         """Readings along a given trajectory and their derivatives.
 
         Parameters
@@ -397,9 +393,7 @@ class EstimationProblem:
             by_torque, by_path = (None if by is None else np.pad(by, extra) for by in moved)
             directions = Directions(wanted, by_start, by_torque, by_path)
         feedback = inputs.guided(feedback, driven, episode.measured_arm)
-        sweep = simulate(
-            self.step, theta, state, episode.grid.steps, inputs.torque, inputs.path, feedback, directions
-        )
+        sweep = simulate(self.step, theta, state, episode.grid.steps, inputs.torque, inputs.path, feedback, directions)
         if not sweep.status.ok:
             return f"{episode.name}: {sweep.status.message}"
         predicted, sensitivities = [], []
