@@ -117,6 +117,16 @@ def test_steepest_descent_lowers_the_papers_cost(make_problem):
     assert solution.parameters["T1.bend"].value == pytest.approx(22.0, rel=0.05)
 
 
+def test_steepest_descent_with_a_memory_returns_the_best_point(make_problem):
+    problem = make_problem(free=("T1.bend", "T2.bend"), duration=2.0, weighting="paper")
+    solution = solve(problem, SteepestDescent(trial="spectral", memory=10, gradient_tolerance=1e-4))
+    costs = [entry.cost for entry in solution.history]
+    assert solution.status == Status.CONVERGED
+    assert any(after > before for before, after in itertools.pairwise(costs))
+    assert solution.cost == pytest.approx(min(costs), rel=1e-12)
+    assert solution.x == pytest.approx(solve(problem, GaussNewton(cost_tolerance=1e-12)).x, rel=1e-3)
+
+
 def test_estimated_start_gives_the_same_optimum_in_both_formulations(make_problem):
     problem = make_problem(free=("T1.bend", "T2.bend"), duration=0.6, initial_state="estimated")
     single = solve(problem, GaussNewton())
