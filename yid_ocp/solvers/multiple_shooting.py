@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 Hessian = Literal["gauss_newton", "exact"]
 
 SUCCESS = {"Solve_Succeeded", "Solved_To_Acceptable_Level"}
-# Curvature for a change of a parameter by its size, over the mean square of the whitened residuals.
+# Least curvature for a change of a parameter by its size, over the mean square of the whitened residuals.
 RIDGE = 0.1
 
 
@@ -194,6 +194,8 @@ class _Nlp:
         self.recorder = recorder
         self.best = np.zeros(transcription.size)
         self._asked = np.zeros(0)
+        self._ridge = RIDGE
+        self._change = np.zeros(len(transcription.problem.shared))
         self._keep: list[_Function] = []
 
     def prepare(self, w0: Array) -> None:
@@ -261,9 +263,22 @@ class _Nlp:
         residual, slope, cost = self.transcription.residual(w, True)
         assert slope is not None
         gradient = slope.T @ residual
+        self._hold(w)
         self.best = w
         self.recorder.accept(cost, self.transcription.unknowns(w), float(np.max(np.abs(gradient))) / self._unit)
         return [cost / self._unit, gradient / self._unit]
+
+    def _hold(self, w: Array) -> None:
+        """Raise the ridge where parameters swing to and fro, lower it where they keep going."""
+        change = (w - self.best)[: len(self._change)] / self._size(w)
+        turned = float(change @ self._change) < 0
+        self._ridge = 4.0 * self._ridge if turned else max(0.5 * self._ridge, RIDGE)
+        self._change = change
+
+    def _size(self, w: Array) -> Array:
+        problem = self.transcription.problem
+        count = len(problem.shared)
+        return np.maximum(np.abs(w[:count]), problem.scales[:count])
 
     def _jacobian(self, w: Array, _: Array) -> list:
         value, jacobian = self.transcription.constraints(w, True)
@@ -273,12 +288,10 @@ class _Nlp:
     def _curvature(self, w: Array, _: Array, lam_f: Array, lam_g: Array) -> list:
         residual, slope, cost = self.transcription.residual(w, True)
         assert slope is not None
-        problem = self.transcription.problem
-        count = len(problem.shared)
-        # the worse the fit, the less the linear model is worth: parameters, of which some are weakly informed, are held
+        size = self._size(w)
+        # along weakly informed parameters the curvature that Gauss-Newton leaves out may be as large as its own
         ridge = np.zeros(len(w))
-        size = np.maximum(np.abs(w[:count]), problem.scales[:count])
-        ridge[:count] = RIDGE * 2 * cost / len(residual) / size**2
+        ridge[: len(size)] = self._ridge * 2 * cost / len(residual) / size**2
         matrix = (slope.T @ slope + scipy.sparse.diags(ridge)) * (float(lam_f[0]) / self._unit)
         if self.hessian == "exact":
             matrix = matrix + self.transcription.curvature(w, lam_g)
