@@ -22,6 +22,8 @@ REACH = 3.0
 # Fraction of a point's cost or defects that a better point may at most have; shortest fraction of a step that is tried.
 MARGIN = 1.0 - 1e-5
 SHORTEST = 1e-3
+# Damping up to which a step tells how far the cost can still be lowered.
+TRUSTED = 0.1
 
 
 @dataclass(frozen=True)
@@ -120,13 +122,15 @@ class Lifted:
             low = np.where(problem.positive, np.maximum(lower, x / REACH), lower)
             high = np.where(problem.positive, np.minimum(upper, np.maximum(x, 1e-3 * problem.scales) * REACH), upper)
             step = bounded_step(now.jacobian * size, closed, mu, (low - x) / size, (high - x) / size) * size
-            change = now.by_defect + now.jacobian @ step
-            promised = now.cost - 0.5 * float(np.sum((now.residual + change) ** 2))
-            slope = float(now.residual @ change)
+            after = closed + now.jacobian @ step
+            promised = 0.5 * float(closed @ closed - after @ after)
             moved = float(np.max(np.abs(step) / size, initial=0.0))
-            little = self.cost_tolerance * max(now.cost, 1e-300)
-            if now.defect < self.defect_tolerance and (moved < self.step_tolerance or promised <= little):
-                return self._end(Status.CONVERGED, f"closed to {now.defect:.1e}", x, recorder)
+            if moved < self.step_tolerance or (mu < TRUSTED and promised <= self.cost_tolerance * now.cost):
+                if now.defect < self.defect_tolerance:
+                    return self._end(Status.CONVERGED, f"closed to {now.defect:.1e}", x, recorder)
+                # a change along what the data do not inform would only open the defects again
+                step = np.zeros_like(step)
+            slope = float(now.residual @ (now.by_defect + now.jacobian @ step))
             factor = 1.0
             while True:
                 trial_x = np.clip(x + factor * step, lower, upper)

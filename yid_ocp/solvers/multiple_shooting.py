@@ -263,9 +263,11 @@ class _Nlp:
         residual, slope, cost = self.transcription.residual(w, True)
         assert slope is not None
         gradient = slope.T @ residual
-        self._hold(w)
-        self.best = w
-        self.recorder.accept(cost, self.transcription.unknowns(w), float(np.max(np.abs(gradient))) / self._unit)
+        if not np.array_equal(w, self.best):
+            # IPOPT may ask more than once for the gradient at the point that it accepted
+            self._hold(w)
+            self.best = w
+            self.recorder.accept(cost, self.transcription.unknowns(w), float(np.max(np.abs(gradient))) / self._unit)
         return [cost / self._unit, gradient / self._unit]
 
     def _hold(self, w: Array) -> None:
