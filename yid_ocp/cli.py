@@ -296,6 +296,7 @@ def solve_summary(result: dict[str, Any]) -> list[str]:
         lines.append(f"cannot be found from these recordings: {', '.join(lost)}")
     if weak and not failed:
         lines.append(f"only weakly determined: {', '.join(weak)}")
+        lines.append("their deviations are too small on one side; `yid-ocp identifiability` gives intervals")
     lines.append(
         f"{result['status']}: {result['message']} ({result['iterations']} iterations, {result['seconds']:.1f} s)"
     )
