@@ -75,7 +75,7 @@ class Lifted:
 
     A linear step closes every defect; the recursion  S_{j+1} = A_j S_j + B_j,  c_{j+1} = A_j c_j + d_j  expresses all
     node steps by the parameters' step (condensing), so that an iteration costs one rollout with one direction more
-    than single shooting's. The merit of a step is the cost plus a penalty on the defects.
+    than single shooting's. A filter decides whether a step is good: it must improve the cost or the defects.
 
     Attributes
     ----------
