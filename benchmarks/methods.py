@@ -1,4 +1,4 @@
-"""Time to solution of every method from the same start, as ratios to Gauss-Newton in the same run.
+"""Time to solution of every method from the same start, as ratios to Gauss-Newton single shooting in the same run.
 
 python benchmarks/methods.py [--arms N] [--json FILE]
 """
@@ -20,7 +20,7 @@ from yid_ocp.data.recording import read_recording
 from yid_ocp.data.synthetic import paper_system
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.solvers import GaussNewton, Lifted, MultipleShooting, SingleShooting
+from yid_ocp.solvers import GaussNewton, Lifted, MultipleShooting, SingleShooting, SteepestDescent
 
 RECORDINGS = {1: "single_arm_vision_estimate.h5", 2: "dual_arm_vision_estimate.h5"}
 
@@ -29,7 +29,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run every method from 3 N m/rad and print one table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--arms", type=int, choices=(1, 2), default=1)
-    parser.add_argument("--json", type=Path, metavar="FILE", help="store the ratios")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="store the ratios of CPU time")
     options = parser.parse_args(arguments)
     recording = read_recording(Path(yid_ocp.__file__).parent / "data" / "defaults" / RECORDINGS[options.arms])
     step = compile_step(paper_system(options.arms), TIME_STEP, "left_damping")
@@ -41,9 +41,24 @@ def main(arguments: list[str] | None = None) -> int:
         "lifted": Lifted(),
         "multiple_shooting, node every 10 steps": MultipleShooting(node_interval=10),
         "multiple_shooting, node every step": MultipleShooting(node_interval=1),
+        "steepest_descent, as in the paper": SteepestDescent(),
+        "steepest_descent, spectral": SteepestDescent(
+            trial="spectral", memory=10, iterations=800, gradient_tolerance=1e-4
+        ),
     }
     table = Table(title=f"{recording.name}: 500 steps, from 3 N m/rad")
-    for title in ("method", "status", "cost", "iterations", "CPU [s]", "/ gauss_newton", "peak [MiB]"):
+    titles = (
+        "method",
+        "status",
+        "cost",
+        "iterations",
+        "rollouts",
+        "wall [s]",
+        "CPU [s]",
+        "/ gauss_newton",
+        "peak [MiB]",
+    )
+    for title in titles:
         table.add_column(title, justify="left" if title in ("method", "status") else "right")
     ratios: dict[str, float] = {}
     reference = 0.0
@@ -56,6 +71,8 @@ def main(arguments: list[str] | None = None) -> int:
             run.solution.status.value,
             f"{run.whitened_cost:.2f}",
             str(run.solution.iterations),
+            str(run.solution.evaluations),
+            f"{run.wall_seconds:.2f}",
             f"{run.cpu_seconds:.2f}",
             f"{ratios[name]:.1f}",
             f"{run.peak_memory:.0f}",

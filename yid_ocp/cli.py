@@ -322,6 +322,7 @@ def solve_summary(result: dict[str, Any]) -> list[str]:
         lines.append(f"cannot be found from these recordings: {', '.join(lost)}")
     if weak and not failed:
         lines.append(f"only weakly determined: {', '.join(weak)}")
+        lines.append("their deviations are too small on one side; `yid-ocp identifiability` gives intervals")
     lines.append(
         f"{result['status']}: {result['message']} ({result['iterations']} iterations, {result['seconds']:.1f} s)"
     )
@@ -379,9 +380,14 @@ def compare_summary(result: dict[str, Any]) -> list[str]:
     row("peak memory [MiB]", *(f"{entry['peak_memory_mib']:.0f}" for entry in methods.values()))
     lines += [*table(prices), ""]
     for name, entry in methods.items():
+        if entry["status"] != "converged":
+            lines.append(f"{name} did not converge: {entry['message']}")
         lines += [f"{name} differs: {sentence}" for sentence in entry["disagreements"]]
     lines += result["explained"]
-    if result["agree"]:
+    if not any(methods[result["reference"]]["parameters"][name]["verdict"] == "identifiable" for name in free):
+        lines.append("no parameter is identifiable from these recordings, so there is nothing to agree on")
+        lines.append("`yid-ocp identifiability CONFIG --what-if` says what would have to be measured")
+    elif result["agree"]:
         lines.append("all methods agree on the identifiable parameters within their uncertainty")
     return lines
 

@@ -44,6 +44,33 @@ def test_a_method_that_stops_early_is_said_to_differ(problem):
     assert any("iteration_limit" in sentence for sentence in found.agreement["steepest_descent"])
 
 
+def test_steepest_descent_goes_astray_exactly_where_nothing_is_identifiable(problem):
+    """The core of the paper's effect on a quick case; docs/comparison.md has its four experiments."""
+    truth = {"T1.bend": 22.0, "T2.bend": 10.7, "T3.twist": 9.7}
+    descent = SteepestDescent(trial="spectral", memory=10, gradient_tolerance=1e-4)
+    found = compare(problem, [GaussNewton(), descent], truth)
+    assert found.agree
+    sentence = found.explained[-1]
+    assert "T3.twist (3 for 9.7, not identifiable)" in sentence
+    assert "T1.bend" not in sentence
+    assert "T2.bend" not in sentence
+    assert "exactly the parameters that the data do not identify" in sentence
+    short = compare(problem, [GaussNewton(), SteepestDescent(iterations=2)], truth)
+    assert "could be identified: the method stopped short (iteration_limit)" in short.explained[-1]
+
+
+def test_nothing_to_agree_on(repository, tmp_path, capsys):
+    config = repository / "configs" / "springs_series_ends.yaml"
+    methods = "compare.methods={gauss_newton: {}, lifted: {iterations: 3}, multiple_shooting: {iterations: 2}}"
+    assert main(["compare", str(config), "--out", str(tmp_path / "run"), "--set", methods]) == 0
+    text = capsys.readouterr().out
+    assert "lifted did not converge: no convergence in 3 iterations" in text
+    assert "multiple_shooting did not converge: IPOPT stopped after 2 iterations" in text
+    assert "no parameter is identifiable from these recordings, so there is nothing to agree on" in text
+    result = json.loads((tmp_path / "run" / "result.json").read_text(encoding="utf-8"))
+    assert all(entry["parameters"]["spring_1.stiffness"]["value"] > 0 for entry in result["methods"].values())
+
+
 def test_published_answers_are_the_papers():
     assert PUBLISHED["dual_arm_vision"]["T1.twist"] == 0.0
     assert set(PUBLISHED) == {f"{arms}_arm_{eyes}" for arms in ("single", "dual") for eyes in ("vision", "no_vision")}

@@ -60,10 +60,13 @@ def test_the_independent_figures_leave_the_unseen_twists_out(golden_problem):
 
 
 def test_a_start_that_nothing_is_known_of(golden_problem):
-    """With next to no prior on the start the deviation nears the 254 to 345 % of an independent computation."""
+    """A prior of 10 rad and 50 rad/s on the start leaves T3.bend 228 %, where the default prior leaves it 172 %.
+
+    An independent computation gave 254 to 345 %, with a prior that it does not state.
+    """
     problem = golden_problem("single", False)
     problem.options = replace(problem.options, configuration_std=10.0, velocity_std=50.0)
-    assert 2.0 < identifiability(problem).parameters["T3.bend"].std_relative < 3.5
+    assert identifiability(problem).parameters["T3.bend"].std_relative == pytest.approx(2.28, rel=0.05)
 
 
 def test_correlations_and_information(golden_problem):

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import itertools
+from importlib import resources
 
 import numpy as np
 import pytest
 
+from yid_ocp.data import read_recording
 from yid_ocp.errors import SolverError
+from yid_ocp.integrator.step import compile_step
+from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import GaussNewton, Lifted, MultipleShooting, SingleShooting, Status, SteepestDescent, solve
 
+FREE = ("T1.bend", "T1.twist", "T2.bend", "T2.twist", "T3.bend", "T3.twist")
 SEEN = ("T1.bend", "T1.twist", "T2.bend")
 
 
@@ -73,11 +78,53 @@ def test_lifted_agrees(short, reference):
     assert within(solution, reference)
 
 
+@pytest.fixture(scope="module")
+def two_arms(paper_systems):
+    """50 variables, 500 steps, six parameters from 3 N m/rad; two of the twists leave no trace in the data."""
+    step = compile_step(paper_systems["dual"], 0.01, "left_damping")
+    recording = read_recording(resources.files("yid_ocp.data") / "defaults" / "dual_arm_vision_estimate.h5")
+    return EstimationProblem(step, [recording], FREE)
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [
+        Lifted(),
+        pytest.param(MultipleShooting(node_interval=10), marks=pytest.mark.slow),
+        pytest.param(MultipleShooting(node_interval=1), marks=pytest.mark.slow),
+    ],
+    ids=["lifted", "node every 10 steps", "node every step"],
+)
+def test_fifty_variables_from_far_away(two_arms, solver):
+    """One start is enough, and weakly informed parameters do not keep the methods busy."""
+    single = solve(two_arms, GaussNewton())
+    solution = solve(two_arms, solver)
+    assert solution.status == Status.CONVERGED, solution.message
+    assert "starts" not in solution.message
+    assert solution.iterations <= 40
+    assert solution.cost == pytest.approx(single.cost, abs=0.2)
+    found = [name for name, entry in single.parameters.items() if entry.verdict == "identifiable"]
+    assert found == ["T1.bend", "T1.twist", "T2.bend", "T3.bend"]
+    for name in found:
+        reference = single.parameters[name]
+        assert solution.parameters[name].value == pytest.approx(reference.value, abs=0.1 * reference.std), name
+
+
 def test_steepest_descent_lowers_the_papers_cost(make_problem):
     problem = make_problem(free=("T1.bend", "T2.bend"), duration=2.0, weighting="paper")
     solution = solve(problem, SteepestDescent(iterations=60, trial="spectral"))
     assert solution.history[-1].cost < 0.05 * solution.history[0].cost
     assert solution.parameters["T1.bend"].value == pytest.approx(22.0, rel=0.05)
+
+
+def test_steepest_descent_with_a_memory_returns_the_best_point(make_problem):
+    problem = make_problem(free=("T1.bend", "T2.bend"), duration=2.0, weighting="paper")
+    solution = solve(problem, SteepestDescent(trial="spectral", memory=10, gradient_tolerance=1e-4))
+    costs = [entry.cost for entry in solution.history]
+    assert solution.status == Status.CONVERGED
+    assert any(after > before for before, after in itertools.pairwise(costs))
+    assert solution.cost == pytest.approx(min(costs), rel=1e-12)
+    assert solution.x == pytest.approx(solve(problem, GaussNewton(cost_tolerance=1e-12)).x, rel=1e-3)
 
 
 def test_estimated_start_gives_the_same_optimum_in_both_formulations(make_problem):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.problem import Episode, EpisodeResult
 from yid_ocp.solvers import Iterate, Solution, Status, solve
-from yid_ocp.solvers.base import Solver
+from yid_ocp.solvers.base import IDENTIFIABLE, Solver
 
 Array = NDArray[np.float64]
 
@@ -71,7 +71,8 @@ class Comparison:
         One sentence for each identifiable parameter on which the method differs, with the likely reason; empty where
         it agrees.
     explained : tuple of str
-        What became of the parameters that the data do not inform.
+        What became of the parameters that the data do not inform, and, where the truth is known, which parameters
+        steepest descent left far from it.
     """
 
     runs: tuple[MethodRun, ...]
@@ -151,7 +152,7 @@ def _differences(run: MethodRun, best: MethodRun) -> list[str]:
 
 
 def _explanations(runs: Sequence[MethodRun], best: MethodRun, truth: Mapping[str, float]) -> list[str]:
-    """Where methods sent the parameters that the analysis calls weak or not identifiable."""
+    """Where methods sent the parameters that the data do not identify, and where the paper's method went astray."""
     sentences = []
     for name, reference in best.solution.parameters.items():
         if not reference.free or reference.verdict == "identifiable":
@@ -160,7 +161,31 @@ def _explanations(runs: Sequence[MethodRun], best: MethodRun, truth: Mapping[str
         places = ", ".join(f"{run.method} {run.solution.parameters[name].value:.3g}" for run in runs)
         verdict = {"weak": "weakly informed by", "not_identifiable": "not identifiable from"}[reference.verdict]
         sentences.append(f"{name}{known} is {verdict} these data: where it ends is the method's choice ({places})")
+    sentences += [_astray(run, best, truth) for run in runs if run.method == "steepest_descent" and truth]
     return sentences
+
+
+def _astray(run: MethodRun, best: MethodRun, truth: Mapping[str, float]) -> str:
+    """Which parameters a method left far from the truth, and whether these are the ones that the data do not tell."""
+    known = {name: entry for name, entry in best.solution.parameters.items() if entry.free and name in truth}
+    found = {name: run.solution.parameters[name].value for name in known}
+    # the same limit makes a deviation too large for an identifiable parameter
+    astray = [name for name in known if abs(found[name] - truth[name]) > IDENTIFIABLE * abs(truth[name])]
+    verdicts = {name: entry.verdict.replace("_", " ") for name, entry in known.items()}
+    hidden = [name for name in known if known[name].verdict != "identifiable"]
+    within = f"within {100 * IDENTIFIABLE:.0f} % of the truth"
+    if not astray:
+        return f"{run.method} ended {within} everywhere"
+    places = ", ".join(f"{name} ({found[name]:.3g} for {truth[name]:.3g}, {verdicts[name]})" for name in astray)
+    text = f"where {run.method} did not end {within}: {places}"
+    if astray == hidden:
+        return f"{text}; these are exactly the parameters that the data do not identify"
+    seen, lucky = [name for name in astray if name not in hidden], [name for name in hidden if name not in astray]
+    if seen:
+        text += f"; {', '.join(seen)} could be identified: the method stopped short ({run.solution.status.value})"
+    if lucky:
+        text += f"; {', '.join(f'{name} ({verdicts[name]})' for name in lucky)} came out near the truth all the same"
+    return text
 
 
 class _Memory:

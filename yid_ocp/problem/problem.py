@@ -627,8 +627,14 @@ class EstimationProblem:
             dict(zip(self.system.parameters.names, self.theta, strict=True)),
         )
 
-    def gradient(self, x: ArrayLike) -> tuple[float, Array, Evaluation]:
+    def gradient(self, x: ArrayLike, evaluation: Evaluation | None = None) -> tuple[float, Array, Evaluation]:
         """Cost and its gradient by the adjoint sweep.
+
+        Parameters
+        ----------
+        x : array_like, shape (nx,)
+        evaluation : Evaluation, optional
+            At `x`, where it is known already: the rollout is most of the work.
 
         Returns
         -------
@@ -638,7 +644,8 @@ class EstimationProblem:
             Without a Jacobian.
         """
         x = np.asarray(x, float)
-        evaluation = self.evaluate(x, derivatives=False)
+        if evaluation is None:
+            evaluation = self.evaluate(x, derivatives=False)
         gradient = np.zeros(len(x))
         if not evaluation.ok:
             return evaluation.cost, gradient, evaluation

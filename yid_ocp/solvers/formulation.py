@@ -204,7 +204,9 @@ class Transcription:
         times = layout.nodes * h
         for column in range(self.nx):
             state[:, column] = np.interp(times, times[chosen], state[chosen, column])
-        force = np.stack([np.interp(times, times[chosen], pull[chosen, c]) for c in range(self.m)], axis=1)
+        force = np.zeros((len(times), self.m))
+        for column in range(self.m):
+            force[:, column] = np.interp(times, times[chosen], pull[chosen, column])
         driven = list(problem.system.driven_indices)
         state[:, driven] = episode.measured_arm[layout.nodes]
         velocity = np.gradient(state[:, :n], times, axis=0)

@@ -19,6 +19,11 @@ Array = NDArray[np.float64]
 
 # Largest factor by which one iteration changes an unknown that is positive by nature.
 REACH = 3.0
+# Fraction of a point's cost or defects that a better point may at most have; shortest fraction of a step that is tried.
+MARGIN = 1.0 - 1e-5
+SHORTEST = 1e-3
+# Damping up to which a step tells how far the cost can still be lowered.
+TRUSTED = 0.1
 
 
 @dataclass(frozen=True)
@@ -33,6 +38,36 @@ class _Linearised:
     states: tuple[tuple[Array, Array, Array], ...]
 
 
+class _Filter:
+    """Which trial points are acceptable: those better than every point so far in cost or in defects.
+
+    A merit function has to weigh the two against each other; a weight that was needed far from the solution makes steps
+    short near it.
+
+    References
+    ----------
+    Waechter and Biegler (2005), SIAM J. Optim. 16(1):1, doi:10.1137/S1052623403426556.
+    """
+
+    def __init__(self, start: _Linearised) -> None:
+        self._largest = 1e4 * max(start.defect, 1.0)
+        self._points: list[tuple[float, float]] = []
+
+    def accepts(self, now: _Linearised, trial: _Linearised, slope: float) -> bool:
+        """Whether to go on from `trial`, for which the linear model says that the cost changes by `slope`."""
+        if not trial.defect <= self._largest or not np.isfinite(trial.cost):
+            return False
+        if any(trial.defect >= MARGIN * defect and trial.cost >= MARGIN * cost for defect, cost in self._points):
+            return False
+        # with defects as good as closed the cost has to fall as it should
+        if slope < 0 and (-slope / max(now.cost, 1e-300)) ** 2.3 > now.defect**1.1:
+            return trial.cost <= now.cost + 1e-4 * slope
+        if trial.defect <= MARGIN * now.defect or trial.cost <= MARGIN * now.cost:
+            self._points.append((now.defect, now.cost))
+            return True
+        return False
+
+
 @SOLVERS.register("lifted")
 @dataclass(frozen=True)
 class Lifted:
@@ -40,7 +75,7 @@ class Lifted:
 
     A linear step closes every defect; the recursion  S_{j+1} = A_j S_j + B_j,  c_{j+1} = A_j c_j + d_j  expresses all
     node steps by the parameters' step (condensing), so that an iteration costs one rollout with one direction more
-    than single shooting's. The merit of a step is the cost plus a penalty on the defects.
+    than single shooting's. A filter decides whether a step is good: it must improve the cost or the defects.
 
     Attributes
     ----------
@@ -78,7 +113,7 @@ class Lifted:
         recorder.evaluations += 1
         if isinstance(now, str):
             return Outcome(Status.FAILED, now, x, (), recorder.evaluations)
-        mu, weight = 1e-4, 0.0
+        mu, filtered = 1e-4, _Filter(now)
         for _ in range(self.iterations):
             size = np.maximum(np.abs(x), problem.scales)
             closed = now.residual + now.by_defect
@@ -87,41 +122,35 @@ class Lifted:
             low = np.where(problem.positive, np.maximum(lower, x / REACH), lower)
             high = np.where(problem.positive, np.minimum(upper, np.maximum(x, 1e-3 * problem.scales) * REACH), upper)
             step = bounded_step(now.jacobian * size, closed, mu, (low - x) / size, (high - x) / size) * size
-            change = now.by_defect + now.jacobian @ step
-            promised = now.cost - 0.5 * float(np.sum((now.residual + change) ** 2))
-            slope = float(now.residual @ change)
-            # exact penalty: large enough that the step descends on cost + weight * defect
-            weight = max(weight, 2.0 * max(slope, 0.0) / max(now.defect, 1e-300)) if now.defect > 0 else weight
+            after = closed + now.jacobian @ step
+            promised = 0.5 * float(closed @ closed - after @ after)
             moved = float(np.max(np.abs(step) / size, initial=0.0))
-            done = now.defect < self.defect_tolerance
-            recent = [entry.cost for entry in recorder.history[-4:]]
-            still = len(recent) == 4 and max(recent) - min(recent) <= self.cost_tolerance * max(now.cost, 1e-300)
-            if done and (
-                still or moved < self.step_tolerance or abs(promised) <= self.cost_tolerance * max(now.cost, 1e-300)
-            ):
-                return self._end(Status.CONVERGED, f"closed to {now.defect:.1e}", x, recorder)
+            if moved < self.step_tolerance or (mu < TRUSTED and promised <= self.cost_tolerance * now.cost):
+                if now.defect < self.defect_tolerance:
+                    return self._end(Status.CONVERGED, f"closed to {now.defect:.1e}", x, recorder)
+                # a change along what the data do not inform would only open the defects again
+                step = np.zeros_like(step)
+            slope = float(now.residual @ (now.by_defect + now.jacobian @ step))
             factor = 1.0
             while True:
                 trial_x = np.clip(x + factor * step, lower, upper)
-                trial_nodes = self._moved(transcription, nodes, now, step, factor)
-                trial = self._linearise(transcription, trial_x, trial_nodes)
+                trial = self._linearise(transcription, trial_x, self._moved(transcription, nodes, now, step, factor))
                 recorder.evaluations += 1
-                if not isinstance(trial, str):
-                    merit, target = trial.cost + weight * trial.defect, now.cost + weight * now.defect
-                    if merit <= target * (1 + 1e-9) or (done and moved < 1e-3):
-                        break
+                if not isinstance(trial, str) and filtered.accepts(now, trial, factor * slope):
+                    break
                 factor *= 0.5
-                if factor < 1e-3:
-                    message = trial if isinstance(trial, str) else "no step lowers cost and defects together"
-                    if mu < 1e2:
-                        break
+                if factor < SHORTEST:
+                    break
+            if factor < SHORTEST:
+                if mu > 1e2:
+                    message = trial if isinstance(trial, str) else "no step lowers the cost or closes the defects"
                     return self._end(Status.STALLED, f"{message}; try more nodes, or gauss_newton", x, recorder)
-            if factor < 1e-3:
                 mu = max(mu * 30.0, 1e-4)
                 continue
             mu = mu * 0.2 if factor == 1.0 else mu * 5.0
             assert not isinstance(trial, str)
-            x, nodes, now = trial_x, trial_nodes, trial
+            nodes = self._moved(transcription, nodes, now, step, factor)
+            x, now = trial_x, trial
         message = f"no convergence in {self.iterations} iterations; largest defect {now.defect:.1e}"
         return self._end(Status.ITERATION_LIMIT, message, x, recorder)
 

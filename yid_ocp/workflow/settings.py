@@ -285,7 +285,7 @@ class CompareSettings:
 
     methods: Annotated[Mapping[str, Mapping[str, Any]], About("settings of each method, by name")] = field(
         default_factory=lambda: {
-            "steepest_descent": {"trial": "spectral", "iterations": 800},
+            "steepest_descent": {"trial": "spectral", "memory": 10, "iterations": 800, "gradient_tolerance": 1e-4},
             "single_shooting": {},
             "gauss_newton": {},
             "multiple_shooting": {"node_interval": 10},
