@@ -120,7 +120,7 @@ def _diagnosed(
     alike = confusability(point, ranked)
     clock.lap("screening")
     enough = before.degrees >= limits.samples_per_unknown * len(nominal.values)
-    gap = has_gap(before, held, limits)
+    gap = has_gap(before, held, limits, ranked)
     fits: tuple[Fit, ...] = ()
     added: tuple[Added, ...] = ()
     smoothed = None

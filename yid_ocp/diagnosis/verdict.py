@@ -260,10 +260,25 @@ def which(finding: Finding) -> list[dict[str, Any]]:
 # -- the decision -----------------------------------------------------------------------------------------------------
 
 
-def has_gap(before: NullTest, held_out: NullTest, limits: Thresholds) -> bool:
-    """Whether either residual is more than noise, by enough to be worth a name."""
+def has_gap(before: NullTest, held_out: NullTest, limits: Thresholds, ranked: Sequence[Score] = ()) -> bool:
+    """Whether the residual is more than noise, by enough to be worth a name.
+
+    Either as a whole, or in one channel along what a candidate would do to it: the sum over all channels does not
+    notice what only a few samples show.
+
+    Parameters
+    ----------
+    before, held_out : NullTest
+    limits : Thresholds
+    ranked : sequence of Score
+        Of all visible candidates; their smallest p-value counts as the best of that many tries.
+    """
     p = min(1.0, 2 * min(before.p_value, held_out.p_value))
-    return p < limits.level and max(before.chi2_per_dof, held_out.chi2_per_dof) > 1 + limits.smallest_gap
+    if p < limits.level and max(before.chi2_per_dof, held_out.chi2_per_dof) > 1 + limits.smallest_gap:
+        return True
+    best = min((score.p_value for score in ranked), default=1.0) * len(ranked)
+    largest = max((*before.channels.values(), *held_out.channels.values()), default=1.0)
+    return best < limits.level and largest > 1 + limits.smallest_gap
 
 
 def decide(
