@@ -1,9 +1,9 @@
 """Effects done to a virtual experiment in the other engine's own terms, for a diagnosis that is not told of them.
 
-Whatever MuJoCo has a term of its own for (joint damping and springs, armature, gravity compensation, inertias, sites)
-is set in its model; other forces are worked out here in NumPy at every inner step; errors of sensors and clocks are
-done to the finished recording. None of the equations of `yid_ocp.effects` take part, but for effects that only change
-the description of the system (masses, lengths, rest angles, gravity, where a grasp sits).
+Whatever MuJoCo has a term of its own for (joint damping, armature, inertias, sites) is set in its model; other forces
+are worked out here in NumPy at every inner step; errors of sensors and clocks are done to the finished recording. None
+of the equations of `yid_ocp.effects` take part, but for effects that only change the description of the system (masses,
+lengths, rest angles, gravity, where a grasp sits).
 """
 
 from __future__ import annotations
@@ -43,13 +43,14 @@ DESCRIBED: tuple[str, ...] = (
     "gravity_tilt",
     "grasp_offset",
 )
-MODELLED: tuple[str, ...] = ("kelvin_voigt", "joint_viscous", "joint_spring", "rotor_inertia")
+MODELLED: tuple[str, ...] = ("kelvin_voigt", "joint_viscous", "rotor_inertia")
 FORCED: tuple[str, ...] = (
     "cubic_stiffness",
     "standard_linear_solid",
     "hysteresis",
     "aerodynamic_drag",
     "gravity_scale",
+    "joint_spring",
     "joint_coulomb",
     "joint_stribeck",
 )
@@ -176,10 +177,6 @@ class Foreign:
                 model.dof_damping[model.joint(place).id] += size["b"]
             elif effect.kind == "rotor_inertia":
                 model.dof_armature[model.joint(place).id] += size["armature"]
-            elif effect.kind == "joint_spring":
-                # MuJoCo has one spring for each joint; arms have none of their own
-                model.jnt_stiffness[model.joint(place).id] = size["stiffness"]
-                model.qpos_spring[model.joint(place).id] = size["rest_angle"]
             else:
                 self._forces.append(getattr(self, f"_{effect.kind}")(model, place, size))
 
@@ -276,6 +273,15 @@ class Foreign:
         def push(model: Any, data: Any) -> None:
             for body, weight in zip(bodies, weights, strict=True):
                 mujoco.mj_applyFT(model, data, weight, np.zeros(3), data.xipos[body], body, data.qfrc_passive)
+
+        return push
+
+    def _joint_spring(self, model: Any, place: str, size: Mapping[str, float]) -> Force:
+        # not MuJoCo's own spring, whose rest angle the search for the equilibrium uses to hold the arm
+        at = model.joint(place).id
+
+        def push(_: Any, data: Any) -> None:
+            data.qfrc_passive[at] -= size["stiffness"] * (data.qpos[at] - size["rest_angle"])
 
         return push
 

@@ -21,12 +21,14 @@ from yid_ocp.diagnosis.score import robust
 from yid_ocp.effects import EffectBase, Reported
 from yid_ocp.problem.problem import Evaluation
 from yid_ocp.solvers import GaussNewton
-from yid_ocp.solvers.base import uncertainty
+from yid_ocp.solvers.base import Outcome, uncertainty
 
 Array = NDArray[np.float64]
 
-SOLVER = GaussNewton(iterations=15, step_tolerance=1e-3, cost_tolerance=1e-6)
+SOLVER = GaussNewton(iterations=25, step_tolerance=1e-3, cost_tolerance=1e-6)
 """A refit starts near its end and must be good to a small part of its deviation only."""
+POOR = 1.1
+"""chi2/n above which a refit is tried again from the initial values of the nominal parameters."""
 RESAMPLES = 1000
 TIE = 0.01
 """Part of chi2/n by which two models may differ and still count as equal, however sure the difference."""
@@ -167,6 +169,28 @@ def refit(
     if known is not None:
         return known
     own = problem.freeing(effects)
+    best = _attempt(own, effects, start)
+    if best is not None and 2 * best[1].cost > POOR * len(best[1].residual):
+        # the nominal fit may have driven its parameters to where this model cannot come back from
+        fresh = {key: value for key, value in start.items() if key not in problem.nominal}
+        again = _attempt(own, effects, fresh)
+        best = again if again is not None and again[1].cost < best[1].cost else best
+    if best is None:
+        return None
+    outcome, finish = best
+    deviation = deviations(own, finish)
+    std = dict(zip(own.names, map(float, deviation), strict=True))
+    loss = held_out_loss(own, outcome.x)
+    values = own.named(outcome.x)
+    if store is not None:
+        store.put(name or describe(effects), Refitted(values, std, outcome.message))
+    return Fit(tuple(effects), own, values, std, finish.cost, finish, loss, outcome.message)
+
+
+def _attempt(
+    own: Composed, effects: Sequence[EffectBase], start: Mapping[str, float]
+) -> tuple[Outcome, Evaluation] | None:
+    """One run from one start and the evaluation at its end; None where the model cannot be rolled out."""
     neutral = {name: value for effect in effects for name, value in effect.neutral.items()}
     x = own.unknowns(start)
     for pull in (1.0, 0.5, 0.2, 0.05, 0.0):
@@ -178,15 +202,7 @@ def refit(
         return None
     outcome = SOLVER.run(own, x, None)
     finish = own.evaluate(outcome.x)
-    if not finish.ok:
-        return None
-    deviation = deviations(own, finish)
-    std = dict(zip(own.names, map(float, deviation), strict=True))
-    loss = held_out_loss(own, outcome.x)
-    values = own.named(outcome.x)
-    if store is not None:
-        store.put(name or describe(effects), Refitted(values, std, outcome.message))
-    return Fit(tuple(effects), own, values, std, finish.cost, finish, loss, outcome.message)
+    return (outcome, finish) if finish.ok else None
 
 
 def recalled(problem: Composed, effects: Sequence[EffectBase], store: Store | None, name: str = "") -> Fit | None:
