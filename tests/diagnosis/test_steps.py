@@ -11,7 +11,7 @@ import scipy.stats
 from yid_ocp.diagnosis import closure, confusability, linearise, null_test, refit, residual_series, scores, visibility
 from yid_ocp.diagnosis.hypotheses import Composed, Series, chosen_effects, smoothed_colour
 from yid_ocp.diagnosis.score import robust, shape_grid
-from yid_ocp.diagnosis.select import Loss, gain, within_reach
+from yid_ocp.diagnosis.select import Loss, far_out, gain, within_reach
 from yid_ocp.effects import make_effect
 
 
@@ -158,3 +158,16 @@ def test_the_simplest_within_one_standard_error_wins(screened):
     two = refit(composed, (effects["joint_coulomb@elbow"], effects["effort_offset@shoulder"]), nominal.values)
     assert within_reach([two, one])[0] is one
     assert nominal not in within_reach([nominal, one])
+
+
+def test_values_far_from_what_one_would_expect_are_noticed(bench):
+    stribeck = make_effect("joint_stribeck", "elbow", bench.system)
+    low, high = stribeck.prior_range["joint_stribeck@elbow.v_stribeck"]
+
+    def values(size, speed):
+        return {"joint_stribeck@elbow.tau_s": size, "joint_stribeck@elbow.v_stribeck": speed}
+
+    assert not far_out(stribeck, values(1.0, (low * high) ** 0.5))
+    assert not far_out(stribeck, values(3.9, 1.9 * high))
+    assert far_out(stribeck, values(1.0, low / 3))
+    assert far_out(stribeck, values(4.1, high))

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
+import threadpoolctl
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.analysis.combinations import Component, combination_words, listed_names, sparse_basis
@@ -169,6 +170,18 @@ def identifiability(
     Ljung (1999), System Identification, section 7.4; Raue et al. (2009), Bioinformatics 25:1923,
     doi:10.1093/bioinformatics/btp358.
     """
+    # the matrices are small: threads of the linear algebra library cost more than they give
+    with threadpoolctl.threadpool_limits(1):
+        return _judged(problem, solution, start, grasp_std, intervals)
+
+
+def _judged(
+    problem: EstimationProblem,
+    solution: Solution | ArrayLike | None,
+    start: StartKnowledge,
+    grasp_std: float | None,
+    intervals: Iterable[str] | Literal["all"],
+) -> Identifiability:
     given = unknown_vector(problem, solution)
     wide = with_nuisances(problem, given, start, grasp_std)
     x = carried(given, problem.names, wide)

@@ -320,11 +320,33 @@ def gain(before: Loss, after: Loss) -> tuple[float, float]:
 
 
 def within_reach(fits: Sequence[Fit]) -> list[Fit]:
-    """Fits whose held-out loss is within one standard error of the best one's (or `TIE` of it), the simplest first."""
+    """Fits whose held-out loss is within one standard error of the best one's (or `TIE` of it), the simplest first.
+
+    Those whose last effect is far from what an engineer would expect of it (`far_out`) count only where all are.
+    """
     best = min(fits, key=lambda fit: fit.loss.mean)
     near = []
     for fit in fits:
         lost, error = gain(fit.loss, best.loss)
         if fit is best or lost <= max(error, TIE * best.loss.mean):
             near.append(fit)
+    sober = [fit for fit in near if not (fit.effects and far_out(fit.effects[-1], fit.values))]
+    near = sober or near
     return sorted(near, key=lambda fit: (fit.size, fit.loss.mean))
+
+
+def far_out(effect: EffectBase, values: Mapping[str, float]) -> bool:
+    """Whether an effect's parameters lie far from where an engineer would expect them.
+
+    That is by more than the width of the range, or by more than a factor of two for a shape whose range has no zero: a
+    solid that relaxes in a tenth of the shortest time expected is another effect's way to look.
+    """
+    for name in (*effect.amplitudes, *effect.shapes):
+        low, high = effect.prior_range[name]
+        if name in effect.shapes and low > 0:
+            inside = low / 2 <= values[name] <= high * 2
+        else:
+            inside = 2 * low - high <= values[name] <= 2 * high - low
+        if not inside:
+            return True
+    return False
