@@ -62,7 +62,7 @@ def test_the_independent_figures_leave_the_unseen_twists_out(golden_problem):
 def test_a_start_that_nothing_is_known_of(golden_problem):
     """A prior of 10 rad and 50 rad/s on the start leaves T3.bend 228 %, where the default prior leaves it 172 %.
 
-    An independent computation gave 254 to 345 %, with a prior that it does not state.
+    An independent computation of the same motion gave 254 to 345 %; the difference is not explained.
     """
     problem = golden_problem("single", False)
     problem.options = replace(problem.options, configuration_std=10.0, velocity_std=50.0)

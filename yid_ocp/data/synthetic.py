@@ -6,9 +6,10 @@ and its treatment of the grasps are MuJoCo's own, so that an estimate is never c
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any, Protocol
@@ -398,96 +399,90 @@ def simulate_in_mujoco(
         )
     mujoco = mujoco_module()
     model = compiled_model(mujoco_xml(system, values, time_step=time_step))
+    with _at_work(mujoco, model, foreign):
+        data = mujoco.MjData(model)
+        # Every joint has one coordinate, so positions, velocities and joints share their addresses.
+        order = np.array([model.joint(name).id for name in system.mechanism.joint_names])
+        driven = order[list(system.driven_indices)]
+        start = initial_posture(system, values) if posture is None else posture
+        data.qpos[:] = model.qpos_spring
+        data.qpos[[model.joint(name).id for name in start]] = list(start.values())
+        balance = _settle(mujoco, model, data, driven)
+        if foreign is not None:
+            foreign.begin(data)
+
+        free = copy.copy(model)
+        free.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
+        shadow = mujoco.MjData(free)
+        rest = data.qpos.copy()
+
+        def arm_torque(q: Array, v: Array, a: Array) -> Array:
+            shadow.qpos[:], shadow.qvel[:], shadow.qacc[:] = rest, 0.0, 0.0
+            shadow.qpos[driven], shadow.qvel[driven], shadow.qacc[driven] = q, v, a
+            mujoco.mj_inverse(free, shadow)
+            return np.array(shadow.qfrc_inverse[driven])
+
+        zero = np.zeros(len(driven))
+        load = balance - arm_torque(rest[driven], zero, zero)
+        sites = [model.site(name).id for name in system.points]
+        ends = [[model.site(f"grasp_{g.name}_{end}").id for end in ("holder", "held")] for g in system.grasps]
+        frames = np.round(np.asarray(frame_times, float) / time_step).astype(int)
+        steps = round(duration * rate)
+        q, v, effort, points, error, seen = [], [], [], [], [], []
+        for k in range(steps + 1):
+            mujoco.mj_kinematics(model, data)
+            offset, velocity, acceleration = motion.at(k / rate)
+            reference = rest[driven] + offset
+            demand = acceleration + 2 * _BANDWIDTH * (velocity - data.qvel[driven])
+            demand += _BANDWIDTH**2 * (reference - data.qpos[driven])
+            torque = load + arm_torque(reference, velocity, demand)
+            q.append(data.qpos[order])
+            v.append(data.qvel[order])
+            effort.append(torque)
+            points.append(data.site_xpos[sites])
+            error.append([np.linalg.norm(data.site_xpos[a] - data.site_xpos[b]) for a, b in ends])
+            data.qfrc_applied[driven] = torque
+            done = k * inner
+            for frame in frames[(frames >= done) & (frames < done + inner)]:
+                if frame > done:
+                    mujoco.mj_step(model, data, nstep=int(frame - done))
+                    mujoco.mj_kinematics(model, data)
+                seen.append(data.site_xpos[sites])
+                done = int(frame)
+            if k < steps:
+                mujoco.mj_step(model, data, nstep=(k + 1) * inner - done)
+        result = SimulatedRun(
+            np.arange(steps + 1) / rate,
+            np.array(q),
+            np.array(v),
+            np.array(effort),
+            np.array(points),
+            frames[: len(seen)] * time_step,
+            np.array(seen).reshape(len(seen), len(sites), 3),
+            np.array(error).reshape(steps + 1, len(ends)),
+        )
+        if (
+            not (np.isfinite(result.q).all() and np.isfinite(result.effort).all())
+            or data.warning[_BAD_ACCELERATION].number
+        ):
+            raise ModelError(
+                "the simulation diverged", where="MuJoCo", hint="take a shorter time_step or a calmer motion"
+            )
+        return result
+
+
+@contextlib.contextmanager
+def _at_work(mujoco: ModuleType, model: Any, foreign: ForeignTerms | None) -> Iterator[None]:
+    """Let foreign terms act inside MuJoCo while the block runs."""
     if foreign is None:
-        return _followed(mujoco, model, system, values, motion, duration, rate, time_step, posture, frame_times, None)
+        yield
+        return
     foreign.prepare(model)
     mujoco.set_mjcb_passive(foreign.force)
     try:
-        return _followed(
-            mujoco, model, system, values, motion, duration, rate, time_step, posture, frame_times, foreign
-        )
+        yield
     finally:
         mujoco.set_mjcb_passive(None)
-
-
-def _followed(
-    mujoco: ModuleType,
-    model: Any,
-    system: System,
-    values: Mapping[str, float] | None,
-    motion: Motion,
-    duration: float,
-    rate: float,
-    time_step: float,
-    posture: Mapping[str, float] | None,
-    frame_times: ArrayLike,
-    foreign: ForeignTerms | None,
-) -> SimulatedRun:
-    inner = round(1.0 / (rate * time_step))
-    data = mujoco.MjData(model)
-    # Every joint has one coordinate, so positions, velocities and joints share their addresses.
-    order = np.array([model.joint(name).id for name in system.mechanism.joint_names])
-    driven = order[list(system.driven_indices)]
-    start = initial_posture(system, values) if posture is None else posture
-    data.qpos[:] = model.qpos_spring
-    data.qpos[[model.joint(name).id for name in start]] = list(start.values())
-    balance = _settle(mujoco, model, data, driven)
-    if foreign is not None:
-        foreign.begin(data)
-
-    free = copy.copy(model)
-    free.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
-    shadow = mujoco.MjData(free)
-    rest = data.qpos.copy()
-
-    def arm_torque(q: Array, v: Array, a: Array) -> Array:
-        shadow.qpos[:], shadow.qvel[:], shadow.qacc[:] = rest, 0.0, 0.0
-        shadow.qpos[driven], shadow.qvel[driven], shadow.qacc[driven] = q, v, a
-        mujoco.mj_inverse(free, shadow)
-        return np.array(shadow.qfrc_inverse[driven])
-
-    zero = np.zeros(len(driven))
-    load = balance - arm_torque(rest[driven], zero, zero)
-    sites = [model.site(name).id for name in system.points]
-    ends = [[model.site(f"grasp_{g.name}_{end}").id for end in ("holder", "held")] for g in system.grasps]
-    frames = np.round(np.asarray(frame_times, float) / time_step).astype(int)
-    steps = round(duration * rate)
-    q, v, effort, points, error, seen = [], [], [], [], [], []
-    for k in range(steps + 1):
-        mujoco.mj_kinematics(model, data)
-        offset, velocity, acceleration = motion.at(k / rate)
-        reference = rest[driven] + offset
-        demand = acceleration + 2 * _BANDWIDTH * (velocity - data.qvel[driven])
-        demand += _BANDWIDTH**2 * (reference - data.qpos[driven])
-        torque = load + arm_torque(reference, velocity, demand)
-        q.append(data.qpos[order])
-        v.append(data.qvel[order])
-        effort.append(torque)
-        points.append(data.site_xpos[sites])
-        error.append([np.linalg.norm(data.site_xpos[a] - data.site_xpos[b]) for a, b in ends])
-        data.qfrc_applied[driven] = torque
-        done = k * inner
-        for frame in frames[(frames >= done) & (frames < done + inner)]:
-            if frame > done:
-                mujoco.mj_step(model, data, nstep=int(frame - done))
-                mujoco.mj_kinematics(model, data)
-            seen.append(data.site_xpos[sites])
-            done = int(frame)
-        if k < steps:
-            mujoco.mj_step(model, data, nstep=(k + 1) * inner - done)
-    result = SimulatedRun(
-        np.arange(steps + 1) / rate,
-        np.array(q),
-        np.array(v),
-        np.array(effort),
-        np.array(points),
-        frames[: len(seen)] * time_step,
-        np.array(seen).reshape(len(seen), len(sites), 3),
-        np.array(error).reshape(steps + 1, len(ends)),
-    )
-    if not (np.isfinite(result.q).all() and np.isfinite(result.effort).all()) or data.warning[_BAD_ACCELERATION].number:
-        raise ModelError("the simulation diverged", where="MuJoCo", hint="take a shorter time_step or a calmer motion")
-    return result
 
 
 _BAD_ACCELERATION = 6  # mjWARN_BADQACC: MuJoCo then resets its state and goes on
