@@ -27,8 +27,9 @@ Array = NDArray[np.float64]
 
 SOLVER = GaussNewton(iterations=25, step_tolerance=1e-3, cost_tolerance=1e-6)
 """A refit starts near its end and must be good to a small part of its deviation only."""
-POOR = 1.1
-"""chi2/n above which a refit is tried again from the initial values of the nominal parameters."""
+POOR, PROMISING = 1.1, 0.2
+"""A refit that ends above this chi2/n, but lowers the excess by this part or more, is tried again from the initial
+values of the nominal parameters."""
 RESAMPLES = 1000
 TIE = 0.01
 """Part of chi2/n by which two models may differ and still count as equal, however sure the difference."""
@@ -170,7 +171,7 @@ def refit(
         return known
     own = problem.freeing(effects)
     best = _attempt(own, effects, start)
-    if best is not None and 2 * best[1].cost > POOR * len(best[1].residual):
+    if best is not None and _half_done(own, effects, start, best[1]):
         # the nominal fit may have driven its parameters to where this model cannot come back from
         fresh = {key: value for key, value in start.items() if key not in problem.nominal}
         again = _attempt(own, effects, fresh)
@@ -185,6 +186,16 @@ def refit(
     if store is not None:
         store.put(name or describe(effects), Refitted(values, std, outcome.message))
     return Fit(tuple(effects), own, values, std, finish.cost, finish, loss, outcome.message)
+
+
+def _half_done(own: Composed, effects: Sequence[EffectBase], start: Mapping[str, float], finish: Evaluation) -> bool:
+    """Whether a refit explains much of what the model without the effects leaves, but by far not all."""
+    count = len(finish.residual)
+    neutral = {name: value for effect in effects for name, value in effect.neutral.items()}
+    before = own.evaluate(own.unknowns({**start, **neutral}), derivatives=False)
+    if 2 * finish.cost < POOR * count or not before.ok:
+        return False
+    return before.cost - finish.cost > PROMISING * (before.cost - count / 2)
 
 
 def _attempt(
