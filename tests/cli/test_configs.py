@@ -22,6 +22,7 @@ DEFT = "../../shared/recordings/deft/bdlo1_train_{}.h5"
 QUICK = {
     **dict.fromkeys(PAPER, COARSE),
     "baxter_arm": ("solver.duration=1.0",),
+    "panda_beam": ("solver.duration=1.5", "model.object.segments.beam.links=2", "solver.iterations=3"),
     **dict.fromkeys(("springs_series_ends", "springs_series_joint", "springs_torsion"), ()),
     "deft_bdlo1": (
         "solver.duration=0.1",
@@ -62,9 +63,8 @@ def test_configuration_runs(cli, repository, tmp_path, name):
     if name == "deft_bdlo1":
         assert set(result["held_out"][0]["baselines"]) == {"stays", "moves_with_clamps", "linear_carry"}
         assert result["held_out"][0]["rmse"]["points"] < 0.05
-    if name == "baxter_arm":
-        assert [channel for channel in result["residuals"] if channel.startswith("joints.effort.left_")]
-        assert len(result["residuals"]) == 7
+    if name in ("baxter_arm", "panda_beam"):
+        assert len([channel for channel in result["residuals"] if channel.startswith("joints.effort.")]) == 7
 
 
 @pytest.mark.slow

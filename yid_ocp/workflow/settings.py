@@ -66,6 +66,7 @@ class YObject:
 
     kind: Literal["y"] = "y"
     links: Annotated[int, Ge(1), Le(64), About("rigid links of every tube")] = 4
+    weight: Annotated[float, Ge(0), Le(1), About("share of its weight that it has; its inertia is whole")] = 1.0
     mount: Annotated[MountSettings | None, About("the trunk's foot; the paper's when absent")] = None
 
 
@@ -75,7 +76,11 @@ class SegmentSettings:
 
     length: Annotated[float | None, Gt(0), Le(50), About("length; not needed beside link_lengths", "m")] = None
     mass: Annotated[float, Gt(0), About("mass of the whole segment", "kg")]
-    radius: Annotated[float, Gt(0), Le(5), About("radius of the solid cylinder", "m")]
+    radius: Annotated[float | None, Gt(0), Le(5), About("radius of the solid cylinder; or give a section", "m")] = None
+    section: Annotated[
+        tuple[Annotated[float, Gt(0)], Annotated[float, Gt(0)]] | None,
+        About("extents of a rectangular cross section along the links' x and y axes", "m"),
+    ] = None
     links: Annotated[int, Ge(1), Le(64), About("number of equal links")] = 4
     link_lengths: Annotated[tuple[float, ...] | None, About("unequal links, base to tip", "m")] = None
     parent: Annotated[str | None, About("segment on which it grows; the mount when absent")] = None
@@ -87,7 +92,7 @@ class SegmentSettings:
     twist_damping: Annotated[float | None, Ge(0), About("of twists, where another", "N m s/rad or N m^2 s")] = None
     rigidity: Annotated[bool, About("whether stiffness and damping are per curvature")] = False
     clamped: Annotated[bool, About("whether it starts at a rigid wall or gripper")] = False
-    joint_order: Annotated[str, About("axes of the turns at a joint, base to tip")] = "xyz"
+    joint_order: Annotated[str, About("axes of the turns at a joint, base to tip; rigid about the others")] = "xyz"
     separate_lengths: Annotated[bool, About("whether every link has a length parameter of its own")] = False
 
 
@@ -97,6 +102,7 @@ class SegmentedObject:
 
     kind: Literal["segments"] = "segments"
     segments: Annotated[Mapping[str, SegmentSettings], About("by name, parents first")] = field(default_factory=dict)
+    weight: Annotated[float, Ge(0), Le(1), About("share of its weight that it has; its inertia is whole")] = 1.0
     mount: Annotated[MountSettings, About("where its root sits")] = field(default_factory=MountSettings)
 
 
@@ -171,6 +177,9 @@ class ArmSettings:
     locked: Annotated[Mapping[str, float], About("value of joints that do not move", "rad or m")] = field(
         default_factory=dict
     )
+    without: Annotated[
+        tuple[str, ...], About("links of the URDF left out with all that hangs on them, such as a hand not mounted")
+    ] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
