@@ -21,7 +21,7 @@ COARSE = (
 DEFT = "../../shared/recordings/deft/bdlo1_train_{}.h5"
 QUICK = {
     **dict.fromkeys(PAPER, COARSE),
-    "baxter_arm": ("solver.duration=1.0",),
+    "baxter_arm": ("solver.duration=2.0",),
     "panda_beam": ("solver.duration=1.5", "model.object.segments.beam.links=2", "solver.iterations=3"),
     **dict.fromkeys(("springs_series_ends", "springs_series_joint", "springs_torsion"), ()),
     "deft_bdlo1": (
