@@ -279,3 +279,20 @@ def test_a_tool_that_is_not_mounted_is_left_out(tmp_path):
         Mechanism.from_urdf(path, without=["hands"])
     with pytest.raises(ModelError, match="joint 'grip' carries a link that is left out"):
         Mechanism.from_urdf(path, joints=["turn", "grip"], without=["hand"])
+
+
+def test_a_frame_that_the_file_does_not_have(urdf_folder):
+    robot = Mechanism.from_urdf(urdf_folder / "double_pendulum.urdf", parametric=False)
+    at = transform(np.eye(3), [0.1, 0.2, 0.3])
+    more = robot.with_frame("load", "tip", at).with_frame("wall", None, at)
+    tip, load = more.frame("tip"), more.frame("load")
+    assert load.joint == tip.joint
+    np.testing.assert_allclose(
+        numbers(load.placement.translation - tip.placement.translation),
+        numbers(tip.placement.rotation) @ [[0.1], [0.2], [0.3]],
+    )
+    assert more.frame("wall").joint == -1
+    with pytest.raises(ModelError, match="there is a frame 'tip' already"):
+        robot.with_frame("tip", None, at)
+    with pytest.raises(ModelError, match="no frame 'tips'"):
+        robot.with_frame("load", "tips", at)

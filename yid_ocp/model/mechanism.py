@@ -234,6 +234,24 @@ class Mechanism:
             self.parameters.joined(other.parameters),
         )
 
+    def with_frame(self, name: str, frame: str | None, placement: ArrayLike) -> Mechanism:
+        """The mechanism with one more frame.
+
+        Parameters
+        ----------
+        name : str
+            Not that of another frame.
+        frame : str or None
+            What it is fixed to; the world for None.
+        placement : array_like, shape (4, 4)
+            Of the new frame in that one.
+        """
+        if name in self.frames:
+            raise ModelError(f"there is a frame '{name}' already", where=self.name)
+        carrier = Frame(-1, Placement.identity()) if frame is None else self.frame(frame)
+        added = Frame(carrier.joint, carrier.placement @ Placement.of(placement))
+        return replace(self, frames={**self.frames, name: added})
+
     def numeric(self, values: Mapping[str, float] | None = None) -> Mechanism:
         """The mechanism with numbers in place of its parameters."""
         return self._evaluated(self.parameters.symbols, self.parameters.vector(values))

@@ -171,7 +171,11 @@ def _robot(run: Run) -> Mechanism | None:
     input_files(run)
     with located(run, "model", "arms", "joints"):
         arms = model.arms
-        return Mechanism.from_urdf(model.robot, joints=arms.joints, locked=arms.locked, without=arms.without)
+        robot = Mechanism.from_urdf(model.robot, joints=arms.joints, locked=arms.locked, without=arms.without)
+    for name, at in model.frames.items():
+        with located(run, "model", "frames", name):
+            robot = robot.with_frame(name, at.frame, _placement(at))
+    return robot
 
 
 def input_files(run: Run) -> dict[str, Path]:

@@ -53,9 +53,9 @@ GraspName = Literal["point", "axis", "weld"]
 
 @dataclass(frozen=True, kw_only=True)
 class MountSettings:
-    """Where the root of an object sits."""
+    """Where the root of an object sits, or a frame that the robot's file does not have."""
 
-    frame: Annotated[str | None, About("frame of the robot that carries the object; the world when absent")] = None
+    frame: Annotated[str | None, About("frame of the robot that carries it; the world when absent")] = None
     xyz: Annotated[Triple, About("position in that frame", "m")] = (0.0, 0.0, 0.0)
     rpy: Annotated[Triple, About("roll, pitch, yaw in that frame", "rad")] = (0.0, 0.0, 0.0)
 
@@ -188,6 +188,9 @@ class ModelSettings:
 
     robot: Annotated[FilePath | None, About("URDF file, or package:NAME of example-robot-data")] = None
     arms: Annotated[ArmSettings, About("the robot's joints")] = field(default_factory=ArmSettings)
+    frames: Annotated[
+        Mapping[str, MountSettings], About("more frames, by name: a tool's tip, the middle of what a gripper holds")
+    ] = field(default_factory=dict)
     object: Annotated[YObject | SegmentedObject | CableObject | None, About("the flexible object")] = None
     grasp: Annotated[Mapping[str, GraspSettings], About("by name: left, right, gripper")] = field(default_factory=dict)
     springs: Annotated[Mapping[str, SpringSettings], About("by joint of the robot")] = field(default_factory=dict)
