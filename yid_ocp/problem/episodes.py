@@ -175,9 +175,9 @@ def _effort_samples(
     angle = _by_joint(0.0 if known is None else known, joints.names, names, "sensors.joints.effort.position_std")
     inertia = apparent_inertia(step, theta, names)
     total = np.sqrt((std * value_gain) ** 2 + (inertia * angle * second_gain) ** 2)
-    # Smoothed values repeat their neighbours: only as many are kept as count as independent. Both ends are left out: the
-    # filter sees one side alone there, the impulse at node 0 depends on the motion before the recording and that at the
-    # last node on the motion after it.
+    # Smoothed values repeat their neighbours: only as many are kept as count as independent. Both ends are left out:
+    # the filter sees one side alone there, the impulse at node 0 depends on the motion before the recording and that at
+    # the last node on the motion after it.
     ends = max(1, math.ceil(smoother.settling / grid.time_step))
     kept = np.arange(ends, grid.steps + 1 - ends, smoother.stride(grid.time_step))
     if not len(kept):
