@@ -24,8 +24,8 @@ from yid_ocp.solvers.base import uncertainty
 
 Array = NDArray[np.float64]
 
-SOLVER = GaussNewton(iterations=15, step_tolerance=1e-3, cost_tolerance=1e-6)
-"""A refit starts near its end and must be good to a small part of its deviation only."""
+SOLVER = GaussNewton(iterations=15, step_tolerance=1e-3, cost_tolerance=1e-4)
+"""A refit starts near its end and must be good to a small part of its deviation, and of `TIE`, only."""
 RESAMPLES = 1000
 TIE = 0.01
 """Part of chi2/n by which two models may differ and still count as equal, however sure the difference."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,11 @@ import h5py
 import numpy as np
 
 from yid_ocp.diagnosis import Finding, Thresholds, diagnose
-from yid_ocp.errors import OutputError
+from yid_ocp.errors import OutputError, SolverError
+from yid_ocp.problem import EstimationProblem
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import Findings
+from yid_ocp.solvers import solve
 from yid_ocp.workflow.build import build_problem
 from yid_ocp.workflow.folder import Monitor, Silent, input_hashes, new_run_folder, versions
 from yid_ocp.workflow.settings import Run, dump_config
@@ -63,17 +66,22 @@ def run_diagnose(run: Run, out: str | Path | None = None, monitor: Monitor | Non
         folder.write("config.yaml", dump_config(run))
         watcher.stage("building the model and its compiled step")
         folder.log("start", command="diagnose", versions=versions(), inputs=inputs)
-        problem = build_problem(run)
+        problem = in_units_of_noise(build_problem(run), run)
 
         def note(text: str) -> None:
             folder.log("stage", text=text)
             watcher.stage(text)
 
+        note("solving the nominal model")
+        nominal = solve(problem, run.solver.method)
+        if nominal.evaluation is None:
+            raise SolverError(f"the nominal model cannot be fitted: {nominal.message}", where="solver")
         said = run.diagnosis
         finding = diagnose(
             problem,
             said.candidates,
             thresholds=Thresholds(level=said.level, effects=said.effects),
+            solution=nominal,
             progress=note,
         )
         folder.log("end", verdict=finding.verdict, effects=[effect.label for effect in finding.effects])
@@ -85,6 +93,44 @@ def run_diagnose(run: Run, out: str | Path | None = None, monitor: Monitor | Non
             watcher.stage("writing the report")
             write_report(folder.path / "report.html", Findings(run.name, run.description, written, problem))
     return DiagnoseOutcome(folder.path, written, finding)
+
+
+def in_units_of_noise(problem: EstimationProblem, run: Run) -> EstimationProblem:
+    """The same problem with the noise alone as the sensors' deviations, by `diagnosis.noise_share`.
+
+    Priors and tie-break shrink alike, so that every fit stays what it is; what changes is when a gap counts as one.
+
+    Raises
+    ------
+    ConfigError
+        A sensor without a deviation in the settings.
+    """
+    share, options = run.diagnosis.noise_share, problem.options
+    if share == 1:
+        return problem
+    used = {samples.sensor.group for episode in problem.episodes for samples in episode.samples}
+    sensors = dict(options.sensors)
+    for group in sorted(used):
+        std = sensors[group].std if group in sensors else None
+        if std is None:
+            raise run.refuse(
+                f"the share of noise in the deviation of '{group}' is given, but not the deviation",
+                "diagnosis",
+                "noise_share",
+                hint=f"set sensors.{group}.std",
+            )
+        smaller = {name: share * value for name, value in std.items()} if isinstance(std, Mapping) else share * std
+        sensors[group] = replace(sensors[group], std=smaller)
+    return problem.with_options(
+        replace(
+            options,
+            sensors=sensors,
+            priors={name: share * std for name, std in options.priors.items()},
+            tie_break=options.tie_break**share if options.tie_break > 0 else 0.0,
+            configuration_std=share * options.configuration_std,
+            velocity_std=share * options.velocity_std,
+        )
+    )
 
 
 def write_predictions(path: Path, finding: Finding) -> None:
