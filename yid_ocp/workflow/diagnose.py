@@ -11,11 +11,11 @@ import h5py
 import numpy as np
 
 from yid_ocp.diagnosis import Finding, Thresholds, diagnose
-from yid_ocp.errors import OutputError, SolverError
+from yid_ocp.errors import OutputError
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import Findings
-from yid_ocp.solvers import solve
+from yid_ocp.solvers import Solution, solve
 from yid_ocp.workflow.build import build_problem
 from yid_ocp.workflow.folder import Monitor, Silent, input_hashes, new_run_folder, versions
 from yid_ocp.workflow.settings import Run, dump_config
@@ -66,19 +66,20 @@ def run_diagnose(run: Run, out: str | Path | None = None, monitor: Monitor | Non
         folder.write("config.yaml", dump_config(run))
         watcher.stage("building the model and its compiled step")
         folder.log("start", command="diagnose", versions=versions(), inputs=inputs)
-        problem = in_units_of_noise(build_problem(run), run)
+        problem = build_problem(run)
 
         def note(text: str) -> None:
             folder.log("stage", text=text)
             watcher.stage(text)
 
-        note("solving the nominal model")
-        nominal = solve(problem, run.solver.method)
-        if nominal.evaluation is None:
-            raise SolverError(f"the nominal model cannot be fitted: {nominal.message}", where="solver")
+        nominal: Solution | None = None
+        if run.diagnosis.noise_share < 1 and problem.held_out:
+            # in units of noise the solver would take any fit for a bad one and start again elsewhere
+            note("solving the nominal model")
+            nominal = solve(problem, run.solver.method)
         said = run.diagnosis
         finding = diagnose(
-            problem,
+            in_units_of_noise(problem, run),
             said.candidates,
             thresholds=Thresholds(level=said.level, effects=said.effects),
             solution=nominal,
