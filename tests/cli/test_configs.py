@@ -67,6 +67,32 @@ def test_configuration_runs(cli, repository, tmp_path, name):
         assert len([channel for channel in result["residuals"] if channel.startswith("joints.effort.")]) == 7
 
 
+WITHHELD = {
+    "its weight": (("model.object.weight=0",), {"kind": "gravity_scale", "location": "object"}),
+    "the beam": (
+        ("model.object=null", "parameters={panda_*.damping: {free: true}, effort_offset@*: {free: true}}"),
+        {"kind": "point_mass", "location": "gripper"},
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", sorted(WITHHELD))
+def test_what_is_withheld_from_the_beams_model_is_named(cli, repository, tmp_path, what):
+    file = configurations(repository)["panda_beam"]
+    missing = [path for path in load_config(file).recordings.estimate if not recording_file(path).is_file()]
+    if missing:
+        pytest.skip(f"its recordings are not here: {missing[0]}")
+    settings, truth = WITHHELD[what]
+    chosen = [part for setting in (*settings, "diagnosis.effects=1") for part in ("--set", setting)]
+    done = cli("diagnose", file, "--out", tmp_path / "run", *chosen, "--set", "output.report=false")
+    assert done.code == 0, done.err
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert result["verdict"] == "effect"
+    assert result["effects"] == [truth]
+    assert result["gap"]["closure_ci"][0] > 0.5
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PAPER)
 def test_the_papers_experiments_in_full(cli, repository, tmp_path, name):

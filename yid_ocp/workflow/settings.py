@@ -290,7 +290,10 @@ class DiagnosisSettings:
     level: Annotated[float, Gt(0), Lt(1), About("significance below which a gap counts as one")] = 0.01
     effects: Annotated[int, Ge(1), Le(10), About("how many effects may be added")] = 3
     noise_share: Annotated[
-        float, Gt(0), Le(1), About("part of the sensors' std that is noise, where it stands for the model's error as well")
+        float,
+        Gt(0),
+        Le(1),
+        About("part of the sensors' std that is noise, where the rest stands for the model's error"),
     ] = 1.0
 
 
