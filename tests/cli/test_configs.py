@@ -21,7 +21,8 @@ COARSE = (
 DEFT = "../../shared/recordings/deft/bdlo1_train_{}.h5"
 QUICK = {
     **dict.fromkeys(PAPER, COARSE),
-    "baxter_arm": ("solver.duration=1.0",),
+    "baxter_arm": ("solver.duration=2.0",),
+    "panda_beam": ("solver.duration=1.5", "model.object.segments.beam.links=2", "solver.iterations=3"),
     **dict.fromkeys(("springs_series_ends", "springs_series_joint", "springs_torsion"), ()),
     "deft_bdlo1": (
         "solver.duration=0.1",
@@ -62,9 +63,34 @@ def test_configuration_runs(cli, repository, tmp_path, name):
     if name == "deft_bdlo1":
         assert set(result["held_out"][0]["baselines"]) == {"stays", "moves_with_clamps", "linear_carry"}
         assert result["held_out"][0]["rmse"]["points"] < 0.05
-    if name == "baxter_arm":
-        assert [channel for channel in result["residuals"] if channel.startswith("joints.effort.left_")]
-        assert len(result["residuals"]) == 7
+    if name in ("baxter_arm", "panda_beam"):
+        assert len([channel for channel in result["residuals"] if channel.startswith("joints.effort.")]) == 7
+
+
+WITHHELD = {
+    "its weight": (("model.object.weight=0",), {"kind": "gravity_scale", "location": "object"}),
+    "the beam": (
+        ("model.object=null", "parameters={panda_*.damping: {free: true}, effort_offset@*: {free: true}}"),
+        {"kind": "point_mass", "location": "gripper"},
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", sorted(WITHHELD))
+def test_what_is_withheld_from_the_beams_model_is_named(cli, repository, tmp_path, what):
+    file = configurations(repository)["panda_beam"]
+    missing = [path for path in load_config(file).recordings.estimate if not recording_file(path).is_file()]
+    if missing:
+        pytest.skip(f"its recordings are not here: {missing[0]}")
+    settings, truth = WITHHELD[what]
+    chosen = [part for setting in (*settings, "diagnosis.effects=1") for part in ("--set", setting)]
+    done = cli("diagnose", file, "--out", tmp_path / "run", *chosen, "--set", "output.report=false")
+    assert done.code == 0, done.err
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert result["verdict"] == "effect"
+    assert result["effects"] == [truth]
+    assert result["gap"]["closure_ci"][0] > 0.5
 
 
 @pytest.mark.slow

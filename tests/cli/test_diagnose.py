@@ -191,6 +191,24 @@ def test_the_command_that_gives_a_result_again(rubbing, tmp_path, monkeypatch):
     assert reproducing(load_config(None, (), DIAGNOSIS_DEFAULT), tmp_path) == "yid-ocp diagnose"
 
 
+def test_a_deviation_that_is_mostly_the_models_error(cli, pendulum, tmp_path):
+    """Deviations ten times the noise, of which a tenth is noise, are the noise again."""
+    chosen = ("--set", "diagnosis.candidates=[joint_coulomb]", "--set", "output.report=false")
+    found = []
+    for std, share in ((0.01, 1.0), (0.1, 0.1)):
+        out = tmp_path / f"run_{std}_{share}"
+        settings = ("--set", f"sensors.joints.effort.std={std}", "--set", f"diagnosis.noise_share={share}")
+        assert cli("diagnose", pendulum, "--out", out, *chosen, *settings).code == 0
+        found.append(json.loads((out / "result.json").read_text())["gap"]["before"]["chi2_per_dof"])
+    assert found[1] == pytest.approx(found[0], rel=0.01)
+
+
+def test_a_share_of_an_unstated_deviation_is_refused(cli, pendulum, tmp_path):
+    done = cli("diagnose", pendulum, "--out", tmp_path / "run", "--set", "diagnosis.noise_share=0.1")
+    assert done.code == 2
+    assert "set sensors.joints.effort.std" in done.err
+
+
 @pytest.mark.slow
 def test_the_embedded_example_finds_what_was_withheld(cli, tmp_path):
     done = cli("diagnose", "--out", tmp_path / "run")

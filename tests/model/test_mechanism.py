@@ -261,3 +261,38 @@ def test_errors_name_what_is_wrong_and_what_is_near(urdf_folder, action, words):
         action(urdf_folder / "mixed_joints.urdf")
     for word in words:
         assert word in str(caught.value)
+
+
+def test_a_tool_that_is_not_mounted_is_left_out(tmp_path):
+    parts = (
+        *(link(name) for name in ("base", "arm", "hand", "finger")),
+        joint("turn", "base", "arm"),
+        joint("wrist", "arm", "hand", "fixed"),
+        joint("grip", "hand", "finger", "prismatic"),
+    )
+    path = urdf(tmp_path, *parts)
+    bare = Mechanism.from_urdf(path, without=["hand"])
+    assert bare.joint_names == ("turn",)
+    assert set(bare.frames) == {"base", "arm"}
+    assert float(bare.numeric().joints[0].bodies[0].mass) == 1.0
+    with pytest.raises(ModelError, match=r"(?s)no link 'hands' to leave out.*did you mean 'hand'"):
+        Mechanism.from_urdf(path, without=["hands"])
+    with pytest.raises(ModelError, match="joint 'grip' carries a link that is left out"):
+        Mechanism.from_urdf(path, joints=["turn", "grip"], without=["hand"])
+
+
+def test_a_frame_that_the_file_does_not_have(urdf_folder):
+    robot = Mechanism.from_urdf(urdf_folder / "double_pendulum.urdf", parametric=False)
+    at = transform(np.eye(3), [0.1, 0.2, 0.3])
+    more = robot.with_frame("load", "tip", at).with_frame("wall", None, at)
+    tip, load = more.frame("tip"), more.frame("load")
+    assert load.joint == tip.joint
+    np.testing.assert_allclose(
+        numbers(load.placement.translation - tip.placement.translation),
+        numbers(tip.placement.rotation) @ [[0.1], [0.2], [0.3]],
+    )
+    assert more.frame("wall").joint == -1
+    with pytest.raises(ModelError, match="there is a frame 'tip' already"):
+        robot.with_frame("tip", None, at)
+    with pytest.raises(ModelError, match="no frame 'tips'"):
+        robot.with_frame("load", "tips", at)

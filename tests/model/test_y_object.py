@@ -138,6 +138,31 @@ def test_another_order_of_turns():
     assert [bool(joint.bodies) for joint in item.mechanism.joints] == [False, False, True]
 
 
+def test_a_flat_beam_that_bends_one_way():
+    beam = Segment(
+        "B", 0.6, 0.3, links=3, section=(0.001, 0.08), joint_order="y", bend=1.2, rigidity=True, clamped=True
+    )
+    item = flexible_object([beam])
+    assert item.mechanism.joint_names == ("B_0_y", "B_1_y", "B_2_y")
+    assert {spring.axis for spring in item.elastic} == {"y"}
+    assert [stiffness(item)[f"B_{i}_y"][0] for i in range(3)] == pytest.approx([2 * 1.2 / 0.2, 1.2 / 0.2, 1.2 / 0.2])
+    x, y, z = 0.001**2 / 12, 0.08**2 / 12, 0.2**2 / 12
+    for joint in item.mechanism.numeric().joints:
+        np.testing.assert_allclose(numbers(joint.bodies[0].about_com), 0.1 * np.diag([y + z, x + z, x + y]))
+    layout = item.segment("B")
+    assert numbers(layout.radius, item.mechanism.parameters).item() == pytest.approx(math.hypot(0.001, 0.08) / 2)
+
+
+def test_a_share_of_the_weight_leaves_the_inertia_whole():
+    whole, half = flexible_object(), flexible_object(weight=0.5)
+    for a, b in zip(whole.mechanism.numeric().joints, half.mechanism.numeric().joints, strict=True):
+        for body, light in zip(a.bodies, b.bodies, strict=True):
+            assert float(light.mass) == float(body.mass)
+            np.testing.assert_array_equal(numbers(light.about_com), numbers(body.about_com))
+            assert body.weight is None
+            assert float(light.weight) == 0.5
+
+
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(2, 7))
 def test_polyline_is_reproduced_by_forward_kinematics(seed, count):
     rng = np.random.default_rng(seed)
@@ -197,7 +222,11 @@ WRONG = {
     "no_link_lengths": ({"link_lengths": []}, ["a link has no length"]),
     "rotations": ({"links": 3, "link_rotations": [np.eye(3)]}, ["1 link rotations for 3 links", "2"]),
     "at_link": ({"parent": "T1", "at_link": 4}, ["at_link = 4", "0 to 3"]),
-    "joint_order": ({"joint_order": "xxz"}, ["joint_order = 'xxz'", "x, y, z once each"]),
+    "joint_order": ({"joint_order": "xxz"}, ["joint_order = 'xxz'", "x, y, z, each at most once"]),
+    "no_axis": ({"joint_order": ""}, ["joint_order = ''"]),
+    "two_sections": ({"section": (0.1, 0.2)}, ["a radius or a section"]),
+    "no_section": ({"radius": None}, ["a radius or a section"]),
+    "flat_section": ({"radius": None, "section": (0.0, 0.2)}, ["section[0] = 0.0", "positive"]),
     "same_name": ({"name": "T1"}, ["two segments are called 'T1'"]),
 }
 

@@ -58,7 +58,7 @@ class Series:
 
 
 def chosen_effects(system: System, recordings: Sequence[Recording], choice: Choice) -> list[EffectBase]:
-    """The effects to try.
+    """The effects to try: none that the nominal model has already.
 
     Parameters
     ----------
@@ -71,11 +71,16 @@ def chosen_effects(system: System, recordings: Sequence[Recording], choice: Choi
     Raises
     ------
     ConfigError
-        No such kind, a kind that has no place here, an empty list.
+        No such kind, a kind that has no place here, an effect of the nominal model, an empty list.
     ModelError
         A location that does not exist.
     """
-    possible = candidates(system, sensors_present(recordings))
+    present = {f"{effect.kind}@{effect.location}" for effect in system.effects}
+    possible = [
+        (kind, place)
+        for kind, place in candidates(system, sensors_present(recordings))
+        if f"{kind}@{place}" not in present
+    ]
     if isinstance(choice, str):
         if choice != "all":
             raise ConfigError(
@@ -86,6 +91,8 @@ def chosen_effects(system: System, recordings: Sequence[Recording], choice: Choi
     for text in choice:
         kind, _, place = text.partition("@")
         cls = EFFECTS[kind]
+        if text in present:
+            raise ConfigError(f"{text} is part of the model", where="diagnosis.candidates", hint="leave it out")
         found = [(kind, place)] if place else [pair for pair in possible if pair[0] == kind]
         if not found:
             missing = ", ".join(sorted(cls.needs - sensors_present(recordings)))
@@ -319,7 +326,8 @@ def noise_colour(problem: EstimationProblem, episode: Episode, samples: Samples)
     """Autocorrelation of a sensor's noise at lags 0, 1, ... samples: white, but for efforts, which are smoothed."""
     if not isinstance(samples.sensor, EffortSensor):
         return np.ones(1)
-    return smoothed_colour(problem.options.path_cutoff, episode.grid.time_step)
+    stride = Smoother(problem.options.path_cutoff).stride(episode.grid.time_step)
+    return smoothed_colour(problem.options.path_cutoff, episode.grid.time_step)[::stride]
 
 
 def smoothed_colour(cutoff: float, step: float) -> Array:

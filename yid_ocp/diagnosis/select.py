@@ -25,8 +25,8 @@ from yid_ocp.solvers.base import Outcome, uncertainty
 
 Array = NDArray[np.float64]
 
-SOLVER = GaussNewton(iterations=25, step_tolerance=1e-3, cost_tolerance=1e-6)
-"""A refit starts near its end and must be good to a small part of its deviation only."""
+SOLVER = GaussNewton(iterations=25, step_tolerance=1e-3, cost_tolerance=1e-5)
+"""A refit starts near its end and must be good to a small part of its deviation, and of `TIE`, only."""
 POOR, PROMISING = 1.1, 0.2
 """A refit that ends above this chi2/n, but lowers the excess by this part or more, is tried again from the initial
 values of the nominal parameters."""

@@ -79,10 +79,12 @@ class RestCurvature(EffectBase):
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """qx and qy [rad] per joint, beside the rest angles that the model has."""
+        """qx and qy [rad] per joint, as far as it bends there, beside the rest angles that the model has."""
+        axes = {spring.axis for spring in segment_springs(system, location)}
         return tuple(
             Quantity(f"q{axis}", "rad", 0.0, -1.0, 1.0, (-0.3, 0.3), f"rest angle of every joint about {axis}")
             for axis in "xy"
+            if axis in axes
         )
 
     def modify(self, system: System) -> System:
@@ -103,9 +105,9 @@ class BendAnisotropy(EffectBase):
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
-        """Segments that bend about y."""
-        bent = {spring.segment for spring in system.elastic if spring.axis == "y"}
-        return tuple(name for name in segment_names(system) if name in bent)
+        """Segments that bend about x and about y."""
+        bent = {(spring.segment, spring.axis) for spring in system.elastic}
+        return tuple(name for name in segment_names(system) if {(name, "x"), (name, "y")} <= bent)
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:

@@ -234,6 +234,24 @@ class Mechanism:
             self.parameters.joined(other.parameters),
         )
 
+    def with_frame(self, name: str, frame: str | None, placement: ArrayLike) -> Mechanism:
+        """The mechanism with one more frame.
+
+        Parameters
+        ----------
+        name : str
+            Not that of another frame.
+        frame : str or None
+            What it is fixed to; the world for None.
+        placement : array_like, shape (4, 4)
+            Of the new frame in that one.
+        """
+        if name in self.frames:
+            raise ModelError(f"there is a frame '{name}' already", where=self.name)
+        carrier = Frame(-1, Placement.identity()) if frame is None else self.frame(frame)
+        added = Frame(carrier.joint, carrier.placement @ Placement.of(placement))
+        return replace(self, frames={**self.frames, name: added})
+
     def numeric(self, values: Mapping[str, float] | None = None) -> Mechanism:
         """The mechanism with numbers in place of its parameters."""
         return self._evaluated(self.parameters.symbols, self.parameters.vector(values))
@@ -285,6 +303,7 @@ class Mechanism:
         locked: Mapping[str, float] | None = None,
         name: str | None = None,
         parametric: bool = True,
+        without: Sequence[str] = (),
     ) -> Mechanism:
         """Read a URDF; keep the chosen joints, lock the others, merge what is then fixed together.
 
@@ -301,6 +320,8 @@ class Mechanism:
             Name of the mechanism; that of the robot in the file when absent.
         parametric : bool
             Whether each kept joint's bodies get the parameter `joint.mass` [kg] (inertia in proportion).
+        without : sequence of str
+            Links to leave out with all that hangs on them, such as a tool that is not mounted.
 
         Returns
         -------
@@ -312,7 +333,7 @@ class Mechanism:
         ModelError
             Missing or malformed file, unknown joint, joint type that is not revolute, continuous, prismatic or fixed.
         """
-        return _from_urdf(Path(str(path)), joints, dict(locked or {}), name, parametric)
+        return _from_urdf(Path(str(path)), joints, dict(locked or {}), name, parametric, without)
 
     def to_urdf(self, values: Mapping[str, float] | None = None) -> str:
         """The mechanism as URDF text: one link per joint, named frames as links on fixed joints.
@@ -401,7 +422,12 @@ def _cs(angle: float) -> tuple[float, float]:
 
 
 def _from_urdf(
-    path: Path, chosen: Sequence[str] | None, locked: dict[str, float], name: str | None, parametric: bool
+    path: Path,
+    chosen: Sequence[str] | None,
+    locked: dict[str, float],
+    name: str | None,
+    parametric: bool,
+    without: Sequence[str],
 ) -> Mechanism:
     import yourdfpy
 
@@ -458,6 +484,10 @@ def _from_urdf(
         twice = sorted({entry for entry in names if names.count(entry) > 1})
         if twice:
             raise ModelError(f"two {kind} '{twice[0]}'", where=str(path), allowed="a tree with unique names")
+    dropped = _with_all_below(without, links, children, str(path))
+    for joint in robot.joints:
+        if joint.child in dropped and joint.name in (*(chosen or ()), *locked):
+            raise ModelError(f"joint '{joint.name}' carries a link that is left out", where=str(path))
     rank = {joint: i for i, joint in enumerate(chosen if chosen is not None else known)}
 
     collected: dict[str, tuple[str | None, Matrix, Any]] = {}
@@ -474,14 +504,16 @@ def _from_urdf(
             body = Inertia.of(float(inertial.mass), np.zeros(3), tensor)
             bodies.setdefault(carrier, []).append(body.moved(Placement.of(at @ origin)))
         for joint in children.get(link, ()):
+            if joint.child in dropped:
+                continue
             origin = np.eye(4) if joint.origin is None else np.asarray(joint.origin, float)
             if joint.name in kept:
                 collected[joint.name] = (carrier, at @ origin, joint)
                 stack.append((joint.child, joint.name, np.eye(4)))
             else:
                 stack.append((joint.child, carrier, at @ origin @ _locked_motion(joint, locked)))
-    if len(frames) < len(links):
-        loose = sorted(set(links) - set(frames))
+    loose = sorted(set(links) - set(frames) - dropped)
+    if loose:
         raise ModelError(f"link '{loose[0]}' does not hang on '{roots[0]}'", where=str(path), allowed="one tree")
 
     order: list[str] = []
@@ -543,6 +575,20 @@ def _locked_motion(joint: Any, locked: Mapping[str, float]) -> Matrix:
         return transform(np.eye(3), value * axis)
     cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
     return transform(np.eye(3) + math.sin(value) * cross + (1 - math.cos(value)) * cross @ cross, np.zeros(3))
+
+
+def _with_all_below(
+    without: Sequence[str], links: Mapping[str, Any], children: Mapping[str, Sequence[Any]], where: str
+) -> set[str]:
+    found: set[str] = set()
+    waiting = list(without)
+    while waiting:
+        link = waiting.pop()
+        if link not in links:
+            raise ModelError(f"there is no link '{link}' to leave out", where=where, hint=nearest(link, links))
+        found.add(link)
+        waiting += [joint.child for joint in children.get(link, ())]
+    return found
 
 
 def _unit_axis(joint: Any) -> NDArray[np.float64]:

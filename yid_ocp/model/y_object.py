@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -30,8 +30,8 @@ class Segment:
         [m]; ignored when `link_lengths` is given.
     mass : float
         Of the whole segment, spread along its length [kg].
-    radius : float
-        [m]; of the solid cylinder that gives each link's inertia.
+    radius : float, optional
+        [m]; of the solid cylinder that gives each link's inertia. None where `section` is given.
     links : int
         Number of equal links.
     link_lengths : sequence of float, optional
@@ -57,7 +57,9 @@ class Segment:
         Whether the first joint turns about the tip of a rigid wall or clamp (only matters with `rigidity`); otherwise
         it sits between the parent's link and the first one.
     joint_order : str
-        Axes of the three turns at each joint, base to tip.
+        Axes of the turns at each joint, base to tip; about those left out the segment is rigid.
+    section : (float, float), optional
+        Extents of a rectangular cross section along the links' x and y axes [m], in place of `radius`.
     separate_lengths : bool
         Whether every link has a length parameter of its own (`SEGMENT.length_0`, ...) in place of `SEGMENT.length`,
         for markers that sit elsewhere in every recording; masses do not follow them.
@@ -69,7 +71,7 @@ class Segment:
     name: str
     length: float
     mass: float
-    radius: float
+    radius: float | None = None
     links: int = 4
     link_lengths: Sequence[float] | None = None
     parent: str | None = None
@@ -83,6 +85,7 @@ class Segment:
     rigidity: bool = False
     clamped: bool = False
     joint_order: str = "xyz"
+    section: tuple[float, float] | None = None
     separate_lengths: bool = False
     length_before: float | None = None
 
@@ -102,7 +105,10 @@ class ElasticJoint:
 
 @dataclass(frozen=True)
 class SegmentLayout:
-    """Where a segment stands in the mechanism: joint names link by link, link lengths [m] and radius [m]."""
+    """Where a segment stands in the mechanism: joint names link by link, link lengths [m] and radius [m].
+
+    The radius of a rectangular section is half its diagonal.
+    """
 
     name: str
     links: tuple[tuple[str, ...], ...]
@@ -142,9 +148,12 @@ def y_segments() -> tuple[Segment, ...]:
 
 
 def flexible_object(
-    segments: Sequence[Segment] | None = None, foot: ArrayLike | None = None, name: str = "y_object"
+    segments: Sequence[Segment] | None = None,
+    foot: ArrayLike | None = None,
+    name: str = "y_object",
+    weight: float = 1.0,
 ) -> FlexibleObject:
-    """Chain of rigid links with a three-axis elastic joint before each.
+    """Chain of rigid links with an elastic joint before each.
 
     Parameters
     ----------
@@ -155,12 +164,14 @@ def flexible_object(
         else the origin.
     name : str
         Name of the mechanism.
+    weight : float
+        Share of its weight that the object has, its inertia unchanged; less than one where something else bears it.
 
     Returns
     -------
     FlexibleObject
         Joints are named `SEGMENT_LINK_AXIS` (`T1_0_x`), parameters `SEGMENT.length` (or `.length_0`, ...), `.mass`,
-        `.radius`, `.bend`, `.twist`, `.damping` (and `.twist_damping` where given).
+        `.radius` (or `.size_x` and `.size_y`), `.bend`, `.twist`, `.damping` (and `.twist_damping` where given).
 
     Raises
     ------
@@ -181,7 +192,7 @@ def flexible_object(
         _check(segment, layouts)
         own = _segment_parameters(segment)
         parameters += own.values()
-        radius, mass = own["radius"].symbol, own["mass"].symbol
+        mass, cross = own["mass"].symbol, _cross_section(own)
         shares = _shares(segment)
         if segment.separate_lengths:
             lengths = tuple(own[f"length_{i}"].symbol for i in range(len(shares)))
@@ -204,12 +215,10 @@ def flexible_object(
         links: list[tuple[str, ...]] = []
         for i, length in enumerate(lengths):
             along = ca.vertcat(0, 0, length)
-            side = length**2 / 12 + radius**2 / 4
-            body = Inertia(
-                mass * float(shares[i]),
-                along / 2,
-                ca.diag(ca.vertcat(side, side, radius**2 / 2)) * mass * float(shares[i]),
-            )
+            slender = length**2 / 12
+            squares = ca.vertcat(slender + cross.y, slender + cross.x, cross.x + cross.y)
+            share = mass * float(shares[i])
+            body = Inertia(share, along / 2, ca.diag(squares) * share, None if weight == 1 else ca.SX(weight))
             names = tuple(f"{segment.name}_{i}_{axis}" for axis in segment.joint_order)
             for a, axis in enumerate(segment.joint_order):
                 placement = tip @ Placement(ca.SX(ca.DM(rotations[i])), ca.SX(ca.DM.zeros(3)))
@@ -243,7 +252,7 @@ def flexible_object(
             frames[f"{segment.name}_{i}_tip"] = Frame(carrier, tip)
             before = length
         frames[f"w_{segment.name}"] = frames[f"{segment.name}_{len(lengths) - 1}_tip"]
-        layouts[segment.name] = SegmentLayout(segment.name, tuple(links), lengths, radius, mass, segment.parent)
+        layouts[segment.name] = SegmentLayout(segment.name, tuple(links), lengths, cross.radius, mass, segment.parent)
 
     mechanism = Mechanism(name, tuple(joints), frames, Parameters(parameters))
     return FlexibleObject(mechanism, tuple(elastic), tuple(layouts.values()))
@@ -322,6 +331,23 @@ def _per_joint(segment: Segment, length: ca.SX, before: ca.SX | None) -> ca.SX:
     return 2 / (length + before)
 
 
+@dataclass(frozen=True)
+class _CrossSection:
+    """Mean squares of x and y over a section [m^2], and the radius that it counts as [m]."""
+
+    x: ca.SX
+    y: ca.SX
+    radius: ca.SX
+
+
+def _cross_section(own: Mapping[str, Parameter]) -> _CrossSection:
+    if "radius" in own:
+        radius = own["radius"].symbol
+        return _CrossSection(radius**2 / 4, radius**2 / 4, radius)
+    x, y = own["size_x"].symbol, own["size_y"].symbol
+    return _CrossSection(x**2 / 12, y**2 / 12, ca.sqrt(x**2 + y**2) / 2)
+
+
 def _segment_parameters(segment: Segment) -> dict[str, Parameter]:
     per, rate = ("N m^2", "N m^2 s") if segment.rigidity else ("N m/rad", "N m s/rad")
     length = float(np.sum(segment.link_lengths)) if segment.link_lengths is not None else segment.length
@@ -336,7 +362,14 @@ def _segment_parameters(segment: Segment) -> dict[str, Parameter]:
             else {"length": (length, "m", small, "length of the segment")}
         ),
         "mass": (segment.mass, "kg", small, "mass of the segment"),
-        "radius": (segment.radius, "m", small, "radius of the solid cylinder"),
+        **(
+            {"radius": (segment.radius, "m", small, "radius of the solid cylinder")}
+            if segment.radius is not None
+            else {
+                f"size_{axis}": (size, "m", small, f"extent of the section along {axis}")
+                for axis, size in zip("xy", segment.section or (), strict=True)
+            }
+        ),
         "bend": (segment.bend, per, 0.0, "bending stiffness of every joint, about x and y"),
         "twist": (segment.twist, per, 0.0, "twisting stiffness of every joint, about z"),
         "damping": (segment.damping, rate, 0.0, "viscous damping of every coordinate"),
@@ -359,8 +392,19 @@ def _check(segment: Segment, known: dict[str, SegmentLayout]) -> None:
             where=where,
             hint=nearest(segment.parent, known),
         )
-    for quantity in ("mass", "radius", *(() if segment.link_lengths is not None else ("length",))):
-        value = getattr(segment, quantity)
+    if (segment.radius is None) == (segment.section is None):
+        raise ModelError(
+            "a segment needs a radius or a section",
+            where=where,
+            allowed="one of the two",
+            hint="section: [0.001, 0.08]",
+        )
+    sizes = {"mass": segment.mass}
+    if segment.link_lengths is None:
+        sizes["length"] = segment.length
+    sizes |= {"radius": segment.radius} if segment.radius is not None else {}
+    sizes |= {f"section[{i}]": size for i, size in enumerate(segment.section or ())}
+    for quantity, value in sizes.items():
         if not (math.isfinite(value) and value > 0):
             raise ModelError(f"{quantity} = {value}", where=where, allowed="a positive number in SI units")
     if segment.link_lengths is None and segment.links < 1:
@@ -376,5 +420,6 @@ def _check(segment: Segment, known: dict[str, SegmentLayout]) -> None:
         links = len(known[segment.parent].links)
         if not 0 <= segment.at_link < links:
             raise ModelError(f"at_link = {segment.at_link}", where=where, allowed=f"0 to {links - 1}")
-    if sorted(segment.joint_order) != ["x", "y", "z"]:
-        raise ModelError(f"joint_order = '{segment.joint_order}'", where=where, allowed="the letters x, y, z once each")
+    axes = segment.joint_order
+    if not axes or len(set(axes)) < len(axes) or not set(axes) <= set(AXES):
+        raise ModelError(f"joint_order = '{axes}'", where=where, allowed="letters of x, y, z, each at most once")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -194,14 +195,23 @@ def _effort_samples(
     angle = _by_joint(0.0 if known is None else known, joints.names, names, "sensors.joints.effort.position_std")
     inertia = apparent_inertia(step, theta, names)
     total = np.sqrt((std * value_gain) ** 2 + (inertia * angle * second_gain) ** 2)
-    # the impulse at node 0 depends on the motion before the recording, that at the last node on the motion after it
-    inner = slice(1, grid.steps)
-    deviation = np.broadcast_to(total, measured.shape)[inner]
+    # Smoothed values repeat their neighbours: only as many are kept as count as independent. Both ends are left out:
+    # the filter sees one side alone there, the impulse at node 0 depends on the motion before the recording and that at
+    # the last node on the motion after it.
+    ends = max(1, math.ceil(smoother.settling / grid.time_step))
+    kept = np.arange(ends, grid.steps + 1 - ends, smoother.stride(grid.time_step))
+    if not len(kept):
+        raise DataError(
+            f"{grid.steps * grid.time_step:.3g} s of efforts are too short for a filter of {smoother.cutoff:g} Hz",
+            where=recording.name,
+            allowed=f"more than {2 * ends * grid.time_step:.3g} s",
+            hint="use a longer recording, or raise solver.path_cutoff",
+        )
     return make_samples(
         EffortSensor(names),
-        grid.times[inner],
-        measured[inner],
-        deviation,
+        grid.times[kept],
+        measured[kept],
+        np.broadcast_to(total, measured.shape)[kept],
         grid,
         f"{recording.name}: joints.effort",
         (1, grid.steps - 1),

@@ -234,6 +234,22 @@ class Smoother:
         smooth = scipy.signal.sosfiltfilt(sections, resampled, axis=0, padlen=pad)
         return np.asarray(scipy.interpolate.CubicSpline(even, smooth, axis=0)(np.clip(t, even[0], even[-1])))
 
+    def stride(self, step: float) -> int:
+        """Samples of a clock with this step [s] from one smoothed value to the next that tells something new: 1/(2 f).
+
+        Noise that was white is limited to a band of the cutoff f and correlated over about that time.
+        """
+        return max(1, round(1 / (2 * self.cutoff * step))) if math.isfinite(self.cutoff) else 1
+
+    @property
+    def settling(self) -> float:
+        """How far from either end of a record the filter still sees what it does not hold [s].
+
+        The slowest pair of its poles has then decayed to a thousandth.
+        """
+        decay = 2 * math.pi * self.cutoff * math.sin(math.pi / (2 * FILTER_ORDER))
+        return math.log(1e3) / decay
+
     def gains(self, step: float) -> tuple[float, float, float]:
         """Factors from white-noise deviation to that of the value, its rate [1/s] and its second rate [1/s^2]."""
         if not math.isfinite(self.cutoff):

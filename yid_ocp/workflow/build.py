@@ -170,7 +170,12 @@ def _robot(run: Run) -> Mechanism | None:
         return None
     input_files(run)
     with located(run, "model", "arms", "joints"):
-        return Mechanism.from_urdf(model.robot, joints=model.arms.joints, locked=model.arms.locked)
+        arms = model.arms
+        robot = Mechanism.from_urdf(model.robot, joints=arms.joints, locked=arms.locked, without=arms.without)
+    for name, at in model.frames.items():
+        with located(run, "model", "frames", name):
+            robot = robot.with_frame(name, at.frame, _placement(at))
+    return robot
 
 
 def input_files(run: Run) -> dict[str, Path]:
@@ -220,10 +225,10 @@ def _objects(run: Run, damping: float, links: int | None) -> list[Placed]:
         ]
         if item.mount is None:
             foot = placement_matrix((0.85, 0.0, -0.93))
-            return [(flexible_object(segments, foot), None, None)]
-        return [(flexible_object(segments), item.mount.frame, _placement(item.mount))]
-    segments = _segments(item, damping, links)
-    return [(flexible_object(segments, name="object"), item.mount.frame, _placement(item.mount))]
+            return [(flexible_object(segments, foot, weight=item.weight), None, None)]
+        return [(flexible_object(segments, weight=item.weight), item.mount.frame, _placement(item.mount))]
+    made = flexible_object(_segments(item, damping, links), name="object", weight=item.weight)
+    return [(made, item.mount.frame, _placement(item.mount))]
 
 
 def _placement(mount: MountSettings) -> np.ndarray:
@@ -258,6 +263,7 @@ def _segments(item: SegmentedObject, damping: float, links: int | None) -> list[
                 rigidity=s.rigidity,
                 clamped=s.clamped,
                 joint_order=s.joint_order,
+                section=s.section,
                 separate_lengths=s.separate_lengths,
             )
         )

@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 import os
 import shlex
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +16,11 @@ import numpy as np
 from yid_ocp.diagnosis import Finding, Thresholds, diagnose
 from yid_ocp.diagnosis.localise import units
 from yid_ocp.errors import OutputError
+from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.problem import Episode, EpisodeResult
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import Findings
+from yid_ocp.solvers import Solution, solve
 from yid_ocp.workflow.build import build_problem
 from yid_ocp.workflow.folder import Monitor, Silent, input_hashes, new_run_folder, versions
 from yid_ocp.workflow.refits import Refits
@@ -80,12 +82,18 @@ def run_diagnose(run: Run, out: str | Path | None = None, monitor: Monitor | Non
             folder.log("stage", text=text)
             watcher.stage(text)
 
+        nominal: Solution | None = None
+        if run.diagnosis.noise_share < 1 and problem.held_out:
+            # in units of noise the solver would take any fit for a bad one and start again elsewhere
+            note("solving the nominal model")
+            nominal = solve(problem, run.solver.method)
         said = run.diagnosis
         try:
             finding = diagnose(
-                problem,
+                in_units_of_noise(problem, run),
                 said.candidates,
                 thresholds=Thresholds(level=said.level, effects=said.effects),
+                solution=nominal,
                 progress=note,
                 store=refits,
             )
@@ -117,6 +125,44 @@ def reproducing(run: Run, folder: Path) -> str:
     if any(origin.startswith("embedded default") for origin in origins):
         return "yid-ocp diagnose"
     return shlex.join(["yid-ocp", "diagnose", run.file])
+
+
+def in_units_of_noise(problem: EstimationProblem, run: Run) -> EstimationProblem:
+    """The same problem with the noise alone as the sensors' deviations, by `diagnosis.noise_share`.
+
+    Priors and tie-break shrink alike, so that every fit stays what it is; what changes is when a gap counts as one.
+
+    Raises
+    ------
+    ConfigError
+        A sensor without a deviation in the settings.
+    """
+    share, options = run.diagnosis.noise_share, problem.options
+    if share == 1:
+        return problem
+    used = {samples.sensor.group for episode in problem.episodes for samples in episode.samples}
+    sensors = dict(options.sensors)
+    for group in sorted(used):
+        std = sensors[group].std if group in sensors else None
+        if std is None:
+            raise run.refuse(
+                f"the share of noise in the deviation of '{group}' is given, but not the deviation",
+                "diagnosis",
+                "noise_share",
+                hint=f"set sensors.{group}.std",
+            )
+        smaller = {name: share * value for name, value in std.items()} if isinstance(std, Mapping) else share * std
+        sensors[group] = replace(sensors[group], std=smaller)
+    return problem.with_options(
+        replace(
+            options,
+            sensors=sensors,
+            priors={name: share * std for name, std in options.priors.items()},
+            tie_break=options.tie_break**share if options.tie_break > 0 else 0.0,
+            configuration_std=share * options.configuration_std,
+            velocity_std=share * options.velocity_std,
+        )
+    )
 
 
 def predictions(finding: Finding) -> list[Prediction]:

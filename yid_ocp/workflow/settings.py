@@ -53,9 +53,9 @@ GraspName = Literal["point", "axis", "weld"]
 
 @dataclass(frozen=True, kw_only=True)
 class MountSettings:
-    """Where the root of an object sits."""
+    """Where the root of an object sits, or a frame that the robot's file does not have."""
 
-    frame: Annotated[str | None, About("frame of the robot that carries the object; the world when absent")] = None
+    frame: Annotated[str | None, About("frame of the robot that carries it; the world when absent")] = None
     xyz: Annotated[Triple, About("position in that frame", "m")] = (0.0, 0.0, 0.0)
     rpy: Annotated[Triple, About("roll, pitch, yaw in that frame", "rad")] = (0.0, 0.0, 0.0)
 
@@ -66,6 +66,7 @@ class YObject:
 
     kind: Literal["y"] = "y"
     links: Annotated[int, Ge(1), Le(64), About("rigid links of every tube")] = 4
+    weight: Annotated[float, Ge(0), Le(1), About("share of its weight that it has; its inertia is whole")] = 1.0
     mount: Annotated[MountSettings | None, About("the trunk's foot; the paper's when absent")] = None
 
 
@@ -75,7 +76,11 @@ class SegmentSettings:
 
     length: Annotated[float | None, Gt(0), Le(50), About("length; not needed beside link_lengths", "m")] = None
     mass: Annotated[float, Gt(0), About("mass of the whole segment", "kg")]
-    radius: Annotated[float, Gt(0), Le(5), About("radius of the solid cylinder", "m")]
+    radius: Annotated[float | None, Gt(0), Le(5), About("radius of the solid cylinder; or give a section", "m")] = None
+    section: Annotated[
+        tuple[Annotated[float, Gt(0)], Annotated[float, Gt(0)]] | None,
+        About("extents of a rectangular cross section along the links' x and y axes", "m"),
+    ] = None
     links: Annotated[int, Ge(1), Le(64), About("number of equal links")] = 4
     link_lengths: Annotated[tuple[float, ...] | None, About("unequal links, base to tip", "m")] = None
     parent: Annotated[str | None, About("segment on which it grows; the mount when absent")] = None
@@ -87,7 +92,7 @@ class SegmentSettings:
     twist_damping: Annotated[float | None, Ge(0), About("of twists, where another", "N m s/rad or N m^2 s")] = None
     rigidity: Annotated[bool, About("whether stiffness and damping are per curvature")] = False
     clamped: Annotated[bool, About("whether it starts at a rigid wall or gripper")] = False
-    joint_order: Annotated[str, About("axes of the turns at a joint, base to tip")] = "xyz"
+    joint_order: Annotated[str, About("axes of the turns at a joint, base to tip; rigid about the others")] = "xyz"
     separate_lengths: Annotated[bool, About("whether every link has a length parameter of its own")] = False
 
 
@@ -97,6 +102,7 @@ class SegmentedObject:
 
     kind: Literal["segments"] = "segments"
     segments: Annotated[Mapping[str, SegmentSettings], About("by name, parents first")] = field(default_factory=dict)
+    weight: Annotated[float, Ge(0), Le(1), About("share of its weight that it has; its inertia is whole")] = 1.0
     mount: Annotated[MountSettings, About("where its root sits")] = field(default_factory=MountSettings)
 
 
@@ -171,6 +177,9 @@ class ArmSettings:
     locked: Annotated[Mapping[str, float], About("value of joints that do not move", "rad or m")] = field(
         default_factory=dict
     )
+    without: Annotated[
+        tuple[str, ...], About("links of the URDF left out with all that hangs on them, such as a hand not mounted")
+    ] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,6 +188,9 @@ class ModelSettings:
 
     robot: Annotated[FilePath | None, About("URDF file, or package:NAME of example-robot-data")] = None
     arms: Annotated[ArmSettings, About("the robot's joints")] = field(default_factory=ArmSettings)
+    frames: Annotated[
+        Mapping[str, MountSettings], About("more frames, by name: a tool's tip, the middle of what a gripper holds")
+    ] = field(default_factory=dict)
     object: Annotated[YObject | SegmentedObject | CableObject | None, About("the flexible object")] = None
     grasp: Annotated[Mapping[str, GraspSettings], About("by name: left, right, gripper")] = field(default_factory=dict)
     springs: Annotated[Mapping[str, SpringSettings], About("by joint of the robot")] = field(default_factory=dict)
@@ -277,6 +289,12 @@ class DiagnosisSettings:
     ] = "all"
     level: Annotated[float, Gt(0), Lt(1), About("significance below which a gap counts as one")] = 0.01
     effects: Annotated[int, Ge(1), Le(10), About("how many effects may be added")] = 3
+    noise_share: Annotated[
+        float,
+        Gt(0),
+        Le(1),
+        About("part of the sensors' std that is noise, where the rest stands for the model's error"),
+    ] = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)

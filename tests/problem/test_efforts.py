@@ -1,0 +1,68 @@
+"""Smoothed joint efforts count for as much as they tell."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from yid_ocp.data.recording import JointGroup, Recording
+from yid_ocp.errors import DataError
+from yid_ocp.integrator.step import compile_step
+from yid_ocp.model import Mechanism, System
+from yid_ocp.problem import EstimationProblem, ProblemOptions
+from yid_ocp.problem.inputs import Smoother
+from yid_ocp.solvers import GaussNewton, solve
+
+JOINTS = ("shoulder", "elbow")
+TRUTH = {"shoulder.damping": 0.3, "elbow.damping": 0.2}
+NOISE = 0.05  # of the efforts [N m]
+CUTOFF = 5.0  # [Hz]
+TWINS = 60
+
+
+@pytest.fixture(scope="module")
+def arm(urdf_folder):
+    """arm(effort, cutoff): both joints moved as measured for six seconds at 100 Hz, their efforts measured."""
+    robot = Mechanism.from_urdf(urdf_folder / "double_pendulum.urdf")
+    step = compile_step(System.build(robot, prescribed=JOINTS, damping=0.1), 0.01)
+    t = 0.01 * np.arange(601)
+    path = np.stack([0.6 * np.sin(2.9 * t), 0.5 * np.sin(3.7 * t + 1)], axis=1)
+
+    def build(effort: np.ndarray, cutoff: float) -> EstimationProblem:
+        joints = JointGroup(JOINTS, t, path, effort=effort, position_std=0.0, effort_std=NOISE)
+        options = ProblemOptions(path_cutoff=cutoff, tie_break=0.0)
+        return EstimationProblem(step, [Recording(joints, name="arm")], tuple(TRUTH), options, TRUTH)
+
+    return build
+
+
+def test_deviations_are_those_of_repeats(arm):
+    exact = arm(np.zeros((601, 2)), math.inf)
+    inner = exact.evaluate(exact.start, derivatives=False).episodes[0].predicted[0]
+    clean = np.vstack([inner[:1], inner, inner[-1:]])
+    found, stated = [], []
+    for seed in range(TWINS):
+        noise = NOISE * np.random.default_rng(seed).standard_normal(clean.shape)
+        solution = solve(arm(clean + noise, CUTOFF), GaussNewton())
+        found.append([solution.parameters[name].value for name in TRUTH])
+        stated.append([solution.parameters[name].std for name in TRUTH])
+    error = np.array(found) - list(TRUTH.values())
+    inside = np.mean(np.abs(error) <= 1.96 * np.array(stated))
+    assert 0.90 <= inside <= 0.99
+    np.testing.assert_allclose(np.std(error, axis=0), np.median(stated, axis=0), rtol=0.2)
+
+
+def test_a_record_shorter_than_the_filter_is_refused(arm):
+    with pytest.raises(DataError, match=r"(?s)6 s of efforts are too short.*more than 11\.5 s"):
+        arm(np.zeros((601, 2)), 0.5)
+
+
+def test_neighbours_that_repeat_each_other_are_left_out(arm):
+    plain, smooth = (arm(np.zeros((601, 2)), cutoff).episodes[0].samples[0] for cutoff in (math.inf, CUTOFF))
+    np.testing.assert_array_equal(plain.node, np.arange(1, 600))
+    np.testing.assert_array_equal(smooth.node + np.rint(smooth.fraction), np.arange(58, 543, 10))
+    assert Smoother(CUTOFF).stride(0.01) == 10
+    assert Smoother(CUTOFF).settling == pytest.approx(0.574, abs=1e-3)
+    assert Smoother(30.0).stride(0.05) == 1
