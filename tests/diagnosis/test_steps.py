@@ -11,7 +11,7 @@ import scipy.stats
 from yid_ocp.diagnosis import closure, confusability, linearise, null_test, refit, residual_series, scores, visibility
 from yid_ocp.diagnosis.hypotheses import Composed, Series, chosen_effects, smoothed_colour
 from yid_ocp.diagnosis.score import robust, shape_grid
-from yid_ocp.diagnosis.select import Loss, far_out, gain, within_reach
+from yid_ocp.diagnosis.select import Loss, gain, out_of_shape, oversized, within_reach
 from yid_ocp.effects import make_effect
 
 
@@ -167,7 +167,8 @@ def test_values_far_from_what_one_would_expect_are_noticed(bench):
     def values(size, speed):
         return {"joint_stribeck@elbow.tau_s": size, "joint_stribeck@elbow.v_stribeck": speed}
 
-    assert not far_out(stribeck, values(1.0, (low * high) ** 0.5))
-    assert not far_out(stribeck, values(3.9, 1.9 * high))
-    assert far_out(stribeck, values(1.0, low / 3))
-    assert far_out(stribeck, values(4.1, high))
+    middle = (low * high) ** 0.5
+    assert not oversized(stribeck, values(3.9, middle))
+    assert oversized(stribeck, values(4.1, middle))
+    assert not out_of_shape(stribeck, values(4.1, 1.9 * high))
+    assert out_of_shape(stribeck, values(1.0, low / 3))

@@ -333,7 +333,8 @@ def gain(before: Loss, after: Loss) -> tuple[float, float]:
 def within_reach(fits: Sequence[Fit]) -> list[Fit]:
     """Fits whose held-out loss is within one standard error of the best one's (or `TIE` of it), the simplest first.
 
-    Those whose last effect is far from what an engineer would expect of it (`far_out`) count only where all are.
+    An effect whose shape is far from what an engineer would expect (`out_of_shape`) counts only where all are: a solid
+    that relaxes in a tenth of the shortest time expected is a damper. One whose amplitude is (`oversized`) comes last.
     """
     best = min(fits, key=lambda fit: fit.loss.mean)
     near = []
@@ -341,23 +342,21 @@ def within_reach(fits: Sequence[Fit]) -> list[Fit]:
         lost, error = gain(fit.loss, best.loss)
         if fit is best or lost <= max(error, TIE * best.loss.mean):
             near.append(fit)
-    sober = [fit for fit in near if not (fit.effects and far_out(fit.effects[-1], fit.values))]
-    near = sober or near
-    return sorted(near, key=lambda fit: (fit.size, fit.loss.mean))
+    near = [fit for fit in near if not (fit.effects and out_of_shape(fit.effects[-1], fit.values))] or near
+    return sorted(near, key=lambda f: (bool(f.effects) and oversized(f.effects[-1], f.values), f.size, f.loss.mean))
 
 
-def far_out(effect: EffectBase, values: Mapping[str, float]) -> bool:
-    """Whether an effect's parameters lie far from where an engineer would expect them.
-
-    That is by more than the width of the range, or by more than a factor of two for a shape whose range has no zero: a
-    solid that relaxes in a tenth of the shortest time expected is another effect's way to look.
-    """
-    for name in (*effect.amplitudes, *effect.shapes):
+def out_of_shape(effect: EffectBase, values: Mapping[str, float]) -> bool:
+    """Whether a shape parameter lies outside its range by more than a factor of two, or than the range's width."""
+    for name in effect.shapes:
         low, high = effect.prior_range[name]
-        if name in effect.shapes and low > 0:
-            inside = low / 2 <= values[name] <= high * 2
-        else:
-            inside = 2 * low - high <= values[name] <= 2 * high - low
-        if not inside:
+        near, far = (low / 2, high * 2) if low > 0 else (2 * low - high, 2 * high - low)
+        if not near <= values[name] <= far:
             return True
     return False
+
+
+def oversized(effect: EffectBase, values: Mapping[str, float]) -> bool:
+    """Whether an amplitude lies outside its range by more than the range's width."""
+    ranges = ((values[name], *effect.prior_range[name]) for name in effect.amplitudes)
+    return any(not 2 * low - high <= value <= 2 * high - low for value, low, high in ranges)
