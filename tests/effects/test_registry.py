@@ -171,3 +171,11 @@ def test_names_and_places_survive_added_joints(one_arm) -> None:
     assert names[changed.mechanism.joints[names.index("T2_0_x")].parent] == names[parent]
     assert places.robot_joints(changed) == places.robot_joints(one_arm)
     assert changed.mechanism.frame("w_T1").joint == names.index("T1_3_z")
+
+
+def test_how_much_stiffening_to_expect_depends_on_how_far_joints_turn() -> None:
+    effect = make_effect("cubic_stiffness", "T1", paper_system(1))
+    low, high = effect.prior_range["cubic_stiffness@T1.k3"]
+    told = effect.expected({"T1": 0.25, "T2": 1.0})
+    assert told.prior_range["cubic_stiffness@T1.k3"] == pytest.approx((4 * low, 4 * high))
+    assert effect.expected({"T2": 0.1}) is effect

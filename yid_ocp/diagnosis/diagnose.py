@@ -107,6 +107,7 @@ def _diagnosed(
     clock.lap("compose")
     say("fitting the nominal model")
     nominal = nominal_fit(problem, composed, solution, store)
+    composed.effects = tuple(effect.expected(largest_angles(nominal)) for effect in composed.effects)
     clock.lap("nominal")
     free = composed.freeing(())
     series = residual_series(free)
@@ -207,6 +208,16 @@ def nominal_fit(
     if fit is None:
         raise SolverError("the nominal model cannot be rolled out at its fit", where="diagnosis")
     return fit
+
+
+def largest_angles(fit: Fit) -> dict[str, float]:
+    """How far the joints of each segment turn in the recordings that were fitted [rad]."""
+    system = fit.problem.system
+    found = {}
+    for segment in system.segments:
+        index = [system.mechanism.joint_index(joint) for link in segment.links for joint in link]
+        found[segment.name] = max(float(np.abs(r.sweep.state[:, index]).max()) for r in fit.evaluation.episodes)
+    return found
 
 
 def held_out_test(fit: Fit, level: float) -> NullTest:

@@ -176,6 +176,10 @@ class EffectBase:
             result[name] = Reported(value, std, unit)
         return result
 
+    def expected(self, largest: Mapping[str, float]) -> EffectBase:
+        """The effect with the ranges to expect where the joints of each segment turn so far in the data [rad]."""
+        return self
+
     def modify(self, system: System) -> System:
         """The system with the effect's changes of description."""
         return system

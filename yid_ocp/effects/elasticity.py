@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 
 import casadi as ca
@@ -26,6 +27,8 @@ from yid_ocp.model.y_object import AXES
 
 REFERENCE_ANGLE = 0.5
 """Stands for the largest angle in the data where a range depends on it [rad]."""
+SMALLEST_ANGLE = 0.02
+"""A segment that turns less says nothing of how its springs stiffen [rad]."""
 RELAXATION = 5e-3
 """Of mounts and junctions [s]: too short to damp any motion that is seen."""
 
@@ -54,10 +57,22 @@ class CubicStiffness(EffectBase):
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """k3 [N m/rad^3]; its range is -0.5 to 1 times stiffness over `REFERENCE_ANGLE` squared."""
+        """k3 [N m/rad^3]; its range is -0.5 to 1 times stiffness over the square of the largest angle in the data.
+
+        That is `REFERENCE_ANGLE` until `expected` is told of another.
+        """
         unit = typical_stiffness(system, location) / REFERENCE_ANGLE**2
         text = "cubic stiffness of every joint"
         return (Quantity("k3", "N m/rad^3", 0.0, -10 * unit, 50 * unit, (-0.5 * unit, unit), text),)
+
+    def expected(self, largest: Mapping[str, float]) -> CubicStiffness:
+        """See `EffectBase.expected`."""
+        if self.location not in largest:
+            return self
+        factor = (REFERENCE_ANGLE / max(largest[self.location], SMALLEST_ANGLE)) ** 2
+        [k3] = self.quantities
+        low, high = k3.prior_range
+        return replace(self, quantities=(replace(k3, prior_range=(factor * low, factor * high)),))
 
     def terms(self, state: MidpointState) -> Terms:
         """See the class."""
