@@ -230,6 +230,7 @@ def test_efforts_of_prescribed_joints_say_which(bench):
     assert places[0].location == "elbow"
     assert places[0].share > 0.8
     assert found.explainable > 0.5
+    assert found.side == "either", "a force at a measured joint and its sensor's bias are the same"
 
 
 def test_effects_take_the_share_that_they_close():

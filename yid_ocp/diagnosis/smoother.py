@@ -74,10 +74,13 @@ class Source:
     ----------
     location : str
     kind : "force", "offset" or "bias"
+    read : bool
+        Whether a bias of an effort sensor would be the same: a force at a prescribed joint whose effort is measured.
     """
 
     location: str
     kind: Kind
+    read: bool = False
 
 
 @dataclass(frozen=True)
@@ -212,9 +215,12 @@ class Smoothed:
 
     @property
     def side(self) -> str:
-        """Whether the gap lies in the plant, in the sensors or in both, by evidence."""
+        """Whether the gap lies in the plant, in the sensors or in both, by evidence; "either" where it cannot tell."""
         if max(self.evidence.values()) <= 0:
             return "none"
+        heaviest = max(self.weight, key=lambda source: self.weight[source])
+        if heaviest.read:
+            return "either"
         # both must beat either alone by more than chance
         alone = max(("plant", "sensor"), key=lambda name: self.evidence[name])
         return "both" if self.evidence["both"] - self.evidence[alone] > WORTH else alone
@@ -293,7 +299,7 @@ class _Builder:
         largest = max((max(v) for v in of_place.values()), default=1.0)
         size = {p: FORCE * max(float(np.sqrt(np.mean(np.square(v)))), 1e-2 * largest) for p, v in of_place.items()}
         unknowns = list(joints)
-        sources = [Source(place[name], "force") for name in joints]
+        sources = [Source(place[name], "force", name in measured) for name in joints]
         reference = [size[place[name]] for name in joints]
         self.closed: list[int] = []
         row = 0

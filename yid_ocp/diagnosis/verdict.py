@@ -389,7 +389,11 @@ def _out_of_range(effect: EffectBase, fit: Fit) -> list[str]:
     return found
 
 
-SIDES = {"plant": ", in the mechanics rather than in what sensors read", "sensor": ", in what sensors read"}
+SIDES = {
+    "plant": ", in the mechanics rather than in what sensors read",
+    "sensor": ", in what sensors read",
+    "either": ", in the mechanics or in what the effort sensor reads, which efforts alone do not tell apart",
+}
 
 
 def sentences(finding: Finding) -> str:

@@ -202,6 +202,7 @@ def _side(smoothed: Smoothed) -> str:
         "plant": "the mechanics, not what sensors read",
         "sensor": "what sensors read, not the mechanics",
         "both": "both the mechanics and what sensors read",
+        "either": "the mechanics or what the effort sensors read, which efforts alone do not tell apart",
         "none": "neither the mechanics nor the sensors' biases, as far as these unknowns can tell",
     }
     evidence = smoothed.evidence
