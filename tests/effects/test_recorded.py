@@ -76,7 +76,9 @@ def test_neutral_readings_change_nothing(mode, feedback, benches) -> None:
     assert not plain.readings.active
     assert full.readings.active
     assert plain.as_recorded
-    assert full.with_free(["T1.bend", "kelvin_voigt@T3.tau", "clock_scale@clock.scale"]).as_recorded
+    assert full.with_free(["T1.bend", "kelvin_voigt@T3.tau"]).as_recorded
+    # the momentum that an LQR filter follows depends on how fast the clock runs
+    assert full.with_free(["T1.bend", "clock_scale@clock.scale"]).as_recorded is (feedback != "lqr")
     assert not full.with_free(["effort_delay@left.delay"]).as_recorded
     assert not full.with_free(["camera_latency@camera.delay"]).as_recorded
     with pytest.raises(SolverError, match="gauss_newton"):

@@ -440,7 +440,10 @@ class EstimationProblem:
 
     @property
     def as_recorded(self) -> bool:
-        """Whether no effect on recorded inputs or times is at work: none is free, and all others are neutral."""
+        """Whether no effect on recorded inputs or times is at work: none is free, and all others are neutral.
+
+        What the tracking filter follows counts as such an input.
+        """
         for episode in self.episodes:
             inputs = self.inputs(episode, self.theta, self._columns)
             pairs = ((inputs.torque, episode.torque), (inputs.path, episode.path), (inputs.arm, episode.measured_arm))
