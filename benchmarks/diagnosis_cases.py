@@ -91,7 +91,7 @@ def record(case: Case, motion_seed: int, noise_seed: int) -> Recording:
     nominal = build_system(run)
     links = len(nominal.segments[0].links) * case.links
     system = nominal if case.links == 1 else build_system(run, links)
-    values = TRUTH if case.links == 1 else finer_values(system, TRUTH, case.links)
+    values = TRUTH if case.links == 1 else finer_values(nominal, system, TRUTH)
     posture = initial_posture(nominal, TRUTH)
     motion = Motion.multisine(nominal, TRUTH, seed=motion_seed, posture=posture, travel=TRAVEL[1])
     return withheld_experiment(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 
 import pytest
 
@@ -16,7 +15,7 @@ KV = Withheld("kelvin_voigt", "T1", {"tau": 0.05})
 GUST = Withheld("gusts", "T3", {"size": 0.1})
 
 
-def label(category, *withheld, multiple=math.nan, case="case_000"):
+def label(category, *withheld, multiple=None, case="case_000"):
     return Label(case, category, withheld, multiple, {"T1.bend": 12.0})
 
 

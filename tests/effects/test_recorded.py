@@ -28,6 +28,9 @@ KINDS = {
     "clock_scale": {"clock": {"scale": 0.97}},
     "kelvin_voigt": {"T3": {"tau": 0.03}},
 }
+# what changes the momentum that the arm's motion has
+HEAVIER = {"rotor_inertia": {"left_b": {"armature": 0.05}}, "link_mass": {"left_c": {"scale": 1.1}}}
+KINDS |= HEAVIER
 
 
 def recording(bench, effort: bool = True, camera: bool = True) -> Recording:
@@ -193,3 +196,21 @@ def test_a_cable_from_a_fitted_start(cable, all_effects) -> None:
 def test_options_can_switch_the_camera_off(driven) -> None:
     task = problem(driven, ("camera_latency",), sensors={"points_camera": SensorOptions(use=False)})
     assert np.all(task.evaluate(task.start).jacobian[:, -1] == 0)
+
+
+@pytest.mark.parametrize("kind", sorted(HEAVIER))
+def test_the_filter_follows_the_momentum_of_the_effects(driven, kind) -> None:
+    """The cost is one number, whether derivatives are asked for or not, and however the effect's value is given."""
+    task = problem(driven, (kind,), feedback="lqr")
+    with_slopes, without = (task.evaluate(task.start, derivatives=flag).cost for flag in (True, False))
+    fixed = task.with_free(["T1.bend"])
+    told = problem(driven, (kind,), neutral=True, feedback="lqr")
+    values = dict(zip(task.names, task.start, strict=True))
+    other = told.evaluate([values[name] for name in told.names], derivatives=False).cost
+    assert without == pytest.approx(with_slopes, rel=1e-12)
+    assert fixed.evaluate(fixed.start, derivatives=False).cost == pytest.approx(without, rel=1e-12)
+    assert other == pytest.approx(without, rel=1e-9)
+
+
+def test_an_arms_own_damping_leaves_the_recording_as_it_is(driven) -> None:
+    assert problem(driven, (), feedback="lqr", free=("left_a.damping",)).as_recorded

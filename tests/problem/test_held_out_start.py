@@ -64,12 +64,12 @@ def test_an_estimated_start_is_estimated_in_held_out_recordings_too(swinging):
 def test_only_the_first_moments_count(swinging):
     problem = swinging(initial_state="estimated", configuration_std=0.2, velocity_std=1.0)
     episode = problem.held_out[0]
-    found = problem._held_out_start(episode, problem.theta)
+    found = problem.held_out_start(0, problem.theta, problem.start)
     later = episode.samples[0].value
     later[50:] += 1.0
     again = swinging(initial_state="estimated", configuration_std=0.2, velocity_std=1.0)
     again.held_out[0].samples[0].value[50:] += 1.0
-    assert again._held_out_start(again.held_out[0], again.theta) == pytest.approx(found, abs=1e-12)
+    assert again.held_out_start(0, again.theta, again.start) == pytest.approx(found, abs=1e-12)
 
 
 def test_the_beginning_of_an_episode_holds_what_was_measured_in_it(swinging):

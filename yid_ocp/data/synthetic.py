@@ -370,7 +370,8 @@ def simulate_in_mujoco(
     frame_times : array_like, shape (M,)
         When a camera looks [s], increasing, in [0, duration].
     foreign : ForeignTerms, optional
-        What is at work beside the system's description.
+        What is at work beside the system's description. MuJoCo knows one such callback for the whole process: no other
+        simulation may run meanwhile in another thread.
 
     Returns
     -------

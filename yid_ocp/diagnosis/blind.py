@@ -56,8 +56,8 @@ class Label:
     category : str
         null, single, pair, outside, left_out or finer_chain.
     withheld : tuple of Withheld
-    multiple : float
-        Of the detectable size, as made; NaN where that has no meaning.
+    multiple : float, optional
+        Of the detectable size, as made; None where that has no meaning.
     truth : dict of str to float
         Nominal parameters.
     """
@@ -65,7 +65,7 @@ class Label:
     case: str
     category: str
     withheld: tuple[Withheld, ...]
-    multiple: float
+    multiple: float | None
     truth: Mapping[str, float]
 
     def to_dict(self) -> dict[str, Any]:
@@ -76,7 +76,7 @@ class Label:
     def from_dict(data: Mapping[str, Any]) -> Label:
         """From JSON."""
         withheld = tuple(Withheld(**entry) for entry in data["withheld"])
-        return Label(data["case"], data["category"], withheld, float(data["multiple"]), data["truth"])
+        return Label(data["case"], data["category"], withheld, data["multiple"], data["truth"])
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Case:
     name : str
     estimate, held_out : Recording
     without : tuple of str
-        Kinds that the library is robbed of; always one, mostly one that has nothing to do with the case.
+        Kinds that the library is robbed of; mostly one that has nothing to do with the case.
     """
 
     name: str
@@ -99,7 +99,7 @@ class Case:
 
 def seal(labels: Sequence[Label]) -> tuple[str, str]:
     """Labels as text, and the hash by which they are committed to before the run."""
-    text = json.dumps([label.to_dict() for label in labels], indent=1, sort_keys=True)
+    text = json.dumps([label.to_dict() for label in labels], indent=1, sort_keys=True, allow_nan=False)
     return text, hashlib.sha256(text.encode()).hexdigest()
 
 
@@ -151,6 +151,8 @@ class Ensemble:
                 where="model",
                 allowed="a robot whose arms are driven, nothing prescribed",
             )
+        if seed < 0:
+            raise ConfigError(f"seed = {seed}", where="--seed", allowed="a whole number from 0")
         self.problem, self.seed, self._finer = problem, seed, finer
         self._candidates = candidates
         recording = problem.episodes[0].recording
@@ -158,6 +160,13 @@ class Ensemble:
         names = list(recording.joints.names)
         self.posture = {j: float(recording.joints.position[0, names.index(j)]) for j in problem.system.driven}
         self.vision = any(group.pose is not None for group in recording.points)
+        effects = chosen_effects(problem.system, [recording], candidates)
+        if not {effect.kind for effect in effects} & set(KINDS):
+            raise ConfigError(
+                "none of the candidates can be done in MuJoCo",
+                where="diagnosis.candidates",
+                allowed=", ".join(KINDS),
+            )
         self._point: Linearisation | None = None
 
     def _rng(self, *path: int) -> np.random.Generator:
@@ -186,7 +195,7 @@ class Ensemble:
         )
         made = withheld_experiment(
             system,
-            truth if links == 1 else finer_values(system, truth, links),
+            truth if links == 1 else finer_values(self.problem.system, system, truth),
             withheld,
             motion=motion,
             seed=int(rng.integers(2**31)),
@@ -234,8 +243,8 @@ class Ensemble:
                 )
             except ModelError:
                 continue  # the motion throws the object about; draw another
-            robbed = withheld[0].kind if category == "left_out" else self._other_kind(withheld, rng)
-            return Case(name, estimate, held_out, (robbed,)), Label(name, category, withheld, multiple, truth)
+            robbed = (withheld[0].kind,) if category == "left_out" else self._other_kind(withheld, rng)
+            return Case(name, estimate, held_out, robbed), Label(name, category, withheld, multiple, truth)
         raise ModelError("no motion of this experiment can be simulated", where=f"case {number}")
 
     def _category(self, number: int, count: int) -> str:
@@ -247,16 +256,16 @@ class Ensemble:
         category = [*SHARES, "finer_chain"][place]
         return "single" if category == "finer_chain" and self._finer is None else category
 
-    def _other_kind(self, withheld: Sequence[Withheld], rng: np.random.Generator) -> str:
+    def _other_kind(self, withheld: Sequence[Withheld], rng: np.random.Generator) -> tuple[str, ...]:
         at_work = {effect.kind for effect in withheld}
         kinds = sorted({s.effect.kind for s in self.point().signatures} - at_work)
-        return str(rng.choice(kinds))
+        return (str(rng.choice(kinds)),) if len(kinds) > 1 else ()
 
-    def _withheld(self, category: str, rng: np.random.Generator) -> tuple[tuple[Withheld, ...], float]:
+    def _withheld(self, category: str, rng: np.random.Generator) -> tuple[tuple[Withheld, ...], float | None]:
         if category in ("null", "finer_chain"):
-            return (), math.nan
+            return (), None
         if category == "outside":
-            return (self._outside(rng),), math.nan
+            return (self._outside(rng),), None
         if category == "pair":
             (one, size), (two, _) = self._inside(rng, SIZES[-1]), self._inside(rng, SIZES[-1])
             return ((one, two) if one.label != two.label else (one,)), size
@@ -301,7 +310,7 @@ class Ensemble:
 
     def _outside(self, rng: np.random.Generator) -> Withheld:
         system = self.problem.system
-        kind = str(rng.choice(OUTSIDE))
+        kind = str(rng.choice(OUTSIDE if system.segments else OUTSIDE[:1]))
         if kind == "torque_ripple":
             joint = str(rng.choice(system.driven[: max(len(system.driven) // 2, 1)]))
             return Withheld(kind, joint, {"size": float(rng.uniform(0.5, 2.0))})
@@ -317,11 +326,26 @@ class Ensemble:
         return Withheld(kind, segment, {"size": float(sizes[kind])})
 
 
-def finer_values(system: System, truth: Mapping[str, float], links: int) -> dict[str, float]:
-    """Values that make the same tube of so many times the links: springs and dampers as many times as strong."""
-    nominal = dict(zip(system.parameters.names, map(float, system.parameters.vector()), strict=True)) | dict(truth)
-    scaled = {f"{s.name}.{what}" for s in system.segments for what in ("bend", "twist", "damping", "twist_damping")}
-    return {name: nominal[name] * links for name in scaled & set(nominal)}
+def finer_values(nominal: System, finer: System, truth: Mapping[str, float]) -> dict[str, float]:
+    """Values that make the same tubes of more links: springs and dampers of a joint as many times as strong.
+
+    A segment whose links did not change, or whose stiffness is that of its cross section, keeps its values.
+    """
+    start = dict(zip(nominal.parameters.names, map(float, nominal.parameters.vector()), strict=True))
+    finer_start = dict(zip(finer.parameters.names, map(float, finer.parameters.vector()), strict=True))
+    values = dict(truth)
+    for segment in nominal.segments:
+        factor = len(finer.segment(segment.name).links) / len(segment.links)
+        for what in ("bend", "twist"):
+            name = f"{segment.name}.{what}"
+            if name in truth and start[name] > 0:
+                # the finer description says how a stiffness follows the links
+                values[name] = truth[name] * finer_start[name] / start[name]
+        for what in ("damping", "twist_damping"):
+            name = f"{segment.name}.{what}"
+            if name in start:
+                values[name] = truth.get(name, start[name]) * factor
+    return values
 
 
 # -- answers and score ------------------------------------------------------------------------------------------------
@@ -428,7 +452,8 @@ def mark(label: Label, result: Mapping[str, Any], best: float = math.nan, second
     verdict = str(result["verdict"])
     named = [f"{e['kind']}@{e['location']}" for e in result["effects"]]
     listed = [f"{e['kind']}@{e['location']}" for e in result["which"]]
-    alike = tuple(f"{e['kind']}@{e['location']}" for group in result["confusable"][:1] for e in group)
+    groups = [tuple(f"{e['kind']}@{e['location']}" for e in group) for group in result["confusable"]]
+    alike = next((group for group in groups if named and named[0] in group), ())
     true = [effect.label for effect in label.withheld]
     places = [p["location"] for p in result["where"]]
     gap = verdict not in ("no_gap", "insufficient_data")
@@ -459,7 +484,7 @@ def mark(label: Label, result: Mapping[str, Any], best: float = math.nan, second
         " + ".join(true) or "-",
         verdict,
         " + ".join(named) or "-",
-        label.multiple,
+        math.nan if label.multiple is None else label.multiple,
         gap,
         bool(true) and listed[:1] == true[:1],
         bool(true) and true[0] in listed[:2],

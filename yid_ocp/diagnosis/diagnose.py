@@ -333,9 +333,19 @@ def _pruned(
         gained, error = gain(without.loss, full.loss)
         if gained <= error:
             say(f"left {entry.effect.label} out again: the others do as well")
-            total = closure(nominal.loss, without.loss)
-            kept = [*rest[:-1], Added(rest[-1].effect, without, total, rest[-1].rivals)]
+            kept = _again(composed, nominal, rest, without, store)
     return tuple(kept)
+
+
+def _again(composed: Composed, nominal: Fit, rest: Sequence[Added], last: Fit, store: Store | None) -> list[Added]:
+    """Effects that were kept when another was left out, each with the fit of all up to it."""
+    found = []
+    for i, entry in enumerate(rest):
+        effects = [other.effect for other in rest[: i + 1]]
+        fit = last if i == len(rest) - 1 else refit(composed, effects, last.values, store, f"{describe(effects)} again")
+        if fit is not None:
+            found.append(Added(entry.effect, fit, closure(nominal.loss, fit.loss), entry.rivals))
+    return found
 
 
 def smooth_fit(fit: Fit) -> Smoothed:

@@ -18,6 +18,7 @@ from yid_ocp.integrator.rollout import Rest, Statics
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.initial import FittedStart
 from yid_ocp.problem.inputs import Smoother, sensors_present
 from yid_ocp.problem.problem import Episode
 from yid_ocp.problem.readings import Readings
@@ -210,11 +211,20 @@ class Composed(EstimationProblem):
         made.readings = _SlicedReadings(system, joint.compiled, everything)
         made._statics = _SlicedStatics(joint, everything)
         if joint.system.driven and problem.options.feedback == "lqr":
-            _ = made._reference_momentum  # built once, before copies are made
+            _ = made._momentum_shift  # built once, before copies are made
         if not held:
             made.held_out = tuple(_masked(episode, 1) for episode in made.episodes)
             made.episodes = tuple(_masked(episode, 0) for episode in made.episodes)
         return made
+
+    def held_out_start(self, i: int, theta: Array, x: Array) -> Array:
+        """See `EstimationProblem.held_out_start`; where one recording is split in blocks, both have one start."""
+        return self.split(x, i)[1] if self.blocks else super().held_out_start(i, theta, x)
+
+    def fitted_start(self, episode: Episode, theta: Array) -> FittedStart:
+        """See `EstimationProblem.fitted_start`."""
+        twins = {id(held): own for held, own in zip(self.held_out, self.episodes, strict=True)} if self.blocks else {}
+        return super().fitted_start(twins.get(id(episode), episode), theta)
 
     def sensor(self, sensor: Sensor, wanted: tuple[str, ...]) -> Mapped:
         """See `EstimationProblem.sensor`."""

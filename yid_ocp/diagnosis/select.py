@@ -173,8 +173,13 @@ def refit(
     best = _attempt(own, effects, start)
     if best is not None and _half_done(own, effects, start, best[1]):
         # the nominal fit may have driven its parameters to where this model cannot come back from
-        fresh = {key: value for key, value in start.items() if key not in problem.nominal}
-        again = _attempt(own, effects, fresh)
+        nominal = {*problem.nominal}
+        fresh = {
+            key: value
+            for key, value in start.items()
+            if key.split("[")[0] not in nominal and not key.startswith("start.")
+        }
+        again = _attempt(own, effects, fresh) if len(fresh) < len(start) else None
         best = again if again is not None and again[1].cost < best[1].cost else best
     if best is None:
         return None

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import casadi as ca
@@ -242,6 +242,9 @@ def linear_model(problem: EstimationProblem, x: Array, evaluation: Evaluation) -
     assert evaluation.jacobian is not None
     scale = problem.scales
     found, row = [], 0
+    residual, slopes = problem.prior(x)
+    stated = slice(0, problem.stated_prior_rows)
+    prior = -np.column_stack([residual[stated], slopes[stated] * scale])
     for i, (episode, result) in enumerate(zip(problem.episodes, evaluation.episodes, strict=True)):
         theta = problem.own_theta(episode, problem.split(x, i)[0])
         count = sum(int(np.count_nonzero(s.weight > 0)) for s in episode.samples)
@@ -249,7 +252,10 @@ def linear_model(problem: EstimationProblem, x: Array, evaluation: Evaluation) -
         observed = -np.column_stack([evaluation.residual[rows], evaluation.jacobian[rows] * scale])
         row += count
         found.append(_Builder(problem, episode, theta, result.sweep, result.predicted).build(observed))
-    return tuple(found)
+    # stated priors of the free parameters are observations that no unknown reaches
+    first, *later = found[0].intervals
+    first = replace(first, rest=first.rest + prior.T @ prior)
+    return (replace(found[0], intervals=(first, *later)), *found[1:])
 
 
 class _Builder:
@@ -314,6 +320,8 @@ class _Builder:
             if isinstance(samples.sensor, EffortSensor):
                 continue  # at a prescribed joint a bias and a force are the same
             for column, channel in enumerate(samples.channel_of_column):
+                if not np.any(samples.weight[:, column] > 0):
+                    continue
                 frame = samples.sensor.frames[column // samples.sensor.width]
                 location = self._seen_by(samples.sensor, frame)
                 self.biased.append((k, column))
@@ -326,9 +334,8 @@ class _Builder:
         """What could be wrong where a point is misread: the camera, the arm that holds it, else the sensor's group."""
         if sensor.camera is not None:
             return "camera"
-        tree = self.system.mechanism
         for grasp in self.system.grasps:
-            if frame in (grasp.held, grasp.holder) or tree.frame(frame) == tree.frame(grasp.held):
+            if frame in (grasp.held, grasp.holder):
                 return grasp.name
         return sensor.group
 

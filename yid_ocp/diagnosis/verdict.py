@@ -263,8 +263,8 @@ def which(finding: Finding) -> list[dict[str, Any]]:
 def has_gap(before: NullTest, held_out: NullTest, limits: Thresholds, ranked: Sequence[Score] = ()) -> bool:
     """Whether the residual is more than noise, by enough to be worth a name.
 
-    Either as a whole, or in one channel along what a candidate would do to it: the sum over all channels does not
-    notice what only a few samples show.
+    Either as a whole, or along what a candidate would do to it with some channel above noise: the sum over all channels
+    does not notice what only a few samples show.
 
     Parameters
     ----------

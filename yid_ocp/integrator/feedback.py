@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import casadi as ca
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from yid_ocp.errors import ModelError
 from yid_ocp.integrator.codegen import Mapped
 from yid_ocp.integrator.step import Feedback, Step, compile_step
-from yid_ocp.model.system import System
+from yid_ocp.model.system import Effect, System
 
 Array = NDArray[np.float64]
 
@@ -106,10 +106,10 @@ def lqr_filter(
     return Feedback(index.astype(np.int32), gain, np.hstack([reference[:-1], momenta[:-1]]))
 
 
-class ReferenceMomentum:
-    """Momentum of driven joints along a measured motion as the whole model has it, effects on the arms included.
+class MomentumShift:
+    """What effects add to the momentum of driven joints along a measured motion.
 
-    `lqr_filter` works the reference out once, without effects; an armature or a heavier link changes what the same
+    `lqr_filter` works its reference out once, without effects; an armature or a heavier link changes what the same
     motion's momentum is, and the filter would otherwise pull at the difference.
 
     Parameters
@@ -119,7 +119,7 @@ class ReferenceMomentum:
     Attributes
     ----------
     parameters : tuple of str
-        Those on which the momentum depends.
+        Those of effects on which the momentum depends.
     """
 
     def __init__(self, step: Step) -> None:
@@ -135,7 +135,10 @@ class ReferenceMomentum:
         zero = ca.SX(ca.DM.zeros(e.z0.numel()))
         [momentum] = ca.substitute([ca.densify(e.p1[driven])], [e.q0, e.q1, e.z0, e.z1], [*whole, zero, zero])
         pattern = np.array(ca.DM(ca.jacobian_sparsity(momentum, e.theta), 1)).any(axis=0)
-        columns = np.flatnonzero(pattern)
+        neutral = {name: value for effect in system.effects for name, value in _neutral(effect).items()}
+        columns = [i for i in np.flatnonzero(pattern) if system.parameters.names[i] in neutral]
+        self._columns = np.array(columns, int)
+        self._neutral = np.array([neutral[system.parameters.names[i]] for i in columns])
         self.parameters = tuple(system.parameters.names[i] for i in columns)
         slope = ca.jacobian(momentum, e.theta)[:, [int(i) for i in columns]]
         function = ca.Function("momentum", [before, now, e.u, e.theta, e.time_step], [momentum, ca.densify(slope)])
@@ -143,7 +146,7 @@ class ReferenceMomentum:
         self._time_step = np.array([step.time_step])
 
     def along(self, measured: Array, torque: Array, theta: Array, names: Sequence[str]) -> tuple[Array, Array]:
-        """Momentum at every node but the last, shape (N, nu), and its derivative by named parameters, (N, nu, d).
+        """The shift at every node but the last, shape (N, nu), and its derivative by named parameters, (N, nu, d).
 
         Parameters
         ----------
@@ -154,12 +157,28 @@ class ReferenceMomentum:
         """
         before = np.vstack([measured[:1], measured[:-2]])
         held = np.vstack([torque[:1], torque[:-1]])
+        plain, _ = self._map(before, measured[:-1], held, self.without(theta), self._time_step)
         value, slopes = self._map(before, measured[:-1], held, theta, self._time_step)
         wide = np.zeros((*value.shape[:2], len(names)))
         for column, name in enumerate(names):
             if name in self.parameters:
                 wide[:, :, column] = slopes[:, :, self.parameters.index(name)]
-        return value[:, :, 0], wide
+        return (value - plain)[:, :, 0], wide
+
+    def without(self, theta: Array) -> Array:
+        """theta with these effects absent, at which a filter's own reference is worked out."""
+        plain = theta.copy()
+        plain[self._columns] = self._neutral
+        return plain
+
+    def active(self, theta: Array, names: Sequence[str]) -> bool:
+        """Whether any effect is at work on it, or is among the parameters to differentiate by."""
+        return not set(names).isdisjoint(self.parameters) or bool(np.any(theta[self._columns] != self._neutral))
+
+
+def _neutral(effect: Effect) -> Mapping[str, float]:
+    """Values with which an effect is absent; one that does not say so is taken as it stands."""
+    return dict(getattr(effect, "neutral", {}))
 
 
 def _arms_only(system: System) -> System:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import ConfigError, DataError, nearest
 from yid_ocp.integrator.codegen import Mapped
-from yid_ocp.integrator.feedback import ReferenceMomentum, lqr_filter, proportional_filter
+from yid_ocp.integrator.feedback import MomentumShift, lqr_filter, proportional_filter
 from yid_ocp.integrator.rollout import Rest, Statics, adjoint_gradient, simulate
 from yid_ocp.integrator.step import Directions, Feedback, Step, Sweep, check_shape
 from yid_ocp.problem.episodes import Episode as Episode
@@ -232,7 +232,8 @@ class EstimationProblem:
             if system.driven and options.feedback == "proportional":
                 result = proportional_filter(self.step, episode.measured_arm, options.gains)
             elif system.driven and options.feedback == "lqr":
-                result = lqr_filter(self.step, self._smooth_arm(episode), episode.torque, self.theta)
+                theta = self._momentum_shift.without(self.theta)
+                result = lqr_filter(self.step, self._smooth_arm(episode), episode.torque, theta)
             self._feedback[key] = result
         return self._feedback[key]
 
@@ -469,17 +470,15 @@ class EstimationProblem:
         inputs = self.readings.inputs(episode, theta, wanted)
         if not self.system.driven or self.options.feedback != "lqr":
             return inputs
-        reference = self._reference_momentum
-        moving = [self.system.parameters.index(name) for name in reference.parameters]
-        swept = not set(wanted).isdisjoint(reference.parameters)
-        if not swept and np.array_equal(theta[moving], self.system.parameters.vector()[moving]):
+        shift = self._momentum_shift
+        if not shift.active(theta, wanted):
             return inputs
-        momentum, slope = reference.along(self._smooth_arm(episode), episode.torque, theta, wanted)
-        return replace(inputs, momentum=momentum, by_momentum=slope if swept else None)
+        momentum, slope = shift.along(self._smooth_arm(episode), episode.torque, theta, wanted)
+        return replace(inputs, momentum=momentum, by_momentum=slope if np.any(slope) else None)
 
     @cached_property
-    def _reference_momentum(self) -> ReferenceMomentum:
-        return ReferenceMomentum(self.step)
+    def _momentum_shift(self) -> MomentumShift:
+        return MomentumShift(self.step)
 
     def _smooth_arm(self, episode: Episode) -> Array:
         """Measured angles of the driven joints, smooth enough to be differenced, shape (N + 1, nu)."""
@@ -731,25 +730,26 @@ class EstimationProblem:
         for name in self.local:
             theta[self.system.parameters.index(name)] = self.theta[self.system.parameters.index(name)]
         return [
-            (episode, self.run(episode, theta, self._held_out_start(episode, theta), derivatives=False))
-            for episode in self.held_out
+            (episode, self.run(episode, theta, self.held_out_start(i, theta, np.asarray(x, float)), derivatives=False))
+            for i, episode in enumerate(self.held_out)
         ]
 
-    def _held_out_start(self, episode: Episode, theta: Array) -> Array:
+    def held_out_start(self, i: int, theta: Array, x: Array) -> Array:
         """Deviation of a held-out recording's start from rest, shape (number of estimated rows,)."""
+        episode = self.held_out[i]
         deviation = np.zeros(self._start_size)
         if not self._start_size:
             return deviation
         key = id(episode)
         if key not in self._beginnings:
             short = beginning(episode, max(round(HELD_OUT_START / self.step.time_step), 2))
-            self._beginnings[key] = short
             whole = self.feedback(episode)
             steps = short.grid.steps
             self._smoothed[id(short)] = self._smooth_arm(episode)[: steps + 1]
             self._feedback[id(short)] = (
                 None if whole is None else Feedback(whole.index, whole.gain[:steps], whole.reference[:steps])
             )
+            self._beginnings[key] = short
         short, weight = self._beginnings[key], 1.0 / self.start_deviations
         for _ in range(HELD_OUT_ITERATIONS):
             result = self.run(short, theta, deviation, derivatives=True)

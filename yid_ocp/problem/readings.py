@@ -37,7 +37,7 @@ class Inputs:
         Angles of the driven joints [rad].
     by_torque, by_first_torque, by_path, by_arm : ndarray, shape (..., d), or None
     momentum : ndarray, shape (N, nu), or None
-        Of the driven joints along their measured motion, where it is not that of the tracking filter.
+        What effects add to that of the driven joints along their measured motion.
     by_momentum : ndarray, shape (N, nu, d), or None
     """
 
@@ -63,7 +63,7 @@ class Inputs:
         return np.vstack([np.zeros((x.shape[1], width)) if by is None else by[0] for by, x in parts])
 
     def guided(self, feedback: Feedback | None, driven: tuple[int, ...], measured: Array) -> Feedback | None:
-        """The tracking filter with the true angles in place of the measured ones, and the model's momenta."""
+        """The tracking filter with the true angles in place of the measured ones, and the momenta of these effects."""
         if feedback is None or (self.by_arm is None and self.momentum is None):
             return feedback
         reference = feedback.reference.copy()
@@ -72,7 +72,7 @@ class Inputs:
                 reference[:, column] += (self.arm - measured)[: len(reference), at]
         for column, at in self._followed(feedback, driven, momenta=True):
             if self.momentum is not None:
-                reference[:, column] = self.momentum[:, at]
+                reference[:, column] += self.momentum[:, at]
         return Feedback(feedback.index, feedback.gain, reference)
 
     def torque_directions(self, feedback: Feedback | None, driven: tuple[int, ...]) -> Array | None:

@@ -83,7 +83,7 @@ class Transcription:
             )
         if not problem.as_recorded:
             raise SolverError(
-                "an effect changes recorded inputs or times",
+                "an effect changes recorded inputs, times or what the tracking filter follows",
                 where="multiple shooting",
                 allowed="effects of the mechanics and of what sensors read",
                 hint="use gauss_newton",

@@ -59,6 +59,14 @@ def run_blind(
     """
     watcher = monitor or Silent()
     folder = Path(out)
+    if count < 1:
+        raise run.refuse(f"an ensemble of {count} cases", "diagnosis", hint="give --cases from 1")
+    if run.diagnosis.noise_share < 1 or any(entry.std is not None for entry in run.sensors.values()):
+        raise run.refuse(
+            "virtual recordings have the noise of `virtual_experiment`, not that of these settings",
+            "sensors",
+            hint="leave sensors.*.std and diagnosis.noise_share out",
+        )
     problem = build_problem(run)
     links = len(problem.system.segments[0].links) if problem.system.segments else 0
     finer = (lambda times: build_system(run, links * times)) if links else None

@@ -16,7 +16,7 @@ import numpy as np
 from yid_ocp.diagnosis import Finding, Thresholds, diagnose
 from yid_ocp.diagnosis.localise import units
 from yid_ocp.errors import OutputError
-from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem import EstimationProblem, SensorOptions
 from yid_ocp.problem.problem import Episode, EpisodeResult
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import Findings
@@ -151,18 +151,42 @@ def in_units_of_noise(problem: EstimationProblem, run: Run) -> EstimationProblem
                 "noise_share",
                 hint=f"set sensors.{group}.std",
             )
-        smaller = {name: share * value for name, value in std.items()} if isinstance(std, Mapping) else share * std
-        sensors[group] = replace(sensors[group], std=smaller)
+        sensors[group] = replace(
+            sensors[group], std=_times(share, std), position_std=_encoder(run, problem, sensors, group)
+        )
     return problem.with_options(
         replace(
             options,
             sensors=sensors,
             priors={name: share * std for name, std in options.priors.items()},
+            robust_scale=options.robust_scale / share,
             tie_break=options.tie_break**share if options.tie_break > 0 else 0.0,
             configuration_std=share * options.configuration_std,
             velocity_std=share * options.velocity_std,
         )
     )
+
+
+def _times(share: float, std: float | Mapping[str, float]) -> float | Mapping[str, float]:
+    return {name: share * value for name, value in std.items()} if isinstance(std, Mapping) else share * std
+
+
+def _encoder(
+    run: Run, problem: EstimationProblem, sensors: Mapping[str, SensorOptions], group: str
+) -> float | Mapping[str, float] | None:
+    """The encoders' deviation, which enters that of efforts, shrunk alike."""
+    stated = sensors[group].position_std
+    if stated is not None:
+        return _times(run.diagnosis.noise_share, stated)
+    recorded = [e.recording.joints.position_std for e in problem.episodes if e.recording.joints is not None]
+    if group == "joints.effort" and any(std is not None and np.any(std) for std in recorded):
+        raise run.refuse(
+            "the share of noise is given, but the encoders' deviation stands in the recordings alone",
+            "diagnosis",
+            "noise_share",
+            hint=f"set sensors.{group}.position_std",
+        )
+    return None
 
 
 def predictions(finding: Finding) -> list[Prediction]:

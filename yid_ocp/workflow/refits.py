@@ -35,6 +35,7 @@ class Refits:
         self._folder = folder
         self._key = hashlib.sha256(json.dumps(made_from, sort_keys=True).encode()).hexdigest()
         self._lock = threading.Lock()
+        self._warned = False
         self._known = self._read()
 
     def __len__(self) -> int:
@@ -55,11 +56,16 @@ class Refits:
                 key: {"values": _texts(fit.values), "std": _texts(fit.std), "message": fit.message}
                 for key, fit in self._known.items()
             }
-            self.file.parent.mkdir(parents=True, exist_ok=True)
             fresh = self.file.with_name(f"{self.file.name}.{secrets.token_hex(4)}")
             text = json.dumps({"format": FORMAT, "key": self._key, "refits": refits}, indent=1, allow_nan=False)
-            fresh.write_text(text + "\n", encoding="utf-8")
-            os.replace(fresh, self.file)
+            try:
+                self.file.parent.mkdir(parents=True, exist_ok=True)
+                fresh.write_text(text + "\n", encoding="utf-8")
+                os.replace(fresh, self.file)
+            except OSError as error:
+                if not self._warned:
+                    log.warning("finished refits cannot be kept (%s); the diagnosis goes on without", error)
+                self._warned = True
 
     def clear(self) -> None:
         """Remove the file, what a killed run left of it, and its folder where nothing else is in it."""
