@@ -10,6 +10,8 @@ import pytest
 from jsonschema import validate
 
 from yid_ocp.diagnosis import Thresholds, diagnose
+from yid_ocp.diagnosis.smoother import smooth
+from yid_ocp.diagnosis.verdict import shapeless
 from yid_ocp.errors import YidError
 from yid_ocp.problem import ProblemOptions, SensorOptions
 
@@ -204,3 +206,19 @@ def test_the_papers_weighting_cannot_be_diagnosed(bench):
     )
     problem = bench.problem([bench.recording({}, 1, duration=0.5)], options=options)
     refused(lambda: diagnose(problem, FRICTION), "whitened")
+
+
+def test_a_barely_significant_excess_without_shape_is_chance(bench):
+    finding = diagnose(bench.problem([bench.recording({}, 1)]), FRICTION, [bench.recording({}, 2)])
+    nominal = finding.nominal
+    smoothed = smooth(nominal.problem, nominal.problem.unknowns(nominal.values), nominal.evaluation)
+    limits = Thresholds()
+
+    def tested(p):
+        return replace(finding.before, p_value=p)
+
+    assert smoothed.side == "none"
+    assert shapeless(smoothed, finding.scores, tested(3e-3), tested(0.5), limits)
+    assert not shapeless(smoothed, finding.scores, tested(3e-6), tested(0.5), limits)
+    sure = [replace(score, p_value=1e-9) for score in finding.scores]
+    assert not shapeless(smoothed, sure, tested(3e-3), tested(0.5), limits)

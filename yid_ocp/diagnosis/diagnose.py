@@ -25,7 +25,16 @@ from yid_ocp.diagnosis.score import (
 from yid_ocp.diagnosis.score import scores as score_all
 from yid_ocp.diagnosis.select import Closure, Fit, Store, closure, gain, recalled, refit, refit_all, within_reach
 from yid_ocp.diagnosis.smoother import Smoothed, smooth
-from yid_ocp.diagnosis.verdict import Absorbed, Added, Finding, Thresholds, decide, has_gap, next_experiment
+from yid_ocp.diagnosis.verdict import (
+    Absorbed,
+    Added,
+    Finding,
+    Thresholds,
+    decide,
+    has_gap,
+    next_experiment,
+    shapeless,
+)
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import DataError, SolverError
 from yid_ocp.problem import EstimationProblem
@@ -128,6 +137,7 @@ def _diagnosed(
     if gap and enough:
         say("locating the gap")
         smoothed = smooth_fit(nominal)
+        gap = not shapeless(smoothed, ranked, before, held, limits)
     clock.lap("localisation")
     if gap and enough and ranked:
         fits, added = compose(composed, nominal, ranked, alike, limits, say, store)

@@ -15,6 +15,8 @@ from yid_ocp.diagnosis.smoother import Smoothed
 from yid_ocp.effects import EffectBase
 
 FORMAT = "yid-diagnosis/1"
+SHAPELESS = 0.01
+"""Part of the significance level that an excess without any shape has to reach."""
 
 
 @dataclass(frozen=True)
@@ -279,6 +281,18 @@ def has_gap(before: NullTest, held_out: NullTest, limits: Thresholds, ranked: Se
     best = min((score.p_value for score in ranked), default=1.0) * len(ranked)
     largest = max((*before.channels.values(), *held_out.channels.values()), default=1.0)
     return best < limits.level and largest > 1 + limits.smallest_gap
+
+
+def shapeless(
+    smoothed: Smoothed, ranked: Sequence[Score], before: NullTest, held_out: NullTest, limits: Thresholds
+) -> bool:
+    """Whether an excess is barely significant and neither any unknown nor any candidate explains it: chance, then.
+
+    A sure excess without shape stays a gap: stated noise that is too small looks like that.
+    """
+    best = min((score.p_value for score in ranked), default=1.0) * len(ranked)
+    barely = min(before.p_value, held_out.p_value) > SHAPELESS * limits.level
+    return barely and best >= limits.level and smoothed.side == "none"
 
 
 def decide(
