@@ -11,11 +11,13 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import threadpoolctl
 from make_recordings import TRAVEL, TRUTH
 
 from yid_ocp.config import DIAGNOSIS_DEFAULT, load_config
@@ -24,7 +26,8 @@ from yid_ocp.data.synthetic import Motion, initial_posture
 from yid_ocp.data.withheld import Withheld, withheld_experiment
 from yid_ocp.diagnosis import Finding, Thresholds, diagnose
 from yid_ocp.diagnosis.blind import finer_values
-from yid_ocp.diagnosis.hypotheses import chosen_effects
+from yid_ocp.diagnosis.hypotheses import Composed, chosen_effects
+from yid_ocp.diagnosis.select import refit
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.workflow.build import build_problem, build_system
 
@@ -99,8 +102,8 @@ def record(case: Case, motion_seed: int, noise_seed: int) -> Recording:
     )
 
 
-def found(name: str, seeds: Sequence[int]) -> tuple[Finding, float]:
-    """The diagnosis of a case, and how long it took [s]."""
+def found(name: str, seeds: Sequence[int]) -> tuple[Finding, float, float]:
+    """The diagnosis of a case, how long it took [s], and held-out chi2/n with the true effects in the model."""
     case = CASES[name]
     estimate, held_out = (record(case, *pair) for pair in zip(seeds, NOISE_SEEDS, strict=True))
     nominal = build_problem(load_config(None, (), DIAGNOSIS_DEFAULT))
@@ -109,7 +112,12 @@ def found(name: str, seeds: Sequence[int]) -> tuple[Finding, float]:
     library = [label for label in everything if label.partition("@")[0] not in case.without]
     begun = time.perf_counter()
     finding = diagnose(problem, library, [held_out], thresholds=Thresholds(effects=2))
-    return finding, time.perf_counter() - begun
+    seconds = time.perf_counter() - begun
+    composed = Composed.of(problem, chosen_effects(problem.system, [estimate], "all"), [held_out])
+    true = [effect for effect in composed.effects if effect.label in {w.label for w in case.withheld}]
+    with threadpoolctl.threadpool_limits(1):
+        fit = refit(composed, true, finding.nominal.values) if true else None
+    return finding, seconds, math.nan if fit is None else fit.loss.mean
 
 
 def right(case: Case, finding: Finding) -> bool:
@@ -129,7 +137,7 @@ def right(case: Case, finding: Finding) -> bool:
 
 def run(name: str, seeds: Sequence[int]) -> dict[str, str]:
     case = CASES[name]
-    finding, seconds = found(name, seeds)
+    finding, seconds, best = found(name, seeds)
     truth = " + ".join(effect.label for effect in case.withheld) or "-"
     rivals = "; ".join(", ".join(r.label for r in a.rivals) for a in finding.added if len(a.rivals) > 1)
     judged = "-" if case.verdict == "-" else "yes" if right(case, finding) else "no"
@@ -142,6 +150,7 @@ def run(name: str, seeds: Sequence[int]) -> dict[str, str]:
         "not separable": rivals if finding.effects and rivals else "-",
         "where": finding.where[0].location if finding.where else "-",
         "chi2/n held out": f"{finding.held_out_before.chi2_per_dof:.3g}",
+        "with the truth": "-" if math.isnan(best) else f"{best:.3g}",
         "closure": f"{100 * finding.closure.value:.0f} %" if finding.effects else "-",
         "time": f"{seconds:.0f} s",
     }
