@@ -400,6 +400,7 @@ def simulate_in_mujoco(
         )
     mujoco = mujoco_module()
     model = compiled_model(mujoco_xml(system, values, time_step=time_step))
+    nominal_damping = np.array(model.dof_damping)
     with _at_work(mujoco, model, foreign):
         data = mujoco.MjData(model)
         # Every joint has one coordinate, so positions, velocities and joints share their addresses.
@@ -408,7 +409,7 @@ def simulate_in_mujoco(
         start = initial_posture(system, values) if posture is None else posture
         data.qpos[:] = model.qpos_spring
         data.qpos[[model.joint(name).id for name in start]] = list(start.values())
-        balance = _settle(mujoco, model, data, driven)
+        balance = _settle(mujoco, model, data, driven, nominal_damping)
         if foreign is not None:
             foreign.begin(data)
 
@@ -629,11 +630,16 @@ def virtual_experiment(
     return validate(Recording(joints, tuple(groups), text, source, name, truth=truth))
 
 
-def _settle(mujoco: ModuleType, model: Any, data: Any, driven: Array) -> Array:
-    """Bring `data` to static equilibrium with the driven joints where they are; return their torques [N m]."""
+def _settle(mujoco: ModuleType, model: Any, data: Any, driven: Array, damping: Array) -> Array:
+    """Bring `data` to static equilibrium with the driven joints where they are; return their torques [N m].
+
+    On the way there joints damp as `damping` says: of several shapes that an object can rest in, it must not depend on
+    its own damping which is found.
+    """
     held = copy.copy(model)
     target = data.qpos[driven].copy()
     others = np.setdiff1d(np.arange(model.nv), driven)
+    held.dof_damping[:] = damping
     held.dof_damping[others] *= _SETTLING_FACTOR
     held.dof_damping[driven] += _HOLD_DAMPING
     held.jnt_stiffness[driven] += _HOLD_STIFFNESS
