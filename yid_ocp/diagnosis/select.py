@@ -30,6 +30,8 @@ SOLVER = GaussNewton(iterations=25, step_tolerance=1e-3, cost_tolerance=1e-5)
 POOR, PROMISING = 1.1, 0.2
 """A refit that ends above this chi2/n, but lowers the excess by this part or more, is tried again from the initial
 values of the nominal parameters."""
+STAND_IN = 0.05
+"""Part of chi2/n by which an effect of an unlikely shape must beat all others to count."""
 RESAMPLES = 1000
 TIE = 0.01
 """Part of chi2/n by which two models may differ and still count as equal, however sure the difference."""
@@ -338,16 +340,20 @@ def gain(before: Loss, after: Loss) -> tuple[float, float]:
 def within_reach(fits: Sequence[Fit]) -> list[Fit]:
     """Fits whose held-out loss is within one standard error of the best one's (or `TIE` of it), the simplest first.
 
-    An effect whose shape is far from what an engineer would expect (`out_of_shape`) counts only where all are: a solid
-    that relaxes in a tenth of the shortest time expected is a damper. One whose amplitude is (`oversized`) comes last.
+    An effect whose shape is far from what an engineer would expect (`out_of_shape`) counts only where no other comes
+    near it: a solid that relaxes in a tenth of the shortest time expected is a damper. One whose amplitude is
+    (`oversized`) comes last.
     """
     best = min(fits, key=lambda fit: fit.loss.mean)
+    shapely = [fit for fit in fits if not (fit.effects and out_of_shape(fit.effects[-1], fit.values))]
+    if shapely and min(fit.loss.mean for fit in shapely) <= (1 + STAND_IN) * best.loss.mean:
+        fits = shapely
+        best = min(fits, key=lambda fit: fit.loss.mean)
     near = []
     for fit in fits:
         lost, error = gain(fit.loss, best.loss)
         if fit is best or lost <= max(error, TIE * best.loss.mean):
             near.append(fit)
-    near = [fit for fit in near if not (fit.effects and out_of_shape(fit.effects[-1], fit.values))] or near
     return sorted(near, key=lambda f: (bool(f.effects) and oversized(f.effects[-1], f.values), f.size, f.loss.mean))
 
 
