@@ -4,6 +4,7 @@ from yid_ocp.diagnosis.diagnose import diagnose as diagnose
 from yid_ocp.diagnosis.hypotheses import Composed as Composed
 from yid_ocp.diagnosis.hypotheses import residual_series as residual_series
 from yid_ocp.diagnosis.localise import Place as Place
+from yid_ocp.diagnosis.localise import localise as localise
 from yid_ocp.diagnosis.null_test import NullTest as NullTest
 from yid_ocp.diagnosis.null_test import null_test as null_test
 from yid_ocp.diagnosis.score import confusability as confusability
@@ -13,5 +14,7 @@ from yid_ocp.diagnosis.score import visibility as visibility
 from yid_ocp.diagnosis.select import Refitted as Refitted
 from yid_ocp.diagnosis.select import closure as closure
 from yid_ocp.diagnosis.select import refit as refit
+from yid_ocp.diagnosis.smoother import Smoothed as Smoothed
+from yid_ocp.diagnosis.smoother import smooth as smooth
 from yid_ocp.diagnosis.verdict import Finding as Finding
 from yid_ocp.diagnosis.verdict import Thresholds as Thresholds
