@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
@@ -69,7 +70,7 @@ class Reported:
 
 
 @dataclass(frozen=True)
-class EffectBase:
+class EffectBase(ABC):
     """An effect that changes nothing; every kind overrides what it needs.
 
     Attributes
@@ -96,9 +97,9 @@ class EffectBase:
     needs: ClassVar[frozenset[str]] = frozenset()
 
     @classmethod
+    @abstractmethod
     def locations(cls, system: System) -> tuple[str, ...]:
         """Where in the system the effect can sit."""
-        raise NotImplementedError
 
     @classmethod
     def likely(cls, system: System) -> tuple[str, ...]:
@@ -106,9 +107,9 @@ class EffectBase:
         return cls.locations(system)
 
     @classmethod
+    @abstractmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
         """Its quantities; bounds and ranges may depend on the place."""
-        raise NotImplementedError
 
     @classmethod
     def internal_names(cls, location: str, system: System) -> tuple[str, ...]:
