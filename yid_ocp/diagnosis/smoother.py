@@ -361,9 +361,7 @@ class _Builder:
         self._drop_idle_states()
         states = self.states
         ns = len(states)
-        reading = _Reading(
-            self.problem, self.episode, self.theta, self.sweep, self.predicted, self.edges, self.fixed, states
-        )
+        reading = _Reading(self)
         intervals = []
         at_rest = np.zeros((ns, count))
         for j in range(len(self.edges) - 1):
@@ -466,44 +464,29 @@ class _Builder:
 class _Reading:
     """Slopes of the whitened samples by the states of the nodes about them."""
 
-    def __init__(
-        self,
-        problem: EstimationProblem,
-        episode: Episode,
-        theta: Array,
-        sweep: Sweep,
-        predicted: Sequence[Array],
-        edges: NDArray[np.int64],
-        fixed: NDArray[np.int64],
-        states: NDArray[np.int64],
-    ) -> None:
-        n = problem.system.size
-        self._edges = edges
-        efforts = np.zeros((len(sweep.state), n))
-        efforts[:-1, fixed] = sweep.effort
-        efforts[:-1, list(problem.system.driven_indices)] = sweep.torque
-        efforts[-1] = efforts[-2]
-        group, column, node, fraction, weight, slope, load = [], [], [], [], [], [], []
-        for k, samples in enumerate(episode.samples):
+    def __init__(self, builder: _Builder) -> None:
+        problem, theta, n = builder.problem, builder.theta, builder.n
+        edges = self._edges = builder.edges
+        state, efforts = builder.sweep.state, problem.efforts(builder.sweep)
+        group: list[NDArray[np.int64]] = []
+        column, node, fraction, weight, slope, load = [], [], [], [], [], []
+        for samples, predicted in zip(builder.episode.samples, builder.predicted, strict=True):
             late = problem.lateness(samples, theta, ())
             placed = samples if late is None else samples.late(late[0])
             shape = samples.weight.shape
             where = placed.node if placed.node.ndim > 1 else np.broadcast_to(placed.node[:, None], shape)
             beyond = placed.fraction if placed.node.ndim > 1 else np.broadcast_to(placed.fraction[:, None], shape)
-            nodes = np.arange(len(sweep.state))
-            _, by_q, by_z, by_e, _ = problem.sensor(samples.sensor, ())(
-                sweep.state[nodes, :n], sweep.state[nodes, 2 * n :], efforts, theta
-            )
+            _, by_q, by_z, by_e, _ = problem.sensor(samples.sensor, ())(state[:, :n], state[:, 2 * n :], efforts, theta)
             keep = samples.weight > 0
-            raw = samples.weight * np.where(keep, predicted[k] - samples.value, 0.0)
+            raw = samples.weight * np.where(keep, predicted - samples.value, 0.0)
             factor = huber(raw, problem.options.robust_scale)[1]
-            group.append(np.full(int(keep.sum()), k))
+            group.append(np.full(int(keep.sum()), len(group)))
             column.append(np.broadcast_to(np.arange(shape[1]), shape)[keep])
             node.append(where[keep])
             fraction.append(beyond[keep])
             weight.append((factor * samples.weight)[keep])
-            slope.append(np.concatenate([by_q, np.zeros((*by_q.shape[:2], n)), by_z], axis=2)[:, :, states])
-            load.append(by_e[:, :, fixed])
+            slope.append(np.concatenate([by_q, np.zeros((*by_q.shape[:2], n)), by_z], axis=2)[:, :, builder.states])
+            load.append(by_e[:, :, builder.fixed])
         self._group, self._column = np.concatenate(group), np.concatenate(column)
         self._node, self._fraction = np.concatenate(node), np.concatenate(fraction)
         self._weight, self._slope, self._load = np.concatenate(weight), slope, load
@@ -605,14 +588,14 @@ def _filter(model: Linear, variance: Array, smooth: bool) -> _Pass:
         shaped = scipy.linalg.solve_triangular(factor, design, lower=True, check_finite=False)
         products += white.T @ white
         log_determinant += 2 * float(np.sum(np.log(np.diag(factor))))
-        if smooth:
-            kept.append((mean, p, factor, white, shaped))
-        half = shaped @ p
-        mean = mean + half.T @ white
-        p = p - half.T @ half
         move = np.zeros((size, size))
         move[:ns, :ns], move[:ns, ns:] = interval.transition, interval.drive
         move[ns:, ns:] = model.decay * np.eye(nd)
+        if smooth:
+            kept.append((mean, p, factor, white, shaped, move))
+        half = shaped @ p
+        mean = mean + half.T @ white
+        p = p - half.T @ half
         mean = move @ mean
         p = move @ p @ move.T + fresh
         p = (p + p.T) / 2
@@ -624,13 +607,9 @@ def _filter(model: Linear, variance: Array, smooth: bool) -> _Pass:
     left: list[Array] = []
     r, n = np.zeros((size, columns)), np.zeros((size, size))
     for j in reversed(range(count)):
-        interval = model.intervals[j]
-        mean, p, factor, white, shaped = kept[j]
+        mean, p, factor, white, shaped, move = kept[j]
         if j + 1 < count:
             score[j + 1], information[j + 1] = gain * r[ns:], gain**2 * np.diag(n)[ns:]
-        move = np.zeros((size, size))
-        move[:ns, :ns], move[:ns, ns:] = interval.transition, interval.drive
-        move[ns:, ns:] = model.decay * np.eye(nd)
         pull = white - shaped @ (p @ (move.T @ r))
         left.append(scipy.linalg.solve_triangular(factor, pull, lower=True, trans="T", check_finite=False))
         # L = T (I - P H' S^-1 H)
@@ -690,7 +669,7 @@ def _scores(models: Sequence[Linear], state: _State) -> dict[Source, tuple[float
 
 def _refined(models: Sequence[Linear], variance: dict[Source, float]) -> tuple[dict[Source, float], _State]:
     """Variances of the groups at work by MacKay's fixed point: s^2 <- s^2 |score|^2 / its expectation."""
-    best, state = variance, _run(models, variance)
+    state = _run(models, variance)
     for _ in range(ITERATIONS):
         found = _scores(models, state)
         trial = {
@@ -700,14 +679,14 @@ def _refined(models: Sequence[Linear], variance: dict[Source, float]) -> tuple[d
         after = _run(models, trial)
         if not after.evidence > state.evidence + 0.05:
             break
-        variance, best, state = trial, trial, after
-    return best, state
+        variance, state = trial, after
+    return variance, state
 
 
-def _selected(models: Sequence[Linear], sources: Sequence[Source]) -> tuple[dict[Source, float], _State]:
+def _selected(
+    models: Sequence[Linear], sources: Sequence[Source], variance: dict[Source, float], state: _State
+) -> tuple[dict[Source, float], _State]:
     """Add group after group, that which raises the evidence most, while it rises by more than chance."""
-    every = dict.fromkeys((s for model in models for s in model.sources), 0.0)
-    variance, state = dict(every), _run(models, every)
     while sum(v > 0 for v in variance.values()) < PLACES:
         found = _scores(models, state)
         promising = [s for s in sources if not variance[s] and found[s][0] > found[s][1]]
@@ -754,7 +733,8 @@ def smooth(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> Smoo
     with threadpoolctl.threadpool_limits(1):
         models = linear_model(problem, x, evaluation)
         sources = tuple(dict.fromkeys(source for model in models for source in model.sources))
-        nothing = _run(models, dict.fromkeys(sources, 0.0))
+        none = dict.fromkeys(sources, 0.0)
+        nothing = _run(models, none)
         # what unknowns of the reference deviation add to r'r on average is the variance of their scores
         detectable = {s: math.sqrt(NOTICED / max(v, 1e-300)) for s, (_, v) in _scores(models, nothing).items()}
         sides = {
@@ -765,7 +745,7 @@ def smooth(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> Smoo
         found: dict[str, tuple[dict[Source, float], _State]] = {}
         for side, own in sides.items():
             done = [entry for entry in found.values() if {s for s, v in entry[0].items() if v} <= set(own)]
-            found[side] = done[0] if done else _selected(models, own)
+            found[side] = done[0] if done else _selected(models, own, none, nothing)
         evidence = {"none": 0.0} | {side: state.evidence - nothing.evidence for side, (_, state) in found.items()}
         # what is chosen greedily among all may end behind a choice among fewer
         best, final = max(found.values(), key=lambda entry: entry[1].evidence)

@@ -412,7 +412,8 @@ class EstimationProblem:
         sweep = replace(sweep, by_state=None, by_multipliers=None, by_effort=None)
         return EpisodeResult(sweep, rest, tuple(predicted), tuple(sensitivities) if derivatives else None)
 
-    def _efforts(self, sweep: Sweep) -> Array:
+    def efforts(self, sweep: Sweep) -> Array:
+        """Effort of prescribed joints and torque of driven ones along a rollout, zero elsewhere, shape (N + 1, n)."""
         steps = len(sweep.multipliers)
         effort = np.zeros((steps + 1, self.system.size))
         effort[:-1, list(self.system.prescribed_indices)] = sweep.effort
@@ -427,7 +428,7 @@ class EstimationProblem:
         if late is not None:
             samples = samples.late(late[0])
         by_state = sweep.by_state if derivatives else None
-        effort = self._efforts(sweep)[samples.nodes]
+        effort = self.efforts(sweep)[samples.nodes]
         y, total = self._read(samples, sweep.state, by_state, effort, sweep.by_effort, theta, wanted)
         predicted, slopes = samples.interpolate(y), samples.interpolate(total)
         if late is not None and by_state is not None:
@@ -670,7 +671,7 @@ class EstimationProblem:
                 at_nodes = samples.distribute(pull)
                 nodes = samples.nodes
                 q, z = sweep.state[nodes, :n], sweep.state[nodes, 2 * n :]
-                efforts = self._efforts(sweep)[nodes]
+                efforts = self.efforts(sweep)[nodes]
                 y, by_q, by_z, by_e, by_theta = self.sensor(samples.sensor, wanted)(q, z, efforts, theta)
                 if late is not None:
                     total -= np.sum(pull * samples.slope(y[:, :, 0], unmoved, late[0]), axis=0) @ late[1]
