@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from yid_ocp.data.recording import read_recording, write_recording
+from yid_ocp.data.recording import new_file, read_recording, write_recording
 from yid_ocp.diagnosis import Thresholds
 from yid_ocp.diagnosis.blind import Case, Ensemble, Label, answer, best_closure, mark, opened, score, seal
 from yid_ocp.errors import OutputError, YidError
@@ -162,12 +161,8 @@ def _nothing(message: str) -> dict[str, Any]:
 
 def _write(path: Path, data: Any) -> Any:
     clean = jsonable(data)
-    temporary = path.with_suffix(".part")
-    try:
+    with new_file(path) as temporary:
         temporary.write_text(json.dumps(clean, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-        os.replace(temporary, path)
-    except OSError as error:
-        raise OutputError(f"'{path.name}' cannot be written: {error}", where=str(path.parent)) from error
     return clean
 
 

@@ -7,12 +7,12 @@ import hashlib
 import json
 import logging
 import math
-import os
-import secrets
 import threading
 from collections.abc import Mapping
 
+from yid_ocp.data.recording import new_file
 from yid_ocp.diagnosis import Refitted
+from yid_ocp.errors import OutputError
 from yid_ocp.workflow.folder import RunFolder
 
 FORMAT = "yid-refits/1"
@@ -56,13 +56,12 @@ class Refits:
                 key: {"values": _texts(fit.values), "std": _texts(fit.std), "message": fit.message}
                 for key, fit in self._known.items()
             }
-            fresh = self.file.with_name(f"{self.file.name}.{secrets.token_hex(4)}")
             text = json.dumps({"format": FORMAT, "key": self._key, "refits": refits}, indent=1, allow_nan=False)
             try:
                 self.file.parent.mkdir(parents=True, exist_ok=True)
-                fresh.write_text(text + "\n", encoding="utf-8")
-                os.replace(fresh, self.file)
-            except OSError as error:
+                with new_file(self.file) as fresh:
+                    fresh.write_text(text + "\n", encoding="utf-8")
+            except (OSError, OutputError) as error:
                 if not self._warned:
                     log.warning("finished refits cannot be kept (%s); the diagnosis goes on without", error)
                 self._warned = True
@@ -70,7 +69,7 @@ class Refits:
     def clear(self) -> None:
         """Remove the file, what a killed run left of it, and its folder where nothing else is in it."""
         with contextlib.suppress(OSError):
-            for file in self.file.parent.glob(f"{self.file.name}*"):
+            for file in self.file.parent.glob(f"*{self.file.name}*"):
                 file.unlink()
             self.file.parent.rmdir()
 
