@@ -20,7 +20,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from yid_ocp.config import load_config
+from yid_ocp.config.reader import load_config
 from yid_ocp.solvers import solve
 from yid_ocp.workflow.build import build_problem, build_step, build_system
 

@@ -25,19 +25,19 @@ from rich.console import Console
 from rich.table import Table
 
 import yid_ocp as yid
+from yid_ocp.data.edges import edge_lengths
 from yid_ocp.data.recording import Recording, read_recording
-from yid_ocp.problem.baselines import linear_carry, move_with_clamps, positions, prediction_error, stay
-from yid_ocp.problem.cable import (
+from yid_ocp.model.cable import (
     BranchOptions,
     Cable,
     CableOptions,
-    cable_problem_options,
     cable_system,
     free_parameters,
+    length_values,
     read_vertices,
-    vertex_errors,
 )
-from yid_ocp.problem.problem import EstimationProblem
+from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
+from yid_ocp.problem.validation import linear_carry, move_with_clamps, point_errors, positions, prediction_error, stay
 from yid_ocp.solvers import GaussNewton, solve
 
 FOLDER = Path(__file__).resolve().parents[2] / "shared" / "recordings" / "deft"
@@ -60,6 +60,23 @@ def branched_cable(folder: Path = FOLDER) -> Cable:
     )
 
 
+def cable_options(cable: Cable, recordings: list[Recording], options: CableOptions) -> ProblemOptions:
+    """Of each recording what a prediction may use: the clamps throughout, free vertices in the first two frames."""
+    known = {r.name: length_values(cable, edge_lengths(cable.edges, [r], 2)) for r in recordings}
+    names = [name for name in free_parameters(cable, options) if name.endswith(".rest")]
+    return ProblemOptions(
+        initial_state="fitted_to_points",
+        path_cutoff=8.0,
+        sensors={"points": SensorOptions(std=MODEL_ERROR, points=cable.free)},
+        clamps=cable.clamps,
+        priors=dict.fromkeys(names, 0.2),
+        start_window=TIME_STEP,
+        start_std=NOISE,
+        start_parameters=("clamp_start.roll",),
+        recording_values=known,
+    )
+
+
 def baselines(recording: Recording, cable: Cable) -> dict[str, float]:
     """Prediction errors without a model [m]."""
     free, measured = cable.free, positions(recording, cable.free)
@@ -77,17 +94,17 @@ def run(folder: Path = FOLDER, iterations: int = 15) -> dict[str, Any]:
     recordings = {name: read_recording(folder / f"bdlo1_train_{name}.h5") for name in (*ESTIMATE, *HELD_OUT)}
     estimate, held_out = [recordings[n] for n in ESTIMATE], [recordings[n] for n in HELD_OUT]
     clock = time.perf_counter()
-    system = cable_system(estimate, cable, OPTIONS)
+    system = cable_system(edge_lengths(cable.edges, estimate), cable, OPTIONS)
     step = yid.compile_step(system, TIME_STEP, "left_damping")
     seconds = {"build_and_compile": time.perf_counter() - clock}
-    options = cable_problem_options(cable, estimate + held_out, NOISE, MODEL_ERROR, options=OPTIONS)
+    options = cable_options(cable, estimate + held_out, OPTIONS)
     plain = {name: 0.0 for name in system.parameters.names if name.endswith(".memory")}
     names = free_parameters(cable, CableOptions(default=BRANCH))
     undeformed = EstimationProblem(step, estimate, names, replace(options, priors={}), plain, held_out)
     problem = EstimationProblem(step, estimate, free_parameters(cable, OPTIONS), options, None, held_out)
     clock = time.perf_counter()
-    nominal = vertex_errors(undeformed, cable, undeformed.start)
-    vertex_errors(problem, cable, problem.start)
+    nominal = point_errors(undeformed, undeformed.start, cable.free)
+    point_errors(problem, problem.start, cable.free)
     seconds["starts"] = time.perf_counter() - clock
     episode, (theta, deviation) = problem.episodes[0], problem.split(problem.start, 0)
     clock = time.perf_counter()
@@ -96,11 +113,11 @@ def run(folder: Path = FOLDER, iterations: int = 15) -> dict[str, Any]:
     clock = time.perf_counter()
     solution = solve(problem, GaussNewton(iterations=iterations))
     seconds["fit"] = time.perf_counter() - clock
-    fitted = vertex_errors(problem, cable, solution.x)
+    fitted = point_errors(problem, solution.x, cable.free)
     clock = time.perf_counter()
     simple = solve(undeformed, GaussNewton(iterations=iterations))
     seconds["fit_undeformed_rest"] = time.perf_counter() - clock
-    by_simple = vertex_errors(undeformed, cable, simple.x)
+    by_simple = point_errors(undeformed, simple.x, cable.free)
     files = {}
     for recording in (*estimate, *held_out):
         errors = baselines(recording, cable)

@@ -1,10 +1,10 @@
-"""Withheld effects in data from MuJoCo: what the diagnosis says of each, failures included.
+"""InjectedEffect effects in data from MuJoCo: what the diagnosis says of each, failures included.
 
     python benchmarks/diagnosis_cases.py [CASE ...] [--seeds 1 7] [--json FILE]
 
 Every case is one arm that moves the foam Y (43 variables, 5 s to estimate on, 5 s of another motion held out, arm and
 camera points), all candidates of the library in play. Effects are done in the simulator's own terms
-(`yid_ocp.data.withheld`).
+(`yid_ocp.virtual.injected`).
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from pathlib import Path
 import threadpoolctl
 from make_recordings import TRAVEL, TRUTH
 
-from yid_ocp.config import DIAGNOSIS_DEFAULT, load_config
+from yid_ocp.config.reader import DIAGNOSIS_DEFAULT, load_config
 from yid_ocp.data.recording import Recording
-from yid_ocp.data.synthetic import Motion, initial_posture
-from yid_ocp.data.withheld import Withheld, withheld_experiment
 from yid_ocp.diagnosis import Finding, Thresholds, diagnose
 from yid_ocp.diagnosis.blind import finer_values
-from yid_ocp.diagnosis.hypotheses import Composed, chosen_effects
+from yid_ocp.diagnosis.hypotheses import CandidateProblem, chosen_effects
 from yid_ocp.diagnosis.select import refit
 from yid_ocp.problem import EstimationProblem
+from yid_ocp.virtual.experiment import Motion, initial_posture
+from yid_ocp.virtual.injected import InjectedEffect, injected_experiment
 from yid_ocp.workflow.build import build_problem, build_system
 
 NOISE_SEEDS = (401, 402)
@@ -38,14 +38,14 @@ NOISE_SEEDS = (401, 402)
 class Case:
     """What is done in the simulator, the verdict that it deserves, and what the library is robbed of."""
 
-    withheld: tuple[Withheld, ...]
+    withheld: tuple[InjectedEffect, ...]
     verdict: str = "effect"
     without: tuple[str, ...] = ()
     links: int = 1
 
 
 def one(kind: str, location: str, **values: float) -> Case:
-    return Case((Withheld(kind, location, values),))
+    return Case((InjectedEffect(kind, location, values),))
 
 
 CASES: Mapping[str, Case] = {
@@ -59,7 +59,7 @@ CASES: Mapping[str, Case] = {
     "heavy_free_branch": one("density", "T3", scale=1.8),
     "marker_on_branch": one("point_mass", "w_T3", mass=0.02),
     "long_branch": one("length_scale", "T2", scale=1.02),
-    "air": Case((Withheld("aerodynamic_drag", "T3", {"cd": 3.0}),), "no_gap"),  # too little to be seen here
+    "air": Case((InjectedEffect("aerodynamic_drag", "T3", {"cd": 3.0}),), "no_gap"),  # too little to be seen here
     "weightless": one("gravity_scale", "object", fraction=-0.8),
     "tilted_world": one("gravity_tilt", "world", rx=0.03, ry=0.02),
     "shifted_grasp": one("grasp_offset", "left", dx=0.01, dy=-0.005, dz=0.005),
@@ -77,14 +77,14 @@ CASES: Mapping[str, Case] = {
     "near_surface": one("surface_offset", "camera", fraction=0.8),
     "pair": Case(
         (
-            Withheld("kelvin_voigt", "T1", {"tau": 0.05}),
-            Withheld("camera_translation", "camera", {"x": 0.02, "y": 0.0, "z": 0.0}),
+            InjectedEffect("kelvin_voigt", "T1", {"tau": 0.05}),
+            InjectedEffect("camera_translation", "camera", {"x": 0.02, "y": 0.0, "z": 0.0}),
         )
     ),
-    "robbed_trunk": Case((Withheld("kelvin_voigt", "T1", {"tau": 0.05}),), "unknown", ("kelvin_voigt",)),
-    "ripple": Case((Withheld("torque_ripple", "left_e1", {"size": 1.0}),), "unknown"),
-    "crossed_springs": Case((Withheld("cross_stiffness", "T1", {"size": 8.0}),), "unknown"),
-    "gusts": Case((Withheld("gusts", "T3", {"size": 0.1}),), "unknown"),
+    "robbed_trunk": Case((InjectedEffect("kelvin_voigt", "T1", {"tau": 0.05}),), "unknown", ("kelvin_voigt",)),
+    "ripple": Case((InjectedEffect("torque_ripple", "left_e1", {"size": 1.0}),), "unknown"),
+    "crossed_springs": Case((InjectedEffect("cross_stiffness", "T1", {"size": 8.0}),), "unknown"),
+    "gusts": Case((InjectedEffect("gusts", "T3", {"size": 0.1}),), "unknown"),
     "finer_chain": Case((), "-", (), 2),
 }
 
@@ -97,7 +97,7 @@ def record(case: Case, motion_seed: int, noise_seed: int) -> Recording:
     values = TRUTH if case.links == 1 else finer_values(nominal, system, TRUTH)
     posture = initial_posture(nominal, TRUTH)
     motion = Motion.multisine(nominal, TRUTH, seed=motion_seed, posture=posture, travel=TRAVEL[1])
-    return withheld_experiment(
+    return injected_experiment(
         system, values, case.withheld, motion=motion, seed=noise_seed, posture=posture, name=f"motion_{motion_seed}"
     )
 
@@ -113,7 +113,7 @@ def found(name: str, seeds: Sequence[int]) -> tuple[Finding, float, float]:
     begun = time.perf_counter()
     finding = diagnose(problem, library, [held_out], thresholds=Thresholds(effects=2))
     seconds = time.perf_counter() - begun
-    composed = Composed.of(problem, chosen_effects(problem.system, [estimate], "all"), [held_out])
+    composed = CandidateProblem.of(problem, chosen_effects(problem.system, [estimate], "all"), [held_out])
     true = [effect for effect in composed.effects if effect.label in {w.label for w in case.withheld}]
     with threadpoolctl.threadpool_limits(1):
         fit = refit(composed, true, finding.nominal.values) if true else None

@@ -14,7 +14,7 @@ import time
 from rich.console import Console
 from rich.table import Table
 
-from yid_ocp.config import DIAGNOSIS_DEFAULT, load_config
+from yid_ocp.config.reader import DIAGNOSIS_DEFAULT, load_config
 from yid_ocp.diagnosis import diagnose
 from yid_ocp.workflow.build import build_problem
 

@@ -16,10 +16,11 @@ from make_recordings import TRAVEL, TRUTH, compress
 
 import yid_ocp
 from yid_ocp.data.recording import write_recording
-from yid_ocp.data.synthetic import BAXTER_JOINTS, Motion, initial_posture, virtual_experiment
-from yid_ocp.model import Grasp, Mechanism, System, flexible_object
+from yid_ocp.model import Grasp, System, flexible_object
 from yid_ocp.model.system import placement_matrix
+from yid_ocp.model.urdf import read_urdf
 from yid_ocp.model.y_object import y_segments
+from yid_ocp.virtual.experiment import BAXTER_JOINTS, Motion, initial_posture, virtual_experiment
 
 TAU = 0.05
 NOMINAL_DAMPING = 0.05
@@ -43,7 +44,7 @@ def experiment() -> System:
     names = [f"left_{joint}" for joint in BAXTER_JOINTS]
     segments = [replace(segment, damping=NOMINAL_DAMPING, twist_damping=NOMINAL_DAMPING) for segment in y_segments()]
     return System.build(
-        Mechanism.from_urdf("package:baxter", joints=names),
+        read_urdf("package:baxter", joints=names),
         objects=[(flexible_object(segments, placement_matrix((0.85, 0.0, -0.93))), None, None)],
         grasps=[Grasp("left", "left_gripper", "w_T2")],
         driven=names,

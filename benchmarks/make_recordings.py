@@ -14,7 +14,7 @@ import h5py
 
 import yid_ocp
 from yid_ocp.data.recording import new_file, write_recording
-from yid_ocp.data.synthetic import Motion, initial_posture, paper_system, virtual_experiment
+from yid_ocp.virtual.experiment import Motion, initial_posture, paper_system, virtual_experiment
 
 TRUTH = {
     "T1.bend": 22.0,

@@ -27,7 +27,7 @@ ARM_MASS, ARM_LEVER, POINTER, MARKER = 0.3, 0.2, 0.3, 0.05  # [kg], [m]
 
 
 def course(t: Array) -> Array:
-    """Slow sweep of the motor from -1 to 1 rad that starts and ends at rest."""
+    """Slow rollout of the motor from -1 to 1 rad that starts and ends at rest."""
     return np.asarray(-np.cos(np.pi * t / DURATION))
 
 

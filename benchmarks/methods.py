@@ -17,10 +17,10 @@ from workloads import STIFFNESSES, TIME_STEP
 import yid_ocp
 from yid_ocp.analysis.compare import compare
 from yid_ocp.data.recording import read_recording
-from yid_ocp.data.synthetic import paper_system
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import GaussNewton, Lifted, MultipleShooting, SingleShooting, SteepestDescent
+from yid_ocp.virtual.experiment import paper_system
 
 RECORDINGS = {1: "single_arm_vision_estimate.h5", 2: "dual_arm_vision_estimate.h5"}
 

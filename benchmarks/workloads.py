@@ -19,14 +19,15 @@ from numpy.typing import NDArray
 
 import yid_ocp
 from yid_ocp.data.recording import Recording, read_recording
-from yid_ocp.data.synthetic import paper_system
 from yid_ocp.integrator.discrete import ForceSplit
-from yid_ocp.integrator.feedback import lqr_filter
-from yid_ocp.integrator.rollout import Statics
-from yid_ocp.integrator.step import Directions, Feedback, Step, Sweep, compile_step
+from yid_ocp.integrator.lqr import lqr_filter
+from yid_ocp.integrator.statics import Statics
+from yid_ocp.integrator.step import Directions, Feedback, Rollout, Step, compile_step
 from yid_ocp.model import System
+from yid_ocp.model.urdf import urdf_text
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers.gauss_newton import bounded_step
+from yid_ocp.virtual.experiment import paper_system
 
 Array = NDArray[np.float64]
 
@@ -51,7 +52,7 @@ class Bench:
     torque: Array
     path: Array
     feedback: Feedback
-    swept: Sweep
+    swept: Rollout
     model: Any
     data: Any
     points: list[tuple[Array, Array, Array]]
@@ -74,10 +75,10 @@ class Bench:
         rest = Statics(step).solve(angles[0], theta)
         feedback = lqr_filter(step, angles, torque, theta)
         path = np.zeros((len(torque) + 1, 0))
-        swept = step.kernel.sweep(theta, rest.state, torque, path, feedback, None)
+        swept = step.kernel.rollout(theta, rest.state, torque, path, feedback, None)
         assert swept.status.ok, swept.status.message
         values = dict(zip(system.parameters.names, theta, strict=True))
-        tree = system.mechanism.to_urdf({name: values[name] for name in system.mechanism.parameters.names})
+        tree = urdf_text(system.mechanism, {name: values[name] for name in system.mechanism.parameters.names})
         model = pin.buildModelFromXML(tree)
         assert model.nv == size
         rng = np.random.default_rng(1)
@@ -121,15 +122,15 @@ class Bench:
             self.keep["problem"] = EstimationProblem(self.step, [self.recording], STIFFNESSES)
         return self.keep["problem"]
 
-    def sweep(self, steps: int, directions: Directions | None = None) -> Sweep:
+    def rollout(self, steps: int, directions: Directions | None = None) -> Rollout:
         """Track the recording over the first steps."""
         torque, path = self.torque[:steps], self.path[: steps + 1]
-        return self.step.kernel.sweep(self.theta, self.start, torque, path, self.feedback, directions)
+        return self.step.kernel.rollout(self.theta, self.start, torque, path, self.feedback, directions)
 
 
 def step(bench: Bench) -> int:
     """One step in compiled code: a rollout of 100 of them."""
-    bench.sweep(100)
+    bench.rollout(100)
     return 100
 
 
@@ -138,7 +139,7 @@ def step_with_a_and_b(bench: Bench) -> int:
     steps = 25
     directions = bench.directions("everything", (), everything=True)
     assert directions.torque is not None
-    bench.sweep(steps, Directions((), directions.start, directions.torque[:steps]))
+    bench.rollout(steps, Directions((), directions.start, directions.torque[:steps]))
     return steps
 
 
@@ -162,13 +163,13 @@ def jacobians_called_from_python(bench: Bench) -> int:
 
 def rollout_500(bench: Bench) -> int:
     """A rollout of 500 steps that tracks a recording."""
-    bench.sweep(500)
+    bench.rollout(500)
     return 1
 
 
 def sensitivities_500(bench: Bench) -> int:
     """The same with forward sensitivities by six stiffnesses: what a Gauss-Newton iteration costs in the main."""
-    bench.sweep(500, bench.directions("six", STIFFNESSES, everything=False))
+    bench.rollout(500, bench.directions("six", STIFFNESSES, everything=False))
     return 1
 
 

@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.model import Grasp, Mechanism, System, flexible_object
+from yid_ocp.model import Grasp, System
+from yid_ocp.model.urdf import read_urdf
+from yid_ocp.model.y_object import y_object
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 SIDES = {"single": ("left",), "dual": ("left", "right")}
@@ -71,10 +73,10 @@ def paper_systems():
 
     def build(sides: tuple[str, ...]) -> System:
         names = [f"{side}_{joint}" for side in sides for joint in BAXTER_JOINTS]
-        robot = Mechanism.from_urdf("package:baxter", joints=names)
+        robot = read_urdf("package:baxter", joints=names)
         held = dict(zip(("left", "right"), ("w_T2", "w_T3"), strict=True))
         grasps = [Grasp(side, f"{side}_gripper", held[side]) for side in sides]
-        objects = [(flexible_object(), None, None)]
+        objects = [(y_object(), None, None)]
         return System.build(robot, objects=objects, grasps=grasps, driven=names, damping=0.05)
 
     return {name: build(sides) for name, sides in SIDES.items()}
@@ -121,7 +123,7 @@ def roll():
         fixed = list(step.system.prescribed_indices)
         path = np.tile(start[fixed], (steps + 1, 1)) if path is None else path
         start[fixed] = path[0]
-        return step.kernel.sweep(np.asarray(theta, float), start, torque, path, feedback, directions)
+        return step.kernel.rollout(np.asarray(theta, float), start, torque, path, feedback, directions)
 
     return rollout
 

@@ -11,9 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from yid_ocp.analysis.identifiability import identifiability as identifiability
     from yid_ocp.analysis.what_if import what_if as what_if
-    from yid_ocp.config import load_config as load_config
-    from yid_ocp.config import load_problem as load_problem
-    from yid_ocp.config import load_system as load_system
+    from yid_ocp.config.reader import load_config as load_config
     from yid_ocp.data import Recording as Recording
     from yid_ocp.data import read_any as read_any
     from yid_ocp.data import read_recording as read_recording
@@ -40,6 +38,8 @@ if TYPE_CHECKING:
     from yid_ocp.solvers import Status as Status
     from yid_ocp.solvers import SteepestDescent as SteepestDescent
     from yid_ocp.solvers import solve as solve
+    from yid_ocp.workflow.build import load_problem as load_problem
+    from yid_ocp.workflow.build import load_system as load_system
 
     __version__: str
 
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 _HOMES: dict[str, tuple[str, ...]] = {
     "analysis.identifiability": ("identifiability",),
     "analysis.what_if": ("what_if",),
-    "config": ("load_config", "load_problem", "load_system"),
+    "config.reader": ("load_config",),
     "data": ("Recording", "read_any", "read_recording", "write_recording"),
     "diagnosis": ("Finding", "diagnose"),
     "errors": ("YidError",),
@@ -56,6 +56,7 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "integrator.step": ("compile_step",),
     "model": ("FlexibleObject", "Grasp", "Mechanism", "Segment", "System", "flexible_object"),
     "problem": ("EstimationProblem", "ProblemOptions", "SensorOptions"),
+    "workflow.build": ("load_problem", "load_system"),
     "solvers": (
         "GaussNewton",
         "Lifted",

@@ -19,10 +19,10 @@ from yid_ocp.errors import YidError
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
+    from yid_ocp.config.settings import Run
     from yid_ocp.data import Recording
     from yid_ocp.solvers import Iterate
     from yid_ocp.workflow.folder import Monitor
-    from yid_ocp.workflow.settings import Run
 
 Rows = list[Sequence[str]]
 
@@ -129,7 +129,7 @@ def _identifiability_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _diagnose(arguments: argparse.Namespace) -> int:
-    from yid_ocp.config import DIAGNOSIS_DEFAULT, load_config
+    from yid_ocp.config.reader import DIAGNOSIS_DEFAULT, load_config
     from yid_ocp.workflow.diagnose import run_diagnose
 
     run = load_config(arguments.config, arguments.overrides, DIAGNOSIS_DEFAULT)
@@ -138,7 +138,7 @@ def _diagnose(arguments: argparse.Namespace) -> int:
 
 
 def _blind(arguments: argparse.Namespace) -> int:
-    from yid_ocp.config import DIAGNOSIS_DEFAULT, load_config
+    from yid_ocp.config.reader import DIAGNOSIS_DEFAULT, load_config
     from yid_ocp.workflow.blind import run_blind, summary_lines
 
     run = load_config(arguments.config, arguments.overrides, DIAGNOSIS_DEFAULT)
@@ -238,7 +238,7 @@ def _export_arguments(parser: argparse.ArgumentParser) -> None:
 def _schema(arguments: argparse.Namespace) -> int:
     import json
 
-    from yid_ocp.config import schema
+    from yid_ocp.config.reader import schema
     from yid_ocp.errors import OutputError
 
     text = json.dumps(schema(), indent=1)
@@ -557,7 +557,7 @@ def table(rows: Rows) -> list[str]:
 
 
 def _load(arguments: argparse.Namespace) -> Run:
-    from yid_ocp.config import load_config
+    from yid_ocp.config.reader import load_config
 
     return load_config(arguments.config, arguments.overrides)
 

@@ -8,13 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.config import load_problem
 from yid_ocp.data import Recording
 from yid_ocp.data.recording import JointGroup, PointGroup
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.model import Grasp, Mechanism, Segment, System, flexible_object
+from yid_ocp.model import Grasp, Segment, System, flexible_object
 from yid_ocp.model.system import Spring
+from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
+from yid_ocp.workflow.build import load_problem
 
 STIFFNESSES = ("T1.bend", "T1.twist", "T2.bend", "T2.twist", "T3.bend", "T3.twist")
 PENDULUM = {"elbow.stiffness": 4.0, "elbow.damping": 0.15, "elbow.rest": 0.3}
@@ -80,7 +81,7 @@ def twin():
 @pytest.fixture(scope="session")
 def pendulum(urdf_folder):
     """pendulum(recording=None): a shoulder moved as measured, a springy elbow, the tip seen to 2 mm at 25 Hz."""
-    robot = Mechanism.from_urdf(urdf_folder / "double_pendulum.urdf")
+    robot = read_urdf(urdf_folder / "double_pendulum.urdf")
     system = System.build(
         robot, prescribed=["shoulder"], springs={"elbow": Spring(3.0, 0.0)}, damping=0.1, points=["tip"]
     )
@@ -121,7 +122,7 @@ def held_tube():
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "hand.urdf"
         file.write_text(urdf)
-        robot = Mechanism.from_urdf(file, joints=["x", "z", "turn"])
+        robot = read_urdf(file, joints=["x", "z", "turn"])
     tube = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=3, bend=4.0, twist=3.0)])
     # a hand without a y motor meets the tip all the same: the tube bends in one plane
     grasps = [Grasp("hand", "hand", "w_T1", "point")]

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from yid_ocp.analysis.identifiability import identifiability
-from yid_ocp.config import load_problem
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import GaussNewton, solve
+from yid_ocp.workflow.build import load_problem
 
 TWINS = 100
 TRUTH = {"T1.bend": 22.0, "T1.twist": 13.6, "T2.bend": 10.7, "T2.twist": 8.2, "T3.bend": 11.5, "T3.twist": 9.7}

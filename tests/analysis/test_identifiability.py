@@ -227,7 +227,7 @@ def test_a_start_fitted_to_points_becomes_the_centre_of_a_prior(pendulum, twin):
     empty = pendulum()
     made = pendulum(twin(empty, empty.start, 3))
     recordings = [episode.recording for episode in made.episodes]
-    options = replace(made.options, initial_state="given", start_window=0.05)
+    options = replace(made.options, initial_state="fitted_to_points", start_window=0.05)
     given = EstimationProblem(made.step, recordings, made.free, options)
     known, unknown = identifiability(given, start="known"), identifiability(given)
     assert known.nuisances == ()

@@ -10,15 +10,15 @@ import pytest
 
 from yid_ocp.analysis import layouts
 from yid_ocp.analysis.identifiability import identifiability
-from yid_ocp.analysis.layouts import Setting, Workshop, sights
+from yid_ocp.analysis.layouts import LayoutBuilder, Setting, sights
 from yid_ocp.analysis.what_if import Change, compatible, what_if
-from yid_ocp.config import load_problem
 from yid_ocp.data.recording import PointGroup
-from yid_ocp.data.synthetic import Motion, paper_system, virtual_experiment
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import GaussNewton, solve
+from yid_ocp.virtual.experiment import Motion, paper_system, virtual_experiment
+from yid_ocp.workflow.build import load_problem
 
 TRUTH = {"T1.bend": 22.0, "T1.twist": 13.6, "T2.bend": 10.7, "T2.twist": 8.2, "T3.bend": 11.5, "T3.twist": 9.7}
 
@@ -117,12 +117,12 @@ def test_another_motion_comes_from_held_out_recordings_without_mujoco(short_run,
         raise DataError("MuJoCo is not installed")
 
     monkeypatch.setattr(layouts, "simulate_in_mujoco", missing)
-    workshop = Workshop(Setting(short_run, short_run.start))
-    other = workshop.layout(frozenset({"motion"}))
+    builder = LayoutBuilder(Setting(short_run, short_run.start))
+    other = builder.layout(frozenset({"motion"}))
     assert not isinstance(other, str), other
     held_out = short_run.held_out[0].measured_arm[:20]
     np.testing.assert_allclose(other.problem.episodes[0].measured_arm[:20], held_out, atol=1e-12)
-    assert workshop.layout(frozenset({"travel"})) == "MuJoCo is not installed"
+    assert builder.layout(frozenset({"travel"})) == "MuJoCo is not installed"
 
 
 def test_what_cannot_be_worked_out_is_said_and_ranked_last(short_run, monkeypatch):
@@ -166,7 +166,7 @@ def test_one_arm_needs_another_arm_and_welds(repository):
 def test_the_smallest_set_finds_all_six_in_another_engine(repository):
     """Two arms with welds and no camera, MuJoCo's motion and noise, from a start of 3 N m/rad each."""
     made = load_problem(repository / "configs" / "dual_arm_no_vision.yaml")
-    layout = Workshop(Setting(made, at_truth(made))).layout(frozenset({"weld"}))
+    layout = LayoutBuilder(Setting(made, at_truth(made))).layout(frozenset({"weld"}))
     assert not isinstance(layout, str), layout
     system = layout.problem.system
     posture = dict(zip(system.driven, map(float, made.episodes[0].measured_arm[0]), strict=True))

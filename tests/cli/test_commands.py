@@ -10,7 +10,7 @@ import time
 import h5py
 import pytest
 
-from yid_ocp.config import load_config, schema
+from yid_ocp.config.reader import load_config, schema
 from yid_ocp.data import read_recording
 
 SOLVE_KEYS = {

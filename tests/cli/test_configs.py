@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from yid_ocp.config import load_config
+from yid_ocp.config.reader import load_config
 from yid_ocp.workflow.build import recording_file
 
 PAPER = ("single_arm_no_vision", "single_arm_vision", "dual_arm_no_vision", "dual_arm_vision")
@@ -68,7 +68,7 @@ def test_configuration_runs(cli, repository, tmp_path, name):
 
 
 WITHHELD = {
-    "its weight": (("model.object.weight=0",), {"kind": "gravity_scale", "location": "object"}),
+    "its weight": (("model.object.gravity_fraction=0",), {"kind": "gravity_scale", "location": "object"}),
     "the beam": (
         ("model.object=null", "parameters={panda_*.damping: {free: true}, effort_offset@*: {free: true}}"),
         {"kind": "point_mass", "location": "gripper"},

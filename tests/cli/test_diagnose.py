@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
-from yid_ocp.config import DIAGNOSIS_DEFAULT, load_config
+from yid_ocp.config.reader import DIAGNOSIS_DEFAULT, load_config
 from yid_ocp.data import read_recording, write_recording
 from yid_ocp.diagnosis import Refitted, select
 from yid_ocp.workflow.diagnose import reproducing, run_diagnose
@@ -197,14 +197,14 @@ def test_a_deviation_that_is_mostly_the_models_error(cli, pendulum, tmp_path):
     found = []
     for std, share in ((0.01, 1.0), (0.1, 0.1)):
         out = tmp_path / f"run_{std}_{share}"
-        settings = ("--set", f"sensors.joints.effort.std={std}", "--set", f"diagnosis.noise_share={share}")
+        settings = ("--set", f"sensors.joints.effort.std={std}", "--set", f"diagnosis.noise_fraction={share}")
         assert cli("diagnose", pendulum, "--out", out, *chosen, *settings).code == 0
         found.append(json.loads((out / "result.json").read_text())["gap"]["before"]["chi2_per_dof"])
     assert found[1] == pytest.approx(found[0], rel=0.01)
 
 
 def test_a_share_of_an_unstated_deviation_is_refused(cli, pendulum, tmp_path):
-    done = cli("diagnose", pendulum, "--out", tmp_path / "run", "--set", "diagnosis.noise_share=0.1")
+    done = cli("diagnose", pendulum, "--out", tmp_path / "run", "--set", "diagnosis.noise_fraction=0.1")
     assert done.code == 2
     assert "set sensors.joints.effort.std" in done.err
 

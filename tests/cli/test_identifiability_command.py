@@ -8,7 +8,7 @@ from dataclasses import replace
 import jsonschema
 import pytest
 
-from yid_ocp.config import load_config
+from yid_ocp.config.reader import load_config
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.identifiability import second_arm
 

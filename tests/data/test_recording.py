@@ -546,11 +546,15 @@ def test_an_interruption_leaves_nothing(tmp_path: Path) -> None:
 # ------------------------------------------------------------------------------------------------- real recordings
 
 
+# joints and points of the recordings in each folder
+REAL_SIZES = {"baxter": (7, 0), "deft": (0, 20), "double_pendulum": (2, 0), "panda_beam": (7, 0), "soft_beam": (0, 6)}
+
+
 @pytest.mark.skipif(
     not REAL_FILES, reason="the real recordings are not here (folder shared/recordings beside the project)"
 )
 def test_the_real_recordings_are_all_there() -> None:
-    assert {path.parent.name for path in REAL_FILES} == {"baxter", "deft", "panda_beam"}
+    assert {path.parent.name for path in REAL_FILES} == set(REAL_SIZES)
 
 
 @pytest.mark.parametrize(
@@ -566,8 +570,7 @@ def test_the_real_recordings_are_all_there() -> None:
 )
 def test_real_recordings_read(path: Path, tmp_path: Path) -> None:
     recording = read_recording(path)
-    expected = {"baxter": (7, 0), "deft": (0, 20), "panda_beam": (7, 0)}[path.parent.name]
-    assert (len(recording.joint_names), len(recording.point_names)) == expected
+    assert (len(recording.joint_names), len(recording.point_names)) == REAL_SIZES[path.parent.name]
     assert 4.0 < recording.duration < 60.0
     assert recording.source
     write_recording(recording, tmp_path / "copy.h5")

@@ -13,7 +13,8 @@ from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.effects import make_effect
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.step import Step, compile_step
-from yid_ocp.model import Mechanism, System
+from yid_ocp.model import System
+from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 
 TIME_STEP = 0.01
@@ -60,7 +61,7 @@ class Bench:
 
 @lru_cache(maxsize=1)
 def _bench(file: str) -> Bench:
-    tree = Mechanism.from_urdf(file)
+    tree = read_urdf(file)
     system = System.build(tree, prescribed=JOINTS, damping=dict.fromkeys(JOINTS, 0.05))
     return Bench(system, compile_step(system, TIME_STEP))
 

@@ -7,12 +7,12 @@ import json
 import pytest
 
 from yid_ocp.cli import main
-from yid_ocp.data.withheld import Withheld
 from yid_ocp.diagnosis.blind import Ensemble, Label, mark, opened, score, seal
 from yid_ocp.errors import ConfigError, DataError
+from yid_ocp.virtual.injected import InjectedEffect
 
-KV = Withheld("kelvin_voigt", "T1", {"tau": 0.05})
-GUST = Withheld("gusts", "T3", {"size": 0.1})
+KV = InjectedEffect("kelvin_voigt", "T1", {"tau": 0.05})
+GUST = InjectedEffect("gusts", "T3", {"size": 0.1})
 
 
 def label(category, *withheld, multiple=None, case="case_000"):

@@ -11,8 +11,9 @@ from yid_ocp.diagnosis import diagnose
 from yid_ocp.effects import make_effect
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.model import Mechanism, System
+from yid_ocp.model import System
 from yid_ocp.model.kinematics import forward_kinematics
+from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 
 TIME_STEP, NOISE = 0.01, 1e-3
@@ -21,7 +22,7 @@ TIME_STEP, NOISE = 0.01, 1e-3
 @pytest.fixture(scope="module")
 def swinging(urdf_folder):
     """A pendulum let go, with dry friction in the elbow that the model does not know."""
-    tree = Mechanism.from_urdf(str(urdf_folder / "double_pendulum.urdf"))
+    tree = read_urdf(str(urdf_folder / "double_pendulum.urdf"))
     nominal = System.build(tree, damping={"shoulder": 0.1, "elbow": 0.1})
     real = nominal.with_effects([make_effect("joint_coulomb", "elbow", nominal, {"tau_c": 0.02})])
     step = compile_step(real, TIME_STEP)

@@ -10,8 +10,8 @@ import pytest
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.diagnosis import Thresholds, diagnose
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.model import Mechanism, System
-from yid_ocp.model.mechanism import robot_description_file
+from yid_ocp.model import System
+from yid_ocp.model.urdf import read_urdf, robot_description_file
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 
 pin = pytest.importorskip("pinocchio", reason="the other engine is Pinocchio: pip install pin")
@@ -33,7 +33,7 @@ CANDIDATES = (
 @lru_cache(maxsize=2)
 def robot(side: str):
     names = tuple(f"{side}_{joint}" for joint in JOINTS)
-    system = System.build(Mechanism.from_urdf("package:baxter", joints=names), prescribed=names, damping=0.05)
+    system = System.build(read_urdf("package:baxter", joints=names), prescribed=names, damping=0.05)
     model = pin.buildModelFromUrdf(str(robot_description_file("baxter")))
     locked = [j for j in range(1, model.njoints) if model.names[j] not in names]
     return names, compile_step(system, TIME_STEP), pin.buildReducedModel(model, locked, pin.neutral(model))

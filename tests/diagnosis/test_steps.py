@@ -9,8 +9,8 @@ import pytest
 import scipy.stats
 
 from yid_ocp.diagnosis import closure, confusability, linearise, null_test, refit, residual_series, scores, visibility
-from yid_ocp.diagnosis.hypotheses import Composed, Series, chosen_effects, smoothed_colour
-from yid_ocp.diagnosis.score import robust, shape_grid
+from yid_ocp.diagnosis.hypotheses import CandidateProblem, Series, chosen_effects, smoothed_colour
+from yid_ocp.diagnosis.screening import robust, shape_grid
 from yid_ocp.diagnosis.select import Loss, gain, out_of_shape, oversized, within_reach
 from yid_ocp.effects import make_effect
 
@@ -26,7 +26,7 @@ def screened(bench):
     problem = bench.problem(recordings[:1])
     choice = ("effort_offset", "joint_coulomb", "joint_stribeck@elbow", "rotor_inertia@elbow", "link_mass@elbow")
     effects = chosen_effects(bench.system, recordings, choice)
-    composed = Composed.of(problem, effects, recordings[1:])
+    composed = CandidateProblem.of(problem, effects, recordings[1:])
     nominal = refit(composed, (), {})
     return composed, nominal, linearise(composed, (), nominal.values)
 

@@ -31,7 +31,7 @@ def test_the_example_runs(text, repository, tmp_path) -> None:
 
 
 def test_the_configuration_is_valid(text) -> None:
-    from yid_ocp.workflow.settings import EffectSettings
+    from yid_ocp.config.settings import EffectSettings
 
     [block] = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
     [entry] = YAML(typ="safe").load(block)["model"]["effects"]

@@ -10,13 +10,16 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from yid_ocp.data.edges import edge_lengths
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.effects import SENSORS, EffectBase, candidates, make_effect
-from yid_ocp.integrator.rollout import Statics, simulate
-from yid_ocp.integrator.step import Directions, Step, Sweep, compile_step
+from yid_ocp.integrator.rollout import simulate
+from yid_ocp.integrator.statics import Statics
+from yid_ocp.integrator.step import Directions, Rollout, Step, compile_step
 from yid_ocp.model import Grasp, Mechanism, Segment, System, flexible_object, forward_kinematics
-from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, roll_pitch_yaw, transform
-from yid_ocp.problem.cable import Cable, CableOptions, cable_system
+from yid_ocp.model.cable import Cable, CableOptions, cable_system
+from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement
+from yid_ocp.model.rotations import roll_pitch_yaw, transform
 from yid_ocp.sensors import EffortSensor, PointSensor, Sensor, sensor_function
 
 POSTURE = np.array([0.3, 0.8, 0.9])
@@ -81,7 +84,7 @@ class Run:
     step: Step
     theta: np.ndarray
     start: np.ndarray
-    sweep: Sweep
+    rollout: Rollout
 
 
 class Bench:
@@ -126,23 +129,25 @@ class Bench:
         begin = self.start(step) if start is None else start
         directions = Directions(tuple(names), np.zeros((len(begin), len(names)))) if names else None
         count = steps or self.steps
-        sweep = simulate(step, theta, begin, count, self.torque[:count], self.path[: count + 1], directions=directions)
-        return Run(step, theta, begin, sweep)
+        rollout = simulate(
+            step, theta, begin, count, self.torque[:count], self.path[: count + 1], directions=directions
+        )
+        return Run(step, theta, begin, rollout)
 
     def nominal_part(self, run: Run) -> np.ndarray:
         """Coordinates and momenta of the joints that the nominal model has."""
         names, n = run.step.system.mechanism.joint_names, run.step.sizes["n"]
         at = [names.index(name) for name in self.system.mechanism.joint_names]
-        return np.hstack([run.sweep.state[:, at], run.sweep.state[:, [n + i for i in at]]])
+        return np.hstack([run.rollout.state[:, at], run.rollout.state[:, [n + i for i in at]]])
 
     def reading(self, run: Run, sensor: Sensor) -> np.ndarray:
         """What a sensor reads at every node but the last."""
-        n, sweep, system = run.step.sizes["n"], run.sweep, run.step.system
+        n, rollout, system = run.step.sizes["n"], run.rollout, run.step.system
         function = sensor_function(system, sensor, ())
-        effort = np.zeros((len(sweep.state) - 1, n))
-        effort[:, list(system.prescribed_indices)] = sweep.effort
-        effort[:, list(system.driven_indices)] = sweep.torque
-        rows = zip(sweep.state[:-1], effort, strict=True)
+        effort = np.zeros((len(rollout.state) - 1, n))
+        effort[:, list(system.prescribed_indices)] = rollout.effort
+        effort[:, list(system.driven_indices)] = rollout.torque
+        rows = zip(rollout.state[:-1], effort, strict=True)
         return np.array([np.array(function(x[:n], x[2 * n :], e, run.theta)[0]).ravel() for x, e in rows])
 
 
@@ -183,7 +188,7 @@ def benches(driven, prescribed) -> dict[str, Bench]:
 @pytest.fixture(scope="session")
 def cable() -> tuple[Cable, Recording, System]:
     layout, recording = made_cable()
-    return layout, recording, cable_system([recording], layout, CableOptions())
+    return layout, recording, cable_system(edge_lengths(layout.edges, [recording]), layout, CableOptions())
 
 
 @pytest.fixture(scope="session")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.effects import EFFECTS
-from yid_ocp.integrator.codegen import compiler
+from yid_ocp.integrator.compiler import compiler
 from yid_ocp.integrator.rollout import adjoint_gradient
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.sensors import sensor_function
@@ -34,7 +34,7 @@ def at(bench, effects, where: str) -> SimpleNamespace:
         values |= somewhere(effect)
     start = bench.start(step)
     run = bench.run(step, values, names, start, STEPS)
-    assert run.sweep.status.ok, run.sweep.status.message
+    assert run.rollout.status.ok, run.rollout.status.message
     widths = {name: high - low for effect in effects for name, (low, high) in effect.prior_range.items()}
     return SimpleNamespace(bench=bench, step=step, names=names, values=values, start=start, run=run, widths=widths)
 
@@ -63,16 +63,16 @@ def test_sensitivities_agree_with_differences(kind, mode, where, cases) -> None:
         width = 4e-5 * case.widths[name]
         centre = case.step.system.parameters[name].value if where == "neutral" else case.values[name]
         above, below = (
-            case.bench.run(case.step, case.values | {name: centre + sign * width}, (), case.start, STEPS).sweep
+            case.bench.run(case.step, case.values | {name: centre + sign * width}, (), case.start, STEPS).rollout
             for sign in (1, -1)
         )
-        sweep = case.run.sweep
+        rollout = case.run.rollout
         for field, by in (("state", "by_state"), ("multipliers", "by_multipliers"), ("effort", "by_effort")):
             numeric = (getattr(above, field) - getattr(below, field)) / (2 * width)
-            exact = getattr(sweep, by)[..., column]
+            exact = getattr(rollout, by)[..., column]
             if exact.size == 0:
                 continue
-            floor = 1e-9 * np.max(np.abs(getattr(sweep, field))) / width
+            floor = 1e-9 * np.max(np.abs(getattr(rollout, field))) / width
             error = np.max(np.abs(exact - numeric))
             assert error <= 2e-5 * np.max(np.abs(exact)) + floor, (name, field, error, np.max(np.abs(exact)))
 
@@ -103,12 +103,12 @@ def test_compiled_and_interpreted_agree_with_every_effect(cases) -> None:
     bench = case.bench
     step = compile_step(case.step.system, case.step.time_step)
     assert step.compiled
-    fast, slow = bench.run(step, case.values, case.names, case.start, STEPS).sweep, case.run.sweep
+    fast, slow = bench.run(step, case.values, case.names, case.start, STEPS).rollout, case.run.rollout
     for field in ("state", "multipliers", "by_state", "by_multipliers"):
         one, other = getattr(fast, field), getattr(slow, field)
         assert np.max(np.abs(one - other)) <= 1e-8 * np.max(np.abs(other)), field
     weight = np.random.default_rng(1).normal(size=slow.state.shape)
     exact = np.einsum("kx,kxd->d", weight, slow.by_state)
-    for s, sweep in ((step, fast), (case.step, slow)):
-        gradient = adjoint_gradient(s, case.run.theta, sweep, case.names, weight)
+    for s, rollout in ((step, fast), (case.step, slow)):
+        gradient = adjoint_gradient(s, case.run.theta, rollout, case.names, weight)
         assert gradient.by_theta == pytest.approx(exact, rel=1e-6, abs=1e-8 * np.max(np.abs(exact)))

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from yid_ocp.data.synthetic import paper_system
 from yid_ocp.effects import EFFECTS, SENSORS, candidates, make_effect
-from yid_ocp.integrator.rollout import Statics, simulate
+from yid_ocp.integrator.rollout import simulate
+from yid_ocp.integrator.statics import Statics
 from yid_ocp.integrator.step import compile_step
+from yid_ocp.virtual.experiment import paper_system
 
 POSTURE = (-0.55, -1.0, -0.2, 1.3, -0.1, 1.1, 0.0)
 
@@ -22,10 +23,10 @@ def test_all_together_change_nothing(mode, benches, all_effects, sensors) -> Non
     bench = benches[mode]
     effects = all_effects(bench.system)
     plain, full = bench.run(bench.plain), bench.run(bench.step(*effects))
-    assert full.sweep.status.ok
-    assert full.sweep.status.iterations <= 1.5 * plain.sweep.status.iterations
+    assert full.rollout.status.ok
+    assert full.rollout.status.iterations <= 1.5 * plain.rollout.status.iterations
     assert largest(bench.nominal_part(full) - bench.nominal_part(plain), bench.nominal_part(plain)) < 1e-10
-    assert largest(full.sweep.multipliers - plain.sweep.multipliers, plain.sweep.multipliers) < 1e-10
+    assert largest(full.rollout.multipliers - plain.rollout.multipliers, plain.rollout.multipliers) < 1e-10
     watched = [sensors.camera, sensors.arm] + ([sensors.effort] if mode == "prescribed" else [])
     for sensor in watched:
         nominal = bench.reading(plain, sensor)
@@ -41,9 +42,9 @@ def test_alone_it_changes_nothing_and_has_a_slope(kind, benches) -> None:
     assert effect.neutral == {entry.name: entry.value for entry in effect.parameters}
     step = bench.step(effect)
     plain, run = bench.run(bench.plain, steps=3), bench.run(step, names=effect.parameters.names, steps=3)
-    assert run.sweep.status.ok
+    assert run.rollout.status.ok
     assert largest(bench.nominal_part(run) - bench.nominal_part(plain), bench.nominal_part(plain)) < 1e-10
-    assert np.all(np.isfinite(run.sweep.by_state))
+    assert np.all(np.isfinite(run.rollout.by_state))
     q, p, z = np.split(run.start, [step.sizes["n"], 2 * step.sizes["n"]])
     a, _, _ = step.jacobians(q, p, bench.torque[0], run.theta, internal=z)
     assert np.max(np.abs(a)) < 1e6
@@ -60,8 +61,8 @@ def test_the_papers_system_with_all_candidates(all_effects) -> None:
         rest = Statics(step).solve(POSTURE, theta)
         assert rest.converged
         torque = np.tile(rest.torque, (5, 1)) + np.linspace(0, 1, 5)[:, None]
-        sweep = simulate(step, theta, rest.state, 5, torque)
-        assert sweep.status.ok
+        rollout = simulate(step, theta, rest.state, 5, torque)
+        assert rollout.status.ok
         names = one.mechanism.joint_names
-        results.append(sweep.state[:, [names.index(name) for name in system.mechanism.joint_names]])
+        results.append(rollout.state[:, [names.index(name) for name in system.mechanism.joint_names]])
     assert largest(results[1] - results[0], results[0]) < 1e-10

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 from yid_ocp.effects import EFFECTS, make_effect
-from yid_ocp.integrator.rollout import Statics, simulate
+from yid_ocp.integrator.rollout import simulate
+from yid_ocp.integrator.statics import Statics
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Grasp, Mechanism, Segment, System, flexible_object, forward_kinematics
-from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, roll_pitch_yaw, transform
+from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement
+from yid_ocp.model.rotations import roll_pitch_yaw, transform
 from yid_ocp.sensors import AngleSensor, EffortSensor, PointSensor, sensor_function
 
 LENGTH, MASS, RADIUS, KAPPA = 0.5, 0.2, 0.02, 3.0
@@ -39,7 +41,7 @@ def hinge(mode: str = "prescribed", gravity=(0.0, 0.0, 0.0)) -> System:
 
 
 def follow(system, effects, path, values=None, z0=None):
-    """Effort of the first prescribed joint along its path, the others held, from steady motion; and the sweep."""
+    """Effort of the first prescribed joint along its path, the others held, from steady motion; and the rollout."""
     step = compile_step(system.with_effects(effects), H, use_compiler=False)
     theta = step.system.parameters.vector(values)
     sizes = step.sizes
@@ -48,9 +50,9 @@ def follow(system, effects, path, values=None, z0=None):
     start = np.zeros(sizes["nx"])
     if z0 is not None:
         start[2 * sizes["n"] :] = z0
-    sweep = simulate(step, theta, start, len(lead) - 1, path=lead)
-    assert sweep.status.ok
-    return sweep.effort[1:, 0], sweep
+    rollout = simulate(step, theta, start, len(lead) - 1, path=lead)
+    assert rollout.status.ok
+    return rollout.effort[1:, 0], rollout
 
 
 def still(angle: float, steps: int = 4) -> np.ndarray:
@@ -68,9 +70,9 @@ def swing(system, effects, angle: float, steps: int):
     start = np.zeros(sizes["nx"])
     index = step.system.mechanism.joint_index("T1_0_y")
     start[index] = angle
-    sweep = simulate(step, step.system.parameters.vector(), start, steps)
-    assert sweep.status.ok
-    return sweep.state[:, index]
+    rollout = simulate(step, step.system.parameters.vector(), start, steps)
+    assert rollout.status.ok
+    return rollout.state[:, index]
 
 
 # -- the object's material --------------------------------------------------------------------------------------------
@@ -213,9 +215,9 @@ def test_a_mount_forgets_a_start_that_does_not_fit_its_load() -> None:
         H,
         use_compiler=False,
     )
-    sweep = simulate(step, step.system.parameters.vector(), np.zeros(step.sizes["nx"]), 12)
-    assert sweep.status.ok
-    mount = sweep.state[:, 1]
+    rollout = simulate(step, step.system.parameters.vector(), np.zeros(step.sizes["nx"]), 12)
+    assert rollout.status.ok
+    mount = rollout.state[:, 1]
     # it follows its load from the second step on, without ringing from step to step
     assert np.all(np.diff(mount[2:]) > 0)
 
@@ -272,9 +274,9 @@ def test_damping_calms_a_bouncing_grasp() -> None:
         system, effects = hanging(("grasp_compliance", {"stiffness": 50.0, "damping": damping}))
         step = compile_step(system.with_effects(effects), 0.001, use_compiler=False)
         at = step.system.mechanism.joint_index("foot")
-        sweep = simulate(step, step.system.parameters.vector(), np.zeros(step.sizes["nx"]), 400)
-        assert sweep.status.ok
-        sway.append(np.std(sweep.state[300:, at]))
+        rollout = simulate(step, step.system.parameters.vector(), np.zeros(step.sizes["nx"]), 400)
+        assert rollout.status.ok
+        sway.append(np.std(rollout.state[300:, at]))
     assert sway[1] < 0.1 * sway[0]
 
 
@@ -283,9 +285,9 @@ def test_a_slipping_grasp_creeps_at_its_rate() -> None:
     step = compile_step(system.with_effects(effects), H, use_compiler=False)
     theta = step.system.parameters.vector()
     rest = Statics(step).solve([0.0], theta)
-    sweep = simulate(step, theta, rest.state, 40)
-    assert sweep.status.ok
-    foot, offset = sweep.state[:, step.system.mechanism.joint_index("foot")], sweep.state[:, -1]
+    rollout = simulate(step, theta, rest.state, 40)
+    assert rollout.status.ok
+    foot, offset = rollout.state[:, step.system.mechanism.joint_index("foot")], rollout.state[:, -1]
     # the gripper pulls the tube up, so it creeps towards the tip and the tube sinks
     assert offset[-1] == pytest.approx(0.005 * MASS * G * 40 * H, rel=0.02)
     assert foot[-1] == pytest.approx(-offset[-1], abs=1e-9)

@@ -10,9 +10,10 @@ from yid_ocp.effects import make_effect
 from yid_ocp.errors import DataError, SolverError
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.inputs import Grid, camera_pose, held_torque, held_torque_slope, sensors_present
+from yid_ocp.problem.grid import Grid
+from yid_ocp.problem.inputs import camera_pose, held_torque, held_torque_slope, sensors_present
 from yid_ocp.sensors import sensor_function
-from yid_ocp.solvers.formulation import Transcription
+from yid_ocp.solvers.transcription import Transcription
 
 H, STEPS = 0.01, 24
 NAMES = ("left_a", "left_b", "left_c")
@@ -60,7 +61,7 @@ def problem(bench, kinds, *, neutral=False, feedback="none", free=(), **options)
     step = compile_step(bench.system.with_effects(effects), H, use_compiler=False)
     names = tuple(name for effect in effects for name in effect.parameters.names)
     settings = ProblemOptions(
-        path_cutoff=float("inf"), feedback=feedback, gains=(20.0, 20.0, 10.0), tie_break=0.0, **options
+        path_cutoff=float("inf"), feedback=feedback, gains=(20.0, 20.0, 10.0), weak_prior_factor=0.0, **options
     )
     return EstimationProblem(step, [recording(bench)], ("T1.bend", *names, *free), settings)
 
@@ -148,7 +149,7 @@ def test_a_late_camera_sees_the_past(driven, sensors) -> None:
     position = np.maximum(moved.node + moved.fraction - 3.0, 0.0)
     n = driven.system.size
     function = sensor_function(task.system, sensors.camera, ())
-    nodes = np.array([np.array(function(s[:n], [], np.zeros(n), task.theta)[0]).ravel() for s in now.sweep.state])
+    nodes = np.array([np.array(function(s[:n], [], np.zeros(n), task.theta)[0]).ravel() for s in now.rollout.state])
     for k in range(6):
         expected = np.interp(position, np.arange(len(nodes)), nodes[:, k])
         assert late.predicted[at][:, k] == pytest.approx(expected, abs=1e-9)
@@ -182,7 +183,9 @@ def test_what_a_recording_holds(driven) -> None:
 
 def test_a_cable_from_a_fitted_start(cable, all_effects) -> None:
     layout, made, system = cable
-    options = ProblemOptions(initial_state="given", clamps=layout.clamps, path_cutoff=float("inf"), tie_break=0.0)
+    options = ProblemOptions(
+        initial_state="fitted_to_points", clamps=layout.clamps, path_cutoff=float("inf"), weak_prior_factor=0.0
+    )
     residuals = []
     for one in (system, system.with_effects(all_effects(system))):
         step = compile_step(one, H, "left_damping", use_compiler=False)

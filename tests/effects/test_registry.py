@@ -7,12 +7,13 @@ import re
 
 import pytest
 
-from yid_ocp.data.synthetic import paper_system
 from yid_ocp.effects import EFFECTS, SENSORS, candidates, make_effect, vocabulary
 from yid_ocp.effects import base as places
 from yid_ocp.errors import ConfigError, ModelError
-from yid_ocp.model import Effect, Mechanism, Segment, System, flexible_object
+from yid_ocp.model import Effect, Segment, System, flexible_object
 from yid_ocp.model.system import RecordedEffect
+from yid_ocp.model.urdf import read_urdf
+from yid_ocp.virtual.experiment import paper_system
 
 
 @pytest.fixture(scope="module")
@@ -24,19 +25,26 @@ def one_arm() -> System:
 def beam() -> System:
     """Panda with a beam on its hand, its joints prescribed."""
     names = [f"panda_joint{i}" for i in range(1, 8)]
-    robot = Mechanism.from_urdf("package:panda", joints=names)
+    robot = read_urdf("package:panda", joints=names)
     item = flexible_object([Segment("beam", 0.52, 0.33, 0.01, 3, clamped=True, rigidity=True)], name="beam")
     return System.build(robot, objects=[(item, "panda_hand", None)], prescribed=names)
+
+
+# in the shared vocabulary, not in the library yet
+DESCRIBED_ONLY = {"payload", "joint_presliding", "effort_lag", "servo_gain", "servo_delay", "servo_saturation"}
 
 
 def test_the_vocabulary_is_the_shared_one(shared) -> None:
     text = (shared / "reference" / "effects.md").read_text(encoding="utf-8")
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line.startswith("|")]
     table = {row[0]: row for row in rows[2:]}
-    assert set(EFFECTS) == set(table)
+    described = {kind.strip() for name in table for kind in name.split(",")}
+    assert described - set(EFFECTS) == DESCRIBED_ONLY
+    assert set(EFFECTS) <= described
     system = paper_system(1)
     spots = dict(candidates(system, SENSORS))
-    for kind, row in table.items():
+    for kind in EFFECTS:
+        row = table[kind]
         effect = make_effect(kind, spots[kind], system)
         for quantity in effect.quantities:
             assert re.search(rf"\b{quantity.reported[0]}\b", row[2]), f"{kind}: {quantity.reported[0]} not in {row[2]}"

@@ -25,6 +25,7 @@ from yid_ocp.model import (
 from yid_ocp.model.kinematics import force_cross, motion_cross
 from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import ClosedForce, floating_clamp
+from yid_ocp.model.urdf import read_urdf
 
 
 @dataclass(frozen=True)
@@ -137,7 +138,9 @@ def thick_air(joint: str, coefficient: float, viscosity: float, buoyancy: float)
     def change(effect, system):
         joints = list(system.mechanism.joints)
         index = system.mechanism.joint_index(joint)
-        lighter = tuple(replace(body, weight=1 - effect.parameters.symbols[2]) for body in joints[index].bodies)
+        lighter = tuple(
+            replace(body, gravity_fraction=1 - effect.parameters.symbols[2]) for body in joints[index].bodies
+        )
         joints[index] = replace(joints[index], bodies=lighter)
         return replace(system, mechanism=replace(system.mechanism, joints=tuple(joints)))
 
@@ -209,11 +212,11 @@ class Case:
     path: np.ndarray
     feedback: Feedback
 
-    def sweep(self, theta=None, start=None, torque=None, path=None, feedback=None, directions=None, step=None):
+    def rollout(self, theta=None, start=None, torque=None, path=None, feedback=None, directions=None, step=None):
         chosen = [self.theta, self.start, self.torque, self.path]
         given = [theta, start, torque, path]
         values = [old if new is None else new for old, new in zip(chosen, given, strict=True)]
-        return (step or self.step).kernel.sweep(*values, feedback, directions)
+        return (step or self.step).kernel.rollout(*values, feedback, directions)
 
 
 def make_case(system: System, q: np.ndarray, time_step=2e-3, steps=10, split="symmetric", strength=1.0) -> Case:
@@ -235,7 +238,7 @@ def make_case(system: System, q: np.ndarray, time_step=2e-3, steps=10, split="sy
 
 def closed_loop(urdf_folder, effects=()) -> tuple[System, np.ndarray]:
     """mixed_joints with its two branches joined at a point: two joints driven, one prescribed."""
-    robot = Mechanism.from_urdf(urdf_folder / "mixed_joints.urdf")
+    robot = read_urdf(urdf_folder / "mixed_joints.urdf")
     q = np.zeros(len(robot.joints))
     for name, value in {"slide": 0.1, "spin": 0.4, "hinge": -0.5, "extend": 0.15, "swing": 0.3, "nod": 0.7}.items():
         q[robot.joint_index(name)] = value
@@ -277,7 +280,7 @@ BUILDERS = {
     ),
     "growing": lambda folder: make_case(
         System.build(
-            Mechanism.from_urdf(folder / "mixed_joints.urdf"),
+            read_urdf(folder / "mixed_joints.urdf"),
             driven=["spin", "nod"],
             damping=0.2,
             effects=[growing_link("nod", 0.1, 0.01), growing_link("hinge", -0.2, 0.02)],

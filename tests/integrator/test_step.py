@@ -11,8 +11,8 @@ import pytest
 
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.integrator.step import StepCode, compile_step
-from yid_ocp.model import Grasp, Mechanism, Parameters, Segment, System, Terms, flexible_object, forward_kinematics
-from yid_ocp.model.mechanism import robot_description_file
+from yid_ocp.model import Grasp, Parameters, Segment, System, Terms, flexible_object, forward_kinematics
+from yid_ocp.model.urdf import read_urdf, robot_description_file
 
 ARM = [f"left_{joint}" for joint in ("s0", "s1", "e0", "e1", "w0", "w1", "w2")]
 BENT = np.array([0.3, -0.2, 0.1, 0.4, 0.2, -0.1, 0.2, 0.3, 0.15])
@@ -39,7 +39,7 @@ def smooth(time):
 
 def test_effort_of_prescribed_joints_is_inverse_dynamics_to_second_order(roll, momentum):
     pin = pytest.importorskip("pinocchio", reason="the reference needs Pinocchio: pip install pin")
-    system = System.build(Mechanism.from_urdf("package:baxter", joints=ARM), prescribed=ARM)
+    system = System.build(read_urdf("package:baxter", joints=ARM), prescribed=ARM)
     theta = system.parameters.vector()
     full = pin.buildModelFromUrdf(str(robot_description_file("baxter")))
     rest = [i for i in range(1, full.njoints) if full.names[i] not in ARM]
@@ -260,7 +260,7 @@ def test_a_creeping_grasp_slides_along_the_object(parts, roll, violation):
 @pytest.mark.parametrize("use_compiler", [True, False], ids=["compiled", "interpreted"])
 class TestFailures:
     def test_a_torque_that_is_not_a_number(self, urdf_folder, roll, use_compiler):
-        system = System.build(Mechanism.from_urdf(urdf_folder / "double_pendulum.urdf"), driven=["elbow"])
+        system = System.build(read_urdf(urdf_folder / "double_pendulum.urdf"), driven=["elbow"])
         step = compile_step(system, 0.01, use_compiler=use_compiler)
         theta = system.parameters.vector()
         _, _, _, status = step([0.1, 0.2], [0.0, 0.0], [math.nan], theta)
@@ -275,10 +275,10 @@ class TestFailures:
         assert np.all(np.isnan(swept.multipliers[7:]))
 
     def test_a_grasp_out_of_reach(self, urdf_folder, use_compiler):
-        robot = Mechanism.from_urdf(urdf_folder / "double_pendulum.urdf")
+        robot = read_urdf(urdf_folder / "double_pendulum.urdf")
         far = Grasp("far", "ceiling", "tip", offset=ca.SX(ca.DM([0.0, 3.0, 0.0])))
         # the pendulum is planar: without the third joint the equations would be redundant
-        turn = Mechanism.from_urdf(urdf_folder / "turntable.urdf", joints=["turn"])
+        turn = read_urdf(urdf_folder / "turntable.urdf", joints=["turn"])
         renamed = replace(turn, frames={"disc": turn.frames["disc"]})
         system = System.build(renamed.joined(robot, "disc"), grasps=[far])
         step = compile_step(system, 0.01, use_compiler=use_compiler)
@@ -288,7 +288,7 @@ class TestFailures:
         assert q.shape == (3,)
 
     def test_redundant_grasps(self, urdf_folder, use_compiler):
-        robot = Mechanism.from_urdf(urdf_folder / "turntable.urdf")
+        robot = read_urdf(urdf_folder / "turntable.urdf")
         system = System.build(robot, grasps=[Grasp("one", "floor", "disc"), Grasp("two", "floor", "disc")])
         step = compile_step(system, 0.01, use_compiler=use_compiler)
         _, _, _, status = step([0.1, 0.2, 0.3], np.zeros(3), [], system.parameters.vector())
@@ -296,14 +296,14 @@ class TestFailures:
         assert status.code != StepCode.OK
 
     def test_derivatives_of_a_step_that_failed_are_not_numbers(self, urdf_folder, use_compiler):
-        system = System.build(Mechanism.from_urdf(urdf_folder / "double_pendulum.urdf"), driven=["elbow"])
+        system = System.build(read_urdf(urdf_folder / "double_pendulum.urdf"), driven=["elbow"])
         step = compile_step(system, 0.01, use_compiler=use_compiler)
         for matrix in step.jacobians([0.1, 0.2], [0.0, 0.0], [math.nan], system.parameters.vector()):
             assert np.all(np.isnan(matrix))
 
     def test_a_system_without_unknowns(self, urdf_folder, use_compiler):
         """Everything prescribed: a step is an evaluation."""
-        robot = Mechanism.from_urdf(urdf_folder / "double_pendulum.urdf")
+        robot = read_urdf(urdf_folder / "double_pendulum.urdf")
         system = System.build(robot, prescribed=["shoulder", "elbow"])
         step = compile_step(system, 0.01, use_compiler=use_compiler)
         pair = ([0.1, 0.2], [0.11, 0.19])

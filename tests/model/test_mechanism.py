@@ -10,9 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from yid_ocp.errors import ModelError
-from yid_ocp.model import Mechanism, flexible_object
-from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, merged, roll_pitch_yaw, transform
+from yid_ocp.model import Mechanism
+from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, merged
+from yid_ocp.model.rotations import roll_pitch_yaw, transform
 from yid_ocp.model.system import floating_clamp, placement_matrix
+from yid_ocp.model.urdf import read_urdf, urdf_text
+from yid_ocp.model.y_object import y_object
 
 LINK = '<link name="{name}"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
 LINK += "</inertial></link>"
@@ -63,7 +66,7 @@ def assert_equal_mechanisms(one, two, tolerance=1e-12):
 
 def test_kept_joints_in_the_order_given(urdf_folder):
     names = ["swing", "nod", "slide", "spin"]
-    robot = Mechanism.from_urdf(urdf_folder / "mixed_joints.urdf", joints=names)
+    robot = read_urdf(urdf_folder / "mixed_joints.urdf", joints=names)
     # parents come first, the rest as given
     assert robot.joint_names == ("slide", "swing", "nod", "spin")
     assert robot.parents == (-1, 0, 1, 0)
@@ -73,7 +76,7 @@ def test_kept_joints_in_the_order_given(urdf_folder):
 
 
 def test_limits_and_kinds(urdf_folder):
-    robot = Mechanism.from_urdf(urdf_folder / "mixed_joints.urdf")
+    robot = read_urdf(urdf_folder / "mixed_joints.urdf")
     by_name = dict(zip(robot.joint_names, robot.joints, strict=True))
     slide, spin = by_name["slide"], by_name["spin"]
     assert (slide.kind, slide.unit, slide.lower, slide.upper) == ("prismatic", "m", -0.4, 0.6)
@@ -84,7 +87,7 @@ def test_limits_and_kinds(urdf_folder):
 
 
 def test_mass_parameters_scale_what_a_joint_carries(urdf_folder):
-    robot = Mechanism.from_urdf(urdf_folder / "mixed_joints.urdf", joints=["spin", "swing"])
+    robot = read_urdf(urdf_folder / "mixed_joints.urdf", joints=["spin", "swing"])
     assert robot.parameters.names == ("spin.mass", "swing.mass")
     # rotor, bracket, fork and finger; lever and nose
     assert robot.parameters["spin.mass"].value == pytest.approx(0.9 + 0.35 + 0.6)
@@ -92,17 +95,17 @@ def test_mass_parameters_scale_what_a_joint_carries(urdf_folder):
     nominal, heavy = robot.numeric().joints[0], robot.numeric({"spin.mass": 2 * 1.85}).joints[0]
     np.testing.assert_allclose(numbers(heavy.bodies[0].about_com), 2 * numbers(nominal.bodies[0].about_com))
     np.testing.assert_allclose(numbers(heavy.bodies[0].com), numbers(nominal.bodies[0].com))
-    plain = Mechanism.from_urdf(urdf_folder / "mixed_joints.urdf", parametric=False)
+    plain = read_urdf(urdf_folder / "mixed_joints.urdf", parametric=False)
     assert len(plain.parameters) == 0
 
 
 def test_a_locked_joint_stands_at_its_value_or_within_its_range(urdf_folder):
     path = urdf_folder / "mixed_joints.urdf"
-    whole = Mechanism.from_urdf(path)
+    whole = read_urdf(path)
     q = np.zeros(len(whole.joints))
     # nod may not stand at zero: its range starts at 0.2, that of extend at 0.05
     q[[whole.joint_index(name) for name in ("nod", "extend", "slide")]] = [0.2, 0.05, 0.3]
-    fixed = Mechanism.from_urdf(path, joints=["spin"], locked={"slide": 0.3})
+    fixed = read_urdf(path, joints=["spin"], locked={"slide": 0.3})
     assert fixed.joint_names == ("spin",)
     from yid_ocp.model import forward_kinematics
 
@@ -116,20 +119,20 @@ def test_a_locked_joint_stands_at_its_value_or_within_its_range(urdf_folder):
 @pytest.mark.parametrize("robot", ["package:baxter", "package:panda", "package:ur5", "mixed_joints", "turntable"])
 def test_urdf_round_trip(robot, urdf_folder, tmp_path):
     source = robot if robot.startswith("package:") else urdf_folder / f"{robot}.urdf"
-    mechanism = Mechanism.from_urdf(source)
+    mechanism = read_urdf(source)
     path = tmp_path / "again.urdf"
-    path.write_text(mechanism.to_urdf(), encoding="utf-8")
-    again = Mechanism.from_urdf(path, parametric=False)
+    path.write_text(urdf_text(mechanism), encoding="utf-8")
+    again = read_urdf(path, parametric=False)
     assert_equal_mechanisms(mechanism, again)
     assert again.name == mechanism.name
 
 
 def test_round_trip_of_changed_parameters(tmp_path):
-    mechanism = flexible_object().mechanism
+    mechanism = y_object().mechanism
     values = {"T1.length": 1.0, "T2.mass": 0.1, "T3.radius": 0.03}
     path = tmp_path / "y.urdf"
-    path.write_text(mechanism.to_urdf(values), encoding="utf-8")
-    assert_equal_mechanisms(mechanism.numeric(values), Mechanism.from_urdf(path, parametric=False))
+    path.write_text(urdf_text(mechanism, values), encoding="utf-8")
+    assert_equal_mechanisms(mechanism.numeric(values), read_urdf(path, parametric=False))
 
 
 def test_round_trip_with_names_that_clash_and_half_open_ranges(tmp_path):
@@ -143,8 +146,8 @@ def test_round_trip_with_names_that_clash_and_half_open_ranges(tmp_path):
     frames = {"a_link": Frame(1, shifted), "world": Frame(0, shifted), "b": Frame(-1, shifted)}
     mechanism = Mechanism("clash", joints, frames)
     path = tmp_path / "clash.urdf"
-    path.write_text(mechanism.to_urdf(), encoding="utf-8")
-    assert_equal_mechanisms(mechanism, Mechanism.from_urdf(path, parametric=False))
+    path.write_text(urdf_text(mechanism), encoding="utf-8")
+    assert_equal_mechanisms(mechanism, read_urdf(path, parametric=False))
 
 
 @given(roll=ANGLES, pitch=st.one_of(ANGLES, st.floats(-1e-6, 1e-6).map(lambda x: math.pi / 2 - abs(x))), yaw=ANGLES)
@@ -152,13 +155,13 @@ def test_any_orientation_survives_the_round_trip(tmp_path_factory, roll, pitch, 
     placement = Placement.of(transform(roll_pitch_yaw(roll, pitch, yaw), [0.1, -0.2, 0.3]))
     mechanism = Mechanism("one", (Joint("j", "revolute", -1, placement, (0.0, 0.0, 1.0)),), {})
     path = tmp_path_factory.mktemp("urdf") / "one.urdf"
-    path.write_text(mechanism.to_urdf(), encoding="utf-8")
-    assert_equal_mechanisms(mechanism, Mechanism.from_urdf(path, parametric=False))
+    path.write_text(urdf_text(mechanism), encoding="utf-8")
+    assert_equal_mechanisms(mechanism, read_urdf(path, parametric=False))
 
 
 def test_joined_mechanisms_hang_on_a_frame(urdf_folder):
-    carrier = Mechanism.from_urdf(urdf_folder / "double_pendulum.urdf")
-    item = flexible_object().mechanism
+    carrier = read_urdf(urdf_folder / "double_pendulum.urdf")
+    item = y_object().mechanism
     placement = placement_matrix([0.0, 0.1, 0.0], [0.0, 0.3, 0.0])
     both = carrier.joined(item, "tip", placement)
     assert both.joint_names == (*carrier.joint_names, *item.joint_names)
@@ -204,7 +207,7 @@ def test_merged_bodies_weigh_what_they_weigh_together():
 def test_a_point_mass_needs_no_inertia(tmp_path):
     point = '<link name="b"><inertial><mass value="2"/></inertial></link>'
     path = urdf(tmp_path, link("a"), point, joint("j", "a", "b"))
-    body = Mechanism.from_urdf(path).numeric().joints[0].bodies[0]
+    body = read_urdf(path).numeric().joints[0].bodies[0]
     assert float(body.mass) == 2.0
     np.testing.assert_array_equal(numbers(body.about_com), np.zeros((3, 3)))
 
@@ -237,7 +240,7 @@ def test_a_broken_urdf_is_refused(name, tmp_path):
     parts, words = BROKEN[name]
     path = urdf(tmp_path, *parts)
     with pytest.raises(ModelError) as caught:
-        Mechanism.from_urdf(path)
+        read_urdf(path)
     for word in [*words, str(path)]:
         assert word in str(caught.value)
 
@@ -245,15 +248,15 @@ def test_a_broken_urdf_is_refused(name, tmp_path):
 @pytest.mark.parametrize(
     ("action", "words"),
     [
-        (lambda path: Mechanism.from_urdf("nowhere.urdf"), ["'nowhere.urdf'", "package:NAME"]),
-        (lambda path: Mechanism.from_urdf("package:backster"), ["'backster'", "did you mean 'baxter'?"]),
-        (lambda path: Mechanism.from_urdf(path, joints=["swimg"]), ["'swimg'", "did you mean 'swing'?"]),
-        (lambda path: Mechanism.from_urdf(path, locked={"nods": 1.0}), ["'nods'", "did you mean 'nod'?"]),
-        (lambda path: Mechanism.from_urdf(path, joints=["bolt"]), ["movable joint 'bolt'"]),
-        (lambda path: Mechanism.from_urdf(path).joint_index("slider"), ["'slider'", "'slide'", "mixed_joints"]),
-        (lambda path: Mechanism.from_urdf(path).frame("tol"), ["frame 'tol'", "'tool'"]),
-        (lambda path: Mechanism.from_urdf(path).joined(Mechanism.from_urdf(path)), ["two parts", "'bracket'"]),
-        (lambda path: Mechanism.from_urdf(path).joined(floating_clamp("c"), "rotr"), ["'rotr'", "'rotor'"]),
+        (lambda path: read_urdf("nowhere.urdf"), ["'nowhere.urdf'", "package:NAME"]),
+        (lambda path: read_urdf("package:backster"), ["'backster'", "did you mean 'baxter'?"]),
+        (lambda path: read_urdf(path, joints=["swimg"]), ["'swimg'", "did you mean 'swing'?"]),
+        (lambda path: read_urdf(path, locked={"nods": 1.0}), ["'nods'", "did you mean 'nod'?"]),
+        (lambda path: read_urdf(path, joints=["bolt"]), ["movable joint 'bolt'"]),
+        (lambda path: read_urdf(path).joint_index("slider"), ["'slider'", "'slide'", "mixed_joints"]),
+        (lambda path: read_urdf(path).frame("tol"), ["frame 'tol'", "'tool'"]),
+        (lambda path: read_urdf(path).joined(read_urdf(path)), ["two parts", "'bracket'"]),
+        (lambda path: read_urdf(path).joined(floating_clamp("c"), "rotr"), ["'rotr'", "'rotor'"]),
     ],
 )
 def test_errors_name_what_is_wrong_and_what_is_near(urdf_folder, action, words):
@@ -271,18 +274,18 @@ def test_a_tool_that_is_not_mounted_is_left_out(tmp_path):
         joint("grip", "hand", "finger", "prismatic"),
     )
     path = urdf(tmp_path, *parts)
-    bare = Mechanism.from_urdf(path, without=["hand"])
+    bare = read_urdf(path, exclude_links=["hand"])
     assert bare.joint_names == ("turn",)
     assert set(bare.frames) == {"base", "arm"}
     assert float(bare.numeric().joints[0].bodies[0].mass) == 1.0
     with pytest.raises(ModelError, match=r"(?s)no link 'hands' to leave out.*did you mean 'hand'"):
-        Mechanism.from_urdf(path, without=["hands"])
+        read_urdf(path, exclude_links=["hands"])
     with pytest.raises(ModelError, match="joint 'grip' carries a link that is left out"):
-        Mechanism.from_urdf(path, joints=["turn", "grip"], without=["hand"])
+        read_urdf(path, joints=["turn", "grip"], exclude_links=["hand"])
 
 
 def test_a_frame_that_the_file_does_not_have(urdf_folder):
-    robot = Mechanism.from_urdf(urdf_folder / "double_pendulum.urdf", parametric=False)
+    robot = read_urdf(urdf_folder / "double_pendulum.urdf", parametric=False)
     at = transform(np.eye(3), [0.1, 0.2, 0.3])
     more = robot.with_frame("load", "tip", at).with_frame("wall", None, at)
     tip, load = more.frame("tip"), more.frame("load")

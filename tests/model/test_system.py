@@ -10,7 +10,6 @@ from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model import (
     Effect,
     Grasp,
-    Mechanism,
     Parameter,
     Parameters,
     Segment,
@@ -19,8 +18,10 @@ from yid_ocp.model import (
     flexible_object,
     forward_kinematics,
 )
-from yid_ocp.model.mechanism import roll_pitch_yaw
+from yid_ocp.model.rotations import roll_pitch_yaw
 from yid_ocp.model.system import floating_clamp
+from yid_ocp.model.urdf import read_urdf
+from yid_ocp.model.y_object import y_object
 
 
 def numbers(expression) -> np.ndarray:
@@ -29,11 +30,11 @@ def numbers(expression) -> np.ndarray:
 
 @pytest.fixture
 def robot(urdf_folder):
-    return Mechanism.from_urdf(urdf_folder / "mixed_joints.urdf")
+    return read_urdf(urdf_folder / "mixed_joints.urdf")
 
 
 def test_sizes_of_the_paper_systems(single_arm, dual_arm):
-    alone = System.build(objects=[(flexible_object(), None, None)])
+    alone = System.build(objects=[(y_object(), None, None)])
     assert [system.size for system in (alone, single_arm, dual_arm)] == [36, 43, 50]
     assert [system.constraint_count for system in (alone, single_arm, dual_arm)] == [0, 3, 6]
     assert [len(system.driven) for system in (alone, single_arm, dual_arm)] == [0, 7, 14]
@@ -166,8 +167,8 @@ WRONG = {
     "grasp_twice": (lambda robot: System.build(robot, grasps=[Grasp("g", "tool", "nose")] * 2), ["'g'", "grasps"]),
     "point": (lambda robot: System.build(robot, points=["w_T1"]), ["'w_T1'"]),
     "gravity": (lambda robot: System.build(robot, gravity=[9.81]), ["gravity", "three numbers"]),
-    "frame": (lambda robot: System.build(robot, objects=[(flexible_object(), "rotr", None)]), ["'rotr'", "'rotor'"]),
-    "objects": (lambda robot: System.build(objects=[(flexible_object(), None, None)] * 2), ["two parts", "'T1_0_tip'"]),
+    "frame": (lambda robot: System.build(robot, objects=[(y_object(), "rotr", None)]), ["'rotr'", "'rotor'"]),
+    "objects": (lambda robot: System.build(objects=[(y_object(), None, None)] * 2), ["two parts", "'T1_0_tip'"]),
     "segment": (lambda robot: System.build(robot).segment("T1"), ["segment 'T1'"]),
 }
 

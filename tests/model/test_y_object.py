@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 
 from yid_ocp.errors import ConfigError, ModelError, OutputError
 from yid_ocp.model import Segment, flexible_object, forward_kinematics
-from yid_ocp.model.mechanism import roll_pitch_yaw, transform
-from yid_ocp.model.y_object import polyline_rotations, write_y_urdf, y_segments
+from yid_ocp.model.flexible import polyline_rotations
+from yid_ocp.model.rotations import roll_pitch_yaw, transform
+from yid_ocp.model.y_object import write_y_urdf, y_object, y_segments
 
 
 def numbers(expression, parameters=None) -> np.ndarray:
@@ -40,7 +41,7 @@ def stiffness(item, values=None):
 
 
 def test_the_paper_y():
-    item = flexible_object()
+    item = y_object()
     names = item.mechanism.joint_names
     assert len(names) == 36
     assert names[:4] == ("T1_0_x", "T1_0_y", "T1_0_z", "T1_1_x")
@@ -58,14 +59,14 @@ def test_the_paper_y():
 
 
 def test_the_paper_y_stands_where_it_should():
-    item = flexible_object()
+    item = y_object()
     foot, junction, left, right = positions(item, ["object_root", "w_T1", "w_T2", "w_T3"])
     half = math.sqrt(0.5)
     np.testing.assert_allclose(foot, [0.85, 0.0, -0.93])
     np.testing.assert_allclose(junction, foot + np.array([0, 0, 0.813]))
     np.testing.assert_allclose(left, junction + 0.610 * half * np.array([0, 1, 1]), atol=1e-15)
     np.testing.assert_allclose(right, junction + 0.737 * half * np.array([0, -1, 1]), atol=1e-15)
-    moved = flexible_object(foot=transform(np.eye(3), [0.0, 0.0, 1.0]))
+    moved = flexible_object(y_segments(), transform(np.eye(3), [0.0, 0.0, 1.0]))
     np.testing.assert_allclose(positions(moved, ["w_T1"])[0], [0, 0, 1.813])
     assert flexible_object(y_segments()).mechanism.joint_names == item.mechanism.joint_names
 
@@ -154,13 +155,13 @@ def test_a_flat_beam_that_bends_one_way():
 
 
 def test_a_share_of_the_weight_leaves_the_inertia_whole():
-    whole, half = flexible_object(), flexible_object(weight=0.5)
+    whole, half = y_object(), y_object(gravity_fraction=0.5)
     for a, b in zip(whole.mechanism.numeric().joints, half.mechanism.numeric().joints, strict=True):
         for body, light in zip(a.bodies, b.bodies, strict=True):
             assert float(light.mass) == float(body.mass)
             np.testing.assert_array_equal(numbers(light.about_com), numbers(body.about_com))
-            assert body.weight is None
-            assert float(light.weight) == 0.5
+            assert body.gravity_fraction is None
+            assert float(light.gravity_fraction) == 0.5
 
 
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(2, 7))
@@ -248,7 +249,7 @@ def test_negative_stiffness_is_refused():
 
 def test_unknown_segment_has_a_near_name():
     with pytest.raises(ModelError, match="did you mean 'T1'"):
-        flexible_object().segment("T11")
+        y_object().segment("T11")
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@ import pytest
 
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.errors import DataError
-from yid_ocp.problem.baselines import linear_carry, move_with_clamps, positions, prediction_error, stay
+from yid_ocp.problem.validation import linear_carry, move_with_clamps, positions, prediction_error, stay
 
 PARENT = ("p0", "p1", "p2", "p3", "p4")
 NAMES = (*PARENT, "c1", "c2")

@@ -4,27 +4,27 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from yid_ocp.data.edges import edge_lengths, measured
 from yid_ocp.data.recording import PointGroup, Recording, read_recording
 from yid_ocp.errors import DataError, ModelError
-from yid_ocp.integrator.rollout import Statics, simulate
+from yid_ocp.integrator.rollout import simulate
+from yid_ocp.integrator.statics import Statics
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import forward_kinematics
-from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.baselines import linear_carry, positions, prediction_error
-from yid_ocp.problem.cable import (
+from yid_ocp.model.cable import (
     BranchOptions,
     Cable,
     CableOptions,
-    cable_problem_options,
     cable_system,
-    edge_lengths,
     free_parameters,
     length_values,
-    measured,
     read_vertices,
-    vertex_errors,
 )
-from yid_ocp.problem.inputs import Grid, Smoother, prescribed_path
+from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
+from yid_ocp.problem.grid import Grid
+from yid_ocp.problem.inputs import prescribed_path
+from yid_ocp.problem.low_pass import LowPass
+from yid_ocp.problem.validation import linear_carry, point_errors, positions, prediction_error
 from yid_ocp.solvers import GaussNewton, solve
 
 PARENT = tuple(f"p{i}" for i in range(7))
@@ -41,6 +41,24 @@ TRUTH = {"parent.bend": 2.0e-3, "parent.damping": 3e-4, "c.bend": 4.0e-3, "clamp
 def line(at, towards, length):
     direction = np.asarray(towards) / np.linalg.norm(towards, axis=-1, keepdims=True)
     return at, at + length * direction
+
+
+def cable_options(cable, recordings, noise, model_error, path_cutoff=8.0, options=None):
+    """Of each recording what a prediction may use: the clamps throughout, free vertices in the first two frames."""
+    options = options or CableOptions()
+    known = {r.name: length_values(cable, edge_lengths(cable.edges, [r], 2)) for r in recordings}
+    names = [name for name in free_parameters(cable, options) if name.endswith(".rest")]
+    return ProblemOptions(
+        initial_state="fitted_to_points",
+        path_cutoff=path_cutoff,
+        sensors={"points": SensorOptions(std=model_error, points=cable.free)},
+        clamps=cable.clamps,
+        priors=dict.fromkeys(names, 0.2),
+        start_window=PERIOD,
+        start_std=noise,
+        start_parameters=("clamp_start.roll", "clamp_end.roll") if options.end == "weld" else ("clamp_start.roll",),
+        recording_values=known if options.separate_lengths else {},
+    )
 
 
 @pytest.fixture(scope="module")
@@ -72,9 +90,9 @@ def twin(cable, clamps):
     t, held = clamps
     options = CableOptions(default=BranchOptions(bend=1e-3, twist=2e-3, damping=1e-4), separate_lengths=False)
     stub = as_recording(cable, t, held)
-    system = cable_system([as_recording(cable, t, {})], cable, options)
+    system = cable_system(edge_lengths(cable.edges, [as_recording(cable, t, {})]), cable, options)
     step = compile_step(system, PERIOD, "left_damping")
-    path = prescribed_path(stub, system, Grid(0.0, PERIOD, len(t) - 1), Smoother(np.inf), cable.clamps)
+    path = prescribed_path(stub, system, Grid(0.0, PERIOD, len(t) - 1), LowPass(np.inf), cable.clamps)
     theta = system.parameters.vector(TRUTH)
     rest = Statics(step).solve(path[0], theta)
     assert rest.converged, rest.message
@@ -131,27 +149,27 @@ def test_every_row_of_the_axis_constraint_matches_its_derivatives(twin):
 def test_the_values_of_a_twin_are_found_from_its_vertices(cable, twin):
     step, options, recording = twin
     settings = replace(
-        cable_problem_options(cable, [recording], 1e-6, 1e-3, path_cutoff=np.inf, options=options),
+        cable_options(cable, [recording], 1e-6, 1e-3, path_cutoff=np.inf, options=options),
         # the first edge of the twin is not seen bent, so its roll is given here and fitted elsewhere
         start_parameters=(),
         recording_values={recording.name: {"clamp_start.roll": TRUTH["clamp_start.roll"]}},
     )
     free = ("parent.bend", "parent.damping", "c.bend")
     problem = EstimationProblem(step, [recording], free, settings)
-    before = vertex_errors(problem, cable, problem.start)["twin"]
+    before = point_errors(problem, problem.start, cable.free)["twin"]
     solution = solve(problem, GaussNewton())
     # what the points leave open of the start follows the stiffnesses with which it was fitted, so once more
     problem = problem.with_free(free, dict(zip(free, solution.x, strict=True)))
     solution = solve(problem, GaussNewton())
     np.testing.assert_allclose(solution.x, [TRUTH[name] for name in free], rtol=0.08)
-    after = vertex_errors(problem, cable, solution.x)["twin"]
+    after = point_errors(problem, solution.x, cable.free)["twin"]
     assert after < 5e-4
     assert before > 10 * after
 
 
 def test_the_roll_of_a_clamp_is_found_from_two_frames(cable, twin):
     step, options, recording = twin
-    settings = cable_problem_options(cable, [recording], 1e-6, 1e-3, path_cutoff=np.inf, options=options)
+    settings = cable_options(cable, [recording], 1e-6, 1e-3, path_cutoff=np.inf, options=options)
     problem = EstimationProblem(step, [recording], ("parent.bend",), settings, TRUTH | {"clamp_start.roll": -2.0})
     episode = problem.episodes[0]
     fitted = problem.fitted_start(episode, problem.theta)
@@ -167,7 +185,7 @@ def test_held_out_starts_use_no_frame_after_the_second(cable, twin):
     free = [recording.points[0].names.index(v) for v in cable.free]
     seen[2:, free] += 1.0
     other = Recording(points=(replace(recording.points[0], position=seen),), name="other")
-    settings = cable_problem_options(cable, [recording, other], 1e-6, 1e-3, options=options)
+    settings = cable_options(cable, [recording, other], 1e-6, 1e-3, options=options)
     problem = EstimationProblem(step, [recording], ("parent.bend",), settings, None, [other])
     first = problem.run(problem.episodes[0], problem.theta, np.zeros(0), False)
     second = problem.run(problem.held_out[0], problem.theta, np.zeros(0), False)
@@ -178,12 +196,12 @@ def test_edges_are_as_long_as_measured(cable):
     t = PERIOD * np.arange(4)
     seen = {v: np.tile(1.25 * np.asarray(UNDEFORMED[v]), (4, 1)) for v in cable.vertices}
     recording = as_recording(cable, t, seen)
-    lengths = edge_lengths(cable, [recording])
+    lengths = edge_lengths(cable.edges, [recording])
     expected = 1.25 * np.linalg.norm(np.subtract(UNDEFORMED["c2"], UNDEFORMED["c1"]))
     assert lengths["c1", "c2"] == pytest.approx(expected)
-    values = length_values(cable, recording)
+    values = length_values(cable, edge_lengths(cable.edges, [recording], 2))
     assert values["c.length_1"] == pytest.approx(expected)
-    assert set(values) <= set(cable_system([recording], cable).parameters.names)
+    assert set(values) <= set(cable_system(edge_lengths(cable.edges, [recording]), cable).parameters.names)
     np.testing.assert_array_equal(measured(recording, "c1"), seen["c1"])
 
 
@@ -191,7 +209,7 @@ def test_free_parameters_are_parameters(cable):
     options = CableOptions(memory=0.5, rest_angles=True, default=BranchOptions(twist_damping=1e-4))
     recording = as_recording(cable, PERIOD * np.arange(4), {})
     names = free_parameters(cable, options)
-    assert set(names) <= set(cable_system([recording], cable, options).parameters.names)
+    assert set(names) <= set(cable_system(edge_lengths(cable.edges, [recording]), cable, options).parameters.names)
     assert {"parent.memory", "c.twist_damping", "parent_3_y.rest", "c_0_x.rest"} <= set(names)
     assert not any(name.endswith(".mass") for name in names)
 
@@ -232,9 +250,9 @@ def test_a_real_cable_is_predicted_better_than_by_carrying_it_along(repository):
     )
     recording = read_recording(folder / "bdlo1_train_021.h5")
     options = CableOptions(memory=0.75)
-    step = compile_step(cable_system([recording], cable, options), PERIOD, "left_damping")
-    settings = cable_problem_options(cable, [recording], 2e-4, 0.1, options=options)
+    step = compile_step(cable_system(edge_lengths(cable.edges, [recording]), cable, options), PERIOD, "left_damping")
+    settings = cable_options(cable, [recording], 2e-4, 0.1, options=options)
     problem = EstimationProblem(step, [recording], free_parameters(cable, options), settings)
-    error = vertex_errors(problem, cable, problem.start)[recording.name]
+    error = point_errors(problem, problem.start, cable.free)[recording.name]
     carried = linear_carry(recording, cable.free, cable.parent, cable.children, cable.held)
     assert error < 0.5 * prediction_error(carried, positions(recording, cable.free))

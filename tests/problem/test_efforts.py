@@ -10,9 +10,10 @@ import pytest
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.model import Mechanism, System
+from yid_ocp.model import System
+from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.problem.inputs import Smoother
+from yid_ocp.problem.low_pass import LowPass
 from yid_ocp.solvers import GaussNewton, solve
 
 JOINTS = ("shoulder", "elbow")
@@ -25,14 +26,14 @@ TWINS = 60
 @pytest.fixture(scope="module")
 def arm(urdf_folder):
     """arm(effort, cutoff): both joints moved as measured for six seconds at 100 Hz, their efforts measured."""
-    robot = Mechanism.from_urdf(urdf_folder / "double_pendulum.urdf")
+    robot = read_urdf(urdf_folder / "double_pendulum.urdf")
     step = compile_step(System.build(robot, prescribed=JOINTS, damping=0.1), 0.01)
     t = 0.01 * np.arange(601)
     path = np.stack([0.6 * np.sin(2.9 * t), 0.5 * np.sin(3.7 * t + 1)], axis=1)
 
     def build(effort: np.ndarray, cutoff: float) -> EstimationProblem:
         joints = JointGroup(JOINTS, t, path, effort=effort, position_std=0.0, effort_std=NOISE)
-        options = ProblemOptions(path_cutoff=cutoff, tie_break=0.0)
+        options = ProblemOptions(path_cutoff=cutoff, weak_prior_factor=0.0)
         return EstimationProblem(step, [Recording(joints, name="arm")], tuple(TRUTH), options, TRUTH)
 
     return build
@@ -63,6 +64,6 @@ def test_neighbours_that_repeat_each_other_are_left_out(arm):
     plain, smooth = (arm(np.zeros((601, 2)), cutoff).episodes[0].samples[0] for cutoff in (math.inf, CUTOFF))
     np.testing.assert_array_equal(plain.node, np.arange(1, 600))
     np.testing.assert_array_equal(smooth.node + np.rint(smooth.fraction), np.arange(58, 543, 10))
-    assert Smoother(CUTOFF).stride(0.01) == 10
-    assert Smoother(CUTOFF).settling == pytest.approx(0.574, abs=1e-3)
-    assert Smoother(30.0).stride(0.05) == 1
+    assert LowPass(CUTOFF).stride(0.01) == 10
+    assert LowPass(CUTOFF).settling == pytest.approx(0.574, abs=1e-3)
+    assert LowPass(30.0).stride(0.05) == 1

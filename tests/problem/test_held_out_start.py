@@ -9,8 +9,9 @@ import pytest
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.model import Mechanism, System
+from yid_ocp.model import System
 from yid_ocp.model.kinematics import forward_kinematics
+from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.episodes import beginning
 
@@ -19,7 +20,7 @@ TIME_STEP, NOISE = 0.01, 1e-3
 
 @pytest.fixture(scope="module")
 def swinging(urdf_folder):
-    tree = Mechanism.from_urdf(str(urdf_folder / "double_pendulum.urdf"))
+    tree = read_urdf(str(urdf_folder / "double_pendulum.urdf"))
     system = System.build(tree, damping={"shoulder": 0.1, "elbow": 0.1})
     step = compile_step(system, TIME_STEP, use_compiler=False)
     frames = list(system.mechanism.frames)[-2:]

@@ -15,6 +15,8 @@ from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Mechanism, Segment, System, flexible_object
 from yid_ocp.model.kinematics import mass_matrix
 from yid_ocp.model.mechanism import Joint, Placement
+from yid_ocp.model.urdf import read_urdf
+from yid_ocp.model.y_object import y_object
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -39,7 +41,7 @@ def random_state(case, momentum, seed, spread=1.0):
 @pytest.fixture(scope="module")
 def cases(urdf_folder):
     def read(name, **options):
-        return System.build(Mechanism.from_urdf(urdf_folder / f"{name}.urdf"), **options)
+        return System.build(read_urdf(urdf_folder / f"{name}.urdf"), **options)
 
     arm = [f"left_{joint}" for joint in ("s0", "s1", "e0", "e1", "w0", "w1", "w2")]
     cable = flexible_object([Segment("C", 0.6, 0.3, 0.02, links=3, bend=2.0, twist=1.0)])
@@ -47,9 +49,9 @@ def cases(urdf_folder):
         "mixed_joints": case(read("mixed_joints"), 2e-3),
         "turntable": case(read("turntable"), 5e-3),
         "double_pendulum": case(read("double_pendulum"), 2e-3),
-        "arm": case(System.build(Mechanism.from_urdf("package:baxter", joints=arm)), 5e-3),
+        "arm": case(System.build(read_urdf("package:baxter", joints=arm)), 5e-3),
         "cable": case(System.build(objects=[(cable, None, None)]), 1e-3),
-        "foam_y": case(System.build(objects=[(flexible_object(), None, None)]), 1e-3),
+        "foam_y": case(System.build(objects=[(y_object(), None, None)]), 1e-3),
     }
 
 
@@ -58,7 +60,7 @@ def gantry(urdf_folder):
     """All joints of mixed_joints on two free horizontal rails."""
     axes = {"rail_x": (1.0, 0.0, 0.0), "rail_y": (0.0, 1.0, 0.0)}
     rails = [Joint(name, "prismatic", i - 1, Placement.identity(), axis) for i, (name, axis) in enumerate(axes.items())]
-    other = Mechanism.from_urdf(urdf_folder / "mixed_joints.urdf")
+    other = read_urdf(urdf_folder / "mixed_joints.urdf")
     shifted = [replace(joint, parent=joint.parent + 2) for joint in other.joints]
     mechanism = Mechanism("gantry", (*rails, *shifted), {}, other.parameters)
     return case(System.build(mechanism), 2e-3)

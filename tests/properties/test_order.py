@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.model import Mechanism, System, flexible_object
+from yid_ocp.model import System
+from yid_ocp.model.urdf import read_urdf
+from yid_ocp.model.y_object import y_object
 
 # The foam's thin tubes twist too fast (70 000 1/s) for a time step in the range where the order shows: thicker, softer.
 SLOW_OBJECT = {
@@ -55,7 +57,7 @@ class Motion:
 
 
 def mixed_joints(urdf_folder):
-    robot = Mechanism.from_urdf(urdf_folder / "mixed_joints.urdf")
+    robot = read_urdf(urdf_folder / "mixed_joints.urdf")
     system = System.build(robot, driven=["spin", "extend"], damping=0.4)
     n = system.size
     rng = np.random.default_rng(1)
@@ -64,7 +66,7 @@ def mixed_joints(urdf_folder):
 
 def one_arm(urdf_folder):
     names = [f"left_{joint}" for joint in ("s0", "s1", "e0", "e1", "w0", "w1", "w2")]
-    system = System.build(Mechanism.from_urdf("package:baxter", joints=names), driven=names, damping=0.5)
+    system = System.build(read_urdf("package:baxter", joints=names), driven=names, damping=0.5)
     q = np.array([-0.4, -1.1, -0.15, 1.2, -0.1, 1.1, 0.0])
     v = np.array([0.3, -0.5, 0.2, 0.4, -0.6, 0.1, 0.5])
     return Motion(system, q, v, np.array([6.0, 20.0, 5.0, 10.0, 1.0, 2.0, 0.1]), 0.4, (80, 160, 320))
@@ -72,14 +74,14 @@ def one_arm(urdf_folder):
 
 def y_alone(urdf_folder):
     driven = ["T1_3_x", "T2_1_y"]
-    system = System.build(objects=[(flexible_object(), None, None)], driven=driven)
+    system = System.build(objects=[(y_object(), None, None)], driven=driven)
     rng = np.random.default_rng(2)
     q, v = 0.05 * rng.normal(size=system.size), 0.2 * rng.normal(size=system.size)
     return Motion(system, q, v, np.array([0.8, 0.3]), 0.02, (100, 200, 400), SLOW_OBJECT)
 
 
 def double_pendulum(urdf_folder):
-    robot = Mechanism.from_urdf(urdf_folder / "double_pendulum.urdf")
+    robot = read_urdf(urdf_folder / "double_pendulum.urdf")
     system = System.build(robot, driven=["elbow"], damping=0.1)
     return Motion(system, np.array([1.0, -0.5]), np.array([0.5, 2.0]), np.array([0.6]), 1.0, (200, 400, 800))
 

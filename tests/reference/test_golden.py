@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from yid_ocp.integrator import codegen
+from yid_ocp.integrator import compiler
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import forward_kinematics
 from yid_ocp.model.mechanism import merged
@@ -39,7 +39,7 @@ def compare_derivatives(trep, step, theta, k):
 
 def test_sizes(case):
     trep, system, step, _ = case
-    assert step.compiled == (codegen.compiler() is not None)
+    assert step.compiled == (compiler.compiler() is not None)
     assert step.time_step == float(trep.dt)
     assert (system.size, system.constraint_count) == (trep.q.shape[1], trep.lam.shape[1])
 

@@ -8,10 +8,10 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from yid_ocp.model import Mechanism, flexible_object, forward_kinematics
-from yid_ocp.model import mechanism as mechanism_module
+from yid_ocp.model import Mechanism, forward_kinematics, rotations
 from yid_ocp.model.kinematics import mass_matrix, rigid_body, second_derivatives
-from yid_ocp.model.mechanism import robot_description_file
+from yid_ocp.model.urdf import read_urdf, robot_description_file
+from yid_ocp.model.y_object import y_object
 
 pin = pytest.importorskip("pinocchio", reason="the reference needs Pinocchio: pip install pin")
 
@@ -76,7 +76,7 @@ class Twin:
 def twin(request, urdf_folder):
     """Read without rounding nearly exact entries, which Pinocchio does not do either."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mechanism_module, "SNAP", 0.0)
+        patch.setattr(rotations, "SNAP", 0.0)
         return make_twin(urdf_folder, *ROBOTS[request.param])
 
 
@@ -88,14 +88,14 @@ def make_twin(urdf_folder, file, joints, locked):
     else:
         path = urdf_folder / file
     if file is None:
-        mechanism = flexible_object().mechanism.numeric()
+        mechanism = y_object().mechanism.numeric()
     else:
-        mechanism = Mechanism.from_urdf(path, joints=joints, locked=locked).numeric()
+        mechanism = read_urdf(path, joints=joints, locked=locked).numeric()
     full = pin.buildModelFromUrdf(str(path))
     full.gravity.linear = GRAVITY
     if joints is None:
         return Twin(mechanism, full)
-    whole = Twin(Mechanism.from_urdf(path).numeric(), full)
+    whole = Twin(read_urdf(path).numeric(), full)
     values = [locked.get(name, 0.0) for name in whole.mechanism.joint_names]
     out = [i for i in range(1, full.njoints) if full.names[i] not in joints]
     return Twin(mechanism, pin.buildReducedModel(full, out, whole.configuration(values)))
@@ -157,9 +157,9 @@ def test_mass_matrix_gravity_and_inverse_dynamics(twin):
 
 @pytest.mark.parametrize("robot", ["baxter", "ur5"])
 def test_rounding_of_nearly_exact_placements_moves_nothing_visibly(robot, monkeypatch):
-    rounded = Mechanism.from_urdf(f"package:{robot}").numeric()
-    monkeypatch.setattr(mechanism_module, "SNAP", 0.0)
-    exact = Mechanism.from_urdf(f"package:{robot}").numeric()
+    rounded = read_urdf(f"package:{robot}").numeric()
+    monkeypatch.setattr(rotations, "SNAP", 0.0)
+    exact = read_urdf(f"package:{robot}").numeric()
     moved = [
         np.max(np.abs(np.array(ca.DM(a.placement.matrix() - b.placement.matrix()))))
         for a, b in zip(rounded.joints, exact.joints, strict=True)
@@ -169,12 +169,12 @@ def test_rounding_of_nearly_exact_placements_moves_nothing_visibly(robot, monkey
 
 def test_generated_object_has_the_frames_of_its_urdf(urdf_folder):
     model = pin.buildModelFromUrdf(str(urdf_folder / "y_object.urdf"))
-    assert all(model.existFrame(name) for name in flexible_object().mechanism.frames)
+    assert all(model.existFrame(name) for name in y_object().mechanism.frames)
 
 
 @pytest.mark.parametrize("file", ["mixed_joints.urdf", "turntable.urdf"])
 def test_second_derivatives_against_automatic_differentiation(urdf_folder, file):
-    mechanism = Mechanism.from_urdf(urdf_folder / file).numeric()
+    mechanism = read_urdf(urdf_folder / file).numeric()
     n = len(mechanism.joints)
     q, v = ca.SX.sym("q", n), ca.SX.sym("v", n)
     rigid = rigid_body(forward_kinematics(mechanism, q), v, ca.SX(ca.DM(GRAVITY)))

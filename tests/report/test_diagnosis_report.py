@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.config import load_problem
 from yid_ocp.data import JointGroup, Recording, write_recording
 from yid_ocp.diagnosis import Thresholds, diagnose
 from yid_ocp.report import figures
 from yid_ocp.report.figures import Change, Curve, Ranked, Row
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import Findings
+from yid_ocp.workflow.build import load_problem
 from yid_ocp.workflow.diagnose import predictions
 
 CHAPTERS = ("gap", "where", "which", "alike", "curves", "absorbed")
@@ -46,7 +46,7 @@ def found(tmp_path_factory, urdf_folder):
             for episode in problem_episodes:
                 theta = nominal.theta
                 swept = nominal.run(episode, theta, np.zeros(0), derivatives=False)
-                effort = np.vstack([swept.sweep.effort, swept.sweep.effort[-1:]])[:151]
+                effort = np.vstack([swept.rollout.effort, swept.rollout.effort[-1:]])[:151]
                 joints = recordings[episode.name].joints
                 effort = effort + rub * np.sign(np.gradient(joints.position, axis=0)) * [0, 1]
                 effort = effort + 0.02 * rng.standard_normal(effort.shape)

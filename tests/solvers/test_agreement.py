@@ -147,7 +147,7 @@ def test_bounds_are_respected(one_arm, recording, make_problem):
 
 
 def test_open_loop_needs_multiple_shooting(make_problem):
-    """Without feedback the arm leaves the measured motion, and one rollout over the recording means nothing."""
+    """Without feedback the arm leaves the measured motion, and one sweep over the recording means nothing."""
     problem = make_problem(free=("T1.bend", "T2.bend"), feedback="none", duration=1.0)
     single = GaussNewton(iterations=15).run(problem, problem.start, None)
     nodes = MultipleShooting(node_interval=10).run(problem, problem.start, None)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from yid_ocp.solvers.formulation import Transcription
+from yid_ocp.solvers.transcription import Transcription
 
 
 @pytest.mark.parametrize("weighting", ["whitened", "paper"])
 def test_gradients_of_the_cost_agree(make_problem, weighting):
-    problem = make_problem(duration=1.0, weighting=weighting, robust_scale=2.0 if weighting == "whitened" else np.inf)
+    problem = make_problem(
+        duration=1.0, weighting=weighting, huber_threshold=2.0 if weighting == "whitened" else np.inf
+    )
     x = problem.start * np.array([5.0, 4.0, 3.0, 2.0, 3.0, 2.0])
     now = problem.evaluate(x)
     forward = now.jacobian.T @ now.residual

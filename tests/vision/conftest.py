@@ -1,4 +1,4 @@
-"""A virtual film of one arm moving the foam Y, its joints' recording, its tracks, and a small film from disk."""
+"""Virtual frames of one arm moving the foam Y, its joints' recording, its tracks, and a few frames from disk."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 from yid_ocp.data.recording import JointGroup, Recording, read_recording
 from yid_ocp.errors import DataError
-from yid_ocp.vision import DepthCamera, Shutter, TrackOptions, film, look_at, read_film, track
+from yid_ocp.vision import DepthCamera, FrameTiming, TrackOptions, look_at, read_frames, track, virtual_frames
 from yid_ocp.vision.fit import ShapeFit
 from yid_ocp.vision.frames import open3d_module
 
@@ -56,7 +56,7 @@ def shape(system):
 def run(system):
     """Three seconds in MuJoCo."""
     pytest.importorskip("mujoco", reason="virtual films need MuJoCo")
-    from yid_ocp.data.synthetic import Motion, initial_posture, simulate_in_mujoco
+    from yid_ocp.virtual.experiment import Motion, initial_posture, simulate_in_mujoco
 
     posture = initial_posture(system, TRUTH)
     motion = Motion.multisine(system, TRUTH, seed=1, posture=posture, travel=0.15)
@@ -73,12 +73,12 @@ def recording(system, run):
 
 @pytest.fixture(scope="session")
 def tracked(system, run, recording, shape):
-    """tracked(options, **camera and shutter): a film, its track and the errors of all points in the good frames [m]."""
+    """tracked(options, **camera and timing): frames, their track, the errors of all points in the good ones [m]."""
 
-    def make(options=None, outliers=0.0, seed=0, frames=None, stages=(), **shutter):
-        when = Shutter(**{"rate": 4.0, "latency": LATENCY, **shutter})
-        made = film(system, run.t, run.q, POSE, camera=DepthCamera(outliers=outliers), shutter=when, seed=seed)
-        seen = made.film if frames is None else made.film.select(frames)
+    def make(options=None, outliers=0.0, seed=0, frames=None, stages=(), **timing):
+        when = FrameTiming(**{"rate": 4.0, "latency": LATENCY, **timing})
+        made = virtual_frames(system, run.t, run.q, POSE, camera=DepthCamera(outliers=outliers), timing=when, seed=seed)
+        seen = made.sequence if frames is None else made.sequence.select(frames)
         chosen = replace(options or TrackOptions(), points=system.points)
         found = track(system, recording, seen, urdf="package:baxter", options=chosen, stages=stages)
         were = np.array([shape.place(made.course(t)) for t in found.t])
@@ -99,8 +99,8 @@ def small(system):
     truth = json.loads((DATA / "truth.json").read_text())
     assert tuple(truth["points"]) == system.points
     return SimpleNamespace(
-        film=read_film(DATA / "frames"),
+        sequence=read_frames(DATA / "frames"),
         recording=read_recording(DATA / "joints.h5"),
         truth=np.array(truth["position"]),
-        clouds=[read_film(DATA / "frames").load(i) for i in range(3)],
+        clouds=[read_frames(DATA / "frames").load(i) for i in range(3)],
     )

@@ -1,4 +1,4 @@
-"""Make the small film in tests/vision/data: three clouds of the foam Y in one arm's hand, and the joints' recording.
+"""Make the few frames in tests/vision/data: three clouds of the foam Y in one arm's hand, and the joints' recording.
 
 PYTHONPATH=. python tests/vision/make_data.py
 """
@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from yid_ocp.data.recording import JointGroup, Recording, write_recording
-from yid_ocp.data.synthetic import Motion, initial_posture, paper_system, simulate_in_mujoco
-from yid_ocp.vision import Film, FilterOptions, Shutter, film, look_at, write_film
+from yid_ocp.virtual.experiment import Motion, initial_posture, paper_system, simulate_in_mujoco
+from yid_ocp.vision import FilterOptions, FrameSequence, FrameTiming, look_at, virtual_frames, write_frames
 from yid_ocp.vision.filters import ObjectRegion, voxel_grid, without_outliers, without_robot
 from yid_ocp.vision.fit import ShapeFit
 from yid_ocp.vision.meshes import Surfaces, numeric_mechanism, robot_meshes
@@ -26,18 +26,20 @@ def main() -> None:
     posture = initial_posture(system)
     motion = Motion.multisine(system, seed=1, posture=posture, travel=0.15)
     run = simulate_in_mujoco(system, None, motion, posture=posture, duration=1.5, time_step=2.5e-4)
-    made = film(system, run.t, run.q, look_at([2.6, 0.0, 0.45], [0.85, 0.0, -0.1]), shutter=Shutter(rate=2.7), seed=5)
+    made = virtual_frames(
+        system, run.t, run.q, look_at([2.6, 0.0, 0.45], [0.85, 0.0, -0.1]), timing=FrameTiming(rate=2.7), seed=5
+    )
     tree = numeric_mechanism(system)
     robot = Surfaces(tree, robot_meshes("package:baxter", tree))
     region = ObjectRegion(system, FilterOptions())
-    pose, clouds = made.film.pose, []
+    pose, clouds = made.sequence.pose, []
     for i, q in enumerate(made.q):
-        points = made.film.world(i)
+        points = made.sequence.world(i)
         cloud = voxel_grid(points[region.at(q, pose[:3, 3]).contains(points)], VOXEL)
         cloud = cloud.keep(without_outliers(cloud, 12, 4.0))
         cloud = cloud.keep(without_robot(cloud, robot, q, 0.03))
         clouds.append((cloud.points - pose[:3, 3]) @ pose[:3, :3])
-    write_film(Film.of(made.taken, clouds, pose), FOLDER / "frames")
+    write_frames(FrameSequence.of(made.taken, clouds, pose), FOLDER / "frames")
     names = system.driven
     every = slice(None, None, 2)
     joints = JointGroup(names, run.t[every], np.round(run.q[every, : len(names)], 6), position_std=2e-4)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.errors import ConfigError, DataError
-from yid_ocp.vision import DepthCamera, Room, Shutter, film, look_at
+from yid_ocp.vision import Background, DepthCamera, FrameTiming, look_at, virtual_frames
 
 SHAPE = (480, 640)
 
@@ -64,31 +64,31 @@ def test_outliers_are_as_many_as_asked_for():
 
 def test_the_shutter():
     rng = np.random.default_rng(0)
-    when = Shutter(rate=10.0, spread=0.25, dropped=1 / 3, latency=0.05, latency_std=0.002, late=0.1, late_by=0.2)
+    when = FrameTiming(rate=10.0, spread=0.25, dropped=1 / 3, latency=0.05, latency_std=0.002, late=0.1, late_by=0.2)
     taken, stamps = when.times(0.0, 300.0, rng)
     assert len(taken) == pytest.approx(2000, rel=0.05)
     delay = stamps - taken - 0.05
     assert (delay > 0.15).mean() == pytest.approx(0.1, abs=0.03)
     assert np.std(delay[delay < 0.1]) == pytest.approx(0.002, rel=0.1)
     with pytest.raises(ConfigError, match="rate"):
-        Shutter(rate=0.0).times(0.0, 1.0, rng)
+        FrameTiming(rate=0.0).times(0.0, 1.0, rng)
 
 
 def test_a_film_is_the_same_every_time(system, run):
     pose = look_at([2.6, 0.0, 0.45], [0.85, 0.0, -0.1])
-    options = {"urdf": None, "room": Room(None, None), "shutter": Shutter(rate=2.0)}
-    one, two = (film(system, run.t, run.q, pose, seed=seed, **options) for seed in (3, 4))
-    first = one.film.load(1)
-    one.film.load(0)
-    assert np.array_equal(first, one.film.load(1))
+    options = {"urdf": None, "background": Background(None, None), "timing": FrameTiming(rate=2.0)}
+    one, two = (virtual_frames(system, run.t, run.q, pose, seed=seed, **options) for seed in (3, 4))
+    first = one.sequence.load(1)
+    one.sequence.load(0)
+    assert np.array_equal(first, one.sequence.load(1))
     assert not np.array_equal(one.taken[:3], two.taken[:3])
-    assert len(one.depth) == len(one.film)
+    assert len(one.depth) == len(one.sequence)
     # the object's surface is where the points are
     from yid_ocp.vision.meshes import Surfaces, numeric_mechanism, tube_meshes
 
     tubes = Surfaces(numeric_mechanism(system), tube_meshes(system))
-    away = tubes.distance(one.film.world(1), one.q[1], 0.2)
+    away = tubes.distance(one.sequence.world(1), one.q[1], 0.2)
     assert np.median(away) < 0.006
     assert len(away) > 5000
     with pytest.raises(DataError, match="pose of the camera is missing"):
-        film(system, run.t, run.q, None, **options)
+        virtual_frames(system, run.t, run.q, None, **options)

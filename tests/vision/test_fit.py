@@ -7,7 +7,8 @@ import pytest
 
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.model.system import System
-from yid_ocp.model.y_object import flexible_object
+from yid_ocp.model.urdf import read_urdf
+from yid_ocp.model.y_object import y_object
 from yid_ocp.vision import FitOptions, ShapeFit
 from yid_ocp.vision.fit import NODE_FACTOR, Sight, _Task
 
@@ -18,7 +19,7 @@ NODES = 4  # of every link
 @pytest.fixture(scope="module")
 def alone():
     """The Y without a robot."""
-    return System.build(objects=[(flexible_object(), None, None)])
+    return System.build(objects=[(y_object(), None, None)])
 
 
 def bent(system, seed, size=0.12):
@@ -175,10 +176,9 @@ def test_derivatives_agree_with_differences(system, shape, run):
 
 
 def test_what_cannot_be_fitted_is_said(alone, urdf_folder):
-    from yid_ocp.model import Mechanism
 
     with pytest.raises(DataError, match="no object"):
-        ShapeFit(System.build(Mechanism.from_urdf(urdf_folder / "double_pendulum.urdf", parametric=False)))
+        ShapeFit(System.build(read_urdf(urdf_folder / "double_pendulum.urdf", parametric=False)))
     nothing = np.empty((0, 3))
     sight = Sight(nothing, np.empty(0), np.empty(0, dtype=np.int64), nothing, CAMERA)
     with pytest.raises(DataError, match="no point"):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.errors import DataError, OutputError
-from yid_ocp.vision import XTION, Film, Pinhole, look_at, read_film, write_film
+from yid_ocp.vision import XTION, FrameSequence, Pinhole, look_at, read_frames, write_frames
 
 CLOUD = np.array([[0.1, -0.2, 2.0], [0.0, 0.3, 1.5], [-0.4, 0.1, 2.25]])
 POSE = look_at([2.0, 0.5, 0.3], [0.0, 0.0, 0.0])
@@ -16,8 +16,8 @@ POSE = look_at([2.0, 0.5, 0.3], [0.0, 0.0, 0.0])
 
 @pytest.fixture
 def folder(tmp_path):
-    write_film(Film.of([0.5, 0.9], [CLOUD, CLOUD[:2]], POSE), tmp_path / "film")
-    return tmp_path / "film"
+    write_frames(FrameSequence.of([0.5, 0.9], [CLOUD, CLOUD[:2]], POSE), tmp_path / "sequence")
+    return tmp_path / "sequence"
 
 
 def changed(folder, **entries):
@@ -49,12 +49,12 @@ def test_look_at_puts_the_target_ahead():
 
 
 def test_a_film_survives_the_disk(folder):
-    film = read_film(folder)
-    assert np.array_equal(film.t, [0.5, 0.9])
-    assert np.allclose(film.pose, POSE)
-    assert np.allclose(film.load(0), CLOUD, atol=1e-6)
-    assert np.allclose(film.world(1), CLOUD[:2] @ POSE[:3, :3].T + POSE[:3, 3], atol=1e-6)
-    assert film.select([1]).names == ("000001.ply",)
+    sequence = read_frames(folder)
+    assert np.array_equal(sequence.t, [0.5, 0.9])
+    assert np.allclose(sequence.pose, POSE)
+    assert np.allclose(sequence.load(0), CLOUD, atol=1e-6)
+    assert np.allclose(sequence.world(1), CLOUD[:2] @ POSE[:3, :3].T + POSE[:3, 3], atol=1e-6)
+    assert sequence.select([1]).names == ("000001.ply",)
 
 
 @pytest.mark.parametrize("ending", [".pcd", ".ply"])
@@ -62,31 +62,31 @@ def test_both_formats_of_clouds(open3d, folder, ending):
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(CLOUD))
     open3d.io.write_point_cloud(str(folder / f"other{ending}"), cloud)
     (folder / "timestamps.csv").write_text(f"file,t\nother{ending},3.5\n")
-    assert np.allclose(read_film(folder).load(0), CLOUD, atol=1e-6)
+    assert np.allclose(read_frames(folder).load(0), CLOUD, atol=1e-6)
 
 
 def test_units_and_frames_of_clouds(folder):
     changed(folder, unit="mm")
-    assert np.allclose(read_film(folder).load(0), 1e-3 * CLOUD)
-    assert np.allclose(read_film(folder, unit="m").load(0), CLOUD, atol=1e-6)
+    assert np.allclose(read_frames(folder).load(0), 1e-3 * CLOUD)
+    assert np.allclose(read_frames(folder, unit="m").load(0), CLOUD, atol=1e-6)
     changed(folder, unit="m", frame="world")
-    assert np.allclose(read_film(folder).world(0), CLOUD, atol=1e-6)
+    assert np.allclose(read_frames(folder).world(0), CLOUD, atol=1e-6)
 
 
 def test_depth_images(tmp_path):
     camera = Pinhole(8, 6, 10.0, 10.0, 3.5, 2.5)
     depth = np.linspace(1.0, 2.0, 48).reshape(6, 8)
     depth[0, :3] = np.nan
-    film = Film(np.array([0.1]), ("a",), POSE, lambda i: camera.cloud(depth), camera)
-    write_film(film, tmp_path / "film", depth=[depth])
-    again = read_film(tmp_path / "film")
+    sequence = FrameSequence(np.array([0.1]), ("a",), POSE, lambda i: camera.cloud(depth), camera)
+    write_frames(sequence, tmp_path / "sequence", depth=[depth])
+    again = read_frames(tmp_path / "sequence")
     assert again.intrinsics == camera
-    assert np.allclose(again.load(0), film.load(0), atol=1e-3)
-    changed(tmp_path / "film", intrinsics=None)
+    assert np.allclose(again.load(0), sequence.load(0), atol=1e-3)
+    changed(tmp_path / "sequence", intrinsics=None)
     with pytest.raises(DataError, match="intrinsics are missing"):
-        read_film(tmp_path / "film")
+        read_frames(tmp_path / "sequence")
     with pytest.raises(OutputError, match="intrinsics"):
-        write_film(Film.of([0.1], [CLOUD], POSE), tmp_path / "other", depth=[depth])
+        write_frames(FrameSequence.of([0.1], [CLOUD], POSE), tmp_path / "other", depth=[depth])
 
 
 @pytest.mark.parametrize(
@@ -107,7 +107,7 @@ def test_depth_images(tmp_path):
 def test_what_is_wrong_with_the_camera_is_said(folder, entries, message):
     changed(folder, **entries)
     with pytest.raises(DataError, match=message) as caught:
-        read_film(folder)
+        read_frames(folder)
     assert "camera.json" in caught.value.where
 
 
@@ -128,18 +128,18 @@ def test_what_is_wrong_with_the_stamps_is_said(folder, rows, message):
         with path.open("w", newline="") as file:
             csv.writer(file).writerows(rows)
     with pytest.raises(DataError, match=message):
-        read_film(folder)
+        read_frames(folder)
 
 
 def test_broken_files_fail_when_loaded(folder, capfd):
     (folder / "000000.ply").write_bytes(b"ply\nformat nonsense")
     (folder / "000001.ply").unlink()
-    film = read_film(folder)
+    sequence = read_frames(folder)
     with pytest.raises(DataError, match="empty or cannot be read"):
-        film.load(0)
+        sequence.load(0)
     with pytest.raises(DataError, match="missing"):
-        film.load(1)
+        sequence.load(1)
     assert "ply" not in capfd.readouterr().out.lower()
     shutil.rmtree(folder)
     with pytest.raises(DataError, match="no such folder"):
-        read_film(folder)
+        read_frames(folder)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from yid_ocp.errors import DataError, ModelError
-from yid_ocp.model import Mechanism
 from yid_ocp.model.system import System
+from yid_ocp.model.urdf import read_urdf
 from yid_ocp.vision import Pinhole, look_at
 from yid_ocp.vision.meshes import Mesh, Surfaces, mesh_file, numeric_mechanism, robot_meshes, tube_meshes
 
@@ -13,7 +13,7 @@ from yid_ocp.vision.meshes import Mesh, Surfaces, mesh_file, numeric_mechanism, 
 @pytest.fixture(scope="module")
 def ball(urdf_folder):
     """A ball of 0.1 m on the second joint's frame of a double pendulum, and a box in the world."""
-    tree = Mechanism.from_urdf(urdf_folder / "double_pendulum.urdf", parametric=False)
+    tree = read_urdf(urdf_folder / "double_pendulum.urdf", parametric=False)
     placed = np.eye(4)
     placed[:3, 3] = [0.0, 5.0, 0.0]
     return Surfaces(tree, {1: Mesh.sphere(0.1), -1: Mesh.box([1.0, 1.0, 1.0]).moved(placed)})
@@ -86,7 +86,7 @@ def test_tubes_have_their_lengths_and_radii(system):
 
 
 def test_what_cannot_be_seen_is_said(tmp_path, urdf_folder):
-    tree = Mechanism.from_urdf(urdf_folder / "double_pendulum.urdf", parametric=False)
+    tree = read_urdf(urdf_folder / "double_pendulum.urdf", parametric=False)
     with pytest.raises(DataError, match="no object"):
         tube_meshes(System.build(tree))
     with pytest.raises(ModelError, match="no URDF file"):

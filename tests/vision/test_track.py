@@ -8,7 +8,7 @@ from matplotlib.image import imread
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, read_recording, write_recording
 from yid_ocp.errors import ConfigError, DataError, ModelError
-from yid_ocp.vision import ClockOptions, Film, FilterOptions, TrackOptions, track
+from yid_ocp.vision import ClockOptions, FilterOptions, FrameSequence, TrackOptions, track
 from yid_ocp.vision.pictures import STAGES, draw_stages, draw_track
 
 MILLIMETRE = 1e-3
@@ -41,7 +41,7 @@ def test_errors_are_within_the_stated_deviations(clean, system):
 
 
 def test_the_seed_hardly_matters(tracked, clean):
-    """The same film, other random points in the walk: within the noise."""
+    """The same frame sequence, other random points in the walk: within the noise."""
     frames = [2, 6]
     clock = ClockOptions(offset=clean.track.clock.offset, search=0.0)
     runs = [tracked(TrackOptions(seed=seed, clock=clock), frames=frames).track.position for seed in (1, 2)]
@@ -70,7 +70,7 @@ def test_the_clocks_offset_is_found(clean):
 
 def test_late_stamps_are_dropped(tracked):
     made = tracked(late=0.25, seed=3)
-    late = set(np.flatnonzero(made.made.film.t - made.made.taken - made.latency > 0.1).tolist())
+    late = set(np.flatnonzero(made.made.sequence.t - made.made.taken - made.latency > 0.1).tolist())
     dropped = {frame.index for frame in made.track.frames if not frame.good}
     assert len(late) == 2
     assert dropped == late
@@ -79,10 +79,10 @@ def test_late_stamps_are_dropped(tracked):
 
 
 def test_a_displaced_camera_is_noticed(system, recording, clean):
-    film = clean.made.film.select([1, 4, 6, 8, 9])
-    pose = film.pose.copy()
+    sequence = clean.made.sequence.select([1, 4, 6, 8, 9])
+    pose = sequence.pose.copy()
     pose[:3, 3] += [0.01, -0.012, 0.006]
-    found = track(system, recording, replace(film, pose=pose), urdf="package:baxter")
+    found = track(system, recording, replace(sequence, pose=pose), urdf="package:baxter")
     assert found.clock.shift == pytest.approx([-0.01, 0.012, -0.006], abs=0.006)
     assert "the camera sees the arm" in found.clock.message
     # and the points' deviations say so
@@ -93,8 +93,10 @@ def test_a_displaced_camera_is_noticed(system, recording, clean):
 def test_without_motion_the_offset_is_as_given(system, clean, small):
     joints = small.recording.joints
     still = replace(joints, position=np.tile(joints.position[:1], (len(joints.t), 1)))
-    film = clean.made.film.select([0, 1, 2])
-    found = track(system, Recording(still), film, urdf="package:baxter", options=TrackOptions(d_max=0.05, worse=10.0))
+    sequence = clean.made.sequence.select([0, 1, 2])
+    found = track(
+        system, Recording(still), sequence, urdf="package:baxter", options=TrackOptions(d_max=0.05, worse=10.0)
+    )
     assert not found.clock.estimated
     assert found.clock.offset == 0.0
     assert "as given: the arm hardly moves" in found.clock.message
@@ -116,16 +118,16 @@ def test_a_recording_that_solve_reads(tmp_path, clean, recording, system):
     assert np.array_equal(group.t, clean.track.t)
     assert np.array_equal(group.position, clean.track.position)
     assert (group.std >= TrackOptions().std_floor).all()
-    assert np.allclose(group.pose, clean.made.film.pose)
+    assert np.allclose(group.pose, clean.made.sequence.pose)
     assert again.description.startswith("Before.")
     assert "clock offset" in again.description
 
 
 def test_the_points_are_those_that_no_arm_holds(system, small):
-    found = track(system, small.recording, small.film)
+    found = track(system, small.recording, small.sequence)
     assert found.names == ("w_T1", "w_T3")
     with pytest.raises(ConfigError, match="no point 'w_T9'"):
-        track(system, small.recording, small.film, options=TrackOptions(points=("w_T9",)))
+        track(system, small.recording, small.sequence, options=TrackOptions(points=("w_T9",)))
 
 
 def test_the_spline_passes_through_the_good_frames(clean, system):
@@ -152,14 +154,14 @@ def test_pictures_of_every_stage(clean, tmp_path):
 
 def test_progress_is_told(system, small):
     told = []
-    track(system, small.recording, small.film, progress=lambda done, total, text: told.append((done, total, text)))
+    track(system, small.recording, small.sequence, progress=lambda done, total, text: told.append((done, total, text)))
     assert [done for done, _, _ in told] == sorted(done for done, _, _ in told)
     assert told[-1] == (6, 6, "done")
     assert told[0][2] == "reading 000000.ply"
 
 
 def test_a_small_film_from_disk(system, small):
-    found = track(system, small.recording, small.film, options=TrackOptions(points=system.points))
+    found = track(system, small.recording, small.sequence, options=TrackOptions(points=system.points))
     errors = np.linalg.norm(found.position - small.truth, axis=2)
     assert errors.max() < 8 * MILLIMETRE
     assert [frame.raw for frame in found.frames] == [len(cloud) for cloud in small.clouds]
@@ -169,9 +171,9 @@ def test_a_small_film_from_disk(system, small):
 
 
 def spoilt(small, **changes):
-    """The small film with some clouds or stamps replaced."""
+    """The small frame sequence with some clouds or stamps replaced."""
     clouds = [changes.get(f"cloud{i}", cloud) for i, cloud in enumerate(small.clouds)]
-    return Film.of(changes.get("t", small.film.t), clouds, small.film.pose)
+    return FrameSequence.of(changes.get("t", small.sequence.t), clouds, small.sequence.pose)
 
 
 @pytest.mark.parametrize(
@@ -219,29 +221,31 @@ def test_nothing_but_bad_clouds_is_an_error(system, small, cloud, message):
 def test_all_points_filtered(system, small):
     options = TrackOptions(filters=FilterOptions(lower=(0.0, 0.0, 5.0)))
     with pytest.raises(DataError, match="no point lies where the object can be"):
-        track(system, small.recording, small.film, options=options)
+        track(system, small.recording, small.sequence, options=options)
 
 
 def test_stamps_out_of_order_twice_or_none_at_all(system, small):
-    t = small.film.t
+    t = small.sequence.t
     clouds = [*small.clouds, small.clouds[0], small.clouds[0]]
-    film = Film.of([t[2], t[0], t[1], t[0], np.nan], [clouds[2], *clouds[:2], *clouds[3:]], small.film.pose)
-    found = track(system, small.recording, film)
+    sequence = FrameSequence.of(
+        [t[2], t[0], t[1], t[0], np.nan], [clouds[2], *clouds[:2], *clouds[3:]], small.sequence.pose
+    )
+    found = track(system, small.recording, sequence)
     assert np.array_equal(found.t, t)
     assert [frame.index for frame in found.frames] == [1, 3, 2, 0, 4]
     assert "a duplicate" in found.frames[1].reason
     assert "not a number" in found.frames[4].reason
-    straight = track(system, small.recording, small.film)
+    straight = track(system, small.recording, small.sequence)
     assert np.abs(found.position - straight.position).max() < 2 * MILLIMETRE
 
 
 def test_the_time_of_another_clock(system, small):
     with pytest.raises(DataError, match="their clocks are not the same") as caught:
-        track(system, small.recording, spoilt(small, t=small.film.t + 1.7e9))
+        track(system, small.recording, spoilt(small, t=small.sequence.t + 1.7e9))
     assert "give the clock offset" in caught.value.hint
     options = TrackOptions(clock=ClockOptions(offset=1.7e9))
-    assert len(track(system, small.recording, spoilt(small, t=small.film.t + 1.7e9), options=options).t) == 3
-    late = track(system, small.recording, spoilt(small, t=[*small.film.t[:2], 99.0]))
+    assert len(track(system, small.recording, spoilt(small, t=small.sequence.t + 1.7e9), options=options).t) == 3
+    late = track(system, small.recording, spoilt(small, t=[*small.sequence.t[:2], 99.0]))
     assert late.frames[2].reason == "there are no joint angles at its time"
 
 
@@ -251,28 +255,28 @@ def test_a_file_that_cannot_be_read(system, small):
             raise DataError("the cloud is empty or cannot be read")
         return small.clouds[index]
 
-    found = track(system, small.recording, replace(small.film, load=load))
+    found = track(system, small.recording, replace(small.sequence, load=load))
     assert found.frames[1].reason == "the cloud is empty or cannot be read"
 
 
 def test_a_recording_that_does_not_fit(system, small, urdf_folder):
     joints = small.recording.joints
     with pytest.raises(DataError, match="no joint angles"):
-        track(system, Recording(points=(PointGroup("points", ("a",), [0.0], np.zeros((1, 1, 3))),)), small.film)
+        track(system, Recording(points=(PointGroup("points", ("a",), [0.0], np.zeros((1, 1, 3))),)), small.sequence)
     names = ("left_s9", *joints.names[1:])
     with pytest.raises(DataError, match="joint 'left_s0' of the model is not recorded"):
-        track(system, Recording(JointGroup(names, joints.t, joints.position)), small.film)
+        track(system, Recording(JointGroup(names, joints.t, joints.position)), small.sequence)
     with pytest.raises(ModelError, match="no visual meshes"):
-        track(system, small.recording, small.film, urdf=urdf_folder / "double_pendulum.urdf")
+        track(system, small.recording, small.sequence, urdf=urdf_folder / "double_pendulum.urdf")
     with pytest.raises(DataError, match="pose of the camera is missing"):
-        Film.of([0.0], [small.clouds[0]], None)
+        FrameSequence.of([0.0], [small.clouds[0]], None)
     with pytest.raises(ConfigError, match="d_max = 0"):
         TrackOptions(d_max=0.0)
 
 
 @pytest.mark.slow
 def test_solve_finds_the_truth_from_tracked_points(tracked, system, run, truth):
-    """From the film to the stiffnesses: the identifiable ones within what is stated."""
+    """From the frame sequence to the stiffnesses: the identifiable ones within what is stated."""
     import yid_ocp as yid
 
     rng = np.random.default_rng(1)

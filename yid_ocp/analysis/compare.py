@@ -94,7 +94,7 @@ def compare(
 ) -> Comparison:
     """Run several methods from the same start and say whether they agree.
 
-    Steepest descent gets the paper's cost (points in metres, no noise levels, no tie-break), the others the problem's.
+    Steepest descent gets the paper's cost (points in metres, no noise levels, no weak prior), the others the problem's.
 
     Parameters
     ----------

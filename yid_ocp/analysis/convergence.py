@@ -12,7 +12,7 @@ import scipy.optimize
 from numpy.typing import NDArray
 
 from yid_ocp.integrator.discrete import ForceSplit
-from yid_ocp.integrator.rollout import Rest, Statics
+from yid_ocp.integrator.statics import Rest, Statics
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System

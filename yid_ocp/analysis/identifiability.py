@@ -235,9 +235,11 @@ def _judged(
     correlations = np.full((len(names), len(names)), np.nan)
     block = covariance[np.ix_(chosen, chosen)] / np.outer(deviation, deviation)
     correlations[np.ix_(known, known)] = block[np.ix_(known, known)]
-    seer = _Seer(wide, x, evaluation, names, chosen, split, scale, inflation)
+    sensor_rows = _SensorRows(wide, x, evaluation, names, chosen, split, scale, inflation)
     nuisances = tuple(name for name in wide.names if name not in names)
-    return Identifiability(parameters, names, correlations, information, seer.directions(), nuisances, chi2, profiles)
+    return Identifiability(
+        parameters, names, correlations, information, sensor_rows.directions(), nuisances, chi2, profiles
+    )
 
 
 def lowered(said: str, interval: tuple[float | None, float | None] | None) -> str:
@@ -294,7 +296,7 @@ def with_nuisances(
     options = problem.options
     initial, known = options.initial_state, dict(options.known_start)
     values = {name: dict(entry) for name, entry in options.recording_values.items()}
-    if initial == "given":
+    if initial == "fitted_to_points":
         # the fit's start stays where it is, and becomes the centre of a prior where it is unknown
         for i, episode in enumerate(problem.episodes):
             theta, _ = problem.split(x, i)
@@ -358,7 +360,7 @@ class SplitRows:
 def split_rows(problem: EstimationProblem, evaluation: Evaluation, chosen: Sequence[int]) -> SplitRows:
     """Sensitivities of chosen unknowns, those of all others eliminated together with their priors."""
     assert evaluation.jacobian is not None
-    total = len(evaluation.residual) - problem.tie_break_rows
+    total = len(evaluation.residual) - problem.weak_prior_rows
     data = total - problem.stated_prior_rows
     noise = problem.paper_noise if problem.options.weighting == "paper" else 1.0
     jacobian = np.vstack([evaluation.jacobian[:data] / noise, evaluation.jacobian[data:total]])
@@ -379,7 +381,7 @@ def without(columns: Array, explained: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class _Seer:
+class _SensorRows:
     """Turns sensitivities into directions with words."""
 
     problem: EstimationProblem

@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.analysis.identifiability import StartKnowledge, carried, with_nuisances
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
-from yid_ocp.data.synthetic import Motion, initial_posture, simulate_in_mujoco
 from yid_ocp.errors import DataError, SolverError, YidError
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model.kinematics import forward_kinematics
@@ -21,7 +20,9 @@ from yid_ocp.model.mechanism import Frame, Placement
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem, SensorOptions
 from yid_ocp.problem.episodes import Episode
-from yid_ocp.problem.inputs import Grid, camera_pose
+from yid_ocp.problem.grid import Grid
+from yid_ocp.problem.inputs import camera_pose
+from yid_ocp.virtual.experiment import Motion, initial_posture, simulate_in_mujoco
 
 Array = NDArray[np.float64]
 
@@ -255,7 +256,7 @@ MECHANICS: Mapping[str, str] = {
 }
 
 
-class Workshop:
+class LayoutBuilder:
     """Builds layouts, each once.
 
     Parameters
@@ -313,7 +314,12 @@ class Workshop:
         if "torque" in mechanics:
             sensors = {"joints.effort": self._torque_options()}
         options = replace(
-            wide.options, sensors=sensors, robust_scale=math.inf, tie_break=0.0, weighting="whitened", duration=None
+            wide.options,
+            sensors=sensors,
+            huber_threshold=math.inf,
+            weak_prior_factor=0.0,
+            weighting="whitened",
+            duration=None,
         )
         dense = [self._dense(entry, i, seen, "torque" in mechanics) for i, entry in enumerate(recordings)]
         values = {name: v for name, v in setting.values.items() if name in step.system.parameters}

@@ -66,7 +66,7 @@ def profile_likelihood(
     """Interval of one unknown from  min over all others of chi2(x) - chi2(best) = level.
 
     Each value is reached from the last one, the others first moved along the tangent and then by Gauss-Newton.
-    Unknowns that are positive by nature move in their logarithm. The tie-break does not count.
+    Unknowns that are positive by nature move in their logarithm. The weak prior does not count.
 
     Parameters
     ----------
@@ -292,18 +292,18 @@ class _Walk:
         return _Point(float(x[self.index]), s.copy(), chi2, rows, jacobian)
 
     def _parts(self, evaluation: Evaluation) -> tuple[int, int]:
-        total = len(evaluation.residual) - self.problem.tie_break_rows
+        total = len(evaluation.residual) - self.problem.weak_prior_rows
         return total - self.problem.stated_prior_rows, total
 
     def _chi2(self, evaluation: Evaluation) -> float:
-        """Twice the cost without the tie-break, in units of the noise."""
+        """Twice the cost without the weak prior, in units of the noise."""
         data, total = self._parts(evaluation)
         priors, tied = evaluation.residual[data:total], evaluation.residual[total:]
         stated = float(priors @ priors)
         return (2.0 * evaluation.cost - float(tied @ tied) - stated) / self.noise**2 + stated
 
     def _rows(self, evaluation: Evaluation, s: Array) -> tuple[Array, Array]:
-        """Residual and Jacobian by the coordinates, with the anchors in place of the tie-break."""
+        """Residual and Jacobian by the coordinates, with the anchors in place of the weak prior."""
         assert evaluation.jacobian is not None
         data, total = self._parts(evaluation)
         slope = np.where(self.positive, self.unknowns(s), 1.0)

@@ -17,9 +17,9 @@ from yid_ocp.analysis.layouts import (
     MECHANICS,
     TORQUE_STD,
     Layout,
+    LayoutBuilder,
     Setting,
     View,
-    Workshop,
     regular_times,
     sights,
 )
@@ -176,12 +176,12 @@ def what_if(
     fit = None if solution is None else identifiability(problem, x, start=start, grasp_std=grasp_std)
     inflation = 1.0 if fit is None else max(1.0, fit.chi2_per_dof)
     setting = Setting(problem, x, start, grasp_std, second_arm, torque_std, seed)
-    judge = _Judge(setting, Workshop(setting, tell), inflation)
+    judge = _Judge(setting, LayoutBuilder(setting, tell), inflation)
     base = judge(())
     if not base.verdicts:
         raise SolverError(base.message)
     wanted = None if only is None else set(only)
-    known = possible_changes(setting, judge.workshop)
+    known = possible_changes(setting, judge.builder)
     changes = [change for change in known if wanted is None or change.name in wanted]
     singles = ranked([judge((change,)) for change in changes])
     greedy = _greedy(judge, changes, base, largest)
@@ -199,13 +199,13 @@ def what_if(
     return WhatIf(base, tuple(singles), tuple(ranked(smallest)), tuple(greedy), judge.count)
 
 
-def possible_changes(setting: Setting, workshop: Workshop) -> list[Change]:
+def possible_changes(setting: Setting, builder: LayoutBuilder) -> list[Change]:
     """All single changes that make sense for an experiment."""
     episode = setting.problem.episodes[0]
     camera, arm = setting.camera(episode)[0], setting.arm(episode)[0]
     looked = {view.frame for view in setting.views(episode) if camera is not None and view.group == camera.name}
     felt = {view.frame for view in setting.views(episode) if arm is not None and view.group == arm.name}
-    changes = [Change(name, MECHANICS[name], name) for name in workshop.possible()]
+    changes = [Change(name, MECHANICS[name], name) for name in builder.possible()]
     system = setting.problem.system
     for sight in sights(system):
         if sight.name not in looked | felt:
@@ -236,7 +236,7 @@ class _Judge:
     """Judges sets of changes, each once."""
 
     setting: Setting
-    workshop: Workshop
+    builder: LayoutBuilder
     inflation: float
     count: int = 0
 
@@ -253,7 +253,7 @@ class _Judge:
     def _judged(self, changes: Sequence[Change]) -> Outcome:
         names = tuple(change.name for change in changes)
         words = "; ".join(change.words for change in changes) if changes else "as it is"
-        layout = self.workshop.layout(frozenset(change.mechanics for change in changes if change.mechanics))
+        layout = self.builder.layout(frozenset(change.mechanics for change in changes if change.mechanics))
         if isinstance(layout, str):
             return Outcome(names, words, {}, {}, 0, -math.inf, layout)
         views = [self._views(episode, changes, layout) for episode in self.setting.problem.episodes]

@@ -416,7 +416,10 @@ def new_file(path: Path) -> Iterator[Path]:
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except (OSError, RuntimeError) as error:
-        what, hint = f"the file cannot be written ({_reason(error)})", "choose a writable folder on a disk with room"
+        what, hint = (
+            f"the file cannot be written ({_reason(error)})",
+            "choose a writable folder on a disk with room",
+        )
         raise OutputError(what, where=str(path), hint=hint) from error
     finally:
         with contextlib.suppress(OSError):

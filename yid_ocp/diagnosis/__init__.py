@@ -1,16 +1,16 @@
 """Diagnosis of the sim-to-real gap: is there one, where, which unmodelled effect makes it, how far it closes."""
 
 from yid_ocp.diagnosis.diagnose import diagnose as diagnose
-from yid_ocp.diagnosis.hypotheses import Composed as Composed
+from yid_ocp.diagnosis.hypotheses import CandidateProblem as CandidateProblem
 from yid_ocp.diagnosis.hypotheses import residual_series as residual_series
 from yid_ocp.diagnosis.localise import Place as Place
 from yid_ocp.diagnosis.localise import localise as localise
 from yid_ocp.diagnosis.null_test import NullTest as NullTest
 from yid_ocp.diagnosis.null_test import null_test as null_test
-from yid_ocp.diagnosis.score import confusability as confusability
-from yid_ocp.diagnosis.score import linearise as linearise
-from yid_ocp.diagnosis.score import scores as scores
-from yid_ocp.diagnosis.score import visibility as visibility
+from yid_ocp.diagnosis.screening import confusability as confusability
+from yid_ocp.diagnosis.screening import linearise as linearise
+from yid_ocp.diagnosis.screening import scores as scores
+from yid_ocp.diagnosis.screening import visibility as visibility
 from yid_ocp.diagnosis.select import Refitted as Refitted
 from yid_ocp.diagnosis.select import closure as closure
 from yid_ocp.diagnosis.select import refit as refit

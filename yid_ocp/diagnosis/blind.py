@@ -19,11 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.data.recording import Recording
-from yid_ocp.data.synthetic import Motion
-from yid_ocp.data.withheld import KINDS, OUTSIDE, Withheld, withheld_experiment
 from yid_ocp.diagnosis.diagnose import diagnose, nominal_fit
-from yid_ocp.diagnosis.hypotheses import Choice, Composed, chosen_effects
-from yid_ocp.diagnosis.score import DETECTION, Linearisation, linearise
+from yid_ocp.diagnosis.hypotheses import CandidateProblem, Choice, chosen_effects
+from yid_ocp.diagnosis.screening import DETECTION, Linearisation, linearise
 from yid_ocp.diagnosis.select import closure, refit
 from yid_ocp.diagnosis.verdict import Finding, Thresholds
 from yid_ocp.effects import EFFECTS
@@ -31,6 +29,8 @@ from yid_ocp.effects.base import Quantity, segment_springs
 from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
+from yid_ocp.virtual.experiment import Motion
+from yid_ocp.virtual.injected import KINDS, OUTSIDE, InjectedEffect, injected_experiment
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
@@ -55,7 +55,7 @@ class Label:
     case : str
     category : str
         null, single, pair, outside, left_out or finer_chain.
-    withheld : tuple of Withheld
+    withheld : tuple of InjectedEffect
     multiple : float, optional
         Of the detectable size, as made; None where that has no meaning.
     truth : dict of str to float
@@ -64,7 +64,7 @@ class Label:
 
     case: str
     category: str
-    withheld: tuple[Withheld, ...]
+    withheld: tuple[InjectedEffect, ...]
     multiple: float | None
     truth: Mapping[str, float]
 
@@ -75,7 +75,7 @@ class Label:
     @staticmethod
     def from_dict(data: Mapping[str, Any]) -> Label:
         """From JSON."""
-        withheld = tuple(Withheld(**entry) for entry in data["withheld"])
+        withheld = tuple(InjectedEffect(**entry) for entry in data["withheld"])
         return Label(data["case"], data["category"], withheld, data["multiple"], data["truth"])
 
 
@@ -180,7 +180,7 @@ class Ensemble:
     def record(
         self,
         truth: Mapping[str, float],
-        withheld: Sequence[Withheld],
+        withheld: Sequence[InjectedEffect],
         rng: np.random.Generator,
         name: str,
         links: int = 1,
@@ -193,7 +193,7 @@ class Ensemble:
         motion = Motion.multisine(
             self.problem.system, truth, seed=int(rng.integers(2**31)), posture=self.posture, travel=TRAVEL
         )
-        made = withheld_experiment(
+        made = injected_experiment(
             system,
             truth if links == 1 else finer_values(self.problem.system, system, truth),
             withheld,
@@ -211,7 +211,7 @@ class Ensemble:
             clean = self.record(self.truth(rng), (), rng, "clean")
             problem = self.of(clean)
             effects = chosen_effects(problem.system, [clean], self._candidates)
-            composed = Composed.of(problem, effects, [self.record(self.truth(rng), (), rng, "other")])
+            composed = CandidateProblem.of(problem, effects, [self.record(self.truth(rng), (), rng, "other")])
             self._point = linearise(composed, (), nominal_fit(problem, composed).values)
         return self._point
 
@@ -256,12 +256,12 @@ class Ensemble:
         category = [*SHARES, "finer_chain"][place]
         return "single" if category == "finer_chain" and self._finer is None else category
 
-    def _other_kind(self, withheld: Sequence[Withheld], rng: np.random.Generator) -> tuple[str, ...]:
+    def _other_kind(self, withheld: Sequence[InjectedEffect], rng: np.random.Generator) -> tuple[str, ...]:
         at_work = {effect.kind for effect in withheld}
         kinds = sorted({s.effect.kind for s in self.point().signatures} - at_work)
         return (str(rng.choice(kinds)),) if len(kinds) > 1 else ()
 
-    def _withheld(self, category: str, rng: np.random.Generator) -> tuple[tuple[Withheld, ...], float | None]:
+    def _withheld(self, category: str, rng: np.random.Generator) -> tuple[tuple[InjectedEffect, ...], float | None]:
         if category in ("null", "finer_chain"):
             return (), None
         if category == "outside":
@@ -273,14 +273,14 @@ class Ensemble:
         effect, multiple = self._inside(rng, size)
         return (effect,), multiple
 
-    def _inside(self, rng: np.random.Generator, wanted: float) -> tuple[Withheld, float]:
+    def _inside(self, rng: np.random.Generator, wanted: float) -> tuple[InjectedEffect, float]:
         """An effect of the library at so many times its detectable size, or as near as its range lets it come."""
         groups: dict[str, dict[str, list[int]]] = {}
         for i, signature in enumerate(self.point().signatures):
             if signature.effect.kind in KINDS:
                 places = groups.setdefault(signature.effect.kind, {})
                 places.setdefault(signature.effect.location, []).append(i)
-        best: tuple[Withheld, float] | None = None
+        best: tuple[InjectedEffect, float] | None = None
         for _ in range(40):
             kind = str(rng.choice(sorted(groups)))
             place = str(rng.choice(sorted(groups[kind])))
@@ -299,7 +299,7 @@ class Ensemble:
             reach = np.min(np.where(way > 0, high, low)[way != 0] / way[way != 0])
             factor = min(factor, float(reach))
             values = dict(zip(effect.amplitudes, neutral + factor * way, strict=True)) | signature.shape
-            made = Withheld(kind, place, {n: r.value for n, r in effect.reported(values).items()})
+            made = InjectedEffect(kind, place, {n: r.value for n, r in effect.reported(values).items()})
             multiple = factor * seen / DETECTION
             if multiple > 0.9 * wanted:
                 return made, wanted
@@ -308,12 +308,12 @@ class Ensemble:
         assert best is not None
         return best
 
-    def _outside(self, rng: np.random.Generator) -> Withheld:
+    def _outside(self, rng: np.random.Generator) -> InjectedEffect:
         system = self.problem.system
         kind = str(rng.choice(OUTSIDE if system.segments else OUTSIDE[:1]))
         if kind == "torque_ripple":
             joint = str(rng.choice(system.driven[: max(len(system.driven) // 2, 1)]))
-            return Withheld(kind, joint, {"size": float(rng.uniform(0.5, 2.0))})
+            return InjectedEffect(kind, joint, {"size": float(rng.uniform(0.5, 2.0))})
         segment = str(rng.choice([s.name for s in system.segments]))
         start = dict(zip(system.parameters.names, self.problem.theta, strict=True))
         springs = [s for s in segment_springs(system, segment) if s.kind == "bend"]
@@ -323,7 +323,7 @@ class Ensemble:
             "quadratic_stiffness": stiffness * rng.uniform(2.0, 5.0),
             "gusts": rng.uniform(0.05, 0.15),
         }
-        return Withheld(kind, segment, {"size": float(sizes[kind])})
+        return InjectedEffect(kind, segment, {"size": float(sizes[kind])})
 
 
 def finer_values(nominal: System, finer: System, truth: Mapping[str, float]) -> dict[str, float]:
@@ -374,7 +374,7 @@ def best_closure(ensemble: Ensemble, case: Case, label: Label, candidates: Choic
     """Held-out closure of the true effects, refitted: the most that a diagnosis could reach."""
     problem = ensemble.of(case.estimate)
     effects = chosen_effects(problem.system, [case.estimate], candidates)
-    composed = Composed.of(problem, effects, [case.held_out])
+    composed = CandidateProblem.of(problem, effects, [case.held_out])
     nominal = nominal_fit(problem, composed)
     true = {entry.label: entry for entry in label.withheld}
     chosen = [effect for effect in effects if effect.label in true]

@@ -11,30 +11,14 @@ import threadpoolctl
 from numpy.typing import NDArray
 
 from yid_ocp.data.recording import Recording
-from yid_ocp.diagnosis.hypotheses import Choice, Composed, Series, chosen_effects, describe, residual_series
+from yid_ocp.diagnosis.hypotheses import CandidateProblem, Choice, Series, chosen_effects, describe, residual_series
 from yid_ocp.diagnosis.localise import attributed, localise, merged
 from yid_ocp.diagnosis.null_test import NullTest, noise_floor, null_test
-from yid_ocp.diagnosis.score import (
-    Confusability,
-    Score,
-    Visibility,
-    confusability,
-    linearise,
-    visibility,
-)
-from yid_ocp.diagnosis.score import scores as score_all
+from yid_ocp.diagnosis.screening import Confusability, Score, Visibility, confusability, linearise, visibility
+from yid_ocp.diagnosis.screening import scores as score_all
 from yid_ocp.diagnosis.select import Closure, Fit, Store, closure, gain, recalled, refit, refit_all, within_reach
 from yid_ocp.diagnosis.smoother import Smoothed, smooth
-from yid_ocp.diagnosis.verdict import (
-    Absorbed,
-    Added,
-    Finding,
-    Thresholds,
-    decide,
-    has_gap,
-    next_experiment,
-    shapeless,
-)
+from yid_ocp.diagnosis.verdict import Absorbed, Added, Finding, Thresholds, decide, has_gap, next_experiment, shapeless
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import DataError, SolverError
 from yid_ocp.problem import EstimationProblem
@@ -112,7 +96,7 @@ def _diagnosed(
         )
     effects = chosen_effects(problem.system, [episode.recording for episode in problem.episodes], candidates)
     say(f"composing {len(effects)} candidates into one step")
-    composed = Composed.of(problem, effects, held_out)
+    composed = CandidateProblem.of(problem, effects, held_out)
     clock.lap("compose")
     say("fitting the nominal model")
     nominal = nominal_fit(problem, composed, solution, store)
@@ -195,7 +179,7 @@ class _Clock:
 
 
 def nominal_fit(
-    problem: EstimationProblem, composed: Composed, solution: Solution | None = None, store: Store | None = None
+    problem: EstimationProblem, composed: CandidateProblem, solution: Solution | None = None, store: Store | None = None
 ) -> Fit:
     """The nominal model fitted and placed among the hypotheses.
 
@@ -227,7 +211,7 @@ def largest_angles(fit: Fit) -> dict[str, float]:
     found = {}
     for segment in system.segments:
         index = [system.mechanism.joint_index(joint) for link in segment.links for joint in link]
-        found[segment.name] = max(float(np.abs(r.sweep.state[:, index]).max()) for r in fit.evaluation.episodes)
+        found[segment.name] = max(float(np.abs(r.rollout.state[:, index]).max()) for r in fit.evaluation.episodes)
     return found
 
 
@@ -256,7 +240,7 @@ def held_out_test(fit: Fit, level: float) -> NullTest:
     return null_test(_held_series(problem), np.concatenate(residuals), 0, level)
 
 
-def _held_series(problem: Composed) -> tuple[Series, ...]:
+def _held_series(problem: CandidateProblem) -> tuple[Series, ...]:
     swapped = problem.freeing(())
     swapped.episodes = problem.held_out
     return residual_series(swapped)
@@ -276,7 +260,7 @@ def shortlist(
 
 
 def compose(
-    composed: Composed,
+    composed: CandidateProblem,
     nominal: Fit,
     ranked: Sequence[Score],
     alike: Confusability,
@@ -327,7 +311,7 @@ def compose(
 
 
 def _pruned(
-    composed: Composed, nominal: Fit, added: tuple[Added, ...], say: Progress, store: Store | None = None
+    composed: CandidateProblem, nominal: Fit, added: tuple[Added, ...], say: Progress, store: Store | None = None
 ) -> tuple[Added, ...]:
     """Leave out effects without which held-out recordings are predicted as well."""
     kept = list(added)
@@ -348,7 +332,9 @@ def _pruned(
     return tuple(kept)
 
 
-def _again(composed: Composed, nominal: Fit, rest: Sequence[Added], last: Fit, store: Store | None) -> list[Added]:
+def _again(
+    composed: CandidateProblem, nominal: Fit, rest: Sequence[Added], last: Fit, store: Store | None
+) -> list[Added]:
     """Effects that were kept when another was left out, each with the fit of all up to it."""
     found = []
     for i, entry in enumerate(rest):

@@ -14,15 +14,16 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.effects import EFFECTS, EffectBase, candidates, make_effect
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.integrator.codegen import Mapped
-from yid_ocp.integrator.rollout import Rest, Statics
+from yid_ocp.integrator.statics import Rest, Statics
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.initial import FittedStart
-from yid_ocp.problem.inputs import Smoother, sensors_present
+from yid_ocp.problem.corrections import InputCorrections
+from yid_ocp.problem.inputs import sensors_present
+from yid_ocp.problem.low_pass import LowPass
+from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.problem import Episode
-from yid_ocp.problem.readings import Readings
-from yid_ocp.problem.residuals import Samples
+from yid_ocp.problem.start import FittedStart
 from yid_ocp.sensors import EffortSensor, Sensor
 
 Array = NDArray[np.float64]
@@ -142,7 +143,7 @@ class _SlicedStatics(Statics):
         return replace(rest, by_theta=rest.by_theta[:, [self._names.index(name) for name in names]])
 
 
-class _SlicedReadings(Readings):
+class _SlicedReadings(InputCorrections):
     def __init__(self, system: System, use_compiler: bool, names: tuple[str, ...]) -> None:
         super().__init__(system, use_compiler)
         self._names = names
@@ -167,7 +168,7 @@ class _SlicedReadings(Readings):
         return None if found is None else self._chosen_columns(found, names)
 
 
-class Composed(EstimationProblem):
+class CandidateProblem(EstimationProblem):
     """The estimation problem of a system with all candidates, of which any part can be freed at no cost.
 
     Sensors, statics and readings are differentiated by everything once and sliced, recordings are placed on the nodes
@@ -189,7 +190,9 @@ class Composed(EstimationProblem):
     _everything: tuple[str, ...]
 
     @staticmethod
-    def of(problem: EstimationProblem, effects: Sequence[EffectBase], held_out: Sequence[Recording] = ()) -> Composed:
+    def of(
+        problem: EstimationProblem, effects: Sequence[EffectBase], held_out: Sequence[Recording] = ()
+    ) -> CandidateProblem:
         """Compose the candidates with a problem's system, all neutral.
 
         Raises
@@ -204,7 +207,7 @@ class Composed(EstimationProblem):
         held = [*held_out] if held_out else [episode.recording for episode in problem.held_out]
         _check_apart(estimate, held)
         values = dict(zip(problem.system.parameters.names, map(float, problem.theta), strict=True))
-        made = Composed(joint, estimate, problem.free, problem.options, values, held)
+        made = CandidateProblem(joint, estimate, problem.free, problem.options, values, held)
         made.effects, made.nominal, made.blocks = tuple(effects), tuple(problem.free), not held
         everything = (*problem.free, *(name for effect in effects for name in effect.parameters.names))
         made._everything = everything
@@ -233,7 +236,7 @@ class Composed(EstimationProblem):
         full = super().sensor(sensor, self._everything)
         return _SlicedMap(full, [self._everything.index(name) for name in wanted])
 
-    def freeing(self, effects: Sequence[EffectBase], names: Sequence[str] | None = None) -> Composed:
+    def freeing(self, effects: Sequence[EffectBase], names: Sequence[str] | None = None) -> CandidateProblem:
         """The problem with the parameters of some effects free beside the nominal ones.
 
         Parameters
@@ -252,7 +255,7 @@ class Composed(EstimationProblem):
             made.__dict__.pop(cached, None)
         return made
 
-    def at(self, values: Mapping[str, float]) -> Composed:
+    def at(self, values: Mapping[str, float]) -> CandidateProblem:
         """The problem with other values of parameters that are not free."""
         made = copy.copy(self)
         made.theta = self.theta.copy()
@@ -307,7 +310,7 @@ def _masked(episode: Episode, parity: int) -> Episode:
     return replace(episode, samples=tuple(samples))
 
 
-def sample_times(episode: Episode, samples: Samples) -> Array:
+def sample_times(episode: Episode, samples: Measurements) -> Array:
     """Times of samples since the start of their recording, shape (M,) [s]."""
     return np.asarray((samples.node + samples.fraction) * episode.grid.time_step)
 
@@ -332,11 +335,11 @@ def residual_series(problem: EstimationProblem) -> tuple[Series, ...]:
     return tuple(series)
 
 
-def noise_colour(problem: EstimationProblem, episode: Episode, samples: Samples) -> Array:
+def noise_colour(problem: EstimationProblem, episode: Episode, samples: Measurements) -> Array:
     """Autocorrelation of a sensor's noise at lags 0, 1, ... samples: white, but for efforts, which are smoothed."""
     if not isinstance(samples.sensor, EffortSensor):
         return np.ones(1)
-    stride = Smoother(problem.options.path_cutoff).stride(episode.grid.time_step)
+    stride = LowPass(problem.options.path_cutoff).stride(episode.grid.time_step)
     return smoothed_colour(problem.options.path_cutoff, episode.grid.time_step)[::stride]
 
 
@@ -348,7 +351,7 @@ def smoothed_colour(cutoff: float, step: float) -> Array:
     impulse = np.zeros((2 * half + 1, 1))
     impulse[half] = 1.0
     times = step * np.arange(2 * half + 1, dtype=float)
-    response = Smoother(cutoff)(times, impulse)[:, 0]
+    response = LowPass(cutoff)(times, impulse)[:, 0]
     full = np.correlate(response, response, "full")[2 * half :]
     return np.asarray(full[:half] / full[0])
 

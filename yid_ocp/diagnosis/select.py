@@ -16,8 +16,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.diagnosis.hypotheses import Composed, describe, residual_series, sample_times
-from yid_ocp.diagnosis.score import robust
+from yid_ocp.diagnosis.hypotheses import CandidateProblem, describe, residual_series, sample_times
+from yid_ocp.diagnosis.screening import robust
 from yid_ocp.effects import EffectBase, Reported
 from yid_ocp.problem.problem import Evaluation
 from yid_ocp.solvers import GaussNewton
@@ -71,7 +71,7 @@ class Fit:
     Attributes
     ----------
     effects : tuple of EffectBase
-    problem : Composed
+    problem : CandidateProblem
     values : dict of str to float
         Unknowns.
     std : dict of str to float
@@ -87,7 +87,7 @@ class Fit:
     """
 
     effects: tuple[EffectBase, ...]
-    problem: Composed
+    problem: CandidateProblem
     values: dict[str, float]
     std: dict[str, float]
     cost: float
@@ -144,7 +144,7 @@ class Closure:
 
 
 def refit(
-    problem: Composed,
+    problem: CandidateProblem,
     effects: Sequence[EffectBase],
     start: Mapping[str, float],
     store: Store | None = None,
@@ -154,7 +154,7 @@ def refit(
 
     Parameters
     ----------
-    problem : Composed
+    problem : CandidateProblem
     effects : sequence of EffectBase
     start : mapping of str to float
         Where unknowns begin; a start that cannot be rolled out is drawn back towards neutral effects.
@@ -195,7 +195,9 @@ def refit(
     return Fit(tuple(effects), own, values, std, finish.cost, finish, loss, outcome.message)
 
 
-def _half_done(own: Composed, effects: Sequence[EffectBase], start: Mapping[str, float], finish: Evaluation) -> bool:
+def _half_done(
+    own: CandidateProblem, effects: Sequence[EffectBase], start: Mapping[str, float], finish: Evaluation
+) -> bool:
     """Whether a refit explains much of what the model without the effects leaves, but by far not all."""
     count = len(finish.residual)
     neutral = {name: value for effect in effects for name, value in effect.neutral.items()}
@@ -206,7 +208,7 @@ def _half_done(own: Composed, effects: Sequence[EffectBase], start: Mapping[str,
 
 
 def _attempt(
-    own: Composed, effects: Sequence[EffectBase], start: Mapping[str, float]
+    own: CandidateProblem, effects: Sequence[EffectBase], start: Mapping[str, float]
 ) -> tuple[Outcome, Evaluation] | None:
     """One run from one start and the evaluation at its end; None where the model cannot be rolled out."""
     neutral = {name: value for effect in effects for name, value in effect.neutral.items()}
@@ -223,7 +225,9 @@ def _attempt(
     return (outcome, finish) if finish.ok else None
 
 
-def recalled(problem: Composed, effects: Sequence[EffectBase], store: Store | None, name: str = "") -> Fit | None:
+def recalled(
+    problem: CandidateProblem, effects: Sequence[EffectBase], store: Store | None, name: str = ""
+) -> Fit | None:
     """A refit that a store knows, evaluated once; None where it knows none."""
     known = None if store is None else store.get(name or describe(effects))
     own = problem.freeing(effects)
@@ -237,7 +241,7 @@ def recalled(problem: Composed, effects: Sequence[EffectBase], store: Store | No
     return Fit(tuple(effects), own, known.values, known.std, finish.cost, finish, loss, known.message, True)
 
 
-def deviations(problem: Composed, finish: Evaluation) -> Array:
+def deviations(problem: CandidateProblem, finish: Evaluation) -> Array:
     """Standard deviation of every unknown, shape (nx,): the larger of two.
 
     The first scales (J'J)^-1 by chi2 per degree of freedom; the second is the sandwich (J'J)^-1 S (J'J)^-1 with the
@@ -247,7 +251,7 @@ def deviations(problem: Composed, finish: Evaluation) -> Array:
     plain = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     if finish.jacobian is None or not plain.size:
         return plain
-    rows = len(finish.residual) - problem.tie_break_rows
+    rows = len(finish.residual) - problem.weak_prior_rows
     scale = problem.scales
     jacobian = finish.jacobian[:rows] * scale
     inverse = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-10, hermitian=True)
@@ -256,7 +260,7 @@ def deviations(problem: Composed, finish: Evaluation) -> Array:
 
 
 def refit_all(
-    problem: Composed,
+    problem: CandidateProblem,
     base: Sequence[EffectBase],
     tried: Sequence[tuple[EffectBase, Mapping[str, float]]],
     values: Mapping[str, float],
@@ -277,13 +281,13 @@ def refit_all(
         return [fit for fit in pool.map(one, tried) if fit is not None]
 
 
-def block_length(problem: Composed) -> float:
+def block_length(problem: CandidateProblem) -> float:
     """Length of the blocks of held-out time [s]: some forty of them, between half a second and two seconds long."""
     total = sum(episode.grid.steps * episode.grid.time_step for episode in problem.held_out)
     return float(np.clip(total / 40, 0.5, 2.0))
 
 
-def held_out_loss(problem: Composed, x: Array) -> Loss:
+def held_out_loss(problem: CandidateProblem, x: Array) -> Loss:
     """Predict the held-out recordings; initial states are found in the same way for every model."""
     length = block_length(problem)
     squares: list[Array] = []

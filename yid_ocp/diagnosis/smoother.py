@@ -30,11 +30,11 @@ import threadpoolctl
 from numpy.typing import NDArray
 
 from yid_ocp.effects.base import grasp_names, robot_joints
-from yid_ocp.integrator.sweep import Sweep
+from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import apparent_inertia
+from yid_ocp.problem.measurements import huber
 from yid_ocp.problem.problem import Episode, Evaluation
-from yid_ocp.problem.residuals import huber
 from yid_ocp.sensors import EffortSensor, Sensor
 
 Array = NDArray[np.float64]
@@ -190,7 +190,7 @@ class Smoothed:
     before, after : float
         r'r, after the free parameters' refit, without and with the unknowns.
     degrees_before, degrees_after : float
-        Samples less what the parameters, and the unknowns, take of the noise.
+        Measurements less what the parameters, and the unknowns, take of the noise.
     evidence : dict of str to float
         Log evidence of unknown forces and offsets alone ("plant"), of biases alone ("sensor"), of both, above that of
         neither ("none" is 0).
@@ -251,7 +251,7 @@ def linear_model(problem: EstimationProblem, x: Array, evaluation: Evaluation) -
         rows = slice(row, row + count)
         observed = -np.column_stack([evaluation.residual[rows], evaluation.jacobian[rows] * scale])
         row += count
-        found.append(_Builder(problem, episode, theta, result.sweep, result.predicted).build(observed))
+        found.append(_Builder(problem, episode, theta, result.rollout, result.predicted).build(observed))
     # stated priors of the free parameters are observations that no unknown reaches
     first, *later = found[0].intervals
     first = replace(first, rest=first.rest + prior.T @ prior)
@@ -266,10 +266,16 @@ class _Builder:
         problem: EstimationProblem,
         episode: Episode,
         theta: Array,
-        sweep: Sweep,
+        rollout: Rollout,
         predicted: Sequence[Array],
     ) -> None:
-        self.problem, self.episode, self.theta, self.sweep, self.predicted = problem, episode, theta, sweep, predicted
+        self.problem, self.episode, self.theta, self.rollout, self.predicted = (
+            problem,
+            episode,
+            theta,
+            rollout,
+            predicted,
+        )
         self.step, self.system = problem.step, problem.system
         sizes = self.step.sizes
         self.n, self.nz, self.m, self.nx = sizes["n"], sizes["nz"], sizes["m"], sizes["nx"]
@@ -341,16 +347,16 @@ class _Builder:
 
     def _loads(self) -> Array:
         """Typical load of every coordinate: of its spring, its motor or its prescription, shape (n,) [N m or N]."""
-        system, sweep = self.system, self.sweep
+        system, rollout = self.system, self.rollout
         load = np.zeros(self.n)
-        q = sweep.state[:, : self.n]
+        q = rollout.state[:, : self.n]
         springs = [(system.mechanism.joint_index(s.joint), s) for s in system.elastic]
         if springs:
             symbols = ca.vertcat(*(ca.vertcat(s.stiffness, s.rest) for _, s in springs))
             values = np.array(ca.Function("springs", [system.parameters.symbols], [symbols])(self.theta)).ravel()
             for (index, _), stiffness, rest in zip(springs, values[::2], values[1::2], strict=True):
                 load[index] = stiffness * float(np.sqrt(np.mean((q[:, index] - rest) ** 2)))
-        for indices, force in ((system.driven_indices, sweep.torque), (system.prescribed_indices, sweep.effort)):
+        for indices, force in ((system.driven_indices, rollout.torque), (system.prescribed_indices, rollout.effort)):
             if len(indices):
                 load[list(indices)] = np.sqrt(np.mean(force**2, axis=0))
         return load
@@ -367,7 +373,7 @@ class _Builder:
         for j in range(len(self.edges) - 1):
             first, last = int(self.edges[j]), int(self.edges[j + 1])
             a, e, by_effort = self._steps(first, last)
-            if j == 0 and self.problem.options.initial_state != "given":
+            if j == 0 and self.problem.options.initial_state != "fitted_to_points":
                 # rest under constant unknowns, x = A x + E d; what has no stiffness does not come to rest
                 at_rest[:, :driven] = np.linalg.lstsq(np.eye(ns) - a[0], e[0], rcond=1e-6)[0]
             node = np.zeros((last - first + 1, ns, ns + driven))
@@ -387,7 +393,7 @@ class _Builder:
             intervals.append(_compressed(observed[rows], moved[:, :ns], by_unknown, node[-1][:, :ns], drive))
         span = self.h * float(np.median(np.diff(self.edges)))
         loose = np.zeros(self.nx)
-        if self.problem.options.initial_state == "given":
+        if self.problem.options.initial_state == "fitted_to_points":
             options, joints = self.problem.options, self.system.mechanism.joint_names
             inertia = apparent_inertia(self.step, self.theta, tuple(joints[i] for i in self.free))
             loose[self.free] = options.configuration_std
@@ -422,11 +428,11 @@ class _Builder:
         """A_k (steps, ns, ns), E_k (steps, ns, nd') and the effort's slopes (steps, nc, ns + nd') of some steps."""
         n, nz, nx, h = self.n, self.nz, self.nx, self.h
         span = slice(first, last)
-        stages = self.step.kernel.stages(
+        stages = self.step.kernel.linearize(
             self.theta,
-            self.sweep.state[first : last + 1],
-            self.sweep.multipliers[span],
-            self.sweep.torque[span],
+            self.rollout.state[first : last + 1],
+            self.rollout.multipliers[span],
+            self.rollout.torque[span],
             (),
             True,
         )
@@ -467,7 +473,7 @@ class _Reading:
     def __init__(self, builder: _Builder) -> None:
         problem, theta, n = builder.problem, builder.theta, builder.n
         edges = self._edges = builder.edges
-        state, efforts = builder.sweep.state, problem.efforts(builder.sweep)
+        state, efforts = builder.rollout.state, problem.efforts(builder.rollout)
         group: list[NDArray[np.int64]] = []
         column, node, fraction, weight, slope, load = [], [], [], [], [], []
         for samples, predicted in zip(builder.episode.samples, builder.predicted, strict=True):
@@ -479,7 +485,7 @@ class _Reading:
             _, by_q, by_z, by_e, _ = problem.sensor(samples.sensor, ())(state[:, :n], state[:, 2 * n :], efforts, theta)
             keep = samples.weight > 0
             raw = samples.weight * np.where(keep, predicted - samples.value, 0.0)
-            factor = huber(raw, problem.options.robust_scale)[1]
+            factor = huber(raw, problem.options.huber_threshold)[1]
             group.append(np.full(int(keep.sum()), len(group)))
             column.append(np.broadcast_to(np.arange(shape[1]), shape)[keep])
             node.append(where[keep])

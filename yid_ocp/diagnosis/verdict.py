@@ -9,7 +9,7 @@ from typing import Any
 
 from yid_ocp.diagnosis.localise import Place
 from yid_ocp.diagnosis.null_test import Floor, NullTest
-from yid_ocp.diagnosis.score import Confusability, Score, Visibility
+from yid_ocp.diagnosis.screening import Confusability, Score, Visibility
 from yid_ocp.diagnosis.select import Closure, Fit, closure
 from yid_ocp.diagnosis.smoother import Smoothed
 from yid_ocp.effects import EffectBase

@@ -12,10 +12,10 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.errors import ConfigError, nearest
+from yid_ocp.model.flexible import ElasticJoint
 from yid_ocp.model.mechanism import Inertia, Placement
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.system import Grasp, MidpointState, NodeState, System, Terms
-from yid_ocp.model.y_object import ElasticJoint
 from yid_ocp.registry import Registry
 
 SMOOTHING = 0.02

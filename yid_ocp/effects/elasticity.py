@@ -21,9 +21,9 @@ from yid_ocp.effects.base import (
     typical_stiffness,
     with_springs,
 )
+from yid_ocp.model.flexible import AXES
 from yid_ocp.model.mechanism import Joint, Placement
 from yid_ocp.model.system import MidpointState, System, Terms
-from yid_ocp.model.y_object import AXES
 
 REFERENCE_ANGLE = 0.5
 """Stands for the largest angle in the data where a range depends on it [rad]."""

@@ -87,7 +87,10 @@ class GravityScale(EffectBase):
         tree, bodies = system.mechanism, {}
         for joint in object_joints(system):
             bodies[joint] = [
-                replace(body, weight=(1 if body.weight is None else body.weight) + self["fraction"])
+                replace(
+                    body,
+                    gravity_fraction=(1 if body.gravity_fraction is None else body.gravity_fraction) + self["fraction"],
+                )
                 for body in tree.joints[tree.joint_index(joint)].bodies
             ]
         return with_bodies(system, bodies)

@@ -10,17 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.errors import ModelError
-from yid_ocp.integrator import codegen
-from yid_ocp.integrator.sweep import (
+from yid_ocp.integrator import codegen, compiler
+from yid_ocp.integrator.step_model import (
     ITERATION_LIMIT,
-    STAGE_MATRICES,
+    LINEARIZATION_MATRICES,
     Directions,
     Feedback,
     Gradient,
-    Stages,
+    Rollout,
     StepCode,
-    Sweep,
-    empty_stages,
+    StepLinearization,
+    empty_linearization,
     status_of,
 )
 
@@ -82,7 +82,7 @@ class CompiledKernel:
     def _theta_columns(self, names: tuple[str, ...]) -> _CompiledColumns:
         if names not in self._columns:
             function = codegen.theta_function(self._step.equations, names)
-            library = codegen.compile_library(codegen.function_source(function), straight_line=True)
+            library = compiler.compile_library(codegen.function_source(function), straight_line=True)
             if library is None:
                 raise ModelError("the compiler worked for the step but not for its derivatives", hint="set CC=none")
             address = ctypes.cast(library.by_theta, ctypes.c_void_p).value
@@ -114,7 +114,7 @@ class CompiledKernel:
         )
         return struct, [values, w, iw]
 
-    def sweep(
+    def rollout(
         self,
         theta: Array,
         start: Array,
@@ -122,8 +122,8 @@ class CompiledKernel:
         path: Array,
         feedback: Feedback | None,
         wanted: Directions | None,
-    ) -> Sweep:
-        """See `Kernel.sweep`."""
+    ) -> Rollout:
+        """See `Kernel.rollout`."""
         sizes = self._step.sizes
         steps = len(torque)
         theta, torque, path = (np.ascontiguousarray(a, dtype=float) for a in (theta, torque, path))
@@ -167,12 +167,12 @@ class CompiledKernel:
         )
         del keep, held
         status = status_of(code, info, effort, state, sizes)
-        return Sweep(state, multipliers, effort, applied, by_state, by_multipliers, by_effort, status)
+        return Rollout(state, multipliers, effort, applied, by_state, by_multipliers, by_effort, status)
 
     def adjoint(
         self,
         theta: Array,
-        swept: Sweep,
+        rollout: Rollout,
         feedback: Feedback | None,
         names: tuple[str, ...],
         by_state: Array,
@@ -181,13 +181,15 @@ class CompiledKernel:
     ) -> Gradient:
         """See `Kernel.adjoint`."""
         sizes = self._step.sizes
-        steps = len(swept.multipliers)
+        steps = len(rollout.multipliers)
         gradient, by_start = np.zeros(max(len(names), 1)), np.zeros(sizes["nx"])
         by_torque, by_path = np.zeros((steps, sizes["nu"])), np.zeros((steps + 1, sizes["nc"]))
         info = np.zeros(4)
         struct, keep = self._directions(names, len(names))
         loop, held = _feedback_struct(feedback)
-        inputs = [np.ascontiguousarray(a, dtype=float) for a in (theta, swept.torque, swept.state, swept.multipliers)]
+        inputs = [
+            np.ascontiguousarray(a, dtype=float) for a in (theta, rollout.torque, rollout.state, rollout.multipliers)
+        ]
         partial = [_contiguous(a) for a in (by_state, by_multipliers, by_effort)]
         code = self._library.yid_adjoint(
             ctypes.c_int(steps),
@@ -211,7 +213,7 @@ class CompiledKernel:
                 array[:] = np.nan
         return Gradient(gradient[: len(names)], by_start, by_torque, by_path)
 
-    def stages(
+    def linearize(
         self,
         theta: Array,
         state: Array,
@@ -219,13 +221,13 @@ class CompiledKernel:
         torque: Array,
         names: tuple[str, ...],
         derivatives: bool,
-    ) -> Stages:
-        """See `Kernel.stages`."""
+    ) -> StepLinearization:
+        """See `Kernel.linearize`."""
         inputs = [np.ascontiguousarray(a, dtype=float) for a in (theta, state, multipliers, torque)]
-        stages = empty_stages(self._step.sizes, len(torque), len(names), derivatives)
+        stages = empty_linearization(self._step.sizes, len(torque), len(names), derivatives)
         struct, keep = self._directions(names, len(names))
-        matrices = [getattr(stages, field) if derivatives else None for field in STAGE_MATRICES]
-        self._library.yid_stages(
+        matrices = [getattr(stages, field) if derivatives else None for field in LINEARIZATION_MATRICES]
+        self._library.yid_linearize(
             ctypes.c_int(len(torque)),
             _pointer(inputs[0]),
             ctypes.c_double(self._step.time_step),

@@ -724,7 +724,7 @@ int yid_adjoint(int steps, const double *theta, double time_step, const double *
 
 /* Rows, p1 and their Jacobians at `count` steps of a trajectory that need not satisfy the equations (a transcription's
  * iterate). state: (count + 1, NX). Matrix arguments may be NULL together; with directions also the parameter columns. */
-int yid_stages(int count, const double *theta, double time_step, const double *state, const double *multipliers,
+int yid_linearize(int count, const double *theta, double time_step, const double *state, const double *multipliers,
                const double *applied, const Directions *dir, double *rows, double *p1, double *R1, double *R0,
                double *Ru, double *P1, double *P0, double *Pu, double *Rtheta, double *Ptheta) {
     Work *k = work_new();

@@ -9,18 +9,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import ModelError
-from yid_ocp.integrator import codegen
+from yid_ocp.integrator import codegen, compiler
 from yid_ocp.integrator.compiled import CompiledKernel
 from yid_ocp.integrator.discrete import DiscreteEquations, ForceSplit, discrete_equations
-from yid_ocp.integrator.interpreter import InterpretedKernel
-from yid_ocp.integrator.sweep import Directions as Directions
-from yid_ocp.integrator.sweep import Feedback as Feedback
-from yid_ocp.integrator.sweep import Gradient as Gradient
-from yid_ocp.integrator.sweep import Kernel as Kernel
-from yid_ocp.integrator.sweep import Stages as Stages
-from yid_ocp.integrator.sweep import StepCode as StepCode
-from yid_ocp.integrator.sweep import StepStatus as StepStatus
-from yid_ocp.integrator.sweep import Sweep as Sweep
+from yid_ocp.integrator.interpreted import InterpretedKernel
+from yid_ocp.integrator.step_model import Directions as Directions
+from yid_ocp.integrator.step_model import Feedback as Feedback
+from yid_ocp.integrator.step_model import Gradient as Gradient
+from yid_ocp.integrator.step_model import Kernel as Kernel
+from yid_ocp.integrator.step_model import Rollout as Rollout
+from yid_ocp.integrator.step_model import StepCode as StepCode
+from yid_ocp.integrator.step_model import StepLinearization as StepLinearization
+from yid_ocp.integrator.step_model import StepStatus as StepStatus
 from yid_ocp.model.system import System
 
 Array = NDArray[np.float64]
@@ -62,7 +62,7 @@ class Step:
         self.functions = codegen.step_functions(self.equations)
         self.structure = codegen.structure(self.functions)
         library = (
-            codegen.compile_library(codegen.kernel_source(self.functions, self.structure)) if use_compiler else None
+            compiler.compile_library(codegen.kernel_source(self.functions, self.structure)) if use_compiler else None
         )
         self.compiled = library is not None
         self.kernel: Kernel = InterpretedKernel(self) if library is None else CompiledKernel(self, library)
@@ -111,10 +111,10 @@ class Step:
         lam : ndarray, shape (m,)
         status : StepStatus
         """
-        sweep = self._single(q0, p0, u, theta, prescribed, internal, None)
+        rollout = self._single(q0, p0, u, theta, prescribed, internal, None)
         n = self.system.size
-        after = sweep.state[1]
-        return after[:n], after[n : 2 * n], sweep.multipliers[0], sweep.status
+        after = rollout.state[1]
+        return after[:n], after[n : 2 * n], rollout.multipliers[0], rollout.status
 
     def jacobians(
         self,
@@ -147,9 +147,9 @@ class Step:
         start[:, nt : nt + nx] = np.eye(nx)
         torque = np.zeros((1, nu, nt + nx + nu))
         torque[0, :, nt + nx :] = np.eye(nu)
-        sweep = self._single(q0, p0, u, theta, prescribed, internal, Directions(chosen, start, torque))
-        assert sweep.by_state is not None
-        after = sweep.by_state[1]
+        rollout = self._single(q0, p0, u, theta, prescribed, internal, Directions(chosen, start, torque))
+        assert rollout.by_state is not None
+        after = rollout.by_state[1]
         return after[:, nt : nt + nx].copy(), after[:, nt + nx :].copy(), after[:, :nt].copy()
 
     def _single(
@@ -161,7 +161,7 @@ class Step:
         prescribed: tuple[ArrayLike, ArrayLike] | None,
         internal: ArrayLike | None,
         wanted: Directions | None,
-    ) -> Sweep:
+    ) -> Rollout:
         sizes = self.sizes
         z0 = np.zeros(sizes["nz"]) if internal is None else check_shape("internal", internal, (sizes["nz"],))
         start = np.concatenate([check_shape("q0", q0, (sizes["n"],)), check_shape("p0", p0, (sizes["n"],)), z0])
@@ -177,7 +177,7 @@ class Step:
             path = np.stack([check_shape("prescribed", s, (sizes["nc"],)) for s in prescribed])
         start[list(self.system.prescribed_indices)] = path[0]
         torque = check_shape("u", u, (sizes["nu"],))[None, :]
-        return self.kernel.sweep(check_shape("theta", theta, (sizes["ntheta"],)), start, torque, path, None, wanted)
+        return self.kernel.rollout(check_shape("theta", theta, (sizes["ntheta"],)), start, torque, path, None, wanted)
 
 
 def compile_step(

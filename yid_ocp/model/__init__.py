@@ -3,6 +3,9 @@
 Everything here is description and symbols, nothing is solved; extend it with new terms through `effects`, not here.
 """
 
+from yid_ocp.model.flexible import FlexibleObject as FlexibleObject
+from yid_ocp.model.flexible import Segment as Segment
+from yid_ocp.model.flexible import flexible_object as flexible_object
 from yid_ocp.model.kinematics import Kinematics as Kinematics
 from yid_ocp.model.kinematics import forward_kinematics as forward_kinematics
 from yid_ocp.model.mechanism import Mechanism as Mechanism
@@ -14,6 +17,3 @@ from yid_ocp.model.system import MidpointState as MidpointState
 from yid_ocp.model.system import NodeState as NodeState
 from yid_ocp.model.system import System as System
 from yid_ocp.model.system import Terms as Terms
-from yid_ocp.model.y_object import FlexibleObject as FlexibleObject
-from yid_ocp.model.y_object import Segment as Segment
-from yid_ocp.model.y_object import flexible_object as flexible_object

@@ -171,7 +171,7 @@ def rigid_body(kinematics: Kinematics, v: ca.SX, gravity: ca.SX) -> RigidBody:
     second = [ca.SX(ca.DM.zeros(3, 3))] * n
     momentum = [zero6] * n
     # with one body whose weight is not its mass times gravity, weight is summed apart from inertia
-    apart = any(body.weight is not None for joint in mechanism.joints for body in joint.bodies)
+    apart = any(body.gravity_fraction is not None for joint in mechanism.joints for body in joint.bodies)
     heavy, heavy_first = list(mass), list(first)
     kinetic, potential = ca.SX(0), ca.SX(0)
     for j, joint in enumerate(mechanism.joints):
@@ -183,7 +183,7 @@ def rigid_body(kinematics: Kinematics, v: ca.SX, gravity: ca.SX) -> RigidBody:
             spin = about_com @ angular
             wrench = ca.vertcat(spin + cross(com, impulse), impulse)
             kinetic += 0.5 * (ca.dot(impulse, linear) + ca.dot(spin, angular))
-            heaviness = body.mass if body.weight is None else body.mass * body.weight
+            heaviness = body.mass if body.gravity_fraction is None else body.mass * body.gravity_fraction
             potential -= heaviness * ca.dot(gravity, com)
             mass[j] = mass[j] + body.mass
             first[j] = first[j] + body.mass * com

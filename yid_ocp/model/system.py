@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from yid_ocp.errors import ModelError, nearest
+from yid_ocp.model.flexible import AXES, ElasticJoint, FlexibleObject, SegmentLayout
 from yid_ocp.model.kinematics import Kinematics
-from yid_ocp.model.mechanism import Frame, Joint, Mechanism, Placement, roll_pitch_yaw, transform
+from yid_ocp.model.mechanism import Frame, Joint, Mechanism, Placement
 from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.model.y_object import AXES, ElasticJoint, FlexibleObject, SegmentLayout
+from yid_ocp.model.rotations import roll_pitch_yaw, transform
 
 GraspKind = Literal["point", "axis", "weld"]
 EQUATIONS: dict[str, int] = {"point": 3, "axis": 5, "weld": 6}

@@ -1,140 +1,20 @@
-"""Flexible branched objects as chains of rigid links with elastic joints: the paper's Y, a cable, a beam."""
+"""The source paper's foam letter Y: three tubes of four links, its trunk's foot on the ground."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
-import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from yid_ocp.errors import ModelError, OutputError, nearest
-from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement, roll_pitch_yaw, snapped, transform
-from yid_ocp.model.parameters import Parameter, Parameters
+from yid_ocp.errors import OutputError
+from yid_ocp.model.flexible import FlexibleObject, Segment, flexible_object
+from yid_ocp.model.rotations import roll_pitch_yaw, transform
+from yid_ocp.model.urdf import urdf_text
 
-AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-
-
-@dataclass(frozen=True)
-class Segment:
-    """What one tube, branch or beam is like.
-
-    Attributes
-    ----------
-    name : str
-    length : float
-        [m]; ignored when `link_lengths` is given.
-    mass : float
-        Of the whole segment, spread along its length [kg].
-    radius : float, optional
-        [m]; of the solid cylinder that gives each link's inertia. None where `section` is given.
-    links : int
-        Number of equal links.
-    link_lengths : sequence of float, optional
-        Unequal links [m], base to tip.
-    parent : str, optional
-        Segment on which it grows; None for the root.
-    at_link : int, optional
-        It leaves at the tip of this link of the parent (0-based); the last one when absent.
-    rotation : (3, 3) array_like, optional
-        Of its first link at rest in the frame of the parent's link (of the root's frame for the root).
-    link_rotations : sequence of (3, 3) array_like, optional
-        Rest rotation of every later link in the frame of the one before (a measured undeformed shape).
-    bend, twist : float
-        Nominal stiffness of every joint [N m/rad], or rigidity [N m^2] when `rigidity` is set.
-    damping : float
-        Viscous damping of every coordinate [N m s/rad] ([N m^2 s] when `rigidity` is set).
-    twist_damping : float, optional
-        Damping of the twists where it differs from that of the bends.
-    rigidity : bool
-        Whether bend, twist and damping are per curvature: a joint between links of length a and b then has
-        2/(a + b) times the value, and the first joint of a clamped segment 2/a.
-    clamped : bool
-        Whether the first joint turns about the tip of a rigid wall or clamp (only matters with `rigidity`); otherwise
-        it sits between the parent's link and the first one.
-    joint_order : str
-        Axes of the turns at each joint, base to tip; about those left out the segment is rigid.
-    section : (float, float), optional
-        Extents of a rectangular cross section along the links' x and y axes [m], in place of `radius`.
-    separate_lengths : bool
-        Whether every link has a length parameter of its own (`SEGMENT.length_0`, ...) in place of `SEGMENT.length`,
-        for markers that sit elsewhere in every recording; masses do not follow them.
-    length_before : float, optional
-        Length of a flexible edge that a clamp keeps straight before a root segment; with `rigidity` its first joint
-        then counts half of it [m].
-    """
-
-    name: str
-    length: float
-    mass: float
-    radius: float | None = None
-    links: int = 4
-    link_lengths: Sequence[float] | None = None
-    parent: str | None = None
-    at_link: int | None = None
-    rotation: ArrayLike | None = None
-    link_rotations: Sequence[ArrayLike] | None = None
-    bend: float = 3.0
-    twist: float = 3.0
-    damping: float = 0.05
-    twist_damping: float | None = None
-    rigidity: bool = False
-    clamped: bool = False
-    joint_order: str = "xyz"
-    section: tuple[float, float] | None = None
-    separate_lengths: bool = False
-    length_before: float | None = None
-
-
-@dataclass(frozen=True)
-class ElasticJoint:
-    """A spring 1/2 stiffness (q - rest)^2 and a damper -damping v on one coordinate, both possibly symbolic."""
-
-    joint: str
-    segment: str
-    kind: Literal["bend", "twist"]
-    axis: str
-    stiffness: ca.SX
-    damping: ca.SX
-    rest: ca.SX
-
-
-@dataclass(frozen=True)
-class SegmentLayout:
-    """Where a segment stands in the mechanism: joint names link by link, link lengths [m] and radius [m].
-
-    The radius of a rectangular section is half its diagonal.
-    """
-
-    name: str
-    links: tuple[tuple[str, ...], ...]
-    lengths: tuple[ca.SX, ...]
-    radius: ca.SX
-    mass: ca.SX
-    parent: str | None
-
-
-@dataclass(frozen=True)
-class FlexibleObject:
-    """A generated object: its tree, its elastic joints and where each segment stands.
-
-    Frames: `SEGMENT` tip as `w_SEGMENT`, tip of link i as `SEGMENT_i_tip`, and the root frame `object_root`.
-    """
-
-    mechanism: Mechanism
-    elastic: tuple[ElasticJoint, ...]
-    segments: tuple[SegmentLayout, ...]
-
-    def segment(self, name: str) -> SegmentLayout:
-        """Layout of a segment by name."""
-        for entry in self.segments:
-            if entry.name == name:
-                return entry
-        raise ModelError(f"there is no segment '{name}'", hint=nearest(name, [s.name for s in self.segments]))
+Y_FOOT = (0.85, 0.0, -0.93)
+"""Where the trunk's foot stands in the world, Baxter's `base` [m]."""
 
 
 def y_segments() -> tuple[Segment, ...]:
@@ -147,279 +27,23 @@ def y_segments() -> tuple[Segment, ...]:
     )
 
 
-def flexible_object(
-    segments: Sequence[Segment] | None = None,
-    foot: ArrayLike | None = None,
-    name: str = "y_object",
-    weight: float = 1.0,
-) -> FlexibleObject:
-    """Chain of rigid links with an elastic joint before each.
+def y_object(links: int = 4, gravity_fraction: float = 1.0) -> FlexibleObject:
+    """The paper's Y, its trunk's foot at (0.85, 0, -0.93) m.
 
     Parameters
     ----------
-    segments : sequence of Segment, optional
-        Parents first; the paper's Y when absent.
-    foot : array_like, shape (4, 4), optional
-        Placement of the root; the paper's trunk foot at (0.85, 0, -0.93) m when neither this nor `segments` is given,
-        else the origin.
-    name : str
-        Name of the mechanism.
-    weight : float
-        Share of its weight that the object has, its inertia unchanged; less than one where something else bears it.
-
-    Returns
-    -------
-    FlexibleObject
-        Joints are named `SEGMENT_LINK_AXIS` (`T1_0_x`), parameters `SEGMENT.length` (or `.length_0`, ...), `.mass`,
-        `.radius` (or `.size_x` and `.size_y`), `.bend`, `.twist`, `.damping` (and `.twist_damping` where given).
-
-    Raises
-    ------
-    ModelError
-        Unknown parent, parent after child, non-positive length, mass or radius, links that do not fit.
+    links : int
+        Rigid links of every tube; the nominal stiffness per joint is that of four links.
+    gravity_fraction : float
+        See `flexible_object`.
     """
-    if segments is None:
-        segments = y_segments()
-        foot = transform(np.eye(3), [0.85, 0.0, -0.93]) if foot is None else foot
-    root = Placement.identity() if foot is None else Placement.of(foot)
-    parameters: list[Parameter] = []
-    joints: list[Joint] = []
-    frames: dict[str, Frame] = {"object_root": Frame(-1, root)}
-    elastic: list[ElasticJoint] = []
-    layouts: dict[str, SegmentLayout] = {}
-
-    for segment in segments:
-        _check(segment, layouts)
-        own = _segment_parameters(segment)
-        parameters += own.values()
-        mass, cross = own["mass"].symbol, _cross_section(own)
-        shares = _shares(segment)
-        if segment.separate_lengths:
-            lengths = tuple(own[f"length_{i}"].symbol for i in range(len(shares)))
-        else:
-            lengths = tuple(own["length"].symbol * float(share) for share in shares)
-        later: Sequence[ArrayLike | None] = (
-            [None] * (len(shares) - 1) if segment.link_rotations is None else segment.link_rotations
-        )
-        rotations = [_rotation(entry) for entry in (segment.rotation, *later)]
-        before: ca.SX | None
-        if segment.parent is None:
-            carrier, tip = -1, root
-            before = None if segment.length_before is None or segment.clamped else ca.SX(segment.length_before)
-        else:
-            above = layouts[segment.parent]
-            at = len(above.links) - 1 if segment.at_link is None else segment.at_link
-            frame = frames[f"{segment.parent}_{at}_tip"]
-            carrier, tip = frame.joint, frame.placement
-            before = None if segment.clamped else above.lengths[at]
-        links: list[tuple[str, ...]] = []
-        for i, length in enumerate(lengths):
-            along = ca.vertcat(0, 0, length)
-            slender = length**2 / 12
-            squares = ca.vertcat(slender + cross.y, slender + cross.x, cross.x + cross.y)
-            share = mass * float(shares[i])
-            body = Inertia(share, along / 2, ca.diag(squares) * share, None if weight == 1 else ca.SX(weight))
-            names = tuple(f"{segment.name}_{i}_{axis}" for axis in segment.joint_order)
-            for a, axis in enumerate(segment.joint_order):
-                placement = tip @ Placement(ca.SX(ca.DM(rotations[i])), ca.SX(ca.DM.zeros(3)))
-                joints.append(
-                    Joint(
-                        names[a],
-                        "revolute",
-                        carrier,
-                        placement if a == 0 else Placement.identity(),
-                        AXES[axis],
-                        (body,) if a == len(segment.joint_order) - 1 else (),
-                    )
-                )
-                carrier = len(joints) - 1
-                kind: Literal["bend", "twist"] = "twist" if axis == "z" else "bend"
-                factor = _per_joint(segment, length, before)
-                damping = own.get("twist_damping", own["damping"]) if kind == "twist" else own["damping"]
-                elastic.append(
-                    ElasticJoint(
-                        names[a],
-                        segment.name,
-                        kind,
-                        axis,
-                        own[kind].symbol * factor,
-                        damping.symbol * factor,
-                        ca.SX(0),
-                    )
-                )
-            links.append(names)
-            tip = Placement(ca.SX(ca.DM.eye(3)), along)
-            frames[f"{segment.name}_{i}_tip"] = Frame(carrier, tip)
-            before = length
-        frames[f"w_{segment.name}"] = frames[f"{segment.name}_{len(lengths) - 1}_tip"]
-        layouts[segment.name] = SegmentLayout(segment.name, tuple(links), lengths, cross.radius, mass, segment.parent)
-
-    mechanism = Mechanism(name, tuple(joints), frames, Parameters(parameters))
-    return FlexibleObject(mechanism, tuple(elastic), tuple(layouts.values()))
-
-
-def polyline_rotations(vertices: ArrayLike, start: ArrayLike | None = None) -> list[NDArray[np.float64]]:
-    """Rotations that turn each edge's frame into the next one's by the shortest way (no twist).
-
-    Parameters
-    ----------
-    vertices : array_like, shape (k, 3)
-        Undeformed centre line [m].
-    start : array_like, shape (3, 3), optional
-        Frame before the first edge, whose z axis is the direction it continues; the world's when absent.
-
-    Returns
-    -------
-    list of ndarray, shape (3, 3)
-        One for every edge, to be used as `Segment.rotation` and `Segment.link_rotations`.
-
-    Raises
-    ------
-    ModelError
-        Fewer than two vertices, not three coordinates each, or two that coincide.
-    """
-    points = np.asarray(vertices, float)
-    if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2:
-        raise ModelError(f"vertices have shape {points.shape}", where="polyline", allowed="(k, 3) with k from 2")
-    edges = np.diff(points, axis=0)
-    if not np.all(np.linalg.norm(edges, axis=1) > 0):
-        raise ModelError("two neighbouring vertices coincide or are not finite", where="polyline")
-    frame = np.eye(3) if start is None else np.asarray(start, float)
-    rotations = []
-    for edge in edges:
-        local = frame.T @ (edge / np.linalg.norm(edge))
-        turn = _shortest_turn(local)
-        rotations.append(turn)
-        frame = frame @ turn
-    return rotations
+    segments = [replace(segment, links=links) for segment in y_segments()]
+    return flexible_object(segments, transform(np.eye(3), Y_FOOT), "y_object", gravity_fraction)
 
 
 def write_y_urdf(path: str | Path) -> None:
     """Write the paper's Y object as URDF; `OutputError` where that is not possible."""
     try:
-        Path(path).write_text(flexible_object().mechanism.to_urdf(), encoding="utf-8")
+        Path(path).write_text(urdf_text(y_object().mechanism), encoding="utf-8")
     except OSError as error:
         raise OutputError(f"the URDF cannot be written: {error.strerror}", where=str(path)) from error
-
-
-def _shortest_turn(direction: NDArray[np.float64]) -> NDArray[np.float64]:
-    axis = np.cross([0.0, 0.0, 1.0], direction)
-    sine, cosine = float(np.linalg.norm(axis)), float(direction[2])
-    if sine < 1e-12:
-        return np.eye(3) if cosine > 0 else np.diag([1.0, -1.0, -1.0])
-    u = axis / sine
-    skew = np.array([[0, -u[2], u[1]], [u[2], 0, -u[0]], [-u[1], u[0], 0]])
-    return np.eye(3) + sine * skew + (1 - cosine) * skew @ skew
-
-
-def _rotation(matrix: ArrayLike | None) -> NDArray[np.float64]:
-    return np.eye(3) if matrix is None else snapped(np.asarray(matrix, float))
-
-
-def _shares(segment: Segment) -> NDArray[np.float64]:
-    if segment.link_lengths is None:
-        return np.full(segment.links, 1.0 / segment.links)
-    lengths = np.asarray(segment.link_lengths, float)
-    return lengths / lengths.sum()
-
-
-def _per_joint(segment: Segment, length: ca.SX, before: ca.SX | None) -> ca.SX:
-    if not segment.rigidity:
-        return ca.SX(1)
-    if before is None:
-        return 2 / length if segment.clamped else 1 / length
-    return 2 / (length + before)
-
-
-@dataclass(frozen=True)
-class _CrossSection:
-    """Mean squares of x and y over a section [m^2], and the radius that it counts as [m]."""
-
-    x: ca.SX
-    y: ca.SX
-    radius: ca.SX
-
-
-def _cross_section(own: Mapping[str, Parameter]) -> _CrossSection:
-    if "radius" in own:
-        radius = own["radius"].symbol
-        return _CrossSection(radius**2 / 4, radius**2 / 4, radius)
-    x, y = own["size_x"].symbol, own["size_y"].symbol
-    return _CrossSection(x**2 / 12, y**2 / 12, ca.sqrt(x**2 + y**2) / 2)
-
-
-def _segment_parameters(segment: Segment) -> dict[str, Parameter]:
-    per, rate = ("N m^2", "N m^2 s") if segment.rigidity else ("N m/rad", "N m s/rad")
-    length = float(np.sum(segment.link_lengths)) if segment.link_lengths is not None else segment.length
-    small = 1e-9
-    entries = {
-        **(
-            {
-                f"length_{i}": (length * float(share), "m", small, f"length of link {i}")
-                for i, share in enumerate(_shares(segment))
-            }
-            if segment.separate_lengths
-            else {"length": (length, "m", small, "length of the segment")}
-        ),
-        "mass": (segment.mass, "kg", small, "mass of the segment"),
-        **(
-            {"radius": (segment.radius, "m", small, "radius of the solid cylinder")}
-            if segment.radius is not None
-            else {
-                f"size_{axis}": (size, "m", small, f"extent of the section along {axis}")
-                for axis, size in zip("xy", segment.section or (), strict=True)
-            }
-        ),
-        "bend": (segment.bend, per, 0.0, "bending stiffness of every joint, about x and y"),
-        "twist": (segment.twist, per, 0.0, "twisting stiffness of every joint, about z"),
-        "damping": (segment.damping, rate, 0.0, "viscous damping of every coordinate"),
-    }
-    if segment.twist_damping is not None:
-        entries["twist_damping"] = (segment.twist_damping, rate, 0.0, "viscous damping of the twists")
-    return {
-        key: Parameter(f"{segment.name}.{key}", value, unit, lower, math.inf, text)
-        for key, (value, unit, lower, text) in entries.items()
-    }
-
-
-def _check(segment: Segment, known: dict[str, SegmentLayout]) -> None:
-    where = f"segment {segment.name}"
-    if segment.name in known:
-        raise ModelError(f"two segments are called '{segment.name}'", where=where)
-    if segment.parent is not None and segment.parent not in known:
-        raise ModelError(
-            f"parent '{segment.parent}' of segment '{segment.name}' does not come before it",
-            where=where,
-            hint=nearest(segment.parent, known),
-        )
-    if (segment.radius is None) == (segment.section is None):
-        raise ModelError(
-            "a segment needs a radius or a section",
-            where=where,
-            allowed="one of the two",
-            hint="section: [0.001, 0.08]",
-        )
-    sizes = {"mass": segment.mass}
-    if segment.link_lengths is None:
-        sizes["length"] = segment.length
-    sizes |= {"radius": segment.radius} if segment.radius is not None else {}
-    sizes |= {f"section[{i}]": size for i, size in enumerate(segment.section or ())}
-    for quantity, value in sizes.items():
-        if not (math.isfinite(value) and value > 0):
-            raise ModelError(f"{quantity} = {value}", where=where, allowed="a positive number in SI units")
-    if segment.link_lengths is None and segment.links < 1:
-        raise ModelError(f"links = {segment.links}", where=where, allowed="a whole number from 1")
-    if segment.link_lengths is not None and not min(segment.link_lengths, default=0.0) > 0:
-        raise ModelError("a link has no length", where=where, allowed="positive lengths [m]")
-    count = len(segment.link_lengths) if segment.link_lengths is not None else segment.links
-    if segment.link_rotations is not None and len(segment.link_rotations) != count - 1:
-        raise ModelError(
-            f"{len(segment.link_rotations)} link rotations for {count} links", where=where, allowed=f"{count - 1}"
-        )
-    if segment.at_link is not None and segment.parent is not None:
-        links = len(known[segment.parent].links)
-        if not 0 <= segment.at_link < links:
-            raise ModelError(f"at_link = {segment.at_link}", where=where, allowed=f"0 to {links - 1}")
-    axes = segment.joint_order
-    if not axes or len(set(axes)) < len(axes) or not set(axes) <= set(AXES):
-        raise ModelError(f"joint_order = '{axes}'", where=where, allowed="letters of x, y, z, each at most once")

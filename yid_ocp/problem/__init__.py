@@ -3,7 +3,7 @@
 Solvers see only `evaluate` and `gradient`; change what is compared with what here, never in a solver.
 """
 
-from yid_ocp.problem.inputs import ClampPath as ClampPath
+from yid_ocp.model.cable import ClampPath as ClampPath
 from yid_ocp.problem.problem import EstimationProblem as EstimationProblem
 from yid_ocp.problem.problem import Evaluation as Evaluation
 from yid_ocp.problem.problem import ProblemOptions as ProblemOptions

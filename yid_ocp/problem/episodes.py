@@ -12,18 +12,11 @@ from numpy.typing import NDArray
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import ConfigError, DataError, nearest
 from yid_ocp.integrator.step import Step
-from yid_ocp.problem.inputs import (
-    Grid,
-    Smoother,
-    camera_pose,
-    columns,
-    held_torque,
-    joint_loads,
-    make_grid,
-    prescribed_path,
-)
+from yid_ocp.problem.grid import Grid, make_grid
+from yid_ocp.problem.inputs import camera_pose, columns, held_torque, joint_loads, prescribed_path
+from yid_ocp.problem.low_pass import LowPass
+from yid_ocp.problem.measurements import Measurements, make_samples, paper_weighting, point_samples
 from yid_ocp.problem.options import ProblemOptions, SensorOptions
-from yid_ocp.problem.residuals import Samples, make_samples, paper_weighting, point_samples
 from yid_ocp.sensors import EffortSensor, PointSensor
 
 Array = NDArray[np.float64]
@@ -43,7 +36,7 @@ class Episode:
         Known coordinates (driven, then prescribed) at node 0.
     measured_arm : ndarray, shape (N + 1, nu)
         Measured angles of the driven joints at every node.
-    samples : tuple of Samples
+    samples : tuple of Measurements
     load : ndarray, shape (N + 1, nk)
         Recorded effort of driven, then prescribed joints, where an effect makes their true angle depend on it.
     """
@@ -54,7 +47,7 @@ class Episode:
     path: Array
     posture: Array
     measured_arm: Array
-    samples: tuple[Samples, ...]
+    samples: tuple[Measurements, ...]
     load: Array
 
     @property
@@ -87,7 +80,7 @@ def prepare_episode(
     grid = make_grid(recording, step.time_step, options.duration)
     if system.driven and recording.joints is None:
         raise DataError("the model's arms are driven but the recording has no joints", where=recording.name)
-    smoother = Smoother(options.path_cutoff)
+    smoother = LowPass(options.path_cutoff)
     path = prescribed_path(recording, system, grid, smoother, options.clamps)
     if recording.joints is not None and system.driven:
         joints = recording.joints
@@ -134,10 +127,10 @@ def beginning(episode: Episode, steps: int) -> Episode:
 
 
 def _samples(
-    step: Step, recording: Recording, options: ProblemOptions, theta: Array, grid: Grid, smoother: Smoother
-) -> list[Samples]:
+    step: Step, recording: Recording, options: ProblemOptions, theta: Array, grid: Grid, smoother: LowPass
+) -> list[Measurements]:
     system = step.system
-    found: list[Samples] = []
+    found: list[Measurements] = []
     for group in recording.points:
         choice = options.sensors.get(group.name, SensorOptions())
         if not choice.use:
@@ -171,10 +164,10 @@ def _effort_samples(
     recording: Recording,
     theta: Array,
     grid: Grid,
-    smoother: Smoother,
+    smoother: LowPass,
     names: tuple[str, ...],
     choice: SensorOptions,
-) -> Samples:
+) -> Measurements:
     joints = recording.joints
     assert joints is not None
     assert joints.effort is not None

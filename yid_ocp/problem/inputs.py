@@ -2,88 +2,22 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 import scipy.interpolate
 import scipy.signal
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import DataError, nearest
+from yid_ocp.model.cable import ClampPath
 from yid_ocp.model.system import System
+from yid_ocp.problem.grid import Grid
+from yid_ocp.problem.low_pass import LowPass
 
 Array = NDArray[np.float64]
-
-FILTER_ORDER = 4
-
-
-@dataclass(frozen=True)
-class ClampPath:
-    """A prescribed clamp (`floating_clamp`) that follows two measured points.
-
-    Attributes
-    ----------
-    clamp : str
-        Name of the clamp.
-    origin : str
-        Point at which its origin sits.
-    towards : str
-        Point to which its z axis looks.
-    roll : "level" or "transported"
-        What the points do not tell, the turn about z: with `level` the third angle stays zero (x axis across world y);
-        with `transported` the clamp never turns about its own z axis, from `level` at the first node on.
-    """
-
-    clamp: str
-    origin: str
-    towards: str
-    roll: Literal["level", "transported"] = "level"
-
-
-@dataclass(frozen=True)
-class Grid:
-    """Nodes of a rollout: t_k = start + k time_step, k = 0..steps."""
-
-    start: float
-    time_step: float
-    steps: int
-
-    @property
-    def times(self) -> Array:
-        """Times of all nodes, shape (steps + 1,) [s]."""
-        return np.asarray(self.start + self.time_step * np.arange(self.steps + 1), dtype=float)
-
-    def locate(self, t: ArrayLike) -> tuple[NDArray[np.int64], Array]:
-        """Node before each time and the fraction of a step beyond it; a time within 1e-6 of a node is that node."""
-        position = (np.asarray(t, float) - self.start) / self.time_step
-        near = np.rint(position)
-        position = np.where(np.abs(position - near) < 1e-6, near, position)
-        node = np.clip(np.floor(position).astype(np.int64), 0, self.steps - 1)
-        return node, position - node
-
-
-def make_grid(recording: Recording, time_step: float, duration: float | None = None) -> Grid:
-    """Nodes that cover the recording's driving group (its joints, else its first group of points).
-
-    Raises
-    ------
-    DataError
-        The recording is shorter than two steps.
-    """
-    t = recording.joints.t if recording.joints is not None else recording.points[0].t
-    span = float(t[-1] - t[0]) if duration is None else min(duration, float(t[-1] - t[0]))
-    steps = math.floor(span / time_step + 1e-6)
-    if steps < 2:
-        raise DataError(
-            f"{span:.3g} s of data are shorter than two time steps of {time_step:g} s",
-            where=recording.name,
-            hint="record longer, or choose a smaller time step",
-        )
-    return Grid(float(t[0]), time_step, steps)
 
 
 def held_torque(
@@ -145,7 +79,7 @@ def held_torque_slope(joints: JointGroup, driven: tuple[str, ...], grid: Grid, w
     return np.stack(result, axis=1)
 
 
-def joint_loads(recording: Recording, names: tuple[str, ...], grid: Grid, smoother: Smoother) -> Array:
+def joint_loads(recording: Recording, names: tuple[str, ...], grid: Grid, smoother: LowPass) -> Array:
     """Smoothed recorded effort of joints at every node, shape (steps + 1, len(names)) [N m].
 
     Raises
@@ -204,76 +138,8 @@ def columns(joints: JointGroup, names: tuple[str, ...], where: str) -> list[int]
     return [joints.names.index(name) for name in names]
 
 
-@dataclass(frozen=True)
-class Smoother:
-    """Zero-phase low-pass filter (Butterworth of order 4, forward and backward) on an even clock.
-
-    Attributes
-    ----------
-    cutoff : float
-        Frequency at which the amplitude is halved in power twice over [Hz]; infinite for no filter.
-    """
-
-    cutoff: float
-
-    def __call__(self, t: Array, values: Array) -> Array:
-        """Smoothed values at the same times; an uneven clock is resampled to its median step in between.
-
-        Parameters
-        ----------
-        t : ndarray, shape (M,)
-        values : ndarray, shape (M, k)
-        """
-        if not math.isfinite(self.cutoff):
-            return values
-        step = float(np.median(np.diff(t)))
-        even = t[0] + step * np.arange(round((t[-1] - t[0]) / step) + 1)
-        sections = self._sections(step)
-        resampled = scipy.interpolate.interp1d(t, values, axis=0, bounds_error=False, fill_value="extrapolate")(even)
-        pad = min(len(even) - 1, max(15, int(3 / (self.cutoff * step))))
-        smooth = scipy.signal.sosfiltfilt(sections, resampled, axis=0, padlen=pad)
-        return np.asarray(scipy.interpolate.CubicSpline(even, smooth, axis=0)(np.clip(t, even[0], even[-1])))
-
-    def stride(self, step: float) -> int:
-        """Samples of a clock with this step [s] from one smoothed value to the next that tells something new: 1/(2 f).
-
-        Noise that was white is limited to a band of the cutoff f and correlated over about that time.
-        """
-        return max(1, round(1 / (2 * self.cutoff * step))) if math.isfinite(self.cutoff) else 1
-
-    @property
-    def settling(self) -> float:
-        """How far from either end of a record the filter still sees what it does not hold [s].
-
-        The slowest pair of its poles has then decayed to a thousandth.
-        """
-        decay = 2 * math.pi * self.cutoff * math.sin(math.pi / (2 * FILTER_ORDER))
-        return math.log(1e3) / decay
-
-    def gains(self, step: float) -> tuple[float, float, float]:
-        """Factors from white-noise deviation to that of the value, its rate [1/s] and its second rate [1/s^2]."""
-        if not math.isfinite(self.cutoff):
-            return 1.0, math.sqrt(0.5) / step, math.sqrt(6.0) / step**2
-        length = 2 * int(5 / (self.cutoff * step)) + 101
-        impulse = np.zeros(length)
-        impulse[length // 2] = 1.0
-        response = scipy.signal.sosfiltfilt(self._sections(step), impulse)
-        rate = np.gradient(response, step)
-        second = np.zeros_like(response)
-        second[1:-1] = (response[2:] - 2 * response[1:-1] + response[:-2]) / step**2
-        return float(np.linalg.norm(response)), float(np.linalg.norm(rate)), float(np.linalg.norm(second))
-
-    def _sections(self, step: float) -> Array:
-        nyquist = 0.5 / step
-        if not 0 < self.cutoff < nyquist:
-            raise DataError(
-                f"path_cutoff = {self.cutoff:g} Hz", allowed=f"above 0 and below {nyquist:g} Hz for this recording"
-            )
-        return np.asarray(scipy.signal.butter(FILTER_ORDER, self.cutoff / nyquist, output="sos"))
-
-
 def prescribed_path(
-    recording: Recording, system: System, grid: Grid, smoother: Smoother, clamps: tuple[ClampPath, ...] = ()
+    recording: Recording, system: System, grid: Grid, smoother: LowPass, clamps: tuple[ClampPath, ...] = ()
 ) -> Array:
     """Prescribed coordinates at every node, shape (steps + 1, nc).
 
@@ -303,7 +169,7 @@ def prescribed_path(
     return np.stack([course[name] for name in system.prescribed], axis=1)
 
 
-def _clamp_course(recording: Recording, clamp: ClampPath, grid: Grid, smoother: Smoother) -> Mapping[str, Array]:
+def _clamp_course(recording: Recording, clamp: ClampPath, grid: Grid, smoother: LowPass) -> Mapping[str, Array]:
     origin = point_course(recording, clamp.origin, grid, smoother)
     direction = point_course(recording, clamp.towards, grid, smoother) - origin
     length = np.linalg.norm(direction, axis=1, keepdims=True)
@@ -321,7 +187,7 @@ def _clamp_course(recording: Recording, clamp: ClampPath, grid: Grid, smoother: 
     return result
 
 
-def point_course(recording: Recording, point: str, grid: Grid, smoother: Smoother) -> Array:
+def point_course(recording: Recording, point: str, grid: Grid, smoother: LowPass) -> Array:
     """Smoothed position of a recorded point at every node, shape (steps + 1, 3) [m]."""
     for group in recording.points:
         if point in group.names:

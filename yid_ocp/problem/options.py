@@ -8,10 +8,10 @@ from typing import Literal
 
 from numpy.typing import ArrayLike
 
-from yid_ocp.problem.inputs import ClampPath
-from yid_ocp.problem.residuals import Weighting
+from yid_ocp.model.cable import ClampPath
+from yid_ocp.problem.measurements import Weighting
 
-InitialState = Literal["equilibrium", "estimated", "given"]
+StartKind = Literal["equilibrium", "estimated", "fitted_to_points"]
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class ProblemOptions:
 
     Attributes
     ----------
-    initial_state : "equilibrium", "estimated" or "given"
+    initial_state : "equilibrium", "estimated" or "fitted_to_points"
         Rest at the first posture (depends on theta); that plus a free deviation with a prior; or fixed at the
         configuration that fits the first measured points.
     feedback : "none", "proportional" or "lqr"
@@ -54,7 +54,7 @@ class ProblemOptions:
     gains : sequence of float
         Proportional gains of one arm or of all driven joints [N m/rad].
     weighting : "whitened" or "paper"
-    robust_scale : float
+    huber_threshold : float
         Huber scale in standard deviations; infinite for squares.
     path_cutoff : float
         Low-pass cutoff of prescribed paths and of the efforts compared with them [Hz].
@@ -64,7 +64,7 @@ class ProblemOptions:
         Free parameters with a value of their own in every recording.
     priors : mapping of parameter to deviation
         Gaussian priors about the initial value, in the parameter's unit.
-    tie_break : float
+    weak_prior_factor : float
         Every other free parameter that is positive by nature gets a prior that calls this factor up or down one
         standard deviation (log-normal about its start), so that one that the data do not inform stays near its start;
         zero for none. Not used with the paper's weighting.
@@ -73,12 +73,12 @@ class ProblemOptions:
     duration : float, optional
         Use only the first seconds of every recording [s].
     start_window : float
-        How long the measured points that fix a `given` start may reach [s].
+        How long the measured points that fix a fitted start may reach [s].
     start_std : float, optional
-        Noise deviation of the points in the fit of a `given` start, where the sensors' one stands for the model's error
+        Noise deviation of the points in the fit of a fitted start, where the sensors' one stands for the model's error
         as well [m].
     start_parameters : tuple of str
-        Parameters that are fitted along with a `given` start in every recording, held-out ones included, from these
+        Parameters that are fitted along with a fitted start in every recording, held-out ones included, from these
         first points alone; none of them may be free.
     recording_values : mapping of recording to mapping of parameter to value
         Known values of parameters that differ from recording to recording, such as where markers sit.
@@ -87,17 +87,17 @@ class ProblemOptions:
         it.
     """
 
-    initial_state: InitialState = "equilibrium"
+    initial_state: StartKind = "equilibrium"
     feedback: Literal["none", "proportional", "lqr"] = "lqr"
     gains: tuple[float, ...] = (80.0, 80.0, 60.0, 60.0, 15.0, 15.0, 8.0)
     weighting: Weighting = "whitened"
-    robust_scale: float = float("inf")
+    huber_threshold: float = float("inf")
     path_cutoff: float = 10.0
     sensors: Mapping[str, SensorOptions] = field(default_factory=dict)
     clamps: tuple[ClampPath, ...] = ()
     local: tuple[str, ...] = ()
     priors: Mapping[str, float] = field(default_factory=dict)
-    tie_break: float = 10.0
+    weak_prior_factor: float = 10.0
     configuration_std: float = 0.05
     velocity_std: float = 0.2
     duration: float | None = None

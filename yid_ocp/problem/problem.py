@@ -14,17 +14,18 @@ from numpy.typing import ArrayLike, NDArray
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import ConfigError, DataError, nearest
 from yid_ocp.integrator.codegen import Mapped
-from yid_ocp.integrator.feedback import MomentumShift, lqr_filter, proportional_filter
-from yid_ocp.integrator.rollout import Rest, Statics, adjoint_gradient, simulate
-from yid_ocp.integrator.step import Directions, Feedback, Step, Sweep, check_shape
+from yid_ocp.integrator.lqr import MomentumShift, lqr_filter, proportional_filter
+from yid_ocp.integrator.rollout import adjoint_gradient, simulate
+from yid_ocp.integrator.statics import Rest, Statics
+from yid_ocp.integrator.step import Directions, Feedback, Rollout, Step, check_shape
+from yid_ocp.problem.corrections import InputCorrections, Inputs
 from yid_ocp.problem.episodes import Episode as Episode
 from yid_ocp.problem.episodes import apparent_inertia, beginning, prepare_episode
-from yid_ocp.problem.initial import FittedStart, StartFit
-from yid_ocp.problem.inputs import Smoother
+from yid_ocp.problem.low_pass import LowPass
+from yid_ocp.problem.measurements import Measurements, huber
 from yid_ocp.problem.options import ProblemOptions as ProblemOptions
 from yid_ocp.problem.options import SensorOptions as SensorOptions
-from yid_ocp.problem.readings import Inputs, Readings
-from yid_ocp.problem.residuals import Samples, huber
+from yid_ocp.problem.start import FittedStart, StartFit
 from yid_ocp.sensors import Sensor, sensor_function
 
 Array = NDArray[np.float64]
@@ -41,7 +42,7 @@ class EpisodeResult:
 
     Attributes
     ----------
-    sweep : Sweep
+    rollout : Rollout
     rest : Rest or None
         The equilibrium at which it started.
     predicted : tuple of ndarray, shape (M, k) each
@@ -49,7 +50,7 @@ class EpisodeResult:
     sensitivities : tuple of ndarray, shape (M, k, d) each, or None
     """
 
-    sweep: Sweep
+    rollout: Rollout
     rest: Rest | None
     predicted: tuple[Array, ...]
     sensitivities: tuple[Array, ...] | None
@@ -135,7 +136,7 @@ class EstimationProblem:
         if not recordings:
             raise DataError("there is no recording to estimate on", hint="give at least one under recordings.estimate")
         self._statics: Statics | None = None
-        self.readings = Readings(self.system, step.compiled)
+        self.readings = InputCorrections(self.system, step.compiled)
         self._functions: dict[tuple[Sensor, tuple[str, ...]], Mapped] = {}
         self.episodes = tuple(self.prepare(recording) for recording in recordings)
         self.held_out = tuple(self.prepare(recording) for recording in held_out)
@@ -238,12 +239,12 @@ class EstimationProblem:
         return self._feedback[key]
 
     def fitted_start(self, episode: Episode, theta: Array) -> FittedStart:
-        """The `given` start of an episode; worked out once, at the first parameters that it is asked for with."""
+        """The fitted start of an episode; worked out once, at the first parameters that it is asked for with."""
         key = id(episode)
         if key not in self._fitted:
             if self._start_fit is None:
                 self._start_fit = StartFit(self.step, self.options.start_parameters)
-            samples: Sequence[Samples] = episode.samples
+            samples: Sequence[Measurements] = episode.samples
             if self.options.start_std is not None:
                 std = self.options.start_std
                 samples = [replace(s, weight=np.where(s.weight > 0, 1.0 / std, 0.0)) for s in samples]
@@ -257,7 +258,7 @@ class EstimationProblem:
         own = theta.copy()
         for name, value in known.items():
             own[self.system.parameters.index(name)] = value
-        if self.options.initial_state == "given" and episode.name not in self.options.known_start:
+        if self.options.initial_state == "fitted_to_points" and episode.name not in self.options.known_start:
             for name, value in self.fitted_start(episode, own).values.items():
                 own[self.system.parameters.index(name)] = value
         return own
@@ -276,7 +277,7 @@ class EstimationProblem:
         known = self.options.known_start.get(episode.name)
         if known is not None:
             state, by_theta = check_shape("known_start", known, (nx,)).copy(), np.zeros((nx, len(wanted)))
-        elif self.options.initial_state == "given":
+        elif self.options.initial_state == "fitted_to_points":
             state, by_theta = self.fitted_start(episode, theta).state.copy(), np.zeros((nx, len(wanted)))
         else:
             guess = self._starts.get(key)
@@ -328,12 +329,12 @@ class EstimationProblem:
         state, by_all, _, message = self._begin(episode, own, none, self._columns)
         return state, by_all, message
 
-    def predict_along(self, samples: Samples, state: Array, by_state: Array, theta: Array) -> tuple[Array, Array]:
-        """Readings along a given trajectory and their derivatives.
+    def predict_along(self, samples: Measurements, state: Array, by_state: Array, theta: Array) -> tuple[Array, Array]:
+        """InputCorrections along a given trajectory and their derivatives.
 
         Parameters
         ----------
-        samples : Samples
+        samples : Measurements
         state : ndarray, shape (N + 1, nx)
         by_state : ndarray, shape (N + 1, nx, d)
             The first of the d directions are the free parameters.
@@ -350,7 +351,7 @@ class EstimationProblem:
 
     def _read(
         self,
-        samples: Samples,
+        samples: Measurements,
         state: Array,
         by_state: Array | None,
         effort: Array,
@@ -358,7 +359,7 @@ class EstimationProblem:
         theta: Array,
         wanted: tuple[str, ...],
     ) -> tuple[Array, Array]:
-        """Readings at the samples' nodes, (nodes, k), and their derivatives by d directions, (nodes, k, d).
+        """InputCorrections at the samples' nodes, (nodes, k), and their derivatives by d directions, (nodes, k, d).
 
         `effort` has a row for every node of the samples; `by_effort` is that of prescribed joints along the rollout.
         """
@@ -400,42 +401,44 @@ class EstimationProblem:
             by_torque, by_path = (None if by is None else np.pad(by, extra) for by in moved)
             directions = Directions(wanted, by_start, by_torque, by_path)
         feedback = inputs.guided(feedback, driven, episode.measured_arm)
-        sweep = simulate(self.step, theta, state, episode.grid.steps, inputs.torque, inputs.path, feedback, directions)
-        if not sweep.status.ok:
-            return f"{episode.name}: {sweep.status.message}"
+        rollout = simulate(
+            self.step, theta, state, episode.grid.steps, inputs.torque, inputs.path, feedback, directions
+        )
+        if not rollout.status.ok:
+            return f"{episode.name}: {rollout.status.message}"
         predicted, sensitivities = [], []
         for samples in episode.samples:
-            values, by_all = self._predict(samples, sweep, theta, wanted, derivatives)
+            values, by_all = self._predict(samples, rollout, theta, wanted, derivatives)
             predicted.append(values)
             sensitivities.append(by_all)
         # states by all directions are the largest arrays of all, and what samples need of them has been taken
-        sweep = replace(sweep, by_state=None, by_multipliers=None, by_effort=None)
-        return EpisodeResult(sweep, rest, tuple(predicted), tuple(sensitivities) if derivatives else None)
+        rollout = replace(rollout, by_state=None, by_multipliers=None, by_effort=None)
+        return EpisodeResult(rollout, rest, tuple(predicted), tuple(sensitivities) if derivatives else None)
 
-    def efforts(self, sweep: Sweep) -> Array:
+    def efforts(self, rollout: Rollout) -> Array:
         """Effort of prescribed joints and torque of driven ones along a rollout, zero elsewhere, shape (N + 1, n)."""
-        steps = len(sweep.multipliers)
+        steps = len(rollout.multipliers)
         effort = np.zeros((steps + 1, self.system.size))
-        effort[:-1, list(self.system.prescribed_indices)] = sweep.effort
-        effort[:-1, list(self.system.driven_indices)] = sweep.torque
+        effort[:-1, list(self.system.prescribed_indices)] = rollout.effort
+        effort[:-1, list(self.system.driven_indices)] = rollout.torque
         effort[-1] = effort[-2]
         return effort
 
     def _predict(
-        self, samples: Samples, sweep: Sweep, theta: Array, wanted: tuple[str, ...], derivatives: bool
+        self, samples: Measurements, rollout: Rollout, theta: Array, wanted: tuple[str, ...], derivatives: bool
     ) -> tuple[Array, Array]:
         unmoved, late = samples, self.lateness(samples, theta, wanted)
         if late is not None:
             samples = samples.late(late[0])
-        by_state = sweep.by_state if derivatives else None
-        effort = self.efforts(sweep)[samples.nodes]
-        y, total = self._read(samples, sweep.state, by_state, effort, sweep.by_effort, theta, wanted)
+        by_state = rollout.by_state if derivatives else None
+        effort = self.efforts(rollout)[samples.nodes]
+        y, total = self._read(samples, rollout.state, by_state, effort, rollout.by_effort, theta, wanted)
         predicted, slopes = samples.interpolate(y), samples.interpolate(total)
         if late is not None and by_state is not None:
             slopes[:, :, : len(wanted)] -= samples.slope(y, unmoved, late[0])[:, :, None] * late[1]
         return predicted, slopes
 
-    def lateness(self, samples: Samples, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array] | None:
+    def lateness(self, samples: Measurements, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array] | None:
         """By how many steps each output is late, shape (k,), and its derivative, (k, d); None where none ever is."""
         found = self.readings.sensor_delay(samples.sensor, theta, wanted)
         return None if found is None else (found[0] / self.step.time_step, found[1] / self.step.time_step)
@@ -485,7 +488,7 @@ class EstimationProblem:
         """Measured angles of the driven joints, smooth enough to be differenced, shape (N + 1, nu)."""
         key = id(episode)
         if key not in self._smoothed:
-            self._smoothed[key] = Smoother(self.options.path_cutoff)(episode.grid.times, episode.measured_arm)
+            self._smoothed[key] = LowPass(self.options.path_cutoff)(episode.grid.times, episode.measured_arm)
         return self._smoothed[key]
 
     def evaluate(self, x: ArrayLike, derivatives: bool = True) -> Evaluation:
@@ -525,7 +528,7 @@ class EstimationProblem:
             for k, samples in enumerate(self.episodes[i].samples):
                 difference = np.where(samples.weight > 0, result.predicted[k] - samples.value, 0.0)
                 raw = samples.weight * difference
-                part, factor = huber(raw, self.options.robust_scale)
+                part, factor = huber(raw, self.options.huber_threshold)
                 cost += part
                 keep = (samples.weight > 0).ravel()
                 residuals.append((factor * raw).ravel()[keep])
@@ -568,8 +571,8 @@ class EstimationProblem:
 
     @cached_property
     def _tied(self) -> NDArray[np.int64]:
-        """Unknowns under the tie-break."""
-        if self.options.weighting == "paper" or self.options.tie_break <= 1:
+        """Unknowns under the weak prior."""
+        if self.options.weighting == "paper" or self.options.weak_prior_factor <= 1:
             return np.zeros(0, int)
         return np.flatnonzero(self.positive & ~np.isfinite(self._prior_deviations))
 
@@ -584,12 +587,12 @@ class EstimationProblem:
 
     @property
     def stated_prior_rows(self) -> int:
-        """Rows of initial states' and stated priors, which stand before the tie-break's at the end of the residual."""
+        """Rows of initial states' and stated priors, which stand before the weak priors' at the end of the residual."""
         return int(np.isfinite(self._prior_deviations).sum())
 
     @property
-    def tie_break_rows(self) -> int:
-        """Rows of the tie-break, the last of the residual."""
+    def weak_prior_rows(self) -> int:
+        """Rows of the weak prior, the last of the residual."""
         return len(self._tied)
 
     @property
@@ -609,13 +612,13 @@ class EstimationProblem:
         return float(np.sqrt(np.mean(np.concatenate(found) ** 2)))
 
     def prior(self, x: Array) -> tuple[Array, Array]:
-        """Rows of the priors and of the tie-break, and their derivative by the unknowns."""
+        """Rows of the priors and of the weak prior, and their derivative by the unknowns."""
         stated, tied = np.flatnonzero(np.isfinite(self._prior_deviations)), self._tied
         rows = np.zeros((len(stated) + len(tied), len(x)))
         weight = 1.0 / self._prior_deviations[stated]
         rows[np.arange(len(stated)), stated] = weight
         start = self.start
-        spread = np.log(max(self.options.tie_break, 1.0 + 1e-9))
+        spread = np.log(max(self.options.weak_prior_factor, 1.0 + 1e-9))
         ratio = np.maximum(x[tied] / start[tied], 1e-9)
         rows[len(stated) + np.arange(len(tied)), tied] = 1.0 / (spread * ratio * start[tied])
         return np.concatenate([weight * (x - start)[stated], np.log(ratio) / spread]), rows
@@ -658,20 +661,20 @@ class EstimationProblem:
             episode = self.episodes[i]
             theta, deviation = self.split(x, i)
             theta = self.own_theta(episode, theta)
-            sweep = result.sweep
-            by_state, by_effort = np.zeros((episode.grid.steps + 1, nx)), np.zeros_like(sweep.effort)
+            rollout = result.rollout
+            by_state, by_effort = np.zeros((episode.grid.steps + 1, nx)), np.zeros_like(rollout.effort)
             total = np.zeros(len(wanted))
             for k, samples in enumerate(episode.samples):
                 raw = samples.weight * np.where(samples.weight > 0, result.predicted[k] - samples.value, 0.0)
-                _, factor = huber(raw, self.options.robust_scale)
+                _, factor = huber(raw, self.options.huber_threshold)
                 pull = factor**2 * raw * samples.weight
                 unmoved, late = samples, self.lateness(samples, theta, wanted)
                 if late is not None:
                     samples = samples.late(late[0])
                 at_nodes = samples.distribute(pull)
                 nodes = samples.nodes
-                q, z = sweep.state[nodes, :n], sweep.state[nodes, 2 * n :]
-                efforts = self.efforts(sweep)[nodes]
+                q, z = rollout.state[nodes, :n], rollout.state[nodes, 2 * n :]
+                efforts = self.efforts(rollout)[nodes]
                 y, by_q, by_z, by_e, by_theta = self.sensor(samples.sensor, wanted)(q, z, efforts, theta)
                 if late is not None:
                     total -= np.sum(pull * samples.slope(y[:, :, 0], unmoved, late[0]), axis=0) @ late[1]
@@ -680,19 +683,19 @@ class EstimationProblem:
                 total += np.einsum("mk,mkq->q", at_nodes, by_theta)
                 fixed = list(self.system.prescribed_indices)
                 if fixed:
-                    last = np.minimum(nodes, len(sweep.effort) - 1)
+                    last = np.minimum(nodes, len(rollout.effort) - 1)
                     np.add.at(by_effort, last, np.einsum("mk,mkq->mq", at_nodes, by_e[:, :, fixed]))
             feedback = self.feedback(episode)
-            swept = adjoint_gradient(self.step, theta, sweep, wanted, by_state, None, by_effort, feedback)
+            adjoint = adjoint_gradient(self.step, theta, rollout, wanted, by_state, None, by_effort, feedback)
             inputs = self.inputs(episode, theta, wanted)
             by_torque = inputs.torque_directions(feedback, self.system.driven_indices)
             if by_torque is not None:
-                total += np.einsum("ku,kuw->w", swept.by_torque, by_torque)
+                total += np.einsum("ku,kuw->w", adjoint.by_torque, by_torque)
             if inputs.by_path is not None:
                 # node 0 is part of the start state
-                total += np.einsum("kc,kcw->w", swept.by_path[1:], inputs.by_path[1:])
+                total += np.einsum("kc,kcw->w", adjoint.by_path[1:], inputs.by_path[1:])
             _, by_start, _, _ = self._begin(episode, theta, deviation, wanted)
-            own = np.concatenate([total + swept.by_theta, np.zeros(self._start_size)]) + swept.by_start @ by_start
+            own = np.concatenate([total + adjoint.by_theta, np.zeros(self._start_size)]) + adjoint.by_start @ by_start
             gradient += self._placed(own[None, :], i, len(x))[0]
         prior_residual, prior_jacobian = self.prior(x)
         return evaluation.cost, gradient + prior_jacobian.T @ prior_residual, evaluation

@@ -102,7 +102,7 @@ class Solution:
     x : ndarray, shape (nx,)
         Best point so far.
     covariance : ndarray, shape (nx, nx)
-        From the data and stated priors (the tie-break excluded), scaled by chi2 per degree of freedom above one.
+        From the data and stated priors (the weak prior excluded), scaled by chi2 per degree of freedom above one.
     parameters : dict of str to Estimate
         Free parameters shared by all recordings, and the fixed ones that the problem's model has.
     cost : float
@@ -296,14 +296,14 @@ def _good_fit(problem: EstimationProblem, finish: Evaluation) -> bool:
 
 
 def uncertainty(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, float]:
-    """Covariance of the unknowns from data and stated priors, not the tie-break, and chi2 per degree of freedom.
+    """Covariance of the unknowns from data and stated priors, not the weak prior, and chi2 per degree of freedom.
 
     Directions that the data do not inform get a variance of (1e8 x scale)^2 rather than an infinite one.
     """
     count = len(problem.start)
     if evaluation.jacobian is None or not evaluation.ok:
         return np.full((count, count), np.nan), math.nan
-    total = len(evaluation.residual) - problem.tie_break_rows
+    total = len(evaluation.residual) - problem.weak_prior_rows
     data_rows = total - problem.stated_prior_rows
     scale = problem.scales
     noise = problem.paper_noise if problem.options.weighting == "paper" else 1.0

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.integrator.step import Directions
+from yid_ocp.problem.measurements import huber
 from yid_ocp.problem.problem import EstimationProblem
-from yid_ocp.problem.residuals import huber
 from yid_ocp.solvers.base import SOLVERS, Callback, Outcome, Recorder, Status, projected_gradient
-from yid_ocp.solvers.formulation import Transcription
 from yid_ocp.solvers.gauss_newton import bounded_step
+from yid_ocp.solvers.transcription import Transcription
 
 Array = NDArray[np.float64]
 
@@ -74,7 +74,7 @@ class Lifted:
     """Iterate on node states s_j and parameters x with the defects d_j = F^n(s_j, x) - s_{j+1} free to be non-zero.
 
     A linear step closes every defect; the recursion  S_{j+1} = A_j S_j + B_j,  c_{j+1} = A_j c_j + d_j  expresses all
-    node steps by the parameters' step (condensing), so that an iteration costs one rollout with one direction more
+    node steps by the parameters' step (condensing), so that an iteration costs one sweep with one direction more
     than single shooting's. A filter decides whether a step is good: it must improve the cost or the defects.
 
     Attributes
@@ -186,7 +186,7 @@ class Lifted:
                 predicted, sensitivity = problem.predict_along(samples, trajectory, slopes, theta)
                 seen = samples.weight > 0
                 raw = samples.weight * np.where(seen, predicted - samples.value, 0.0)
-                loss, robust = huber(raw, problem.options.robust_scale)
+                loss, robust = huber(raw, problem.options.huber_threshold)
                 cost += loss
                 keep = seen.ravel()
                 scaled = ((robust * samples.weight)[:, :, None] * sensitivity).reshape(raw.size, -1)[keep]
@@ -222,13 +222,13 @@ class Lifted:
             first, last = int(layout.nodes[j]), int(layout.nodes[j + 1])
             column = np.concatenate([by_x[j], by_defect[j][:, None]], axis=1)
             wanted = (*problem.shared, *problem.local)
-            sweep = transcription.interval_sweep(i, j, nodes[j], theta, Directions(wanted, column))
-            if not sweep.status.ok or sweep.by_state is None:
-                return f"{problem.episodes[i].name}: interval {j}: {sweep.status.message}"
-            trajectory[first:last], slopes[first:last] = sweep.state[:-1], sweep.by_state[:-1]
-            gaps[j + 1] = sweep.state[-1] - nodes[j + 1]
-            by_x[j + 1] = sweep.by_state[-1][:, :width]
-            by_defect[j + 1] = sweep.by_state[-1][:, width] + gaps[j + 1]
+            rollout = transcription.interval_sweep(i, j, nodes[j], theta, Directions(wanted, column))
+            if not rollout.status.ok or rollout.by_state is None:
+                return f"{problem.episodes[i].name}: interval {j}: {rollout.status.message}"
+            trajectory[first:last], slopes[first:last] = rollout.state[:-1], rollout.by_state[:-1]
+            gaps[j + 1] = rollout.state[-1] - nodes[j + 1]
+            by_x[j + 1] = rollout.by_state[-1][:, :width]
+            by_defect[j + 1] = rollout.by_state[-1][:, width] + gaps[j + 1]
             trajectory[last] = nodes[j + 1]
             slopes[last, :, :width], slopes[last, :, width] = by_x[j + 1], by_defect[j + 1]
         return trajectory, slopes, by_x, by_defect, gaps

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from yid_ocp.errors import SolverError
 from yid_ocp.problem.problem import EstimationProblem
 from yid_ocp.solvers.base import SOLVERS, Callback, Outcome, Recorder, Status, check_positive
-from yid_ocp.solvers.formulation import Transcription
+from yid_ocp.solvers.transcription import Transcription
 
 Array = NDArray[np.float64]
 Hessian = Literal["gauss_newton", "exact"]

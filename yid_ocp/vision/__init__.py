@@ -1,21 +1,21 @@
 """From a depth camera's clouds to measured points of the object; and a virtual camera that makes such clouds."""
 
+from yid_ocp.vision.camera import Background as Background
 from yid_ocp.vision.camera import DepthCamera as DepthCamera
-from yid_ocp.vision.camera import Room as Room
-from yid_ocp.vision.camera import Shutter as Shutter
-from yid_ocp.vision.camera import VirtualFilm as VirtualFilm
-from yid_ocp.vision.camera import film as film
+from yid_ocp.vision.camera import FrameTiming as FrameTiming
+from yid_ocp.vision.camera import VirtualFrames as VirtualFrames
+from yid_ocp.vision.camera import virtual_frames as virtual_frames
 from yid_ocp.vision.clock import Clock as Clock
 from yid_ocp.vision.clock import ClockOptions as ClockOptions
 from yid_ocp.vision.filters import FilterOptions as FilterOptions
 from yid_ocp.vision.fit import FitOptions as FitOptions
 from yid_ocp.vision.fit import ShapeFit as ShapeFit
 from yid_ocp.vision.frames import XTION as XTION
-from yid_ocp.vision.frames import Film as Film
+from yid_ocp.vision.frames import FrameSequence as FrameSequence
 from yid_ocp.vision.frames import Pinhole as Pinhole
 from yid_ocp.vision.frames import look_at as look_at
-from yid_ocp.vision.frames import read_film as read_film
-from yid_ocp.vision.frames import write_film as write_film
+from yid_ocp.vision.frames import read_frames as read_frames
+from yid_ocp.vision.frames import write_frames as write_frames
 from yid_ocp.vision.skeleton import WalkOptions as WalkOptions
 from yid_ocp.vision.track import FrameReport as FrameReport
 from yid_ocp.vision.track import Track as Track

@@ -22,7 +22,7 @@ from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
 from yid_ocp.errors import ConfigError
 from yid_ocp.model.system import System
-from yid_ocp.vision.frames import XTION, Film, Pinhole, checked_pose
+from yid_ocp.vision.frames import XTION, FrameSequence, Pinhole, checked_pose
 from yid_ocp.vision.meshes import Mesh, Surfaces, numeric_mechanism, robot_meshes, tube_meshes
 
 Array = NDArray[np.float64]
@@ -135,7 +135,7 @@ class DepthCamera:
 
 
 @dataclass(frozen=True)
-class Shutter:
+class FrameTiming:
     """When a camera takes frames, and what happens to them and to their time stamps.
 
     Attributes
@@ -176,12 +176,12 @@ class Shutter:
 
 
 @dataclass(frozen=True, eq=False)
-class VirtualFilm:
-    """A virtual camera's film with what really was.
+class VirtualFrames:
+    """A virtual camera's frame sequence with what really was.
 
     Attributes
     ----------
-    film : Film
+    sequence : FrameSequence
     taken : ndarray, shape (M,)
         Time of every picture on the simulator's clock [s].
     q : ndarray, shape (M, n)
@@ -192,7 +192,7 @@ class VirtualFilm:
         From a time to the configuration then, shape (n,).
     """
 
-    film: Film
+    sequence: FrameSequence
     taken: Array
     q: Array
     depth: Sequence[Array]
@@ -200,7 +200,7 @@ class VirtualFilm:
 
 
 @dataclass(frozen=True)
-class Room:
+class Background:
     """What stands around the robot: a floor at z and a wall at x [m], None for neither."""
 
     floor: float | None = -0.93
@@ -244,7 +244,7 @@ class _Images(Sequence[Array]):
         return self._kept[number]
 
 
-def film(
+def virtual_frames(
     system: System,
     t: ArrayLike,
     q: ArrayLike,
@@ -252,11 +252,11 @@ def film(
     *,
     urdf: str | None = "package:baxter",
     camera: DepthCamera | None = None,
-    shutter: Shutter | None = None,
-    room: Room | None = None,
+    timing: FrameTiming | None = None,
+    background: Background | None = None,
     values: Mapping[str, float] | None = None,
     seed: int = 0,
-) -> VirtualFilm:
+) -> VirtualFrames:
     """Let a virtual camera look at a motion.
 
     Parameters
@@ -272,8 +272,8 @@ def film(
         File of the robot whose meshes are seen; None to see the object alone.
     camera : DepthCamera, optional
         An Asus Xtion Pro Live where absent.
-    shutter : Shutter, optional
-    room : Room, optional
+    timing : FrameTiming, optional
+    background : Background, optional
         A floor under the paper's Y and a wall behind Baxter where absent; nothing where there is no robot either.
     values : mapping of str to float, optional
         Parameter values (lengths, radii); nominal where absent.
@@ -282,7 +282,7 @@ def film(
 
     Returns
     -------
-    VirtualFilm
+    VirtualFrames
         Frames are rendered when they are loaded, the same every time.
 
     Raises
@@ -290,8 +290,8 @@ def film(
     DataError, ModelError
         No Open3D, no object, a mesh that cannot be read, or a pose that is none.
     """
-    sensor, when = camera or DepthCamera(), shutter or Shutter()
-    matrix = checked_pose(pose, "film")
+    sensor, when = camera or DepthCamera(), timing or FrameTiming()
+    matrix = checked_pose(pose, "sequence")
     times, path = np.asarray(t, float), np.asarray(q, float)
     rng = np.random.default_rng(seed)
     taken, stamps = when.times(float(times[0]), float(times[-1]), rng)
@@ -299,7 +299,7 @@ def film(
     configuration = np.asarray(course(taken))
     tree = numeric_mechanism(system, values)
     meshes = tube_meshes(system, values)
-    fixed = [] if room is None and urdf is None else [(room or Room()).mesh()]
+    fixed = [] if background is None and urdf is None else [(background or Background()).mesh()]
     for joint, mesh in (robot_meshes(urdf, tree) if urdf is not None else {}).items():
         if joint < 0:
             fixed.append(mesh)
@@ -310,5 +310,7 @@ def film(
         meshes[-1] = Mesh.joined(still)
     images = _Images(Surfaces(tree, meshes), sensor, matrix, configuration, seed)
     names = tuple(f"frame {i}" for i in range(len(taken)))
-    made = Film(stamps, names, matrix, lambda i: sensor.pinhole.cloud(images[i]), sensor.pinhole, "virtual camera")
-    return VirtualFilm(made, taken, configuration, images, lambda at: np.asarray(course(at)))
+    made = FrameSequence(
+        stamps, names, matrix, lambda i: sensor.pinhole.cloud(images[i]), sensor.pinhole, "virtual camera"
+    )
+    return VirtualFrames(made, taken, configuration, images, lambda at: np.asarray(course(at)))

@@ -112,7 +112,7 @@ XTION = Pinhole.of_view(640, 480, math.radians(58.0))
 
 
 @dataclass(frozen=True, eq=False)
-class Film:
+class FrameSequence:
     """Clouds of one camera, loaded one at a time.
 
     Attributes
@@ -134,7 +134,7 @@ class Film:
     pose: Array
     load: Callable[[int], Array]
     intrinsics: Pinhole | None = None
-    source: str = "film"
+    source: str = "sequence"
 
     def __len__(self) -> int:
         return len(self.names)
@@ -143,15 +143,15 @@ class Film:
         """Cloud of a frame in the world, shape (N, 3) [m]; `DataError` where it cannot be read."""
         return self.load(index) @ self.pose[:3, :3].T + self.pose[:3, 3]
 
-    def select(self, indices: Sequence[int]) -> Film:
-        """The film with only these frames, in this order."""
+    def select(self, indices: Sequence[int]) -> FrameSequence:
+        """The frame sequence with only these frames, in this order."""
         kept = [int(i) for i in indices]
         names, source = tuple(self.names[i] for i in kept), self.source
-        return Film(self.t[kept], names, self.pose, lambda i: self.load(kept[i]), self.intrinsics, source)
+        return FrameSequence(self.t[kept], names, self.pose, lambda i: self.load(kept[i]), self.intrinsics, source)
 
     @staticmethod
-    def of(t: ArrayLike, clouds: Sequence[ArrayLike], pose: ArrayLike, *, source: str = "film") -> Film:
-        """A film of clouds that are in memory.
+    def of(t: ArrayLike, clouds: Sequence[ArrayLike], pose: ArrayLike, *, source: str = "sequence") -> FrameSequence:
+        """A frame sequence of clouds that are in memory.
 
         Parameters
         ----------
@@ -165,7 +165,7 @@ class Film:
         """
         arrays = [np.asarray(cloud, float).reshape(-1, 3) for cloud in clouds]
         names = tuple(f"frame {i}" for i in range(len(arrays)))
-        return Film(np.asarray(t, float), names, checked_pose(pose, source), arrays.__getitem__, None, source)
+        return FrameSequence(np.asarray(t, float), names, checked_pose(pose, source), arrays.__getitem__, None, source)
 
 
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
@@ -203,7 +203,9 @@ def checked_pose(pose: ArrayLike | None, where: str) -> Array:
 # -- the folder -------------------------------------------------------------------------------------------------------
 
 
-def read_film(folder: str | os.PathLike[str], *, pose: ArrayLike | None = None, unit: str | None = None) -> Film:
+def read_frames(
+    folder: str | os.PathLike[str], *, pose: ArrayLike | None = None, unit: str | None = None
+) -> FrameSequence:
     """Open a folder of clouds or depth images.
 
     The folder holds `camera.json` (`yid-frames/1`: `pose` 4x4, `frame` "camera" or "world" of the clouds, `unit` "m" or
@@ -220,7 +222,7 @@ def read_film(folder: str | os.PathLike[str], *, pose: ArrayLike | None = None, 
 
     Returns
     -------
-    Film
+    FrameSequence
 
     Raises
     ------
@@ -265,19 +267,21 @@ def read_film(folder: str | os.PathLike[str], *, pose: ArrayLike | None = None, 
             points = (points - camera[:3, 3]) @ camera[:3, :3]
         return points
 
-    return Film(times, names, camera, load, intrinsics, str(path))
+    return FrameSequence(times, names, camera, load, intrinsics, str(path))
 
 
-def write_film(film: Film, folder: str | os.PathLike[str], *, depth: Sequence[ArrayLike] | None = None) -> None:
-    """Write a film as a folder that `read_film` reads: binary PLY clouds, or depth images in millimetres.
+def write_frames(
+    sequence: FrameSequence, folder: str | os.PathLike[str], *, depth: Sequence[ArrayLike] | None = None
+) -> None:
+    """Write a frame sequence as a folder that `read_frames` reads: binary PLY clouds, or depth images in millimetres.
 
     Parameters
     ----------
-    film : Film
+    sequence : FrameSequence
     folder : path-like
         Made where it does not exist.
     depth : sequence of array_like, each (height, width), optional
-        Depth images [m] to write instead of clouds; the film must have intrinsics.
+        Depth images [m] to write instead of clouds; the frame sequence must have intrinsics.
 
     Raises
     ------
@@ -289,25 +293,25 @@ def write_film(film: Film, folder: str | os.PathLike[str], *, depth: Sequence[Ar
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"the folder cannot be made: {error.strerror}", where=str(path)) from error
-    if depth is not None and film.intrinsics is None:
+    if depth is not None and sequence.intrinsics is None:
         raise OutputError("depth images need the camera's intrinsics", where=str(path))
     ending = CLOUD_ENDINGS[0] if depth is None else DEPTH_ENDING
-    names = [f"{i:06d}{ending}" for i in range(len(film))]
+    names = [f"{i:06d}{ending}" for i in range(len(sequence))]
     for i, name in enumerate(names):
         if depth is None:
-            _write_cloud(path / name, film.load(i))
+            _write_cloud(path / name, sequence.load(i))
         else:
             _write_depth(path / name, np.asarray(depth[i], float))
-    head: dict[str, Any] = {"format": FORMAT, "pose": film.pose.tolist(), "frame": "camera", "unit": "m"}
-    if film.intrinsics is not None:
-        head["intrinsics"] = asdict(film.intrinsics)
+    head: dict[str, Any] = {"format": FORMAT, "pose": sequence.pose.tolist(), "frame": "camera", "unit": "m"}
+    if sequence.intrinsics is not None:
+        head["intrinsics"] = asdict(sequence.intrinsics)
         head["depth_unit"] = 1e-3
     with new_file(path / CAMERA_FILE) as temporary:
         temporary.write_text(json.dumps(head, indent=1) + "\n", encoding="utf-8")
     with new_file(path / STAMP_FILE) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["file", "t"])
-        writer.writerows([name, repr(float(t))] for name, t in zip(names, film.t, strict=True))
+        writer.writerows([name, repr(float(t))] for name, t in zip(names, sequence.t, strict=True))
 
 
 def _read_camera(path: Path) -> dict[str, Any]:

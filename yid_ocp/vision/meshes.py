@@ -19,8 +19,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import DataError, ModelError
 from yid_ocp.model.kinematics import forward_kinematics
-from yid_ocp.model.mechanism import Mechanism, robot_description_file
+from yid_ocp.model.mechanism import Mechanism
 from yid_ocp.model.system import System
+from yid_ocp.model.urdf import robot_description_file
 from yid_ocp.vision.frames import Pinhole, open3d_module
 
 Array = NDArray[np.float64]

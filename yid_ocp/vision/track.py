@@ -1,4 +1,4 @@
-"""From a film and the joints' recording to measured points: filter, thin, fit, judge, and write them down.
+"""From a frame sequence and the joints' recording to measured points: filter, thin, fit, judge, and write them down.
 
 Every frame ends as a fitted shape or with the reason why it was dropped; nothing in one frame stops the sequence.
 """
@@ -22,7 +22,7 @@ from yid_ocp.model.system import System
 from yid_ocp.vision.clock import Clock, ClockOptions, estimate_clock
 from yid_ocp.vision.filters import Cloud, FilterOptions, ObjectRegion, voxel_grid, without_outliers, without_robot
 from yid_ocp.vision.fit import Fit, FitOptions, ShapeFit, Sight
-from yid_ocp.vision.frames import Film
+from yid_ocp.vision.frames import FrameSequence
 from yid_ocp.vision.meshes import MeshKind, Surfaces, numeric_mechanism, robot_meshes
 from yid_ocp.vision.skeleton import Skeleton, WalkOptions, skeleton
 
@@ -36,7 +36,7 @@ _SAME_TIME = 1e-6  # [s]
 
 @dataclass(frozen=True)
 class TrackOptions:
-    """How a film is turned into measured points.
+    """How a frame sequence is turned into measured points.
 
     Attributes
     ----------
@@ -98,7 +98,7 @@ class FrameReport:
     Attributes
     ----------
     index : int
-        Of the film.
+        Of the sequence.
     name : str
     stamp : float
         As the camera gave it [s].
@@ -223,7 +223,7 @@ class Track:
 def track(
     system: System,
     recording: Recording,
-    film: Film,
+    sequence: FrameSequence,
     *,
     urdf: str | Path | None = None,
     options: TrackOptions | None = None,
@@ -231,7 +231,7 @@ def track(
     stages: Sequence[int] = (),
     progress: Progress | None = None,
 ) -> Track:
-    """Measure the object's points in a film.
+    """Measure the object's points in a sequence.
 
     Parameters
     ----------
@@ -239,14 +239,14 @@ def track(
         Robot and object. Its joints that are not elastic must be in the recording.
     recording : Recording
         Joint angles, for the self-filter, the grasps and the clock.
-    film : Film
+    sequence : FrameSequence
     urdf : str or Path, optional
         File of the robot, for its meshes (`package:baxter`); without it there is no self-filter and no clock offset.
     options : TrackOptions, optional
     values : mapping of str to float, optional
         Parameter values (lengths, radii, relative stiffnesses); nominal where absent.
     stages : sequence of int
-        Frames of the film of which all stages are kept for pictures.
+        Frames of the frame sequence of which all stages are kept for pictures.
     progress : callable, optional
         Called with frames done, frames in all and what is being done.
 
@@ -263,7 +263,7 @@ def track(
     ModelError
         Meshes that cannot be read.
     """
-    return _Tracker(system, recording, film, urdf, options or TrackOptions(), values, stages, progress).run()
+    return _Tracker(system, recording, sequence, urdf, options or TrackOptions(), values, stages, progress).run()
 
 
 class _Tracker:
@@ -273,20 +273,20 @@ class _Tracker:
         self,
         system: System,
         recording: Recording,
-        film: Film,
+        sequence: FrameSequence,
         urdf: str | Path | None,
         options: TrackOptions,
         values: Mapping[str, float] | None,
         stages: Sequence[int],
         progress: Progress | None,
     ) -> None:
-        self.system, self.film, self.options = system, film, options
+        self.system, self.sequence, self.options = system, sequence, options
         self.wanted = frozenset(stages)
         self.tell = progress or (lambda done, total, text: None)
         self.shape = ShapeFit(system, options.fit, values)
         self.names = _chosen_points(system, options.points)
         self.region = ObjectRegion(system, options.filters, values)
-        self.camera = film.pose[:3, 3]
+        self.camera = sequence.pose[:3, 3]
         self.span, self.angles = _joint_angles(system, recording, self.shape.known)
         tree = numeric_mechanism(system, values)
         self.robot: Surfaces | None = None
@@ -305,14 +305,14 @@ class _Tracker:
         return q
 
     def run(self) -> Track:
-        """Both passes over the film."""
-        film, total = self.film, len(self.film)
-        order, reasons = _sorted_frames(film.t)
+        """Both passes over the sequence."""
+        sequence, total = self.sequence, len(self.sequence)
+        order, reasons = _sorted_frames(sequence.t)
         self._check_clock([i for i in order if i not in reasons])
         clouds: list[Cloud | None] = []
         raw: dict[int, int] = {}
         for done, i in enumerate(order):
-            self.tell(done, 2 * total, f"reading {film.names[i]}")
+            self.tell(done, 2 * total, f"reading {sequence.names[i]}")
             cloud = None
             if i not in reasons:
                 try:
@@ -320,14 +320,14 @@ class _Tracker:
                 except DataError as error:
                     reasons[i] = error.what
             clouds.append(cloud)
-        stamps = film.t[order]
+        stamps = sequence.t[order]
         self.tell(total, 2 * total, "comparing the clocks")
         clock = self._clock(clouds, stamps)
         frames: list[FrameReport] = []
         kept: list[Stages] = []
         last: tuple[Array, float] | None = None
         for k, i in enumerate(order):
-            self.tell(total + k, 2 * total, f"fitting {film.names[i]}")
+            self.tell(total + k, 2 * total, f"fitting {sequence.names[i]}")
             report, stage = self._frame(i, clouds[k], clock, k, reasons.get(i, ""), raw.get(i, 0), last)
             clouds[k] = None
             frames.append(report)
@@ -346,19 +346,19 @@ class _Tracker:
     def _check_clock(self, usable: Sequence[int]) -> None:
         if self.span is None or not usable:
             return
-        options, stamps = self.options.clock, self.film.t[list(usable)]
+        options, stamps = self.options.clock, self.sequence.t[list(usable)]
         first, last = float(stamps.min()) - options.offset, float(stamps.max()) - options.offset
         if first > self.span[1] + options.search or last < self.span[0] - options.search:
             raise DataError(
                 f"the frames run from {first:.3f} s to {last:.3f} s, the joints from {self.span[0]:.3f} s to"
                 f" {self.span[1]:.3f} s: their clocks are not the same",
-                where=self.film.source,
+                where=self.sequence.source,
                 hint=f"give the clock offset (stamp minus joint time): {first + options.offset - self.span[0]:.3f} s if"
                 " both started together",
             )
 
     def _read(self, index: int) -> tuple[Cloud, int]:
-        points = self.film.world(index)
+        points = self.sequence.world(index)
         count = len(points)
         points = points[np.isfinite(points).all(axis=1)]
         if not len(points):
@@ -367,7 +367,7 @@ class _Tracker:
         if far > _LARGEST:
             raise DataError(f"the cloud is not in metres: half of its points are {far:.0f} m away (millimetres?)")
         filters = self.options.filters
-        q = self.posture(float(self.film.t[index]) - self.options.clock.offset)
+        q = self.posture(float(self.sequence.t[index]) - self.options.clock.offset)
         inside = self.region.at(q, self.camera).contains(points)
         if not inside.any():
             raise DataError("no point lies where the object can be: check the camera's pose")
@@ -394,9 +394,9 @@ class _Tracker:
         last: tuple[Array, float] | None,
     ) -> tuple[FrameReport, Stages | None]:
         options = self.options
-        stamp = float(self.film.t[index])
+        stamp = float(self.sequence.t[index])
         t, delay = stamp - clock.offset, float(clock.delay[row])
-        report = FrameReport(index, self.film.names[index], stamp, t, reason, raw, 0, 0, delay, 0.0, None)
+        report = FrameReport(index, self.sequence.names[index], stamp, t, reason, raw, 0, 0, delay, 0.0, None)
         if reason or cloud is None:
             return report, None
         if self.span is not None and not self.span[0] <= t <= self.span[1]:
@@ -424,7 +424,7 @@ class _Tracker:
         report = replace(report, fit=fit, reason=self._judge(fit), seconds=spent)
         stage = None
         if index in self.wanted:
-            stage = Stages(self.film.names[index], self.film.world(index), rest.points, found, fit, self.camera)
+            stage = Stages(self.sequence.names[index], self.sequence.world(index), rest.points, found, fit, self.camera)
         return report, stage
 
     def _judge(self, fit: Fit) -> str:
@@ -463,7 +463,7 @@ class _Tracker:
             )
             if "metres" in listed:
                 hint = "say in camera.json that the unit is mm"
-            raise DataError(f"not one frame could be used: {listed}", where=self.film.source, hint=hint)
+            raise DataError(f"not one frame could be used: {listed}", where=self.sequence.source, hint=hint)
         fits = [frame.fit for frame in good if frame.fit is not None]
         t = np.array([frame.t for frame in good])
         columns = [self.system.points.index(name) for name in self.names]
@@ -482,7 +482,7 @@ class _Tracker:
             raise DataError(
                 f"no point is known well enough in any frame: the best within {best:.0f} mm,"
                 f" point_std_max is {1e3 * self.options.point_std_max:g} mm",
-                where=self.film.source,
+                where=self.sequence.source,
                 hint=f"check the camera's pose and clock ({clock.message}), or look at the pictures of a frame",
             )
         return Track(
@@ -496,7 +496,7 @@ class _Tracker:
             tuple(kept),
             self.system.points,
             self.shape.place,
-            self.film.pose,
+            self.sequence.pose,
         )
 
 

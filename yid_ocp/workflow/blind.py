@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from yid_ocp.config.settings import Run, dump_config
 from yid_ocp.data.recording import new_file, read_recording, write_recording
 from yid_ocp.diagnosis import Thresholds
 from yid_ocp.diagnosis.blind import Case, Ensemble, Label, answer, best_closure, mark, opened, score, seal
 from yid_ocp.errors import OutputError, YidError
 from yid_ocp.workflow.build import build_problem, build_system
 from yid_ocp.workflow.folder import Monitor, Silent, jsonable, versions
-from yid_ocp.workflow.settings import Run, dump_config
 
 COMMITMENT, LABELS, RESULT, TABLE = "commitment.json", "sealed/labels.json", "result.json", "table.md"
 
@@ -60,11 +60,11 @@ def run_blind(
     folder = Path(out)
     if count < 1:
         raise run.refuse(f"an ensemble of {count} cases", "diagnosis", hint="give --cases from 1")
-    if run.diagnosis.noise_share < 1 or any(entry.std is not None for entry in run.sensors.values()):
+    if run.diagnosis.noise_fraction < 1 or any(entry.std is not None for entry in run.sensors.values()):
         raise run.refuse(
             "virtual recordings have the noise of `virtual_experiment`, not that of these settings",
             "sensors",
-            hint="leave sensors.*.std and diagnosis.noise_share out",
+            hint="leave sensors.*.std and diagnosis.noise_fraction out",
         )
     problem = build_problem(run)
     links = len(problem.system.segments[0].links) if problem.system.segments else 0

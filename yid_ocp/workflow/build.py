@@ -13,27 +13,24 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.analysis.convergence import grasp_gaps
+from yid_ocp.config.reader import load_config
+from yid_ocp.config.settings import CableObject, MountSettings, ParameterSettings, Run, SegmentedObject, YObject
+from yid_ocp.data.edges import edge_lengths
 from yid_ocp.data.recording import Recording, read_recording
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import DataError, ModelError, YidError, nearest
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model import FlexibleObject, Grasp, Mechanism, Segment, System, flexible_object
-from yid_ocp.model.mechanism import robot_description_file, roll_pitch_yaw
+from yid_ocp.model.cable import BranchOptions, Cable, CableOptions, cable_system, length_values, read_vertices
 from yid_ocp.model.parameters import Parameters
+from yid_ocp.model.rotations import roll_pitch_yaw
 from yid_ocp.model.system import Spring, placement_matrix
-from yid_ocp.model.y_object import y_segments
+from yid_ocp.model.urdf import read_urdf, robot_description_file
+from yid_ocp.model.y_object import Y_FOOT, y_segments
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.cable import (
-    BranchOptions,
-    Cable,
-    CableOptions,
-    cable_system,
-    length_values,
-    read_vertices,
-)
 from yid_ocp.problem.problem import Episode
-from yid_ocp.workflow.settings import CableObject, MountSettings, ParameterSettings, Run, SegmentedObject, YObject
 
+GIVEN_FRAMES = 2  # of a cable's free points, from which every prediction starts
 LARGEST_GAP = 0.01  # what encoder noise and a slightly wrong length of the object can make of a grasp [m]
 Placed = tuple[FlexibleObject, str | None, np.ndarray | None]
 
@@ -149,7 +146,7 @@ def _cable_model(run: Run) -> System:
         gravity=run.model.gravity,
     )
     with located(run, "model", "object"):
-        system = cable_system(recordings, cable, options)
+        system = cable_system(edge_lengths(cable.edges, recordings), cable, options)
     return _completed(run, system)
 
 
@@ -171,7 +168,7 @@ def _robot(run: Run) -> Mechanism | None:
     input_files(run)
     with located(run, "model", "arms", "joints"):
         arms = model.arms
-        robot = Mechanism.from_urdf(model.robot, joints=arms.joints, locked=arms.locked, without=arms.without)
+        robot = read_urdf(model.robot, joints=arms.joints, locked=arms.locked, exclude_links=arms.exclude_links)
     for name, at in model.frames.items():
         with located(run, "model", "frames", name):
             robot = robot.with_frame(name, at.frame, _placement(at))
@@ -224,10 +221,11 @@ def _objects(run: Run, damping: float, links: int | None) -> list[Placed]:
             replace(s, links=count, bend=s.bend * factor, twist=s.twist * factor, damping=damping) for s in y_segments()
         ]
         if item.mount is None:
-            foot = placement_matrix((0.85, 0.0, -0.93))
-            return [(flexible_object(segments, foot, weight=item.weight), None, None)]
-        return [(flexible_object(segments, weight=item.weight), item.mount.frame, _placement(item.mount))]
-    made = flexible_object(_segments(item, damping, links), name="object", weight=item.weight)
+            made = flexible_object(segments, placement_matrix(Y_FOOT), "y_object", item.gravity_fraction)
+            return [(made, None, None)]
+        made = flexible_object(segments, None, "y_object", item.gravity_fraction)
+        return [(made, item.mount.frame, _placement(item.mount))]
+    made = flexible_object(_segments(item, damping, links), name="object", gravity_fraction=item.gravity_fraction)
     return [(made, item.mount.frame, _placement(item.mount))]
 
 
@@ -393,19 +391,22 @@ def problem_options(run: Run, parameters: Parameters, recordings: Sequence[Recor
             said = sensors.get(group, SensorOptions())
             sensors[group] = said if said.points is not None else replace(said, points=cable.free)
         if run.model.object.separate_lengths:
-            own = {recording.name: length_values(cable, recording) for recording in recordings}
+            own = {
+                recording.name: length_values(cable, edge_lengths(cable.edges, [recording], GIVEN_FRAMES))
+                for recording in recordings
+            }
     return ProblemOptions(
         initial_state=solver.initial_state,
         feedback=solver.feedback,
         gains=tuple(solver.gains),
         weighting=solver.weighting,
-        robust_scale=solver.robust_scale,
+        huber_threshold=solver.huber_threshold,
         path_cutoff=solver.path_cutoff,
         sensors=sensors,
         clamps=() if cable is None else cable.clamps,
         local=tuple(name for name, said in chosen.items() if said.local),
         priors={name: said.prior for name, said in chosen.items() if said.prior is not None},
-        tie_break=solver.tie_break,
+        weak_prior_factor=solver.weak_prior_factor,
         configuration_std=solver.configuration_std,
         velocity_std=solver.velocity_std,
         duration=solver.duration,
@@ -504,3 +505,16 @@ def _check_sensors(run: Run, recordings: Sequence[Recording]) -> None:
                 allowed=", ".join(sorted(known)),
                 hint=nearest(name, known),
             )
+
+
+# -- from a file -----------------------------------------------------------------------------------------------------
+
+
+def load_system(path: str | Path, overrides: Sequence[str] = ()) -> System:
+    """The system that a configuration file describes; errors as `load_config` and `build_system`."""
+    return build_system(load_config(path, overrides))
+
+
+def load_problem(path: str | Path, overrides: Sequence[str] = ()) -> EstimationProblem:
+    """The estimation problem that a configuration file describes; errors as `load_config` and `build_problem`."""
+    return build_problem(load_config(path, overrides))

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from yid_ocp.analysis.convergence import Frequencies, natural_frequencies
+from yid_ocp.config.settings import Run, dump_config
 from yid_ocp.data.recording import Recording
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.problem import Episode
 from yid_ocp.workflow.build import build_problem, build_step, build_system, first_gaps
 from yid_ocp.workflow.folder import Monitor, Silent, input_hashes, new_run_folder, versions
-from yid_ocp.workflow.settings import Run, dump_config
 
 FORMAT = "yid-check/1"
 TOLERATED = 0.02  # a frequency that moves by more than this fraction when links or steps are refined is worth a warning
@@ -104,7 +104,7 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
         recorded = 1.0 / float(np.median(np.diff(joints.t)))
         if recorded < 0.5 * rate:
             warnings.append(f"{episode.name}: joints come at {recorded:.4g} Hz, the model steps at {rate:.4g} Hz")
-    if problem.options.initial_state != "given" and (system.driven or system.prescribed or system.elastic):
+    if problem.options.initial_state != "fitted_to_points" and (system.driven or system.prescribed or system.elastic):
         torque = episode.torque[0] if system.driven else None
         rest = problem.statics().solve(episode.posture, problem.own_theta(episode, problem.theta), torque)
         entry["equilibrium"] = {"found": rest.converged, "imbalance": rest.error, "message": rest.message}
@@ -141,7 +141,7 @@ def refine(run: Run, problem: EstimationProblem | None, warnings: list[str]) -> 
     theta, split, guess = system.parameters.vector(), run.solver.force_split, None
     if problem is not None:
         theta = problem.own_theta(problem.episodes[0], theta)
-        if problem.options.initial_state == "given":
+        if problem.options.initial_state == "fitted_to_points":
             guess = problem.fitted_start(problem.episodes[0], theta).state[: system.size]
     own = natural_frequencies(system, posture, theta, h, split, guess)
     if own.message:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from yid_ocp.analysis.compare import PUBLISHED, Comparison, compare
+from yid_ocp.config.settings import Run, dump_config
 from yid_ocp.errors import nearest
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.report.pictures import draw_convergence
@@ -15,7 +16,6 @@ from yid_ocp.solvers import SOLVERS, Iterate
 from yid_ocp.solvers.base import Solver
 from yid_ocp.workflow.build import build_problem
 from yid_ocp.workflow.folder import Monitor, Silent, input_hashes, new_run_folder, versions
-from yid_ocp.workflow.settings import Run, dump_config
 from yid_ocp.workflow.solve import solve_result
 
 FORMAT = "yid-compare/1"

@@ -13,6 +13,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from yid_ocp.config.settings import Run, dump_config
 from yid_ocp.diagnosis import Finding, Thresholds, diagnose
 from yid_ocp.diagnosis.localise import units
 from yid_ocp.errors import OutputError
@@ -24,7 +25,6 @@ from yid_ocp.solvers import Solution, solve
 from yid_ocp.workflow.build import build_problem
 from yid_ocp.workflow.folder import Monitor, Silent, input_hashes, new_run_folder, versions
 from yid_ocp.workflow.refits import Refits
-from yid_ocp.workflow.settings import Run, dump_config
 
 TRAJECTORIES = "yid-diagnosis-trajectories/1"
 log = logging.getLogger(__name__)
@@ -83,7 +83,7 @@ def run_diagnose(run: Run, out: str | Path | None = None, monitor: Monitor | Non
             watcher.stage(text)
 
         nominal: Solution | None = None
-        if run.diagnosis.noise_share < 1 and problem.held_out:
+        if run.diagnosis.noise_fraction < 1 and problem.held_out:
             # in units of noise the solver would take any fit for a bad one and start again elsewhere
             note("solving the nominal model")
             nominal = solve(problem, run.solver.method)
@@ -128,16 +128,16 @@ def reproducing(run: Run, folder: Path) -> str:
 
 
 def in_units_of_noise(problem: EstimationProblem, run: Run) -> EstimationProblem:
-    """The same problem with the noise alone as the sensors' deviations, by `diagnosis.noise_share`.
+    """The same problem with the noise alone as the sensors' deviations, by `diagnosis.noise_fraction`.
 
-    Priors and tie-break shrink alike, so that every fit stays what it is; what changes is when a gap counts as one.
+    Priors and weak prior shrink alike, so that every fit stays what it is; what changes is when a gap counts as one.
 
     Raises
     ------
     ConfigError
         A sensor without a deviation in the settings.
     """
-    share, options = run.diagnosis.noise_share, problem.options
+    share, options = run.diagnosis.noise_fraction, problem.options
     if share == 1:
         return problem
     used = {samples.sensor.group for episode in problem.episodes for samples in episode.samples}
@@ -148,7 +148,7 @@ def in_units_of_noise(problem: EstimationProblem, run: Run) -> EstimationProblem
             raise run.refuse(
                 f"the share of noise in the deviation of '{group}' is given, but not the deviation",
                 "diagnosis",
-                "noise_share",
+                "noise_fraction",
                 hint=f"set sensors.{group}.std",
             )
         sensors[group] = replace(
@@ -159,8 +159,8 @@ def in_units_of_noise(problem: EstimationProblem, run: Run) -> EstimationProblem
             options,
             sensors=sensors,
             priors={name: share * std for name, std in options.priors.items()},
-            robust_scale=options.robust_scale / share,
-            tie_break=options.tie_break**share if options.tie_break > 0 else 0.0,
+            huber_threshold=options.huber_threshold / share,
+            weak_prior_factor=options.weak_prior_factor**share if options.weak_prior_factor > 0 else 0.0,
             configuration_std=share * options.configuration_std,
             velocity_std=share * options.velocity_std,
         )
@@ -177,13 +177,13 @@ def _encoder(
     """The encoders' deviation, which enters that of efforts, shrunk alike."""
     stated = sensors[group].position_std
     if stated is not None:
-        return _times(run.diagnosis.noise_share, stated)
+        return _times(run.diagnosis.noise_fraction, stated)
     recorded = [e.recording.joints.position_std for e in problem.episodes if e.recording.joints is not None]
     if group == "joints.effort" and any(std is not None and np.any(std) for std in recorded):
         raise run.refuse(
             "the share of noise is given, but the encoders' deviation stands in the recordings alone",
             "diagnosis",
-            "noise_share",
+            "noise_fraction",
             hint=f"set sensors.{group}.position_std",
         )
     return None

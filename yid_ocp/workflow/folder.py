@@ -19,11 +19,11 @@ from typing import Any, Protocol, TextIO
 
 import numpy as np
 
+from yid_ocp.config.settings import Run
 from yid_ocp.data.recording import file_sha256
 from yid_ocp.errors import OutputError
 from yid_ocp.solvers import Iterate
 from yid_ocp.workflow.build import input_files
-from yid_ocp.workflow.settings import Run
 
 
 class Monitor(Protocol):

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from yid_ocp.model.cable import Cable
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.baselines import linear_carry, move_with_clamps, stay
-from yid_ocp.problem.cable import Cable
+from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.problem import Episode, EpisodeResult
-from yid_ocp.problem.residuals import Samples
+from yid_ocp.problem.validation import linear_carry, move_with_clamps, stay
 from yid_ocp.sensors import EffortSensor, PointSensor
 
 Array = NDArray[np.float64]
@@ -54,10 +54,10 @@ def held_out_entry(
 def _start_end(problem: EstimationProblem, episode: Episode) -> float:
     """Node up to which measured points were used to fix the start, -1 where none were."""
     options = problem.options
-    return options.start_window / problem.step.time_step if options.initial_state == "given" else -1.0
+    return options.start_window / problem.step.time_step if options.initial_state == "fitted_to_points" else -1.0
 
 
-def _errors(samples: Samples, predicted: Array, fixed: float) -> dict[str, float]:
+def _errors(samples: Measurements, predicted: Array, fixed: float) -> dict[str, float]:
     sensor = samples.sensor
     shape = (len(predicted), len(sensor.channels), sensor.width)
     square = np.sum((predicted - samples.value).reshape(shape) ** 2, axis=2)
@@ -73,7 +73,7 @@ def _errors(samples: Samples, predicted: Array, fixed: float) -> dict[str, float
     return result
 
 
-def _baselines(episode: Episode, samples: Samples, cable: Cable | None) -> dict[str, Array]:
+def _baselines(episode: Episode, samples: Measurements, cable: Cable | None) -> dict[str, Array]:
     sensor = samples.sensor
     if isinstance(sensor, EffortSensor):
         return {"zero": np.zeros_like(samples.value)}

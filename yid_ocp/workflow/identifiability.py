@@ -15,6 +15,7 @@ from yid_ocp.analysis.identifiability import (
     with_grasp_offsets,
 )
 from yid_ocp.analysis.what_if import Outcome, WhatIf, what_if
+from yid_ocp.config.settings import GraspSettings, Run, dump_config
 from yid_ocp.errors import YidError
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
@@ -23,7 +24,6 @@ from yid_ocp.report.sections import Findings
 from yid_ocp.solvers import Solution, Status, solve
 from yid_ocp.workflow.build import build_problem, build_step, build_system
 from yid_ocp.workflow.folder import Monitor, Silent, both, input_hashes, new_run_folder, versions
-from yid_ocp.workflow.settings import GraspSettings, Run, dump_config
 
 FORMAT = "yid-identifiability/1"
 MOST_INTERVALS, MOST_UNKNOWNS = 12, 300  # beyond, profiles take long and are worked out only where asked for

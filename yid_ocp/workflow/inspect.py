@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.analysis.inspection import Linearisation, inspect_step, linearise, sparsity_picture
+from yid_ocp.config.settings import Run, dump_config
 from yid_ocp.errors import ModelError
-from yid_ocp.integrator.rollout import Statics
+from yid_ocp.integrator.statics import Statics
 from yid_ocp.integrator.step import Step
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.workflow.build import build_problem, build_step, parameter_settings
 from yid_ocp.workflow.folder import Monitor, Silent, input_hashes, new_run_folder, versions
-from yid_ocp.workflow.settings import Run, dump_config
 
 FORMAT = "yid-inspect/1"
 Array = NDArray[np.float64]

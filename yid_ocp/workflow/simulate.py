@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from yid_ocp.config.settings import Run, dump_config
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate, write_recording
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.problem import Episode, EpisodeResult
 from yid_ocp.sensors import PointSensor
 from yid_ocp.workflow.build import build_step, build_system, problem_options, read_recordings
 from yid_ocp.workflow.folder import Monitor, Silent, input_hashes, new_run_folder, versions
-from yid_ocp.workflow.settings import Run, dump_config
 
 FORMAT = "yid-simulate/1"
 DURATION = 5.0  # of a virtual experiment whose configuration does not say [s]
@@ -95,7 +95,7 @@ def run_simulate(
 
 
 def _virtual(run: Run, watcher: Monitor, seed: int) -> Recording:
-    from yid_ocp.data.synthetic import virtual_experiment
+    from yid_ocp.virtual.experiment import virtual_experiment
 
     system = build_system(run)
     watcher.stage("simulating a virtual experiment in MuJoCo")
@@ -163,9 +163,9 @@ def _joints(
         return None
     names = tuple(name for name in (*system.driven, *system.prescribed) if name in source.names)
     at = [system.mechanism.joint_index(name) for name in names]
-    position = outcome.sweep.state[:, at]
-    held = {name: outcome.sweep.torque[:, i] for i, name in enumerate(system.driven)}
-    held |= {name: outcome.sweep.effort[:, i] for i, name in enumerate(system.prescribed)}
+    position = outcome.rollout.state[:, at]
+    held = {name: outcome.rollout.torque[:, i] for i, name in enumerate(system.driven)}
+    held |= {name: outcome.rollout.effort[:, i] for i, name in enumerate(system.prescribed)}
     effort = np.stack([np.append(held[name], held[name][-1]) for name in names], axis=1)
     position_std = source.position_std
     effort_std = source.effort_std

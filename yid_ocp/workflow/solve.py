@@ -10,9 +10,10 @@ from typing import Any
 import h5py
 import numpy as np
 
+from yid_ocp.config.settings import Run, dump_config
 from yid_ocp.errors import OutputError
+from yid_ocp.model.cable import Cable
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.cable import Cable
 from yid_ocp.problem.problem import Episode, EpisodeResult
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import Findings
@@ -20,7 +21,6 @@ from yid_ocp.solvers import Solution, Status, solve
 from yid_ocp.workflow.build import build_cable, build_problem
 from yid_ocp.workflow.folder import Monitor, Silent, both, input_hashes, new_run_folder, versions
 from yid_ocp.workflow.held_out import held_out_entry
-from yid_ocp.workflow.settings import Run, dump_config
 
 FORMAT = "yid-solve/1"
 TRAJECTORIES = "yid-trajectories/1"
@@ -163,14 +163,14 @@ def write_trajectories(
 
 
 def _write_episode(group: h5py.Group, problem: EstimationProblem, episode: Episode, outcome: EpisodeResult) -> None:
-    n, sweep = problem.system.size, outcome.sweep
+    n, rollout = problem.system.size, outcome.rollout
     arrays = {
         "t": episode.grid.times,
-        "q": sweep.state[:, :n],
-        "p": sweep.state[:, n : 2 * n],
-        "multipliers": sweep.multipliers,
-        "torque": sweep.torque,
-        "effort": sweep.effort,
+        "q": rollout.state[:, :n],
+        "p": rollout.state[:, n : 2 * n],
+        "multipliers": rollout.multipliers,
+        "torque": rollout.torque,
+        "effort": rollout.effort,
     }
     for name, array in arrays.items():
         group.create_dataset(name, data=array, compression="gzip", shuffle=True)

@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from yid_ocp.config.settings import Run, VirtualFramesSettings, dump_config
 from yid_ocp.data.recording import Recording, file_sha256, read_recording, write_recording
 from yid_ocp.errors import ConfigError
 from yid_ocp.model.system import System
-from yid_ocp.vision.camera import DepthCamera, Shutter, VirtualFilm, film
+from yid_ocp.vision.camera import DepthCamera, FrameTiming, VirtualFrames, virtual_frames
 from yid_ocp.vision.fit import ShapeFit
-from yid_ocp.vision.frames import Film, look_at, read_film, write_film
+from yid_ocp.vision.frames import FrameSequence, look_at, read_frames, write_frames
 from yid_ocp.vision.pictures import draw_stages, draw_track
 from yid_ocp.vision.track import Track, track
 from yid_ocp.workflow.build import build_system, located, recording_file
 from yid_ocp.workflow.folder import Monitor, Silent, input_hashes, new_run_folder, versions
-from yid_ocp.workflow.settings import Run, VirtualFilmSettings, dump_config
 
 FORMAT = "yid-track/1"
 Array = NDArray[np.float64]
@@ -50,7 +50,7 @@ class TrackOutcome:
 def run_track(run: Run, out: str | Path | None = None, monitor: Monitor | None = None) -> TrackOutcome:
     """Track the frames of `track.frames`, or of a virtual camera where there are none.
 
-    The joint angles are those of the first recording under `recordings.estimate`; a virtual film has its own.
+    The joint angles are those of the first recording under `recordings.estimate`; a virtual frame sequence has its own.
 
     Parameters
     ----------
@@ -71,13 +71,13 @@ def run_track(run: Run, out: str | Path | None = None, monitor: Monitor | None =
         folder.write("config.yaml", dump_config(run))
         inputs = input_hashes(run)
         system = build_system(run)
-        made: VirtualFilm | None = None
+        made: VirtualFrames | None = None
         if settings.frames is None:
             watcher.stage("simulating a virtual experiment in MuJoCo")
             recording, made = virtual_film(run, system, settings.virtual)
-            seen = made.film
+            seen = made.sequence
             if settings.keep_frames:
-                write_film(seen, folder.path / "frames")
+                write_frames(seen, folder.path / "frames")
         else:
             recording, seen = _recorded(run, settings.frames)
             inputs |= {settings.frames: file_sha256(Path(settings.frames))}
@@ -106,7 +106,7 @@ def run_track(run: Run, out: str | Path | None = None, monitor: Monitor | None =
 
 
 def track_result(found: Track) -> dict[str, Any]:
-    """`yid-track/1` without the errors of a virtual film, inputs and versions."""
+    """`yid-track/1` without the errors of a virtual frame sequence, inputs and versions."""
     seen = np.asarray(np.isfinite(found.position).all(axis=2))
     spent = [frame.seconds for frame in found.frames if frame.fit is not None]
     clock = found.clock
@@ -147,7 +147,7 @@ def track_result(found: Track) -> dict[str, Any]:
     }
 
 
-def truth_errors(system: System, found: Track, made: VirtualFilm) -> Mapping[str, Mapping[str, float]]:
+def truth_errors(system: System, found: Track, made: VirtualFrames) -> Mapping[str, Mapping[str, float]]:
     """Median and largest distance of every point from where it really was at the time written down [m]."""
     shape = ShapeFit(system)
     columns = [system.points.index(name) for name in found.names]
@@ -160,14 +160,14 @@ def truth_errors(system: System, found: Track, made: VirtualFilm) -> Mapping[str
     }
 
 
-def virtual_film(run: Run, system: System, settings: VirtualFilmSettings) -> tuple[Recording, VirtualFilm]:
-    """A virtual experiment with the parameters' initial values as the truth, and a virtual camera's film of it.
+def virtual_film(run: Run, system: System, settings: VirtualFramesSettings) -> tuple[Recording, VirtualFrames]:
+    """A virtual experiment with the parameters' initial values as the truth, and its frames by a virtual camera.
 
     Raises
     ------
     ConfigError, DataError, ModelError
     """
-    from yid_ocp.data.synthetic import INNER_STEP, Motion, initial_posture, simulate_in_mujoco, virtual_experiment
+    from yid_ocp.virtual.experiment import INNER_STEP, Motion, initial_posture, simulate_in_mujoco, virtual_experiment
 
     for name in settings.offsets:
         if name not in [grasp.name for grasp in system.grasps]:
@@ -191,14 +191,14 @@ def virtual_film(run: Run, system: System, settings: VirtualFilmSettings) -> tup
         )
         # the same once more, for the shape that a recording does not hold
         truth = simulate_in_mujoco(system, None, motion, duration=duration, posture=posture, time_step=INNER_STEP)
-        made = film(
+        made = virtual_frames(
             system,
             truth.t,
             truth.q,
             look_at(settings.eye, settings.target),
             urdf=run.model.robot,
             camera=DepthCamera(outliers=settings.outliers),
-            shutter=Shutter(
+            timing=FrameTiming(
                 settings.rate,
                 dropped=settings.dropped,
                 latency=settings.latency,
@@ -209,7 +209,7 @@ def virtual_film(run: Run, system: System, settings: VirtualFilmSettings) -> tup
     return recording, made
 
 
-def _recorded(run: Run, frames: str) -> tuple[Recording, Film]:
+def _recorded(run: Run, frames: str) -> tuple[Recording, FrameSequence]:
     if not run.recordings.estimate:
         raise ConfigError(
             "there is no recording with the joint angles",
@@ -220,5 +220,5 @@ def _recorded(run: Run, frames: str) -> tuple[Recording, Film]:
         path = recording_file(run.recordings.estimate[0])
         recording = read_recording(path, allow_nan_effort=True)
     with located(run, "track", "frames"):
-        seen = read_film(frames, pose=run.track.pose, unit=run.track.unit)
+        seen = read_frames(frames, pose=run.track.pose, unit=run.track.unit)
     return replace(recording, name=path.stem), seen

@@ -80,7 +80,7 @@ def _course(findings: Findings, role: str, episode: Episode, outcome: EpisodeRes
     assert problem is not None
     assert solution is not None
     theta, _ = problem.split(solution.x, problem.episodes.index(episode) if role == "estimate" else 0)
-    n, state = problem.system.size, outcome.sweep.state
+    n, state = problem.system.size, outcome.rollout.state
     efforts = np.zeros((len(state), n))
     seen = problem.sensor(sensor, ())(state[:, :n], state[:, 2 * n :], efforts, problem.own_theta(episode, theta))
     return np.asarray(seen[0][:, :, 0])

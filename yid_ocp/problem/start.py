@@ -11,10 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.errors import DataError
-from yid_ocp.integrator.rollout import momentum_of, relaxed
+from yid_ocp.integrator.rollout import momentum_of
+from yid_ocp.integrator.statics import relaxed
 from yid_ocp.integrator.step import Step
 from yid_ocp.model import forward_kinematics
-from yid_ocp.problem.residuals import Samples
+from yid_ocp.model.cable import PRESET, START_SPEED
+from yid_ocp.problem.measurements import Measurements
 from yid_ocp.sensors import PointSensor, Sensor, sensor_function
 
 Array = NDArray[np.float64]
@@ -32,10 +34,6 @@ CONSTRAINT_STD = 1e-5
 SOFTNESS = (1000.0, 100.0, 10.0, 1.0)
 # The stage before which the best of all trials is chosen: there the object has its place and hardly its details.
 SELECTION = 2
-# Parameters of a joint whose rest angle is told from the start: its angle there [rad] and the torque it bears [N m].
-PRESET = ("start", "load")
-# Parameter that is told the root mean square speed of the measured points at the start [m/s].
-START_SPEED = "start.speed"
 # A parameter fitted along with the start is tried from so many values across its bounds.
 TRIALS = 4
 
@@ -103,7 +101,7 @@ class StartFit:
         self._load = ca.Function("load", e.arguments, [e.rigid.by_q, e.constraint_matrix])
 
     def solve(
-        self, posture: Array, samples: Sequence[Samples], theta: Array, window: float, path: Array
+        self, posture: Array, samples: Sequence[Measurements], theta: Array, window: float, path: Array
     ) -> FittedStart:
         """Configuration that fits the measured points at the first frames, and the momentum from their change.
 
@@ -111,7 +109,7 @@ class StartFit:
         ----------
         posture : ndarray, shape (nk,)
             Driven, then prescribed coordinates at node 0.
-        samples : sequence of Samples
+        samples : sequence of Measurements
             Only points are used.
         theta : ndarray, shape (ntheta,)
         window : float
@@ -130,7 +128,7 @@ class StartFit:
         """
         step, system = self.step, self.step.system
         last = max(round(window / step.time_step), 1)
-        frames: dict[int, list[tuple[Samples, int]]] = {}
+        frames: dict[int, list[tuple[Measurements, int]]] = {}
         for group in samples:
             if isinstance(group.sensor, PointSensor):
                 for row, (node, fraction) in enumerate(zip(group.node, group.fraction, strict=True)):
@@ -208,7 +206,7 @@ class StartFit:
         self,
         guess: Array,
         values: Array,
-        measured: list[tuple[Samples, int]],
+        measured: list[tuple[Measurements, int]],
         theta: Array,
         rest: Array,
         prior: Array,
@@ -278,7 +276,7 @@ class StartFit:
         return self._sensors[sensor]
 
 
-def _speed(before: Sequence[tuple[Samples, int]], after: Sequence[tuple[Samples, int]], span: float) -> float:
+def _speed(before: Sequence[tuple[Measurements, int]], after: Sequence[tuple[Measurements, int]], span: float) -> float:
     """Root mean square speed of the points seen in both frames, zero where there is one frame only [m/s]."""
     squares = []
     for samples, row in before:

@@ -19,35 +19,17 @@ from ruamel.yaml.comments import CommentedSeq
 
 from yid_ocp.errors import ConfigError
 from yid_ocp.integrator.discrete import ForceSplit
+from yid_ocp.options import About
 from yid_ocp.solvers import SOLVERS, GaussNewton
 from yid_ocp.solvers.base import Solver
 from yid_ocp.vision.track import TrackOptions
-
-
-@dataclass(frozen=True)
-class About:
-    """What a key means and its unit; markers may stand in any part of a type.
-
-    Attributes
-    ----------
-    text : str
-    unit : str
-        SI, empty for text and pure numbers.
-    path : bool
-        Whether the text names a file, relative to the configuration; `package:NAME` and `default:NAME` are kept.
-    """
-
-    text: str = ""
-    unit: str = ""
-    path: bool = False
-
 
 Triple = tuple[float, float, float]
 Quadruple = tuple[float, float, float, float]
 Interval = tuple[float, float]
 FilePath = Annotated[str, About("a file, relative to the configuration", path=True)]
 RecordingPath = Annotated[str, About("a recording, relative to the configuration, or default:NAME.h5", path=True)]
-ArmMode = Literal["driven", "prescribed", "free"]
+ArmMode = Literal["driven", "prescribed", "passive"]
 GraspName = Literal["point", "axis", "weld"]
 
 
@@ -66,7 +48,9 @@ class YObject:
 
     kind: Literal["y"] = "y"
     links: Annotated[int, Ge(1), Le(64), About("rigid links of every tube")] = 4
-    weight: Annotated[float, Ge(0), Le(1), About("share of its weight that it has; its inertia is whole")] = 1.0
+    gravity_fraction: Annotated[float, Ge(0), Le(1), About("part of its weight that it has; its inertia is whole")] = (
+        1.0
+    )
     mount: Annotated[MountSettings | None, About("the trunk's foot; the paper's when absent")] = None
 
 
@@ -102,7 +86,9 @@ class SegmentedObject:
 
     kind: Literal["segments"] = "segments"
     segments: Annotated[Mapping[str, SegmentSettings], About("by name, parents first")] = field(default_factory=dict)
-    weight: Annotated[float, Ge(0), Le(1), About("share of its weight that it has; its inertia is whole")] = 1.0
+    gravity_fraction: Annotated[float, Ge(0), Le(1), About("part of its weight that it has; its inertia is whole")] = (
+        1.0
+    )
     mount: Annotated[MountSettings, About("where its root sits")] = field(default_factory=MountSettings)
 
 
@@ -177,7 +163,7 @@ class ArmSettings:
     locked: Annotated[Mapping[str, float], About("value of joints that do not move", "rad or m")] = field(
         default_factory=dict
     )
-    without: Annotated[
+    exclude_links: Annotated[
         tuple[str, ...], About("links of the URDF left out with all that hangs on them, such as a hand not mounted")
     ] = ()
 
@@ -262,16 +248,17 @@ class SolverSettings:
         8.0,
     )
     initial_state: Annotated[
-        Literal["equilibrium", "estimated", "given"], About("at rest; at rest plus a free deviation; fitted to points")
+        Literal["equilibrium", "estimated", "fitted_to_points"],
+        About("at rest; at rest plus a free deviation; fitted to points"),
     ] = "equilibrium"
-    start_window: Annotated[float, Gt(0), About("how long points that fix a given start may reach", "s")] = 0.02
-    start_std: Annotated[float | None, Gt(0), About("noise of the points that fix a given start", "m")] = None
-    start_parameters: Annotated[tuple[str, ...], About("fitted along with a given start in every recording")] = ()
+    start_window: Annotated[float, Gt(0), About("how long points that fix a fitted start may reach", "s")] = 0.02
+    start_std: Annotated[float | None, Gt(0), About("noise of the points that fix a fitted start", "m")] = None
+    start_parameters: Annotated[tuple[str, ...], About("fitted along with a fitted start in every recording")] = ()
     configuration_std: Annotated[float, Gt(0), About("prior of an estimated start", "rad")] = 0.05
     velocity_std: Annotated[float, Gt(0), About("prior of an estimated start", "rad/s")] = 0.2
     weighting: Annotated[Literal["whitened", "paper"], About("cost in deviations, or the paper's")] = "whitened"
-    robust_scale: Annotated[float, Gt(0), About("Huber scale in deviations; .inf for squares")] = math.inf
-    tie_break: Annotated[
+    huber_threshold: Annotated[float, Gt(0), About("Huber scale in deviations; .inf for squares")] = math.inf
+    weak_prior_factor: Annotated[
         float, Ge(0), About("factor within which parameters stay that nothing informs; 0 for none")
     ] = 10.0
     path_cutoff: Annotated[float, Gt(0), About("low-pass cutoff of prescribed paths and efforts", "Hz")] = 10.0
@@ -289,7 +276,7 @@ class DiagnosisSettings:
     ] = "all"
     level: Annotated[float, Gt(0), Lt(1), About("significance below which a gap counts as one")] = 0.01
     effects: Annotated[int, Ge(1), Le(10), About("how many effects may be added")] = 3
-    noise_share: Annotated[
+    noise_fraction: Annotated[
         float,
         Gt(0),
         Le(1),
@@ -314,7 +301,7 @@ class CompareSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class VirtualFilmSettings:
+class VirtualFramesSettings:
     """A virtual experiment in MuJoCo and the virtual depth camera that films it, where there are no frames."""
 
     seed: Annotated[int, Ge(0), About("of motion, noise and camera")] = 0
@@ -336,16 +323,20 @@ class VirtualFilmSettings:
 class TrackSettings:
     """How points are measured in a depth camera's frames."""
 
-    frames: Annotated[FilePath | None, About("folder of clouds or depth images; a virtual film when absent")] = None
+    frames: Annotated[
+        FilePath | None, About("folder of clouds or depth images; a virtual frame sequence when absent")
+    ] = None
     pose: Annotated[
         tuple[Quadruple, Quadruple, Quadruple, Quadruple] | None,
         About("camera (x right, y down, z ahead) in the world, row by row, instead of the folder's", "m"),
     ] = None
     unit: Annotated[Literal["m", "mm"] | None, About("of the clouds, instead of the folder's")] = None
-    virtual: Annotated[VirtualFilmSettings, About("what is filmed without frames")] = field(
-        default_factory=VirtualFilmSettings
+    virtual: Annotated[VirtualFramesSettings, About("what is filmed without frames")] = field(
+        default_factory=VirtualFramesSettings
     )
-    keep_frames: Annotated[bool, About("whether a virtual film's frames are written to the run folder")] = False
+    keep_frames: Annotated[bool, About("whether a virtual frame sequence's frames are written to the run folder")] = (
+        False
+    )
     pictures: Annotated[int, Ge(0), Le(1000), About("frames of which every stage is drawn")] = 2
     options: Annotated[TrackOptions, About("filters, skeleton, fit, clock and what counts as good")] = field(
         default_factory=TrackOptions

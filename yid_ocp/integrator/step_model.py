@@ -119,7 +119,7 @@ class Feedback:
 
 
 @dataclass(frozen=True)
-class Sweep:
+class Rollout:
     """A rollout and, where asked for, its forward sensitivities.
 
     Attributes
@@ -172,7 +172,7 @@ class Gradient:
 
 
 @dataclass(frozen=True)
-class Stages:
+class StepLinearization:
     """Equations of many steps at once, along a trajectory that need not satisfy them.
 
     Attributes
@@ -206,7 +206,7 @@ class Stages:
 class Kernel(Protocol):
     """What the compiled and the interpreted implementation of the sweeps have in common."""
 
-    def sweep(
+    def rollout(
         self,
         theta: Array,
         start: Array,
@@ -214,14 +214,14 @@ class Kernel(Protocol):
         path: Array,
         feedback: Feedback | None,
         wanted: Directions | None,
-    ) -> Sweep:
+    ) -> Rollout:
         """Roll out over len(torque) steps from the state `start`."""
         ...
 
     def adjoint(
         self,
         theta: Array,
-        swept: Sweep,
+        rollout: Rollout,
         feedback: Feedback | None,
         names: tuple[str, ...],
         by_state: Array,
@@ -231,7 +231,7 @@ class Kernel(Protocol):
         """Gradient of a cost whose partial derivatives along the rollout are given."""
         ...
 
-    def stages(
+    def linearize(
         self,
         theta: Array,
         state: Array,
@@ -239,13 +239,13 @@ class Kernel(Protocol):
         torque: Array,
         names: tuple[str, ...],
         derivatives: bool,
-    ) -> Stages:
+    ) -> StepLinearization:
         """Equations of len(torque) steps along a trajectory, with their Jacobians where asked for."""
         ...
 
 
-# The order in which `yid_stages` takes them.
-STAGE_MATRICES = (
+# The order in which `yid_linearize` takes them.
+LINEARIZATION_MATRICES = (
     "rows_new",
     "rows_old",
     "rows_input",
@@ -257,11 +257,11 @@ STAGE_MATRICES = (
 )
 
 
-def empty_stages(sizes: dict[str, int], count: int, width: int, derivatives: bool) -> Stages:
+def empty_linearization(sizes: dict[str, int], count: int, width: int, derivatives: bool) -> StepLinearization:
     """Zeros in the shapes of `count` steps and `width` parameters, without matrices where no derivatives are wanted."""
     n, nz, m, nu = sizes["n"], sizes["nz"], sizes["m"], sizes["nu"]
     nt, steps = n + nz + m, count if derivatives else 0
-    return Stages(
+    return StepLinearization(
         np.zeros((count, nt)),
         np.zeros((count, n)),
         *(np.zeros((steps, rows, columns)) for rows in (nt, n) for columns in (nt, n + nz, nu)),

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.errors import DataError, nearest
+from yid_ocp.problem.problem import EstimationProblem
+from yid_ocp.sensors import PointSensor
 
 Array = NDArray[np.float64]
 
@@ -168,3 +170,24 @@ def _carried(recording: Recording, points: Sequence[str], known: Sequence[str], 
         moved = np.einsum("pk,mkx->mpx", share, paths - _given_frame(recording, known, given))
     result[given:] = here + moved[given:]
     return result
+
+
+def point_errors(problem: EstimationProblem, x: ArrayLike, points: Sequence[str]) -> dict[str, float]:
+    """Prediction error of every recording of a problem, the held-out ones too, over some points [m].
+
+    NaN for a recording whose rollout fails. The first two frames are given and do not count.
+    """
+    x = np.asarray(x, float)
+    errors = {}
+    episodes = [(episode, problem.split(x, i)) for i, episode in enumerate(problem.episodes)]
+    episodes += [(episode, problem.split(x, 0)) for episode in problem.held_out]
+    for episode, (theta, deviation) in episodes:
+        result = problem.run(episode, theta, deviation, derivatives=False)
+        if isinstance(result, str):
+            errors[episode.name] = float("nan")
+            continue
+        for samples, predicted in zip(episode.samples, result.predicted, strict=True):
+            if isinstance(samples.sensor, PointSensor) and samples.sensor.points == tuple(points):
+                shape = (len(predicted), len(points), 3)
+                errors[episode.name] = prediction_error(predicted.reshape(shape), samples.value.reshape(shape))
+    return errors

@@ -20,12 +20,12 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from yid_ocp.errors import SolverError
-from yid_ocp.integrator.feedback import lqr_filter
+from yid_ocp.integrator.lqr import lqr_filter
 from yid_ocp.integrator.rollout import momentum_of, simulate
-from yid_ocp.integrator.step import Directions, Feedback, Sweep
-from yid_ocp.problem.inputs import Smoother
+from yid_ocp.integrator.step import Directions, Feedback, Rollout
+from yid_ocp.problem.low_pass import LowPass
+from yid_ocp.problem.measurements import Measurements, huber
 from yid_ocp.problem.problem import Episode, EstimationProblem
-from yid_ocp.problem.residuals import Samples, huber
 
 Array = NDArray[np.float64]
 Sparse: TypeAlias = Any
@@ -140,10 +140,10 @@ class Transcription:
         for i, (episode, layout) in enumerate(zip(self.problem.episodes, self.layouts, strict=True)):
             theta = self._theta(w, i)
             start, _, message = self.problem.start_state(episode, theta)
-            sweep = None if message else self._tracked(episode, theta, start)
+            rollout = None if message else self._tracked(episode, theta, start)
             candidates = []
-            if sweep is not None and sweep.status.ok:
-                candidates.append((sweep.state[layout.nodes], sweep.multipliers))
+            if rollout is not None and rollout.status.ok:
+                candidates.append((rollout.state[layout.nodes], rollout.multipliers))
             if not candidates or self._misfit(w, i, *candidates[0]) > POOR_GUESS:
                 candidates.append(self._resting(episode, layout, theta, start))
             state, multipliers = min(candidates, key=lambda pair: self._misfit(w, i, *pair))
@@ -163,7 +163,7 @@ class Transcription:
         values = [value for value, _, _ in self._sample_rows(trial, i, False)]
         return float(np.mean(np.concatenate(values) ** 2))
 
-    def _tracked(self, episode: Episode, theta: Array, start: Array) -> Sweep:
+    def _tracked(self, episode: Episode, theta: Array, start: Array) -> Rollout:
         return simulate(
             self.step,
             theta,
@@ -177,7 +177,7 @@ class Transcription:
     def _tracking(self, episode: Episode, theta: Array) -> Feedback | None:
         feedback = self.problem.feedback(episode)
         if feedback is None and self.problem.system.driven:
-            smooth = Smoother(self.problem.options.path_cutoff)(episode.grid.times, episode.measured_arm)
+            smooth = LowPass(self.problem.options.path_cutoff)(episode.grid.times, episode.measured_arm)
             return lqr_filter(self.step, smooth, episode.torque, theta)
         return feedback
 
@@ -344,7 +344,7 @@ class Transcription:
                 np.repeat(multipliers, 2, axis=0)[:-1],
                 np.repeat(torque, 2, axis=0)[:-1],
             )
-        stages = self.step.kernel.stages(theta, chained, lam, held, problem.shared, derivatives)
+        stages = self.step.kernel.linearize(theta, chained, lam, held, problem.shared, derivatives)
         free = np.array(problem.system.free_indices)
         kept = np.concatenate([free, np.arange(n, n + nz + m)])
         scale = np.concatenate([np.full(len(free), 1.0 / h), np.ones(nz + m)])
@@ -433,13 +433,13 @@ class Transcription:
                 start = np.zeros((nx, count + nx))
                 start[:, count:] = np.eye(nx)
                 directions = Directions(problem.shared, start)
-            sweep = self.interval_sweep(i, j, w[layout.state[j]], theta, directions)
-            values.append((sweep.state[-1] - w[layout.state[j + 1]])[keep])
+            rollout = self.interval_sweep(i, j, w[layout.state[j]], theta, directions)
+            values.append((rollout.state[-1] - w[layout.state[j + 1]])[keep])
             if derivatives:
-                assert sweep.by_state is not None
+                assert rollout.by_state is not None
                 minus = np.zeros((len(keep), nx))
                 minus[np.arange(len(keep)), keep] = -1.0
-                blocks.append(np.hstack([sweep.by_state[-1][keep], minus]))
+                blocks.append(np.hstack([rollout.by_state[-1][keep], minus]))
         value = np.concatenate(values)
         if not derivatives:
             return value, None
@@ -447,7 +447,7 @@ class Transcription:
         column = np.hstack([np.broadcast_to(np.arange(count), (steps, count)), layout.state[:-1], layout.state[1:]])
         return value, self._assembled(np.array(blocks), column, len(keep))
 
-    def interval_sweep(self, i: int, j: int, start: Array, theta: Array, directions: Directions | None) -> Sweep:
+    def interval_sweep(self, i: int, j: int, start: Array, theta: Array, directions: Directions | None) -> Rollout:
         """Rollout over one interval of a recording, with the problem's own feedback."""
         episode, nodes = self.problem.episodes[i], self.layouts[i].nodes
         first, last = int(nodes[j]), int(nodes[j + 1])
@@ -521,7 +521,7 @@ class Transcription:
                 predicted, jacobian = self._between_nodes(w, i, samples, theta, derivatives)
             seen = samples.weight > 0
             raw = samples.weight * np.where(seen, predicted - samples.value, 0.0)
-            loss, factor = huber(raw, problem.options.robust_scale)
+            loss, factor = huber(raw, problem.options.huber_threshold)
             keep = seen.ravel()
             placed: Sparse | None = None
             if jacobian is not None:
@@ -530,7 +530,7 @@ class Transcription:
         return result
 
     def _at_nodes(
-        self, samples: Samples, outputs: Sequence[Array], columns: NDArray[np.int64], derivatives: bool
+        self, samples: Measurements, outputs: Sequence[Array], columns: NDArray[np.int64], derivatives: bool
     ) -> tuple[Array, Sparse | None]:
         y, by_q, by_z, _, by_theta = outputs
         predicted = samples.interpolate(y[:, :, 0])
@@ -555,7 +555,7 @@ class Transcription:
         return predicted, total
 
     def _between_nodes(
-        self, w: Array, i: int, samples: Samples, theta: Array, derivatives: bool
+        self, w: Array, i: int, samples: Measurements, theta: Array, derivatives: bool
     ) -> tuple[Array, Sparse | None]:
         """Predictions at steps that the rollout eliminates, by the chain rule through the interval before them."""
         problem, layout, n = self.problem, self.layouts[i], self.n
@@ -568,12 +568,12 @@ class Transcription:
             start = np.zeros((nx, count + nx))
             start[:, count:] = np.eye(nx)
             directions = Directions(problem.shared, start) if derivatives else None
-            sweep = self.interval_sweep(i, int(j), w[layout.state[j]], theta, directions)
+            rollout = self.interval_sweep(i, int(j), w[layout.state[j]], theta, directions)
             here = owner == j
             offset = nodes[here] - layout.nodes[j]
-            state[here] = sweep.state[offset]
-            if sweep.by_state is not None:
-                slope[here] = sweep.by_state[offset]
+            state[here] = rollout.state[offset]
+            if rollout.by_state is not None:
+                slope[here] = rollout.by_state[offset]
         effort = np.zeros((len(nodes), n))
         y, by_q, by_z, _, by_theta = problem.sensor(samples.sensor, problem.shared)(
             state[:, :n], state[:, 2 * n :], effort, theta

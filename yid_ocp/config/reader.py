@@ -21,12 +21,10 @@ from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
+from yid_ocp.config.settings import Run
+from yid_ocp.config.settings import dump_config as dump_config
 from yid_ocp.errors import ConfigError, nearest
-from yid_ocp.model.system import System
-from yid_ocp.problem import EstimationProblem
-from yid_ocp.workflow.build import build_problem, build_system
-from yid_ocp.workflow.settings import About, Run
-from yid_ocp.workflow.settings import dump_config as dump_config
+from yid_ocp.options import About
 
 KeyPath = tuple[str | int, ...]
 DEFAULT = "dual_arm_vision.yaml"
@@ -67,16 +65,6 @@ def load_config(path: str | Path | None = None, overrides: Sequence[str] = (), d
         _override(data, places, override)
     run = _Reader(places, origin, base).build(Run, data, ())
     return dataclasses.replace(run, name=name, file=file, places=places)
-
-
-def load_system(path: str | Path, overrides: Sequence[str] = ()) -> System:
-    """The system that a configuration file describes; errors as `load_config` and `build_system`."""
-    return build_system(load_config(path, overrides))
-
-
-def load_problem(path: str | Path, overrides: Sequence[str] = ()) -> EstimationProblem:
-    """The estimation problem that a configuration file describes; errors as `load_config` and `build_problem`."""
-    return build_problem(load_config(path, overrides))
 
 
 def schema() -> dict[str, Any]:

@@ -96,7 +96,7 @@ class Inputs:
         return list(zip(later, range(len(driven)), strict=False))
 
 
-class Readings:
+class InputCorrections:
     """Maps from recorded to true inputs and times, from `RecordedEffect.correct` and `.delay` of a system's effects.
 
     Parameters

@@ -12,11 +12,11 @@ import pytest
 from ruamel.yaml import YAML
 
 import yid_ocp as yid
-from yid_ocp.config import DEFAULT, dump_config, load_config, load_problem, load_system, schema
+from yid_ocp.config.reader import DEFAULT, dump_config, load_config, schema
+from yid_ocp.config.settings import SegmentedObject, YObject
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.solvers import GaussNewton, SteepestDescent
-from yid_ocp.workflow.build import build_problem, build_system, problem_options
-from yid_ocp.workflow.settings import SegmentedObject, YObject
+from yid_ocp.workflow.build import build_problem, build_system, load_problem, load_system, problem_options
 
 
 @pytest.fixture
@@ -37,10 +37,12 @@ def test_the_embedded_default_is_the_one_in_configs(repository):
 
 def test_numbers_as_in_yaml_1_2(written):
     run = load_config(
-        written("solver: {time_step: 1e-3, robust_scale: .inf, iterations: 010, path_cutoff: 5}\ndescription: 'yes'\n")
+        written(
+            "solver: {time_step: 1e-3, huber_threshold: .inf, iterations: 010, path_cutoff: 5}\ndescription: 'yes'\n"
+        )
     )
     assert run.solver.time_step == 1e-3
-    assert math.isinf(run.solver.robust_scale)
+    assert math.isinf(run.solver.huber_threshold)
     assert run.solver.method == GaussNewton(iterations=10)
     assert run.solver.path_cutoff == 5.0
     assert run.description == "yes"
@@ -229,7 +231,7 @@ def test_more_links_keep_the_stiffness_of_a_tube(written):
 def test_springs_on_joints(written, urdf_folder):
     run = load_config(
         written(
-            f"model:\n  robot: {urdf_folder / 'mixed_joints.urdf'}\n  arms: {{mode: free}}\n"
+            f"model:\n  robot: {urdf_folder / 'mixed_joints.urdf'}\n  arms: {{mode: passive}}\n"
             "  springs:\n    hinge: {stiffness: 2.0, rest: 0.1, damping: 0.3}\n    slide: {stiffness: 50.0}\n"
             "  damping: {spin: 0.2}\n"
         )

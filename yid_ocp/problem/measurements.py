@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.errors import DataError, nearest
-from yid_ocp.problem.inputs import Grid
+from yid_ocp.problem.grid import Grid
 from yid_ocp.sensors import Sensor
 
 Array = NDArray[np.float64]
@@ -18,7 +18,7 @@ Weighting = Literal["whitened", "paper"]
 
 
 @dataclass(frozen=True)
-class Samples:
+class Measurements:
     """What one sensor measured, placed on the nodes of a rollout.
 
     Attributes
@@ -61,7 +61,7 @@ class Samples:
         after = self.node[self.fraction > 0] + 1
         return np.unique(np.concatenate([self.node, after]))
 
-    def late(self, steps: Array) -> Samples:
+    def late(self, steps: Array) -> Measurements:
         """The same samples, each output that of so many steps before, within the span.
 
         Parameters
@@ -74,13 +74,13 @@ class Samples:
         node = np.minimum(np.floor(position), max(self.span[1] - 1, self.span[0])).astype(np.int64)
         return replace(self, node=node, fraction=position - node)
 
-    def slope(self, at_nodes: Array, unmoved: Samples, steps: Array) -> Array:
+    def slope(self, at_nodes: Array, unmoved: Measurements, steps: Array) -> Array:
         """Change of a prediction per step of time for late samples; at a node the mean of both sides, shape (M, k).
 
         Parameters
         ----------
         at_nodes : ndarray, shape (len(nodes), k)
-        unmoved : Samples
+        unmoved : Measurements
             Those from which they were made by `late`.
         steps : ndarray, shape (k,)
         """
@@ -124,8 +124,8 @@ class Samples:
 
 def point_samples(
     recording: Recording, group: PointGroup, sensor: Sensor, points: tuple[str, ...], grid: Grid, std: float | None
-) -> Samples:
-    """Samples of a group of points.
+) -> Measurements:
+    """Measurements of a group of points.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ def point_samples(
 
 def make_samples(
     sensor: Sensor, t: Array, value: Array, std: Array, grid: Grid, where: str, span: tuple[int, int] | None = None
-) -> Samples:
+) -> Measurements:
     """Whitened samples; `DataError` where a noise level is not positive."""
     seen = np.isfinite(value)
     if np.any(seen & ~(std > 0)):
@@ -180,10 +180,10 @@ def make_samples(
         )
     weight = np.where(seen, 1.0 / np.where(std > 0, std, 1.0), 0.0)
     node, fraction = grid.locate(t)
-    return Samples(sensor, node, fraction, value, weight, np.where(seen, std, np.nan), span or (0, grid.steps))
+    return Measurements(sensor, node, fraction, value, weight, np.where(seen, std, np.nan), span or (0, grid.steps))
 
 
-def paper_weighting(samples: Samples, grid: Grid) -> Samples:
+def paper_weighting(samples: Measurements, grid: Grid) -> Measurements:
     """The source paper's cost: sigma_k = 1 at the node nearest to a measurement, none at k = 0, the end counted twice.
 
     J = sum_{k=1..N} 1/2 sigma_k |w_k - wbar_k|^2 + 1/2 |w_N - wbar_N|^2 for measured points [m^2].

@@ -24,7 +24,7 @@ import scipy.signal
 import scipy.stats
 from numpy.typing import NDArray
 
-from yid_ocp.diagnosis.hypotheses import Composed, Series, residual_series
+from yid_ocp.diagnosis.hypotheses import CandidateProblem, Series, residual_series
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import SolverError
 
@@ -129,13 +129,13 @@ def shape_grid(effect: EffectBase, count: int = GRID) -> list[dict[str, float]]:
 
 
 def linearise(
-    problem: Composed, base: Sequence[EffectBase], values: Mapping[str, float], grid: int = GRID
+    problem: CandidateProblem, base: Sequence[EffectBase], values: Mapping[str, float], grid: int = GRID
 ) -> Linearisation:
     """Residual and signatures of all candidates but those in the model already.
 
     Parameters
     ----------
-    problem : Composed
+    problem : CandidateProblem
     base : sequence of EffectBase
         In the model, with all their parameters free.
     values : mapping of str to float
@@ -166,7 +166,7 @@ def linearise(
         names = list(trial.names)
         places = [names.index(name) for name in swept]
         rest = np.setdiff1d(np.arange(len(names)), places)
-        rows = len(evaluation.residual) - trial.tie_break_rows
+        rows = len(evaluation.residual) - trial.weak_prior_rows
         if k == 0:
             nuisance = evaluation.jacobian[:rows][:, rest]
             basis = _basis(nuisance)

@@ -12,16 +12,16 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from yid_ocp.integrator import codegen
-from yid_ocp.integrator.sweep import (
+from yid_ocp.integrator.step_model import (
     ITERATION_LIMIT,
-    STAGE_MATRICES,
+    LINEARIZATION_MATRICES,
     Directions,
     Feedback,
     Gradient,
-    Stages,
+    Rollout,
     StepCode,
-    Sweep,
-    empty_stages,
+    StepLinearization,
+    empty_linearization,
     status_of,
 )
 
@@ -195,7 +195,7 @@ class InterpretedKernel:
                 factor *= 0.5
         return StepCode.NOT_CONVERGED, error, np.full(n, np.nan), ITERATION_LIMIT
 
-    def sweep(
+    def rollout(
         self,
         theta: Array,
         start: Array,
@@ -203,8 +203,8 @@ class InterpretedKernel:
         path: Array,
         feedback: Feedback | None,
         wanted: Directions | None,
-    ) -> Sweep:
-        """See `Kernel.sweep`."""
+    ) -> Rollout:
+        """See `Kernel.rollout`."""
         s = self._step.sizes
         n, m, nx = s["n"], s["m"], s["nx"]
         steps, d = len(torque), 0 if wanted is None else wanted.count
@@ -261,7 +261,7 @@ class InterpretedKernel:
         info = np.array([k, error, total, total], dtype=float)
         status = status_of(int(code), info, effort, state, s)
         some = wanted is not None
-        return Sweep(
+        return Rollout(
             state,
             multipliers,
             effort,
@@ -316,7 +316,7 @@ class InterpretedKernel:
     def adjoint(
         self,
         theta: Array,
-        swept: Sweep,
+        rollout: Rollout,
         feedback: Feedback | None,
         names: tuple[str, ...],
         by_state: Array,
@@ -327,19 +327,19 @@ class InterpretedKernel:
         s = self._step.sizes
         n, nt = s["n"], s["n"] + s["nz"] + s["m"]
         scale, h = self._scales(theta)
-        steps = len(swept.multipliers)
+        steps = len(rollout.multipliers)
         gradient, by_torque, by_path = np.zeros(len(names)), np.zeros((steps, s["nu"])), np.zeros((steps + 1, s["nc"]))
         costate = by_state[steps].copy()
         for k in reversed(range(steps)):
-            x, after = swept.state[k], swept.state[k + 1]
+            x, after = rollout.state[k], rollout.state[k + 1]
             arguments: list[Array | float] = [
                 x[:n],
                 after[:n],
                 x[n : 2 * n],
                 x[2 * n :],
                 after[2 * n :],
-                swept.multipliers[k],
-                swept.torque[k],
+                rollout.multipliers[k],
+                rollout.torque[k],
                 theta,
                 self._step.time_step,
             ]
@@ -366,7 +366,7 @@ class InterpretedKernel:
         by_path[0] = costate[self._fixed]
         return Gradient(gradient, costate, by_torque, by_path)
 
-    def stages(
+    def linearize(
         self,
         theta: Array,
         state: Array,
@@ -374,12 +374,12 @@ class InterpretedKernel:
         torque: Array,
         names: tuple[str, ...],
         derivatives: bool,
-    ) -> Stages:
-        """See `Kernel.stages`."""
+    ) -> StepLinearization:
+        """See `Kernel.linearize`."""
         s = self._step.sizes
         n = s["n"]
         scale, _ = self._scales(theta)
-        stages = empty_stages(s, len(torque), len(names), derivatives)
+        stages = empty_linearization(s, len(torque), len(names), derivatives)
         for k, u in enumerate(torque):
             x, after = state[k], state[k + 1]
             arguments: list[Array | float] = [
@@ -397,7 +397,7 @@ class InterpretedKernel:
             stages.rows[k], stages.p1[k] = self._rows(arguments, phi, scale)
             if derivatives:
                 matrices = self._linearise(arguments, phi, scale)
-                for name in STAGE_MATRICES[:6]:
+                for name in LINEARIZATION_MATRICES[:6]:
                     getattr(stages, name)[k] = getattr(matrices, name)
                 if names:
                     stages.rows_theta[k], stages.p1_theta[k], _ = self._by_theta(names, arguments)

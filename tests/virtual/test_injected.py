@@ -9,22 +9,22 @@ import numpy as np
 import pytest
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
-from yid_ocp.data.synthetic import Motion, mujoco_xml, paper_system
-from yid_ocp.data.withheld import (
+from yid_ocp.effects import EFFECTS, make_effect
+from yid_ocp.errors import ConfigError
+from yid_ocp.model.kinematics import forward_kinematics
+from yid_ocp.model.system import MidpointState
+from yid_ocp.virtual.experiment import Motion, mujoco_xml, paper_system
+from yid_ocp.virtual.injected import (
     FORCED,
     KINDS,
     MODELLED,
     OUTSIDE,
     READ,
-    Foreign,
-    Withheld,
+    InjectedEffect,
+    InjectedTerms,
+    injected_experiment,
     misread,
-    withheld_experiment,
 )
-from yid_ocp.effects import EFFECTS, make_effect
-from yid_ocp.errors import ConfigError
-from yid_ocp.model.kinematics import forward_kinematics
-from yid_ocp.model.system import MidpointState
 
 mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
 
@@ -47,11 +47,11 @@ def passive(effects, q, v):
     model = mujoco.MjModel.from_xml_string(mujoco_xml(SYSTEM, TRUTH))
     order = [model.joint(name).id for name in SYSTEM.mechanism.joint_names]
     data = mujoco.MjData(model)
-    foreign = Foreign(SYSTEM, TRUTH, effects)
-    foreign.prepare(model)
-    foreign.begin(data)
+    injected = InjectedTerms(SYSTEM, TRUTH, effects)
+    injected.prepare(model)
+    injected.begin(data)
     data.qpos[order], data.qvel[order] = q, v
-    mujoco.set_mjcb_passive(foreign.force)
+    mujoco.set_mjcb_passive(injected.force)
     try:
         mujoco.mj_forward(model, data)
     finally:
@@ -80,7 +80,7 @@ def test_forces_are_those_of_the_library(label):
     kind, _, place = label.partition("@")
     rng = np.random.default_rng(3)
     q, v = rng.uniform(-0.4, 0.4, SYSTEM.size), rng.uniform(-1, 1, SYSTEM.size)
-    with_it, _ = passive([Withheld(kind, place, SIZES[label])], q, v)
+    with_it, _ = passive([InjectedEffect(kind, place, SIZES[label])], q, v)
     without, _ = passive([], q, v)
     expected = symbolic(kind, place, SIZES[label], q, v)
     assert np.abs(expected).max() > 1e-4
@@ -91,7 +91,7 @@ def test_forces_are_those_of_the_library(label):
 def test_weight_is_taken_away_without_the_inertia():
     rng = np.random.default_rng(4)
     q, v = rng.uniform(-0.4, 0.4, SYSTEM.size), np.zeros(SYSTEM.size)
-    lifted = passive([Withheld("gravity_scale", "object", {"fraction": -1.0})], q, v)[0] - passive([], q, v)[0]
+    lifted = passive([InjectedEffect("gravity_scale", "object", {"fraction": -1.0})], q, v)[0] - passive([], q, v)[0]
     effect = make_effect("gravity_scale", "object", SYSTEM, {"fraction": -1.0})
     weightless, heavy = (
         mujoco.MjModel.from_xml_string(mujoco_xml(replace(SYSTEM, gravity=g), TRUTH))
@@ -111,7 +111,7 @@ def test_weight_is_taken_away_without_the_inertia():
 
 def test_a_rotor_is_an_armature():
     q = np.zeros(SYSTEM.size)
-    _, armature = passive([Withheld("rotor_inertia", "left_e1", {"armature": 0.3})], q, q)
+    _, armature = passive([InjectedEffect("rotor_inertia", "left_e1", {"armature": 0.3})], q, q)
     assert armature[SYSTEM.mechanism.joint_index("left_e1")] == 0.3
 
 
@@ -151,7 +151,7 @@ def reading(duration=1.0) -> Recording:
 def test_joints_are_misread_as_the_table_says(label, values, channel, expected):
     kind, _, place = label.partition("@")
     recording = reading()
-    wrong = misread(recording, SYSTEM, Withheld(kind, place, values))
+    wrong = misread(recording, SYSTEM, InjectedEffect(kind, place, values))
     assert getattr(wrong.joints, channel)[:, 1] == pytest.approx(expected(recording))
     other = getattr(wrong.joints, channel)[:, 2]
     assert other == pytest.approx(getattr(recording.joints, channel)[:, 2])
@@ -159,7 +159,7 @@ def test_joints_are_misread_as_the_table_says(label, values, channel, expected):
 
 def test_what_is_recorded_late_acts_later():
     recording = reading()
-    wrong = misread(recording, SYSTEM, Withheld("effort_delay", "left", {"delay": 0.05}))
+    wrong = misread(recording, SYSTEM, InjectedEffect("effort_delay", "left", {"delay": 0.05}))
     assert wrong.joints.effort[:-6] == pytest.approx(recording.joints.effort[5:-1], abs=1e-9)
 
 
@@ -168,7 +168,7 @@ def test_cameras_misplace_points_as_the_table_says():
     true = recording.points[0].position
 
     def seen(kind, **values):
-        return misread(recording, SYSTEM, Withheld(kind, "camera", values)).points[0]
+        return misread(recording, SYSTEM, InjectedEffect(kind, "camera", values)).points[0]
 
     assert seen("camera_translation", x=0.01, y=0.0, z=-0.01).position == pytest.approx(
         true + np.array([0.01, 0.0, -0.01])
@@ -185,11 +185,11 @@ def test_cameras_misplace_points_as_the_table_says():
 def test_an_effect_acts_on_a_whole_recording_and_leaves_no_trace_of_itself():
     motion = Motion.multisine(SYSTEM, TRUTH, seed=1)
     settings = {"motion": motion, "seed": 2, "duration": 0.3, "time_step": 2e-4}
-    clean = withheld_experiment(SYSTEM, TRUTH, (), **settings)
-    pushed = withheld_experiment(
-        SYSTEM, TRUTH, [Withheld("hysteresis", "T1", {"stiffness": 9.0, "yield_angle": 0.1})], **settings
+    clean = injected_experiment(SYSTEM, TRUTH, (), **settings)
+    pushed = injected_experiment(
+        SYSTEM, TRUTH, [InjectedEffect("hysteresis", "T1", {"stiffness": 9.0, "yield_angle": 0.1})], **settings
     )
-    again = withheld_experiment(SYSTEM, TRUTH, (), **settings)
+    again = injected_experiment(SYSTEM, TRUTH, (), **settings)
     assert np.abs(pushed.joints.effort - clean.joints.effort).max() > 1e-3
     assert again.joints.effort == pytest.approx(clean.joints.effort, abs=0)
 
@@ -207,4 +207,4 @@ def test_every_kind_is_done_once_and_what_is_outside_is_not_in_the_library():
 
 def test_a_kind_that_cannot_be_done_is_refused():
     with pytest.raises(ConfigError, match="grasp_slip"):
-        withheld_experiment(SYSTEM, TRUTH, [Withheld("grasp_slip", "left", {})])
+        injected_experiment(SYSTEM, TRUTH, [InjectedEffect("grasp_slip", "left", {})])

@@ -26,18 +26,12 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError, ModelError, nearest
 from yid_ocp.model import Grasp, Mechanism, System, flexible_object
+from yid_ocp.model.flexible import FlexibleObject, Segment, polyline_rotations
 from yid_ocp.model.mechanism import Frame, Placement
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.system import floating_clamp
-from yid_ocp.model.y_object import FlexibleObject, Segment, polyline_rotations
-from yid_ocp.problem.baselines import group_with, prediction_error
-from yid_ocp.problem.initial import PRESET, START_SPEED
-from yid_ocp.problem.inputs import ClampPath
-from yid_ocp.problem.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.sensors import PointSensor
 
 Array = NDArray[np.float64]
 START, END = "clamp_start", "clamp_end"
@@ -47,6 +41,35 @@ SPEED_SCALE = "start.speed_scale"
 # Keeps load/stiffness finite where a stiffness is zero [N m/rad].
 LEAST_STIFFNESS = 1e-9
 START_EDGE, LAST_EDGE = f"{START}_edge", "last_edge"
+
+
+# Parameters of a joint whose rest angle is told from the start: its angle there [rad] and the torque it bears [N m].
+PRESET = ("start", "load")
+# Parameter that is told the root mean square speed of the measured points at the start [m/s].
+START_SPEED = "start.speed"
+
+
+@dataclass(frozen=True)
+class ClampPath:
+    """A prescribed clamp (`floating_clamp`) that follows two measured points.
+
+    Attributes
+    ----------
+    clamp : str
+        Name of the clamp.
+    origin : str
+        Point at which its origin sits.
+    towards : str
+        Point to which its z axis looks.
+    roll : "level" or "transported"
+        What the points do not tell, the turn about z: with `level` the third angle stays zero (x axis across world y);
+        with `transported` the clamp never turns about its own z axis, from `level` at the first node on.
+    """
+
+    clamp: str
+    origin: str
+    towards: str
+    roll: Literal["level", "transported"] = "level"
 
 
 @dataclass(frozen=True)
@@ -209,105 +232,14 @@ def read_vertices(path: str | Path) -> dict[str, Array]:
         raise DataError("the table of vertices is malformed", where=str(path), allowed=allowed) from error
 
 
-def edge_lengths(
-    cable: Cable, recordings: Sequence[Recording], frames: int | None = None
-) -> dict[tuple[str, str], float]:
-    """Median over recordings of the mean measured length of every edge [m].
-
-    Parameters
-    ----------
-    cable : Cable
-    recordings : sequence of Recording
-    frames : int, optional
-        Use only that many frames from the start of each.
-
-    Raises
-    ------
-    DataError
-        No recording, or an edge that none of them ever shows.
-    """
-    result: dict[tuple[str, str], float] = {}
-    for edge in cable.edges:
-        seen = []
-        for recording in recordings:
-            difference = measured(recording, edge[1])[:frames] - measured(recording, edge[0])[:frames]
-            length = np.linalg.norm(difference, axis=1)
-            if np.any(np.isfinite(length)):
-                seen.append(float(np.nanmean(length)))
-        if not seen:
-            raise DataError(f"edge {edge[0]} to {edge[1]} is never seen", hint="give recordings in which it is")
-        result[edge] = float(np.median(seen))
-    return result
-
-
-def measured(recording: Recording, point: str) -> Array:
-    """Measured positions of a point, shape (M, 3) [m], NaN where it was not seen."""
-    for group in recording.points:
-        if point in group.names:
-            return group.position[:, group.names.index(point)]
-    raise DataError(
-        f"point '{point}' is not recorded", where=recording.name, hint=nearest(point, recording.point_names)
-    )
-
-
-def length_values(cable: Cable, recording: Recording, frames: int = 2) -> dict[str, float]:
-    """Values of the edge length parameters in the first frames of a recording [m]."""
-    lengths = edge_lengths(cable, [recording], frames)
+def length_values(cable: Cable, lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
+    """Values of the edge length parameters for given lengths of the edges [m]."""
     values = {f"{START}.length": lengths[cable.parent[0], cable.parent[1]]}
     for name, chain in cable.chains.items():
         first = 1 if name == cable.parent_name else 0
         for i, edge in enumerate(pairwise(chain[first:])):
             values[f"{name}.length_{i}"] = lengths[edge]
     return values
-
-
-def cable_problem_options(
-    cable: Cable,
-    recordings: Sequence[Recording],
-    noise: float,
-    model_error: float,
-    rest_std: float = 0.2,
-    path_cutoff: float = 8.0,
-    options: CableOptions | None = None,
-) -> ProblemOptions:
-    """Options of an estimation on a cable that uses of each recording what a prediction may use.
-
-    That is the clamps' four vertices throughout and the free ones in the first two frames: from these come the edges'
-    lengths, the start, and the rolls of the clamps. The fit alone compares with the free vertices later on.
-
-    Parameters
-    ----------
-    cable : Cable
-    recordings : sequence of Recording
-        All that will be used, held-out ones as well.
-    noise : float
-        Noise deviation of a measured vertex [m], for the start.
-    model_error : float
-        Deviation of a vertex that the fit allows for [m]: a model's error lasts for many frames, so that this is the
-        error that is hoped for times the square root of the number of frames it lasts.
-    rest_std : float
-        Prior deviation of rest angles where they are free [rad].
-    path_cutoff : float
-        Low-pass cutoff of the clamps' paths [Hz].
-    options : CableOptions, optional
-        Those of the system.
-    """
-    options = options or CableOptions()
-    group = group_with(recordings[0], cable.vertices)
-    period = float(np.median(np.diff(group.t)))
-    known = {r.name: length_values(cable, r) for r in recordings} if options.separate_lengths else {}
-    rest = [name for name in free_parameters(cable, options) if name.endswith(REST)]
-    return ProblemOptions(
-        initial_state="given",
-        path_cutoff=path_cutoff,
-        sensors={group.name: SensorOptions(std=model_error, points=cable.free)},
-        clamps=cable.clamps,
-        priors=dict.fromkeys(rest, rest_std),
-        start_window=period,
-        start_std=noise,
-        start_parameters=(START_ROLL, END_ROLL) if options.end == "weld" else (START_ROLL,),
-        recording_values=known,
-    )
 
 
 def free_parameters(cable: Cable, options: CableOptions | None = None) -> tuple[str, ...]:
@@ -329,34 +261,13 @@ def free_parameters(cable: Cable, options: CableOptions | None = None) -> tuple[
     return tuple(names)
 
 
-def vertex_errors(problem: EstimationProblem, cable: Cable, x: ArrayLike) -> dict[str, float]:
-    """Prediction error of every recording of a problem, the held-out ones too, over the free vertices [m].
-
-    NaN for a recording whose rollout fails. The first two frames are given and do not count.
-    """
-    x = np.asarray(x, float)
-    errors = {}
-    episodes = [(episode, problem.split(x, i)) for i, episode in enumerate(problem.episodes)]
-    episodes += [(episode, problem.split(x, 0)) for episode in problem.held_out]
-    for episode, (theta, deviation) in episodes:
-        result = problem.run(episode, theta, deviation, derivatives=False)
-        if isinstance(result, str):
-            errors[episode.name] = float("nan")
-            continue
-        for samples, predicted in zip(episode.samples, result.predicted, strict=True):
-            if isinstance(samples.sensor, PointSensor) and samples.sensor.points == cable.free:
-                shape = (len(predicted), len(cable.free), 3)
-                errors[episode.name] = prediction_error(predicted.reshape(shape), samples.value.reshape(shape))
-    return errors
-
-
-def cable_system(recordings: Sequence[Recording], cable: Cable, options: CableOptions | None = None) -> System:
+def cable_system(lengths: Mapping[tuple[str, str], float], cable: Cable, options: CableOptions | None = None) -> System:
     """The model of a cable held by two clamps.
 
     Parameters
     ----------
-    recordings : sequence of Recording
-        Give the edges' lengths.
+    lengths : mapping of edge to float
+        Length of every one of the cable's edges [m].
     cable : Cable
     options : CableOptions, optional
 
@@ -369,13 +280,10 @@ def cable_system(recordings: Sequence[Recording], cable: Cable, options: CableOp
 
     Raises
     ------
-    DataError
-        An edge that is never seen.
     ModelError
         A cable that does not fit together.
     """
     options = options or CableOptions()
-    lengths = edge_lengths(cable, recordings)
     item = flexible_object(_segments(cable, lengths, options), name="cable")
     if options.rest_angles:
         item = _with_rest_angles(item)

@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 
 from yid_ocp.errors import OutputError
-from yid_ocp.integrator import codegen
+from yid_ocp.integrator import compiler
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.model import Mechanism, System
+from yid_ocp.model import System
+from yid_ocp.model.urdf import read_urdf
 
 SOURCE = "int yid_answer(void) { return %d; }\n"
 
-needs_compiler = pytest.mark.skipif(codegen.compiler() is None, reason="this machine has no C compiler")
+needs_compiler = pytest.mark.skipif(compiler.compiler() is None, reason="this machine has no C compiler")
 
 
 @pytest.fixture
@@ -25,26 +26,26 @@ def cache(tmp_path, monkeypatch):
     folder = tmp_path / "cache"
     monkeypatch.setenv("YID_OCP_CACHE", str(folder))
     yield folder
-    codegen.compiler.cache_clear()
-    codegen._machine.cache_clear()
+    compiler.compiler.cache_clear()
+    compiler._machine.cache_clear()
 
 
 @pytest.fixture
 def pendulum(urdf_folder):
-    return System.build(Mechanism.from_urdf(urdf_folder / "double_pendulum.urdf"))
+    return System.build(read_urdf(urdf_folder / "double_pendulum.urdf"))
 
 
 @pytest.fixture
 def runs(monkeypatch):
     """Commands that were run."""
     commands = []
-    original = codegen.subprocess.run
+    original = compiler.subprocess.run
 
     def run(command, *arguments, **options):
         commands.append(command)
         return original(command, *arguments, **options)
 
-    monkeypatch.setattr(codegen.subprocess, "run", run)
+    monkeypatch.setattr(compiler.subprocess, "run", run)
     return commands
 
 
@@ -52,24 +53,24 @@ def runs(monkeypatch):
 def test_the_cache_folder_is_private(cache):
     old = os.umask(0)
     try:
-        assert codegen.cache_folder() == cache
+        assert compiler.cache_folder() == cache
     finally:
         os.umask(old)
     assert stat.S_IMODE(cache.stat().st_mode) == 0o700
-    assert codegen.cache_folder() == cache
+    assert compiler.cache_folder() == cache
 
 
 @needs_compiler
 def test_the_second_compilation_reads_the_cache(cache, runs):
-    first = codegen.compile_library(SOURCE % 42)
+    first = compiler.compile_library(SOURCE % 42)
     assert first.yid_answer() == 42
     compilations = [command for command in runs if "-shared" in command]
     assert len(compilations) == 1
     assert [path.suffix for path in cache.iterdir()] == [".so"]
     del runs[:]
-    assert codegen.compile_library(SOURCE % 42).yid_answer() == 42
+    assert compiler.compile_library(SOURCE % 42).yid_answer() == 42
     assert runs == []
-    assert codegen.compile_library(SOURCE % 43).yid_answer() == 43
+    assert compiler.compile_library(SOURCE % 43).yid_answer() == 43
     assert len(list(cache.iterdir())) == 2
 
 
@@ -97,7 +98,7 @@ def test_a_cache_that_others_may_write_is_refused(cache, mode):
     cache.mkdir()
     cache.chmod(mode)
     with pytest.raises(OutputError) as caught:
-        codegen.cache_folder()
+        compiler.cache_folder()
     for word in (str(cache), "chmod 700", "YID_OCP_CACHE"):
         assert word in str(caught.value)
 
@@ -107,12 +108,12 @@ def test_a_cache_that_cannot_be_made_is_an_output_error(tmp_path, monkeypatch):
     blocked.write_text("not a folder", encoding="utf-8")
     monkeypatch.setenv("YID_OCP_CACHE", str(blocked / "cache"))
     with pytest.raises(OutputError, match="CC=none"):
-        codegen.cache_folder()
+        compiler.cache_folder()
 
 
 def test_without_a_compiler_everything_works_after_one_notice(cache, monkeypatch, caplog, pendulum):
     monkeypatch.setenv("CC", "none")
-    codegen.compiler.cache_clear()
+    compiler.compiler.cache_clear()
     with caplog.at_level(logging.INFO, logger="yid_ocp"):
         step = compile_step(pendulum, 0.01)
         q, _, _, status = step([0.3, 0.1], [0.0, 0.0], [], pendulum.parameters.vector())
@@ -136,8 +137,8 @@ def test_a_compiler_that_fails_leaves_the_interpreter(cache, tmp_path, monkeypat
     broken.write_text("#!/bin/sh\necho no space left >&2\nexit 1\n", encoding="utf-8")
     broken.chmod(0o755)
     monkeypatch.setenv("CC", str(broken))
-    codegen.compiler.cache_clear()
-    codegen._machine.cache_clear()
+    compiler.compiler.cache_clear()
+    compiler._machine.cache_clear()
     with caplog.at_level(logging.INFO, logger="yid_ocp"):
         step = compile_step(pendulum, 0.01)
     assert not step.compiled
@@ -147,7 +148,7 @@ def test_a_compiler_that_fails_leaves_the_interpreter(cache, tmp_path, monkeypat
 
 @needs_compiler
 def test_a_damaged_library_leaves_the_interpreter(cache, monkeypatch, caplog, pendulum):
-    monkeypatch.setattr(codegen.os, "replace", lambda source, target: target.write_bytes(b"not a library"))
+    monkeypatch.setattr(compiler.os, "replace", lambda source, target: target.write_bytes(b"not a library"))
     with caplog.at_level(logging.INFO, logger="yid_ocp"):
         step = compile_step(pendulum, 0.01)
     assert not step.compiled

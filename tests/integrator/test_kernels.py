@@ -35,7 +35,7 @@ def sizes_of(theta):
 
 
 def after_one(case, theta=None, start=None, torque=None, path=None):
-    swept = case.sweep(theta, start, case.torque[:1] if torque is None else torque[None, :], case.path[:2])
+    swept = case.rollout(theta, start, case.torque[:1] if torque is None else torque[None, :], case.path[:2])
     assert swept.status.ok, swept.status.message
     return swept.state[1]
 
@@ -105,7 +105,7 @@ def test_forward_equals_adjoint_equals_differences(case, fed_back):
     weights = random_cost(case)
     rng = np.random.default_rng(12)
 
-    swept = case.sweep(feedback=feedback)
+    swept = case.rollout(feedback=feedback)
     assert swept.status.ok, swept.status.message
     gradient = case.step.kernel.adjoint(
         theta, swept, feedback, names, weights.state, weights.multipliers, weights.effort
@@ -119,7 +119,7 @@ def test_forward_equals_adjoint_equals_differences(case, fed_back):
     start[s["n"] : 2 * s["n"]] *= 0.01
     path[..., -1] = rng.normal(size=(steps + 1, s["nc"]))
     start[fixed] = path[0]
-    forward = case.sweep(feedback=feedback, directions=Directions(names, start, torque, path))
+    forward = case.rollout(feedback=feedback, directions=Directions(names, start, torque, path))
     slopes = (
         np.tensordot(weights.state, forward.by_state, 2)
         + np.tensordot(weights.multipliers, forward.by_multipliers, 2)
@@ -133,7 +133,7 @@ def test_forward_equals_adjoint_equals_differences(case, fed_back):
     assert slopes[-2] == pytest.approx(expected, rel=1e-8, abs=1e-9 * scale)
 
     def along(direction, epsilon):
-        moved = case.sweep(
+        moved = case.rollout(
             theta + epsilon * direction[0],
             case.start + epsilon * direction[1],
             case.torque + epsilon * direction[2],
@@ -169,8 +169,8 @@ def test_interpreter_equals_compiled(case):
     path = rng.normal(size=(*case.path.shape, d))
     directions = Directions(names, rng.normal(size=(nx, d)), torque, path)
     directions.start[list(case.step.system.prescribed_indices)] = path[0]
-    one = case.sweep(feedback=feedback, directions=directions)
-    two = case.sweep(feedback=feedback, directions=directions, step=plain)
+    one = case.rollout(feedback=feedback, directions=directions)
+    two = case.rollout(feedback=feedback, directions=directions, step=plain)
     weights = random_cost(case)
     partial = (weights.state, weights.multipliers, weights.effort)
     back = [s.kernel.adjoint(case.theta, one, feedback, names, *partial) for s in (case.step, plain)]
@@ -191,7 +191,7 @@ def scale_of(array):
 
 def test_a_sweep_is_its_steps(case):
     n, s = case.step.system.size, case.step.sizes
-    swept = case.sweep()
+    swept = case.rollout()
     for k, u in enumerate(case.torque):
         x = swept.state[k]
         pair = (case.path[k], case.path[k + 1]) if s["nc"] else None
@@ -203,11 +203,11 @@ def test_a_sweep_is_its_steps(case):
         np.testing.assert_allclose(status.effort, swept.effort[k], rtol=0, atol=1e-7 * scale_of(status.effort))
 
 
-def test_stages_are_the_equations_along_any_trajectory(case):
+def test_linearized_steps_are_the_equations_along_any_trajectory(case):
     s, step, names = case.step.sizes, case.step, case.step.system.parameters.names[::3]
     n, h = s["n"], step.time_step
-    swept = case.sweep()
-    exact = step.kernel.stages(case.theta, swept.state, swept.multipliers, swept.torque, (), False)
+    swept = case.rollout()
+    exact = step.kernel.linearize(case.theta, swept.state, swept.multipliers, swept.torque, (), False)
     assert np.max(np.abs(exact.rows[:, step.structure.unknown_row])) < 1e-9 * scale_of(swept.multipliers)
     np.testing.assert_allclose(exact.p1, swept.state[1:, n : 2 * n], rtol=0, atol=1e-9)
     fixed = list(step.system.prescribed_indices)
@@ -217,7 +217,7 @@ def test_stages_are_the_equations_along_any_trajectory(case):
     state = swept.state + 0.01 * rng.normal(size=swept.state.shape)
     lam = swept.multipliers + 0.01 * rng.normal(size=swept.multipliers.shape)
     plain = compile_step(step.system, step.time_step, step.force_split, use_compiler=False)
-    one, two = (k.stages(case.theta, state, lam, case.torque, names, True) for k in (step.kernel, plain.kernel))
+    one, two = (k.linearize(case.theta, state, lam, case.torque, names, True) for k in (step.kernel, plain.kernel))
     for key in vars(one):
         actual, expected = getattr(one, key), getattr(two, key)
         np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-9 * scale_of(expected))
@@ -229,7 +229,7 @@ def test_stages_are_the_equations_along_any_trajectory(case):
 
     def at(epsilon):
         arguments = [value + epsilon * move for value, move in zip(values, moves, strict=True)]
-        return step.kernel.stages(*arguments, (), False)
+        return step.kernel.linearize(*arguments, (), False)
 
     epsilon = 1e-6
     plus, minus = at(epsilon), at(-epsilon)

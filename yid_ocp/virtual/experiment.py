@@ -19,14 +19,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
 
-from yid_ocp.data.mjcf import Evaluator, compiled_model, mujoco_module
-from yid_ocp.data.mjcf import mujoco_xml as mujoco_xml
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model.kinematics import forward_kinematics
-from yid_ocp.model.mechanism import Mechanism, Placement
+from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import Grasp, System
-from yid_ocp.model.y_object import flexible_object
+from yid_ocp.model.urdf import read_urdf
+from yid_ocp.model.y_object import y_object
+from yid_ocp.virtual.mjcf import Evaluator, compiled_model, mujoco_module
+from yid_ocp.virtual.mjcf import mujoco_xml as mujoco_xml
 
 Array = NDArray[np.float64]
 
@@ -73,9 +74,9 @@ def paper_system(arms: int) -> System:
         raise ConfigError(f"arms = {arms}", where="paper_system", allowed="1 or 2")
     sides = ("left", "right")[:arms]
     names = [f"{side}_{joint}" for side in sides for joint in BAXTER_JOINTS]
-    robot = Mechanism.from_urdf("package:baxter", joints=names)
+    robot = read_urdf("package:baxter", joints=names)
     grasps = [Grasp(side, f"{side}_gripper", held) for side, held in zip(sides, ("w_T2", "w_T3"), strict=False)]
-    return System.build(robot, objects=[(flexible_object(), None, None)], grasps=grasps, driven=names, damping=0.05)
+    return System.build(robot, objects=[(y_object(), None, None)], grasps=grasps, driven=names, damping=0.05)
 
 
 def initial_posture(
@@ -287,7 +288,7 @@ class Motion:
         return Motion(system.driven, amplitude, frequency, phase, ramp)
 
 
-class ForeignTerms(Protocol):
+class EngineTerms(Protocol):
     """Terms that the simulator has and the system's description has not."""
 
     def prepare(self, model: Any) -> None:
@@ -345,7 +346,7 @@ def simulate_in_mujoco(
     time_step: float = INNER_STEP,
     posture: Mapping[str, float] | None = None,
     frame_times: ArrayLike = (),
-    foreign: ForeignTerms | None = None,
+    injected: EngineTerms | None = None,
 ) -> SimulatedRun:
     """Let the controller follow a motion in MuJoCo, from static equilibrium at the initial posture.
 
@@ -369,7 +370,7 @@ def simulate_in_mujoco(
         Initial angles; `initial_posture` where absent.
     frame_times : array_like, shape (M,)
         When a camera looks [s], increasing, in [0, duration].
-    foreign : ForeignTerms, optional
+    injected : EngineTerms, optional
         What is at work beside the system's description. MuJoCo knows one such callback for the whole process: no other
         simulation may run meanwhile in another thread.
 
@@ -401,7 +402,7 @@ def simulate_in_mujoco(
     mujoco = mujoco_module()
     model = compiled_model(mujoco_xml(system, values, time_step=time_step))
     nominal_damping = np.array(model.dof_damping)
-    with _at_work(mujoco, model, foreign):
+    with _at_work(mujoco, model, injected):
         data = mujoco.MjData(model)
         # Every joint has one coordinate, so positions, velocities and joints share their addresses.
         order = np.array([model.joint(name).id for name in system.mechanism.joint_names])
@@ -410,8 +411,8 @@ def simulate_in_mujoco(
         data.qpos[:] = model.qpos_spring
         data.qpos[[model.joint(name).id for name in start]] = list(start.values())
         balance = _settle(mujoco, model, data, driven, nominal_damping)
-        if foreign is not None:
-            foreign.begin(data)
+        if injected is not None:
+            injected.begin(data)
 
         free = copy.copy(model)
         free.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
@@ -474,13 +475,13 @@ def simulate_in_mujoco(
 
 
 @contextlib.contextmanager
-def _at_work(mujoco: ModuleType, model: Any, foreign: ForeignTerms | None) -> Iterator[None]:
-    """Let foreign terms act inside MuJoCo while the block runs."""
-    if foreign is None:
+def _at_work(mujoco: ModuleType, model: Any, injected: EngineTerms | None) -> Iterator[None]:
+    """Let injected terms act inside MuJoCo while the block runs."""
+    if injected is None:
         yield
         return
-    foreign.prepare(model)
-    mujoco.set_mjcb_passive(foreign.force)
+    injected.prepare(model)
+    mujoco.set_mjcb_passive(injected.force)
     try:
         yield
     finally:
@@ -511,7 +512,7 @@ def virtual_experiment(
     camera_pose: ArrayLike | None = None,
     time_step: float = INNER_STEP,
     posture: Mapping[str, float] | None = None,
-    foreign: ForeignTerms | None = None,
+    injected: EngineTerms | None = None,
     name: str = "virtual",
     description: str = "",
 ) -> Recording:
@@ -550,7 +551,7 @@ def virtual_experiment(
         Of the simulator [s].
     posture : mapping of str to float, optional
         Initial angles; `initial_posture` where absent.
-    foreign : ForeignTerms, optional
+    injected : EngineTerms, optional
         What is at work beside the system's description.
     name, description : str
         Of the recording; how it was made is appended to the description.
@@ -585,7 +586,7 @@ def virtual_experiment(
         time_step=time_step,
         posture=start,
         frame_times=times,
-        foreign=foreign,
+        injected=injected,
     )
 
     driven = list(system.driven_indices)

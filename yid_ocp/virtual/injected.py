@@ -17,13 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from yid_ocp.data.mjcf import Evaluator, mujoco_module
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
-from yid_ocp.data.synthetic import virtual_experiment
 from yid_ocp.effects import make_effect
 from yid_ocp.effects.base import arms, object_joints
 from yid_ocp.errors import ConfigError, nearest
 from yid_ocp.model.system import System
+from yid_ocp.virtual.experiment import virtual_experiment
+from yid_ocp.virtual.mjcf import Evaluator, mujoco_module
 
 Array = NDArray[np.float64]
 Force = Callable[[Any, Any], None]
@@ -75,7 +75,7 @@ that is stiffer one way than the other, wind that comes and goes."""
 
 
 @dataclass(frozen=True)
-class Withheld:
+class InjectedEffect:
     """An effect that the data have and the model has not.
 
     Attributes
@@ -97,8 +97,8 @@ class Withheld:
         return f"{self.kind}@{self.location}"
 
 
-def withheld_experiment(
-    system: System, values: Mapping[str, float], withheld: Sequence[Withheld], **settings: Any
+def injected_experiment(
+    system: System, values: Mapping[str, float], withheld: Sequence[InjectedEffect], **settings: Any
 ) -> Recording:
     """A virtual experiment with effects that are not in the system's description.
 
@@ -108,7 +108,7 @@ def withheld_experiment(
         Nominal, with driven joints.
     values : mapping of str to float
         True parameter values.
-    withheld : sequence of Withheld
+    withheld : sequence of InjectedEffect
     settings
         Of `virtual_experiment`.
 
@@ -136,26 +136,26 @@ def withheld_experiment(
     described = [make_effect(e.kind, e.location, system, e.values) for e in withheld if e.kind in DESCRIBED]
     changed = system.with_effects(described) if described else system
     inner = [e for e in withheld if e.kind not in DESCRIBED and e.kind not in READ]
-    foreign = Foreign(changed, values, inner) if inner else None
-    made = virtual_experiment(changed, values, foreign=foreign, **settings)
+    injected = InjectedTerms(changed, values, inner) if inner else None
+    made = virtual_experiment(changed, values, injected=injected, **settings)
     for effect in withheld:
         if effect.kind in READ:
             made = misread(made, system, effect)
     return made
 
 
-class Foreign:
+class InjectedTerms:
     """Terms of effects inside MuJoCo: `prepare` edits its model, `force` is called by it at every step.
 
     Parameters
     ----------
     system : System
     values : mapping of str to float
-    effects : sequence of Withheld
+    effects : sequence of InjectedEffect
         Of `MODELLED`, `FORCED` or `OUTSIDE`.
     """
 
-    def __init__(self, system: System, values: Mapping[str, float], effects: Sequence[Withheld]) -> None:
+    def __init__(self, system: System, values: Mapping[str, float], effects: Sequence[InjectedEffect]) -> None:
         self._system, self._effects = system, tuple(effects)
         value = Evaluator(system, values)
         self._stiffness = {s.joint: float(value(s.stiffness)[0]) for s in system.elastic}
@@ -359,14 +359,14 @@ class Foreign:
 # -- sensors and clocks -----------------------------------------------------------------------------------------------
 
 
-def misread(recording: Recording, system: System, effect: Withheld) -> Recording:
+def misread(recording: Recording, system: System, effect: InjectedEffect) -> Recording:
     """The recording as sensors with an error would have made it.
 
     Parameters
     ----------
     recording : Recording
     system : System
-    effect : Withheld
+    effect : InjectedEffect
         Of `READ`.
     """
     if effect.kind.startswith("camera") or effect.kind == "surface_offset":
@@ -380,7 +380,7 @@ def misread(recording: Recording, system: System, effect: Withheld) -> Recording
     return replace(recording, joints=_misfelt(joints, system, effect))
 
 
-def _misfelt(joints: JointGroup, system: System, effect: Withheld) -> JointGroup:
+def _misfelt(joints: JointGroup, system: System, effect: InjectedEffect) -> JointGroup:
     assert joints.effort is not None
     position, effort = joints.position.copy(), joints.effort.copy()
     size = effect.values
@@ -404,7 +404,7 @@ def _misfelt(joints: JointGroup, system: System, effect: Withheld) -> JointGroup
     return replace(joints, position=position, effort=effort)
 
 
-def _misseen(group: PointGroup, system: System, effect: Withheld, duration: float) -> PointGroup:
+def _misseen(group: PointGroup, system: System, effect: InjectedEffect, duration: float) -> PointGroup:
     assert group.pose is not None
     size, position = effect.values, group.position
     centre = np.asarray(group.pose)[:3, 3]

@@ -11,7 +11,14 @@ import pytest
 
 import yid_ocp
 from yid_ocp.data.recording import read_recording
-from yid_ocp.data.synthetic import (
+from yid_ocp.errors import ConfigError, DataError, ModelError
+from yid_ocp.model.flexible import Segment, flexible_object
+from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body
+from yid_ocp.model.mechanism import Frame, Inertia, Placement
+from yid_ocp.model.parameters import Parameter, Parameters
+from yid_ocp.model.system import Grasp, MidpointState, System, Terms, floating_clamp
+from yid_ocp.model.urdf import read_urdf
+from yid_ocp.virtual.experiment import (
     Motion,
     SimulatedRun,
     initial_posture,
@@ -20,12 +27,6 @@ from yid_ocp.data.synthetic import (
     simulate_in_mujoco,
     virtual_experiment,
 )
-from yid_ocp.errors import ConfigError, DataError, ModelError
-from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body
-from yid_ocp.model.mechanism import Frame, Inertia, Mechanism, Placement
-from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.model.system import Grasp, MidpointState, System, Terms, floating_clamp
-from yid_ocp.model.y_object import Segment, flexible_object
 
 mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
 
@@ -331,7 +332,7 @@ def test_without_mujoco_the_error_says_what_to_install(monkeypatch: pytest.Monke
 
 
 def test_other_robots_start_from_the_middle_of_their_range() -> None:
-    robot = Mechanism.from_urdf("package:panda", locked={"panda_finger_joint1": 0.0, "panda_finger_joint2": 0.0})
+    robot = read_urdf("package:panda", locked={"panda_finger_joint1": 0.0, "panda_finger_joint2": 0.0})
     beam = flexible_object([Segment("B", 0.5, 0.2, 0.01, links=2)])
     names = robot.joint_names[:7]
     placement = np.eye(4)

@@ -1,0 +1,56 @@
+"""Nodes of a rollout in time."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from yid_ocp.data.recording import Recording
+from yid_ocp.errors import DataError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Nodes of a rollout: t_k = start + k time_step, k = 0..steps."""
+
+    start: float
+    time_step: float
+    steps: int
+
+    @property
+    def times(self) -> Array:
+        """Times of all nodes, shape (steps + 1,) [s]."""
+        return np.asarray(self.start + self.time_step * np.arange(self.steps + 1), dtype=float)
+
+    def locate(self, t: ArrayLike) -> tuple[NDArray[np.int64], Array]:
+        """Node before each time and the fraction of a step beyond it; a time within 1e-6 of a node is that node."""
+        position = (np.asarray(t, float) - self.start) / self.time_step
+        near = np.rint(position)
+        position = np.where(np.abs(position - near) < 1e-6, near, position)
+        node = np.clip(np.floor(position).astype(np.int64), 0, self.steps - 1)
+        return node, position - node
+
+
+def make_grid(recording: Recording, time_step: float, duration: float | None = None) -> Grid:
+    """Nodes that cover the recording's driving group (its joints, else its first group of points).
+
+    Raises
+    ------
+    DataError
+        The recording is shorter than two steps.
+    """
+    t = recording.joints.t if recording.joints is not None else recording.points[0].t
+    span = float(t[-1] - t[0]) if duration is None else min(duration, float(t[-1] - t[0]))
+    steps = math.floor(span / time_step + 1e-6)
+    if steps < 2:
+        raise DataError(
+            f"{span:.3g} s of data are shorter than two time steps of {time_step:g} s",
+            where=recording.name,
+            hint="record longer, or choose a smaller time step",
+        )
+    return Grid(float(t[0]), time_step, steps)
