@@ -13,7 +13,8 @@ PACKAGE = Path(__file__).parents[1] / NAME
 LAYERS = (
     ("errors",),
     ("registry",),  # it raises errors, so the two cannot share a layer
-    ("options",),
+    ("options", "files", "least_squares"),
+    ("parallel",),
     ("model",),
     ("effects", "sensors"),
     ("integrator",),
