@@ -19,10 +19,10 @@ from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.corrections import InputCorrections
+from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.inputs import sensors_present
 from yid_ocp.problem.low_pass import LowPass
 from yid_ocp.problem.measurements import Measurements
-from yid_ocp.problem.problem import Episode
 from yid_ocp.problem.start import FittedStart
 from yid_ocp.sensors import EffortSensor, Sensor
 

@@ -32,9 +32,9 @@ from numpy.typing import NDArray
 from yid_ocp.effects.base import grasp_names, robot_joints
 from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import apparent_inertia
+from yid_ocp.problem.episodes import Episode, apparent_inertia
 from yid_ocp.problem.measurements import huber
-from yid_ocp.problem.problem import Episode, Evaluation
+from yid_ocp.problem.problem import Evaluation
 from yid_ocp.sensors import EffortSensor, Sensor
 
 Array = NDArray[np.float64]

@@ -18,7 +18,8 @@ from yid_ocp.diagnosis import Finding, Thresholds, diagnose
 from yid_ocp.diagnosis.localise import units
 from yid_ocp.errors import OutputError
 from yid_ocp.problem import EstimationProblem, SensorOptions
-from yid_ocp.problem.problem import Episode, EpisodeResult
+from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.prediction import EpisodeResult
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import Findings
 from yid_ocp.solvers import Solution, solve
