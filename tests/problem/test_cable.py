@@ -172,10 +172,10 @@ def test_the_roll_of_a_clamp_is_found_from_two_frames(cable, twin):
     settings = cable_options(cable, [recording], 1e-6, 1e-3, path_cutoff=np.inf, options=options)
     problem = EstimationProblem(step, [recording], ("parent.bend",), settings, TRUTH | {"clamp_start.roll": -2.0})
     episode = problem.episodes[0]
-    fitted = problem.fitted_start(episode, problem.theta)
+    fitted = episode.start
     # of least elastic energy, not of equilibrium: weight turns the child's root by a little
     assert fitted.values["clamp_start.roll"] == pytest.approx(TRUTH["clamp_start.roll"], abs=0.15)
-    result = problem.run(episode, problem.theta, np.zeros(0), derivatives=False)
+    result = problem.predictor.run(episode, problem.theta, np.zeros(0), False)
     np.testing.assert_allclose(result.predicted[0][0], episode.samples[0].value[0], atol=1e-5)
 
 
@@ -187,8 +187,8 @@ def test_held_out_starts_use_no_frame_after_the_second(cable, twin):
     other = Recording(points=(replace(recording.points[0], position=seen),), name="other")
     settings = cable_options(cable, [recording, other], 1e-6, 1e-3, options=options)
     problem = EstimationProblem(step, [recording], ("parent.bend",), settings, None, [other])
-    first = problem.run(problem.episodes[0], problem.theta, np.zeros(0), False)
-    second = problem.run(problem.held_out[0], problem.theta, np.zeros(0), False)
+    first = problem.predictor.run(problem.episodes[0], problem.theta, np.zeros(0), False)
+    [(_, second)] = problem.validate(problem.start)
     np.testing.assert_array_equal(first.predicted[0], second.predicted[0])
 
 

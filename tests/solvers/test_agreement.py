@@ -139,7 +139,8 @@ def test_bounds_are_respected(one_arm, recording, make_problem):
     problem = make_problem(free=("T1.bend", "T2.bend"), duration=1.0)
     system = problem.system
     narrow = type(system)(**{**vars(system), "parameters": system.parameters.with_bounds({"T1.bend": (0.0, 15.0)})})
-    problem.system = narrow
+    step = compile_step(narrow, problem.step.time_step, problem.step.force_split, use_compiler=problem.step.compiled)
+    problem = EstimationProblem(step, [recording], problem.free, problem.options)
     for solver in (GaussNewton(), SingleShooting(), MultipleShooting(node_interval=10)):
         solution = solve(problem, solver)
         assert solution.x[0] <= 15.0 + 1e-9, solver.name

@@ -1,0 +1,188 @@
+"""What a problem says depends on the question alone: not on what was asked before, and not on who asks beside."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from importlib import resources
+
+import casadi as ca
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import given, settings
+
+from yid_ocp.data import read_recording
+from yid_ocp.data.recording import PointGroup, Recording
+from yid_ocp.integrator.rollout import simulate
+from yid_ocp.integrator.step import compile_step
+from yid_ocp.model import System
+from yid_ocp.model.kinematics import forward_kinematics
+from yid_ocp.model.urdf import read_urdf
+from yid_ocp.problem import EstimationProblem, ProblemOptions
+
+H = 0.01
+KINDS = ("equilibrium", "estimated", "fitted_to_points")
+
+
+@pytest.fixture(scope="module")
+def pendulum(urdf_folder):
+    """Makes problems on three swings of a double pendulum with springs, whose start depends on what is asked."""
+    tree = read_urdf(str(urdf_folder / "double_pendulum.urdf"))
+    system = System.build(tree, damping={"shoulder": 0.1, "elbow": 0.1})
+    step = compile_step(system, H, use_compiler=False)
+    frames = list(system.mechanism.frames)[-2:]
+    q = ca.SX.sym("q", system.size)
+    kinematics = forward_kinematics(system.mechanism, q)
+    place = ca.Function("place", [q], [ca.horzcat(*(kinematics.position(frame) for frame in frames))])
+
+    def record(seed):
+        rng = np.random.default_rng(seed)
+        start = np.zeros(step.sizes["nx"])
+        start[:2], start[2:4] = 0.3 * rng.standard_normal(2), 0.02 * rng.standard_normal(2)
+        rollout = simulate(step, system.parameters.vector(), start, 40)
+        clean = np.stack([np.array(place(x[:2])).T for x in rollout.state])
+        group = PointGroup("points", tuple(frames), H * np.arange(41), clean, std=np.full(clean.shape, 1e-3))
+        return Recording(None, (group,), name=f"swing_{seed}")
+
+    def make(kind):
+        options = ProblemOptions(initial_state=kind, start_window=0.02)
+        free = ("elbow.damping", "shoulder.damping")
+        return EstimationProblem(step, [record(1), record(2)], free, options, held_out=[record(3)])
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def arm(single_arm):
+    """Makes problems on one arm under its tracking filter, at rest in a shape that depends on the stiffness."""
+    step = compile_step(single_arm, H, "left_damping")
+    folder = resources.files("yid_ocp.data") / "defaults"
+    recordings = [read_recording(folder / f"single_arm_vision_{name}.h5") for name in ("estimate", "held_out")]
+
+    def make(kind):
+        options = ProblemOptions(initial_state=kind, duration=0.15)
+        return EstimationProblem(step, recordings[:1], ("T1.bend", "T2.bend"), options, held_out=recordings[1:])
+
+    return make
+
+
+def said(problem, x):
+    """Everything that a problem says of a point."""
+    evaluation = problem.evaluate(x)
+    cost, gradient, _ = problem.gradient(x)
+    held_out = [r if isinstance(r, str) else r.predicted for _, r in problem.validate(x)]
+    return evaluation.cost, evaluation.residual, evaluation.jacobian, cost, gradient, held_out
+
+
+def assert_same(one, other):
+    for a, b in zip(one, other, strict=True):
+        if isinstance(a, (list, tuple)):
+            assert_same(a, b)
+        else:
+            np.testing.assert_array_equal(a, b)
+
+
+def points(problem, seeds):
+    lower, upper = problem.bounds
+    found = []
+    for seed in seeds:
+        change = np.random.default_rng(seed).uniform(0.5, 2.0, len(problem.start))
+        offset = np.where(problem.start == 0, 0.01 * (change - 1), 0.0)
+        found.append(np.clip(problem.start * change + offset, lower, upper))
+    return found
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_answer_does_not_depend_on_earlier_questions(kind, pendulum):
+    reference = {}
+    for seed in range(4):
+        fresh = pendulum(kind)
+        reference[seed] = said(fresh, points(fresh, [seed])[0])
+    asked = pendulum(kind)
+
+    @settings(max_examples=10)
+    @given(st.lists(st.integers(0, 3), min_size=2, max_size=4), st.lists(st.sampled_from("egv"), max_size=3))
+    def check(order, between):
+        for seed, x in zip(order, points(asked, order), strict=True):
+            assert_same(said(asked, x), reference[seed])
+            for question in between:
+                ask = {"e": asked.evaluate, "g": asked.gradient, "v": asked.validate}[question]
+                ask(2.0 * x)
+
+    check()
+
+
+def test_an_answer_at_rest_does_not_depend_on_earlier_questions(arm):
+    fresh, asked = arm("equilibrium"), arm("equilibrium")
+    for x in points(asked, [3, 1, 2]):
+        said(asked, x)
+    for x in points(asked, [1, 2, 3]):
+        assert_same(said(arm("equilibrium"), x), said(asked, x))
+    # a warm start leads to the same equilibrium, to the tolerance of the statics
+    x, near = points(fresh, [1, 2])
+    warm = fresh.evaluate(near).warm
+    assert fresh.evaluate(x, warm=warm).cost == pytest.approx(fresh.evaluate(x).cost, rel=1e-8)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_answer_does_not_depend_on_threads(kind, pendulum):
+    seeds = list(range(4)) * 2
+    reference = [said(pendulum(kind), x) for x in points(pendulum(kind), seeds)]
+    asked = pendulum(kind)
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda x: said(asked, x), points(asked, seeds)))
+    for one, other in zip(found, reference, strict=True):
+        assert_same(one, other)
+
+
+def test_compiled_answers_do_not_depend_on_threads(arm):
+    seeds = list(range(3)) * 2
+    one_by_one = arm("equilibrium")
+    reference = [said(one_by_one, x) for x in points(one_by_one, seeds)]
+    asked = arm("equilibrium")
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda x: said(asked, x), points(asked, seeds)))
+    for one, other in zip(found, reference, strict=True):
+        assert_same(one, other)
+
+
+def test_problems_like_another_leave_it_as_it_is(pendulum):
+    problem = pendulum("estimated")
+    before = said(problem, problem.start)
+    other = problem.freeing(("elbow.damping",)).at({"shoulder.damping": 0.4})
+    said(other, other.start)
+    assert other.names[0] == "elbow.damping"
+    assert "shoulder.damping" not in other.names
+    assert other.functions is problem.functions
+    assert_same(said(problem, problem.start), before)
+    with pytest.raises(ValueError, match="read-only"):
+        problem.theta[0] = 1.0
+
+
+def test_a_freed_part_has_the_columns_of_the_whole(pendulum):
+    problem = pendulum("estimated")
+    part = problem.freeing(("shoulder.damping",))
+    whole = problem.evaluate(problem.start).jacobian
+    mine = part.evaluate(part.start).jacobian
+    kept = [problem.names.index(name) for name in part.names]
+    rows = slice(0, part.rows.data.stop)
+    np.testing.assert_array_equal(mine[rows], whole[rows][:, kept])
+
+
+def test_the_residual_says_what_its_rows_are(pendulum):
+    problem = pendulum("estimated")
+    x = problem.vector({"elbow.damping": 0.2, f"start.q.elbow[{problem.episodes[0].name}]": 0.01})
+    evaluation, rows = problem.evaluate(x), problem.rows
+    parts = [rows.data, rows.stated_priors, rows.weak_priors]
+    assert [part.start for part in parts] == [0, rows.data.stop, rows.stated_priors.stop]
+    assert rows.weak_priors.stop == len(evaluation.residual)
+    for episode, groups, result in zip(problem.episodes, rows.measurements, evaluation.episodes, strict=True):
+        for samples, part, predicted in zip(episode.samples, groups, result.predicted, strict=True):
+            np.testing.assert_array_equal(evaluation.residual[part], samples.whitened(predicted)[samples.seen])
+    stated = evaluation.residual[rows.stated_priors]
+    assert np.count_nonzero(stated) == 1
+    assert stated[np.flatnonzero(stated)[0]] == pytest.approx(0.01 / problem.options.configuration_std)
+    # a factor of two of the ten that call one standard deviation
+    assert sorted(evaluation.residual[rows.weak_priors]) == pytest.approx([0.0, np.log10(2.0)])
+    residual, jacobian = problem.informing(evaluation)
+    assert len(residual) == len(jacobian) == rows.stated_priors.stop
