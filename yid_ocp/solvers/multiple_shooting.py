@@ -86,7 +86,19 @@ class MultipleShooting:
         w0 = transcription.guess(start)
         lower, upper = transcription.bounds()
         nlp.prepare(w0)
-        options: dict[str, Any] = {
+        functions = nlp.functions()
+        solver = ca.nlpsol("multiple_shooting", "ipopt", functions.pop("nlp"), {**self._options(), **functions})
+        result = solver(x0=w0, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
+        w = np.array(result["x"]).ravel()
+        best = w if np.all(np.isfinite(w)) else nlp.best
+        defect = float(np.max(np.abs(transcription.constraints(w, False)[0]), initial=0.0))
+        status, message = self._ended(solver.stats()["return_status"], defect)
+        history, evaluations = tuple(nlp.recorder.history), nlp.recorder.evaluations
+        return Outcome(status, message, transcription.unknowns(best), history, evaluations, transcription.warm)
+
+    def _options(self) -> dict[str, Any]:
+        """Options of CasADi's IPOPT interface."""
+        return {
             "print_time": False,
             "no_nlp_grad": True,
             "error_on_fail": False,
@@ -113,29 +125,16 @@ class MultipleShooting:
                 **self.ipopt,
             },
         }
-        functions = nlp.functions()
-        solver = ca.nlpsol("multiple_shooting", "ipopt", functions.pop("nlp"), {**options, **functions})
-        result = solver(x0=w0, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
-        stats = solver.stats()
-        w = np.array(result["x"]).ravel()
-        defect = float(np.max(np.abs(transcription.constraints(w, False)[0]), initial=0.0))
-        best = w if np.all(np.isfinite(w)) else nlp.best
-        if stats["return_status"] in SUCCESS:
-            status, message = Status.CONVERGED, f"IPOPT: {stats['return_status']}, largest defect {defect:.1e}"
-        elif stats["return_status"] == "Maximum_Iterations_Exceeded":
-            status = Status.ITERATION_LIMIT
-            message = (
-                f"IPOPT stopped after {self.iterations} iterations, largest defect {defect:.1e}; "
-                "raise solver.iterations"
-            )
-        else:
-            status = Status.STALLED
-            message = (
-                f"IPOPT: {stats['return_status']}, largest defect {defect:.1e}; "
-                "start nearer, use more nodes, or use gauss_newton"
-            )
-        history, evaluations = tuple(nlp.recorder.history), nlp.recorder.evaluations
-        return Outcome(status, message, transcription.unknowns(best), history, evaluations, transcription.warm)
+
+    def _ended(self, returned: str, defect: float) -> tuple[Status, str]:
+        """Status and message from IPOPT's own word and the largest defect."""
+        if returned in SUCCESS:
+            return Status.CONVERGED, f"IPOPT: {returned}, largest defect {defect:.1e}"
+        if returned == "Maximum_Iterations_Exceeded":
+            limit = f"IPOPT stopped after {self.iterations} iterations, largest defect {defect:.1e}"
+            return Status.ITERATION_LIMIT, f"{limit}; raise solver.iterations"
+        remedy = "start nearer, use more nodes, or use gauss_newton"
+        return Status.STALLED, f"IPOPT: {returned}, largest defect {defect:.1e}; {remedy}"
 
 
 class _Function(ca.Callback):
