@@ -41,10 +41,10 @@ def test_numbers_as_in_yaml_1_2(written):
             "solver: {time_step: 1e-3, huber_threshold: .inf, iterations: 010, path_cutoff: 5}\ndescription: 'yes'\n"
         )
     )
-    assert run.solver.time_step == 1e-3
-    assert math.isinf(run.solver.huber_threshold)
+    assert run.problem.time_step == 1e-3
+    assert math.isinf(run.problem.huber_threshold)
     assert run.solver.method == GaussNewton(iterations=10)
-    assert run.solver.path_cutoff == 5.0
+    assert run.problem.path_cutoff == 5.0
     assert run.description == "yes"
 
 
@@ -58,7 +58,7 @@ def test_an_empty_file_is_all_defaults(written):
 def test_a_solvers_own_settings_stand_beside_the_common_ones(written):
     run = load_config(written("solver: {name: steepest_descent, iterations: 7, shrink: 0.3, time_step: 0.02}\n"))
     assert run.solver.method == SteepestDescent(iterations=7, shrink=0.3)
-    assert run.solver.time_step == 0.02
+    assert run.problem.time_step == 0.02
     with pytest.raises(ConfigError, match="there is no key 'shrink'"):
         load_config(written("solver: {name: gauss_newton, shrink: 0.3}\n"))
 
@@ -127,7 +127,7 @@ def test_settings_over_the_file_keep_what_they_do_not_touch():
         ("model:\n  arms: {joints: left_s0}\n", "a list"),
         ("solver:\n  duration: true\n", "a number"),
         ("solver:\n  time_step: '0.01'\n", "a number"),
-        ("solver:\n  gains: []\n", "solver.gains"),
+        ("solver:\n  gains: []\n", "problem.gains"),
         ("description: 2024-01-01\n", "description"),
         ("sensors:\n  points: {std: 0}\n", "above 0"),
     ],
@@ -286,7 +286,7 @@ def test_errors_of_the_model_name_the_setting(written):
 def test_a_problem_from_a_file(repository):
     problem = load_problem(
         repository / "configs" / "single_arm_vision.yaml",
-        ["model.object.links=1", "solver.compiler=false", "solver.duration=0.3", "sensors.points_camera.use=false"],
+        ["model.object.links=1", "problem.compiler=false", "problem.duration=0.3", "sensors.points_camera.use=false"],
     )
     assert problem.free == tuple(f"T{i}.{kind}" for i in (1, 2, 3) for kind in ("bend", "twist"))
     assert [s.sensor.group for s in problem.episodes[0].samples] == ["points_arm"]

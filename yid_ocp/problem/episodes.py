@@ -198,7 +198,7 @@ def _effort_samples(
             f"{grid.steps * grid.time_step:.3g} s of efforts are too short for a filter of {smoother.cutoff:g} Hz",
             where=recording.name,
             allowed=f"more than {2 * ends * grid.time_step:.3g} s",
-            hint="use a longer recording, or raise solver.path_cutoff",
+            hint="use a longer recording, or raise problem.path_cutoff",
         )
     return make_samples(
         EffortSensor(names),

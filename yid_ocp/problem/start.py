@@ -138,7 +138,7 @@ class StartFit:
         if not frames:
             raise DataError(
                 f"no point is seen in the first {window:g} s, so the start state cannot be fitted",
-                hint="widen solver.start_window, or start from equilibrium",
+                hint="widen problem.start_window, or start from equilibrium",
             )
         nodes = sorted(frames)
         first, then = nodes[0], nodes[-1]
