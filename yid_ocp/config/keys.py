@@ -48,12 +48,12 @@ class Sections:
             return options
         return {self.key: Option(Literal[tuple(self.classes)], self.default), **options}
 
-    def of(self, name: str) -> Sections:
+    def of(self, name: str, where: str) -> Sections:
         """What stands under a name in a mapping of such sections; of a registry's, the class of that name."""
         if self.key != "name":
             return self
         if name not in self.classes:
-            raise self.unknown(name, "")
+            raise self.unknown(name, where)
         return Sections({"": self.classes[name]})
 
     def unknown(self, word: object, where: str) -> ConfigError:

@@ -164,7 +164,7 @@ def _key_path(hint: Any, parts: list[str], origin: str, raw: Any) -> tuple[str, 
         raise ConfigError(f"there are no keys below '{parts[0]}'", where=origin, hint="shorten the key")
     inner = sections_of(values)
     if inner is not None and inner.key == "name":
-        inner = inner.of(parts[0])
+        inner = inner.of(parts[0], origin)
         own = () if len(parts) == 1 else _key_path(next(iter(inner.classes.values())), parts[1:], origin, None)
         return (parts[0], *own)
     known = {} if inner is None else inner.keys()
@@ -211,13 +211,11 @@ class _Reader:
         if inner is not None:
             if raw is not None and not isinstance(raw, dict):
                 raise self._wrong(raw, hint, path)
-            return {name: self._entry(inner, name, value, (*path, name)) for name, value in (raw or {}).items()}
+            return {
+                name: self._section(inner.of(name, self.where((*path, name))), value, (*path, name))
+                for name, value in (raw or {}).items()
+            }
         return self._leaf(hint, raw, path)
-
-    def _entry(self, sections: Sections, name: str, raw: Any, path: KeyPath) -> Any:
-        if sections.key == "name" and name not in sections.classes:
-            raise sections.unknown(name, self.where(path))
-        return self._section(sections.of(name), raw, path)
 
     def _section(self, sections: Sections, raw: Any, path: KeyPath) -> Any:
         raw = {} if raw is None else raw

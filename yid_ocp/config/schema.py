@@ -35,7 +35,7 @@ def _bare(hint: Any) -> dict[str, Any]:
         return {"type": "array", "items": _of(entries)}
     inner = sections_of(values)
     if inner is not None and inner.key == "name":
-        named = {name: _section(inner.of(name), "") for name in inner.classes}
+        named = {name: _section(inner.of(name, ""), "") for name in inner.classes}
         return {"type": "object", "properties": named, "additionalProperties": False}
     if inner is not None:
         return {"type": "object", "additionalProperties": _of(values)}

@@ -68,7 +68,7 @@ class SegmentSettings:
         About("extents of a rectangular cross section along the links' x and y axes", "m"),
     ] = None
     links: Annotated[int, Ge(1), Le(64), About("number of equal links")] = 4
-    link_lengths: Annotated[tuple[float, ...] | None, About("unequal links, base to tip", "m")] = None
+    link_lengths: Annotated[tuple[Annotated[float, Gt(0)], ...] | None, About("unequal links, base to tip", "m")] = None
     parent: Annotated[str | None, About("segment on which it grows; the mount when absent")] = None
     at_link: Annotated[int | None, Ge(0), About("it leaves at the tip of this link of the parent; the last")] = None
     rpy: Annotated[Triple, About("turn of its first link at rest against what carries it", "rad")] = (0.0, 0.0, 0.0)

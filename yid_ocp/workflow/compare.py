@@ -66,7 +66,7 @@ def run_compare(run: Run, out: str | Path | None = None, monitor: Monitor | None
     """
     watcher = monitor or Silent()
     solvers = chosen_solvers(run)
-    published = _published(run)
+    published = published_answers(run)
     with new_run_folder(run, out, "compare") as folder:
         inputs = input_hashes(run)
         folder.write("config.yaml", dump_config(run))
@@ -113,7 +113,8 @@ def compare_result(
     }
 
 
-def _published(run: Run) -> dict[str, float]:
+def published_answers(run: Run) -> dict[str, float]:
+    """The paper's answers for the experiment that `compare.published` names; none where it names none."""
     name = run.compare.published
     if name is None:
         return {}
