@@ -28,7 +28,7 @@ BOUNDS = (
     (annotated_types.Lt, "lt", operator.lt, "below"),
     (annotated_types.Le, "le", operator.le, "up to"),
 )
-WORDS = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
+WORDS = {float: "a number", int: "a whole number", bool: "true or false", str: "text", Any: "anything"}
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,27 @@ import jsonschema
 import pytest
 from ruamel.yaml import YAML
 
-from yid_ocp.config.schema import schema
+from yid_ocp.config.schema import schema, settings_page
 
 
 def test_the_one_beside_the_configurations_is_current(repository):
     kept = json.loads((repository / "configs" / "schema.json").read_text(encoding="utf-8"))
     assert kept == schema(), "regenerate it with  yid-ocp schema --out configs/schema.json"
+
+
+def test_the_page_in_the_docs_is_current(repository):
+    page = settings_page()
+    assert (repository / "docs" / "settings.md").read_text(encoding="utf-8") == page, (
+        "CONTRIBUTING.md says how to make it"
+    )
+    for line in (
+        "| `time_step` | of the integrator | a number above 0 up to 0.1 [s] | `0.01` |",
+        "## solver, name: lifted",
+        "## model.object.segments.NAME",
+        "| `mass` | mass of the whole segment | a number above 0 [kg] | needed |",
+    ):
+        assert f"\n{line}\n" in page
+    assert "known_start" not in page
 
 
 def test_the_schema_accepts_every_configuration_and_refuses_typos(repository):

@@ -23,7 +23,10 @@ def test_written_back_it_is_the_same_run(repository, tmp_path, name):
 
 
 def test_written_back_every_setting_is_there(written):
-    text = "solver: {name: lifted, node_interval: 3}\ncompare: {methods: {lifted: {iterations: 2}}}\n"
+    text = (
+        "solver: {name: lifted, node_interval: 3}\ncompare: {methods: {lifted: {iterations: 2}}}\n"
+        "track: {options: {filters: {behind: null}}}\n"
+    )
     run = load_config(written(text))
     told = YAML(typ="safe").load(dump_config(run))
     assert told["solver"] == {
@@ -39,6 +42,8 @@ def test_written_back_every_setting_is_there(written):
         | {"node_interval": 10, "iterations": 2}
     }
     assert told["problem"]["time_step"] == 0.01
+    assert told["track"]["options"]["filters"]["behind"] is None
+    assert "duration" not in told["problem"]
     assert set(told) & {"name", "file", "places"} == set()
     assert "known_start" not in told["problem"]
     assert load_config(written(dump_config(run))) == run

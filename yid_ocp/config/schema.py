@@ -1,8 +1,11 @@
-"""JSON Schema of configuration files, for editors that complete and check while typing."""
+"""What a configuration may say: as JSON Schema for editors, and as tables for people."""
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import math
+from collections.abc import Iterator, Mapping
 from dataclasses import MISSING
 from typing import Any
 
@@ -10,7 +13,7 @@ from pydantic import TypeAdapter
 
 from yid_ocp.config.keys import Sections, sections_of
 from yid_ocp.config.settings import Run
-from yid_ocp.options import About, entries_of, options_of, stripped, values_of
+from yid_ocp.options import About, Option, entries_of, options_of, stripped, values_of, words
 
 
 def schema() -> dict[str, Any]:
@@ -20,8 +23,8 @@ def schema() -> dict[str, Any]:
 
 
 def _of(hint: Any) -> dict[str, Any]:
-    about = next((marker for marker in stripped(hint)[1] if isinstance(marker, About)), None)
-    text = "" if about is None else about.text + (f" [{about.unit}]" if about.unit else "")
+    about = _about(hint)
+    text = about.text + (f" [{about.unit}]" if about.unit else "")
     return _bare(hint) | ({"description": text} if text else {})
 
 
@@ -61,3 +64,56 @@ def _section(sections: Sections, word: str) -> dict[str, Any]:
     if kind.__doc__:
         result["description"] = kind.__doc__.splitlines()[0]
     return result | ({"required": required} if required else {})
+
+
+def _about(hint: Any) -> About:
+    """What the outermost marker says."""
+    return next((marker for marker in reversed(stripped(hint)[1]) if isinstance(marker, About)), About())
+
+
+# -- for people -------------------------------------------------------------------------------------------------------
+
+
+def settings_page() -> str:
+    """Every key with what it means, what is allowed and its default, in Markdown."""
+    lines = [
+        "# Settings",
+        "",
+        "Every key of a configuration file. NAME stands for a name of yours or of the model.",
+        "This page is made from the code; CONTRIBUTING.md has the command.",
+    ]
+    tables = {title: (text, rows) for title, text, rows in _tables(Run, "")}
+    for title, (text, rows) in tables.items():
+        lines += ["", f"## {title}", "", text, "", "| key | meaning | allowed | default |", "|---|---|---|---|", *rows]
+    return "\n".join(lines) + "\n"
+
+
+def _tables(hint: Any, path: str) -> Iterator[tuple[str, str, list[str]]]:
+    """Title, first sentence and rows of a section and of all below it."""
+    sections = sections_of(hint)
+    for word, kind in sections.classes.items() if sections is not None else ():
+        options = options_of(kind)
+        title = f"{path}, {sections.key}: {word}" if sections is not None and sections.key else path or "The file"
+        yield title, (kind.__doc__ or "").splitlines()[0], [_row(*item) for item in options.items()]
+        for name, option in options.items():
+            yield from _tables(option.hint, f"{path}.{name}" if path else name)
+    values, entries = values_of(hint), entries_of(hint)
+    named = sections_of(values)
+    if values is not None and (named is None or named.key != "name"):
+        yield from _tables(values, f"{path}.NAME")
+    if entries is not None:
+        yield from _tables(entries, path)
+
+
+def _row(name: str, option: Option) -> str:
+    default = "needed" if option.default is MISSING else _default(option.default)
+    cells = (f"`{name}`", _about(option.hint).text, words(option.hint), default)
+    return "| " + " | ".join(cells) + " |"
+
+
+def _default(value: Any) -> str:
+    if value is None or value in ({}, "") or dataclasses.is_dataclass(value):
+        return ""
+    if isinstance(value, Mapping):
+        return ", ".join(f"`{name}`" for name in value)
+    return "`.inf`" if value == math.inf else f"`{json.dumps(value)}`"

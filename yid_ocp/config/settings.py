@@ -100,7 +100,7 @@ class CableObject(CableOptions):
     children: Annotated[
         Mapping[str, tuple[str, ...]], About("points of every branch, the first one the parent's at which it leaves")
     ] = field(default_factory=dict)
-    undeformed: Annotated[FilePath, About("CSV table with the columns point, x, y, z", "m")]
+    undeformed: Annotated[FilePath, About("CSV table with the columns point, x, y, z [m]")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -349,7 +349,7 @@ def _plain(value: Any) -> Any:
         result: dict[str, Any] = {}
         for name, option in options_of(type(value)).items():
             item = getattr(value, name)
-            if item is not None:
+            if item is not None or option.default is not None:
                 chosen = any(isinstance(marker, Among) for marker in stripped(option.hint)[1])
                 result[name] = {"name": item.name, **_plain(item)} if chosen else _plain(item)
         return result
