@@ -137,6 +137,9 @@ def test_old_or_misplaced_keys_are_told_their_section(written):
         load_config(written("problem: {iterations: 3}\n"))
     assert "'iterations' is a key of `solver`, `compare.methods.NAME`, `track.options.fit`" in caught.value.hint
     with pytest.raises(ConfigError) as caught:
+        load_config(written("solver: {name: steepest_descent, step_tolerance: 1}\n"))
+    assert "'step_tolerance' is a key of `solver` with name: gauss_newton, lifted" in caught.value.hint
+    with pytest.raises(ConfigError) as caught:
         load_config(written("solver: {held_out: []}\n"))
     assert caught.value.hint == "'held_out' is a key of `recordings`"
     with pytest.raises(ConfigError) as caught:

@@ -83,7 +83,7 @@ def unknown_key(root: type, name: str, known: Iterable[str], where: str, within:
     """That a section has no such key, with the nearest one that it has and the sections that have this one."""
     names = list(known)
     close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
-    homes = list(dict.fromkeys(f"`{home}`" if home else "the file itself" for home in homes_of(root, name)))
+    homes = list(dict.fromkeys(homes_of(root, name)))
     hints = [f"did you mean '{close[0]}'?"] if close else []
     hints += [f"'{name}' is a key of {', '.join(homes[:3])}"] if homes else []
     return ConfigError(
@@ -95,13 +95,17 @@ def unknown_key(root: type, name: str, known: Iterable[str], where: str, within:
 
 
 def homes_of(hint: Any, name: str, at: str = "") -> Iterator[str]:
-    """Sections that have a key, as dotted paths; NAME stands for a name that users choose."""
+    """Sections that have a key, in words; NAME stands for a name that users choose."""
     for inner, step in ((values_of(hint), ".NAME"), (entries_of(hint), "")):
         if inner is not None:
             yield from homes_of(inner, name, at + step)
     sections = sections_of(hint)
-    for kind in sections.classes.values() if sections is not None else ():
+    if sections is None:
+        return
+    having = [word for word, kind in sections.classes.items() if name in options_of(kind)]
+    if having:
+        choice = "" if len(having) == len(sections.classes) else f" with {sections.key}: {', '.join(having)}"
+        yield (f"`{at}`" if at else "the file itself") + choice
+    for kind in sections.classes.values():
         for key, option in options_of(kind).items():
-            if key == name:
-                yield at
             yield from homes_of(option.hint, name, f"{at}.{key}" if at else key)
