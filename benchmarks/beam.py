@@ -43,7 +43,7 @@ def main(arguments: list[str] | None = None) -> int:
     for links in chosen.links:
         start = time.perf_counter()
         problem = build_problem(run, build_step(run, build_system(run, links)))
-        solution = solve(problem, run.solver.method)
+        solution = solve(problem, run.solver)
         size = {key: solution.parameters[f"{name}.{key}"].value for key in ("length", "mass", "size_x", "size_y")}
         bend, damping = solution.parameters[f"{name}.bend"], solution.parameters[f"{name}.damping"]
         rigidity, moment = bend.value, second_moment(size["size_x"], size["size_y"])

@@ -47,7 +47,7 @@ TIME_STEP = 0.01  # [s]
 NOISE = 2e-4  # of motion capture, from the scatter of third differences (0.10 to 0.20 mm) [m]
 MODEL_ERROR = 0.1  # about 15 mm that last for some fifty frames [m]
 GRAVITY = 9.81  # [m/s^2]
-BRANCH = BranchOptions(bend=1.5e-3, twist=1e-3, damping=1e-3, twist_damping=1e-3)  # a guess
+BRANCH = BranchOptions(bend=1.5e-3, twist=1e-3, damping=1e-3, twist_damping=True)  # a guess
 OPTIONS = CableOptions(default=BRANCH, memory=0.5, rest_angles=True)
 
 

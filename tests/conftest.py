@@ -152,3 +152,15 @@ def violation():
         return np.array(ca.Function("phi", [e.q1, e.theta, e.time_step], [phi])(q, theta, step.time_step)).ravel()
 
     return evaluate
+
+
+@pytest.fixture
+def written(tmp_path):
+    """Write a configuration file and return its path."""
+
+    def write(text: str, name: str = "run.yaml") -> Path:
+        path = tmp_path / name
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write

@@ -62,7 +62,7 @@ def configured(optional: bool = False) -> Callable[[argparse.ArgumentParser], No
             action="append",
             default=[],
             dest="overrides",
-            help="replace a setting, for example --set solver.time_step=0.005; may be repeated",
+            help="replace a setting, for example --set problem.time_step=0.005; may be repeated",
         )
         parser.add_argument("--quiet", action="store_true", help="print nothing but the run folder's path")
 
@@ -238,7 +238,7 @@ def _export_arguments(parser: argparse.ArgumentParser) -> None:
 def _schema(arguments: argparse.Namespace) -> int:
     import json
 
-    from yid_ocp.config.reader import schema
+    from yid_ocp.config.schema import schema
     from yid_ocp.errors import OutputError
 
     text = json.dumps(schema(), indent=1)

@@ -1,8 +1,34 @@
-"""What an option says of itself, beside its type and bounds: words and a unit, for reader, schema and documentation."""
+"""What an option says of itself where it is defined, and what follows from that: its key, its words, its check.
+
+An option is a field of a frozen dataclass, annotated with its bounds and with `About`:
+
+    time_step: Annotated[float, Gt(0), Le(0.1), About("of the integrator", "s")] = 0.01
+
+Reader, `--set`, checks and JSON Schema follow from it. A field without `About` is set by code alone.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import dataclasses
+import functools
+import operator
+import types
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import annotated_types
+
+from yid_ocp.errors import ConfigError
+from yid_ocp.registry import Registry
+
+BOUNDS = (
+    (annotated_types.Gt, "gt", operator.gt, "above"),
+    (annotated_types.Ge, "ge", operator.ge, "from"),
+    (annotated_types.Lt, "lt", operator.lt, "below"),
+    (annotated_types.Le, "le", operator.le, "up to"),
+)
+WORDS = {float: "a number", int: "a whole number", bool: "true or false", str: "text", Any: "anything"}
 
 
 @dataclass(frozen=True)
@@ -21,3 +47,131 @@ class About:
     text: str = ""
     unit: str = ""
     path: bool = False
+
+
+@dataclass(frozen=True)
+class Among:
+    """Says that a type stands for the classes of a registry: the key `name` chooses one, or the key of a mapping.
+
+    Attributes
+    ----------
+    registry : Registry
+    default : str
+        Chosen where there is no `name`.
+    """
+
+    registry: Registry[Any]
+    default: str = ""
+
+
+@dataclass(frozen=True)
+class Option:
+    """Type with its markers, and default; `MISSING` where there is none."""
+
+    hint: Any
+    default: Any
+
+
+@functools.cache
+def options_of(kind: type) -> Mapping[str, Option]:
+    """Fields of a dataclass that users may set, by name."""
+    hints = get_type_hints(kind, include_extras=True)
+    return {
+        entry.name: Option(
+            hints[entry.name], entry.default if entry.default_factory is MISSING else entry.default_factory()
+        )
+        for entry in dataclasses.fields(kind)
+        if any(isinstance(marker, About) for marker in stripped(hints[entry.name])[1])
+    }
+
+
+def stripped(hint: Any) -> tuple[Any, list[Any]]:
+    """A type without its markers, and these."""
+    markers: list[Any] = []
+    while get_origin(hint) is Annotated:
+        markers += hint.__metadata__
+        hint = get_args(hint)[0]
+    return hint, markers
+
+
+def members(hint: Any) -> tuple[Any, ...]:
+    """Members of a union, without None; the type itself where it is none."""
+    bare, _ = stripped(hint)
+    if get_origin(bare) in (Union, types.UnionType):
+        return tuple(member for member in get_args(bare) if member is not type(None))
+    return (bare,)
+
+
+def values_of(hint: Any) -> Any:
+    """Type of the values of a mapping; None for other types."""
+    found = (stripped(member)[0] for member in members(hint))
+    return next((get_args(bare)[1] for bare in found if get_origin(bare) in (Mapping, dict)), None)
+
+
+def entries_of(hint: Any) -> Any:
+    """Type of the entries of a list of any length; None for other types."""
+    bare, _ = stripped(hint)
+    arguments = get_args(bare)
+    return arguments[0] if get_origin(bare) is tuple and arguments[-1] is Ellipsis else None
+
+
+def words(hint: Any) -> str:
+    """A type in words, with its range and unit."""
+    bare, markers = stripped(hint)
+    unit = next((marker.unit for marker in markers if isinstance(marker, About) and marker.unit), "")
+    limits = [
+        f"{word} {getattr(marker, name):g}"
+        for marker in markers
+        for kind, name, _, word in BOUNDS
+        if isinstance(marker, kind)
+    ]
+    text = " or ".join(dict.fromkeys(map(_words, members(bare))))
+    least = [f", {marker.min_length} at least" for marker in markers if isinstance(marker, annotated_types.Len)]
+    return " ".join([text, *limits]) + "".join(least) + (f" [{unit}]" if unit else "")
+
+
+def _words(hint: Any) -> str:
+    bare, markers = stripped(hint)
+    if markers:
+        return words(hint)
+    if bare in WORDS:
+        return WORDS[bare]
+    arguments = get_args(bare)
+    if get_origin(bare) is Literal:
+        return ", ".join(map(str, arguments))
+    if get_origin(bare) is tuple:
+        count = "" if arguments[-1] is Ellipsis else f" of {len(arguments)}"
+        return f"a list{count}, each {_words(arguments[0])}"
+    if values_of(bare) is not None:
+        return f"names, each with {_words(values_of(bare))}"
+    return "a section"
+
+
+def check(options: Any, where: str) -> None:
+    """Refuse options with a number outside its bounds, however they were made.
+
+    Raises
+    ------
+    ConfigError
+    """
+    kind: Any = type(options)
+    for name, option in options_of(kind).items():
+        value = getattr(options, name)
+        if not _within(option.hint, value):
+            raise ConfigError(f"{name} = {value}", where=where, allowed=words(option.hint))
+
+
+def _within(hint: Any, value: Any) -> bool:
+    """Whether every number of a value is within the bounds of its type; what is no number is."""
+    if isinstance(value, tuple):
+        entries = entries_of(hint)
+        return entries is None or all(_within(entries, entry) for entry in value)
+    if not isinstance(value, (int, float)):
+        return True
+    markers = [marker for part in (hint, *members(hint)) for marker in stripped(part)[1]]
+    return all(
+        compare(value, getattr(marker, name))
+        for marker in markers
+        for kind, name, compare, _ in BOUNDS
+        if isinstance(marker, kind)
+    )

@@ -67,7 +67,7 @@ def test_coverage_on_a_pendulum(pendulum, twin, record_property):
 @pytest.mark.slow
 def test_coverage_on_one_arm_and_the_y(repository, twin, record_property):
     """43 coordinates, 3 s: bends to a percent, T1.twist and T3.bend so weakly that only profiles are honest."""
-    made = load_problem(repository / "configs" / "single_arm_vision.yaml", ["solver.duration=3.0"])
+    made = load_problem(repository / "configs" / "single_arm_vision.yaml", ["problem.duration=3.0"])
     truth = np.array([TRUTH[name] for name in made.names])
     seen = [name for name in TRUTH if name not in ("T2.twist", "T3.twist")]
 

@@ -105,8 +105,8 @@ def short_run(repository):
     """One arm on a coarse Y, half a second."""
     settings = (
         "model.object.links=1",
-        "solver.duration=0.5",
-        "solver.compiler=false",
+        "problem.duration=0.5",
+        "problem.compiler=false",
         "parameters={T*.bend: {free: true, initial: 15}, T*.twist: {free: true, initial: 10}}",
     )
     return load_problem(repository / "configs" / "single_arm_vision.yaml", settings)

@@ -28,9 +28,11 @@ parameters:
   shoulder.stiffness: {{free: true, bounds: [0.0, 100.0]}}
   shoulder.damping: {{free: true}}
   elbow.damping: {{free: true}}
-solver:
+problem:
   path_cutoff: .inf
   compiler: false
+solver:
+  name: gauss_newton
 """
 
 

@@ -33,15 +33,15 @@ def edited(file, old, new):
     [
         ("held_out:", "heldout:", ("there is no key 'heldout'", "recordings.heldout", "did you mean 'held_out'?")),
         ("solver:", "sovler:", ("there is no key 'sovler'", "did you mean 'solver'?")),
-        ("path_cutoff: .inf", "path_cutof: 5", ("did you mean 'path_cutoff'?", "solver")),
+        ("path_cutoff: .inf", "path_cutof: 5", ("did you mean 'path_cutoff'?", "problem")),
         ("{free: true}", "{fre: true}", ("did you mean 'free'?", "parameters.shoulder.damping.fre")),
         ("path_cutoff: .inf", "path_cutoff: 5 Hz", ("path_cutoff", "[Hz]", "write the number alone, in Hz")),
         ("path_cutoff: .inf", "time_step: 10 ms", ("time_step", "[s]", "convert it from ms")),
         ("path_cutoff: .inf", "time_step: 10", ("time_step = 10", "up to 0.1 [s]")),
         ("path_cutoff: .inf", "time_step: -0.01", ("above 0",)),
         ("path_cutoff: .inf", "time_step: .nan", ("time_step",)),
-        ("path_cutoff: .inf", "iterations: many", ("solver.iterations", "a whole number")),
-        ("path_cutoff: .inf", "name: gaus_newton", ("there is no solver", "gauss_newton")),
+        ("name: gauss_newton", "iterations: many", ("solver.iterations", "a whole number")),
+        ("name: gauss_newton", "name: gaus_newton", ("there is no solver", "gauss_newton")),
         ("path_cutoff: .inf", "feedback: lqg", ("none, proportional, lqr",)),
         ("mode: prescribed", "mode: perscribed", ("driven, prescribed, passive",)),
         ("compiler: false", "compiler: no", ("true or false",)),
@@ -74,12 +74,12 @@ def test_configuration(cli, pendulum, left_nothing, old, new, words):
 @pytest.mark.parametrize(
     ("setting", "words"),
     [
-        ("solver.time_stp=0.01", ("--set solver.time_stp", "did you mean 'time_step'?")),
-        ("solver.time_step=fast", ("--set solver.time_step", "a number")),
+        ("problem.time_stp=0.01", ("--set problem.time_stp", "did you mean 'time_step'?")),
+        ("problem.time_step=fast", ("--set problem.time_step", "a number")),
         ("parameters.shoulder.stiffness.initail=3", ("did you mean 'initial'?",)),
-        ("solver.time_step", ("KEY=VALUE",)),
-        ("solver.time_step.deeper=1", ("no keys below 'deeper'",)),
-        ("solver.time_step=[1", ("not valid YAML",)),
+        ("problem.time_step", ("KEY=VALUE",)),
+        ("problem.time_step.deeper=1", ("no keys below 'deeper'",)),
+        ("problem.time_step=[1", ("not valid YAML",)),
     ],
 )
 def test_settings_over_the_file(cli, pendulum, left_nothing, setting, words):
@@ -185,7 +185,7 @@ def test_a_grasp_out_of_reach(cli, tmp_path, monkeypatch, repository, left_nothi
     done = cli(
         "solve", repository / "configs" / "single_arm_no_vision.yaml",
         "--set", "model.object={kind: y, links: 1, mount: {xyz: [2.5, 0, -0.93]}}",
-        "--set", "solver.compiler=false",
+        "--set", "problem.compiler=false",
     )  # fmt: skip
     assert_refused(done, "grasp 'left' cannot be closed", "mm are missing", "model.grasp.left")
     left_nothing()

@@ -10,7 +10,8 @@ import time
 import h5py
 import pytest
 
-from yid_ocp.config.reader import load_config, schema
+from yid_ocp.config.reader import load_config
+from yid_ocp.config.schema import schema
 from yid_ocp.data import read_recording
 
 SOLVE_KEYS = {
@@ -129,7 +130,7 @@ def test_quiet_prints_the_folder_alone(cli, pendulum, tmp_path):
 
 def test_set_changes_the_run(cli, pendulum, tmp_path):
     done = cli(
-        "solve", pendulum, "--out", "a", "--set", "parameters.elbow.damping.free=false", "--set", "solver.duration=0.5"
+        "solve", pendulum, "--out", "a", "--set", "parameters.elbow.damping.free=false", "--set", "problem.duration=0.5"
     )
     assert done.code == 0
     result = json.loads((tmp_path / "a" / "result.json").read_text())
@@ -198,7 +199,7 @@ def test_inspect_agrees_with_finite_differences(cli, tmp_path, monkeypatch, urdf
     monkeypatch.chdir(tmp_path)
     (tmp_path / "free.yaml").write_text(
         f"model:\n  robot: {urdf_folder / 'double_pendulum.urdf'}\n  arms: {{mode: driven}}\n"
-        "solver: {compiler: false}\n"
+        "problem: {compiler: false}\n"
     )
     done = cli("inspect", "free.yaml", "--out", "i")
     assert done.code == 0, done.err

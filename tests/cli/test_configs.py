@@ -13,22 +13,22 @@ PAPER = ("single_arm_no_vision", "single_arm_vision", "dual_arm_no_vision", "dua
 # settings that make each run quick: fewer links, a short horizon, interpreted where that is faster than compiling
 COARSE = (
     "model.object.links=2",
-    "solver.duration=0.3",
+    "problem.duration=0.3",
     "solver.iterations=3",
-    "solver.compiler=false",
+    "problem.compiler=false",
     "parameters={T*.bend: {free: true, initial: 15}, T*.twist: {initial: 10}}",
 )
 DEFT = "../../shared/recordings/deft/bdlo1_train_{}.h5"
 QUICK = {
     **dict.fromkeys(PAPER, COARSE),
-    "baxter_arm": ("solver.duration=2.0",),
-    "panda_beam": ("solver.duration=1.5", "model.object.segments.beam.links=2", "solver.iterations=3"),
+    "baxter_arm": ("problem.duration=2.0",),
+    "panda_beam": ("problem.duration=1.5", "model.object.segments.beam.links=2", "solver.iterations=3"),
     **dict.fromkeys(("springs_series_ends", "springs_series_joint", "springs_torsion"), ()),
     "deft_bdlo1": (
-        "solver.duration=0.1",
+        "problem.duration=0.1",
         "solver.iterations=2",
-        "solver.compiler=false",
-        "solver.start_parameters=[]",
+        "problem.compiler=false",
+        "problem.start_parameters=[]",
         f"recordings.estimate=[{DEFT.format('007')}]",
         f"recordings.held_out=[{DEFT.format('014')}]",
     ),

@@ -57,7 +57,7 @@ def cable_options(cable, recordings, noise, model_error, path_cutoff=8.0, option
         start_window=PERIOD,
         start_std=noise,
         start_parameters=("clamp_start.roll", "clamp_end.roll") if options.end == "weld" else ("clamp_start.roll",),
-        recording_values=known if options.separate_lengths else {},
+        recording_values=known if options.lengths_per_recording else {},
     )
 
 
@@ -88,7 +88,7 @@ def as_recording(cable, t, courses, name="made"):
 def twin(cable, clamps):
     """The compiled step of a cable, and a recording made with it at known values, from rest."""
     t, held = clamps
-    options = CableOptions(default=BranchOptions(bend=1e-3, twist=2e-3, damping=1e-4), separate_lengths=False)
+    options = CableOptions(default=BranchOptions(bend=1e-3, twist=2e-3, damping=1e-4), lengths_per_recording=False)
     stub = as_recording(cable, t, held)
     system = cable_system(edge_lengths(cable.edges, [as_recording(cable, t, {})]), cable, options)
     step = compile_step(system, PERIOD, "left_damping")
@@ -206,7 +206,7 @@ def test_edges_are_as_long_as_measured(cable):
 
 
 def test_free_parameters_are_parameters(cable):
-    options = CableOptions(memory=0.5, rest_angles=True, default=BranchOptions(twist_damping=1e-4))
+    options = CableOptions(memory=0.5, rest_angles=True, default=BranchOptions(twist_damping=True))
     recording = as_recording(cable, PERIOD * np.arange(4), {})
     names = free_parameters(cable, options)
     assert set(names) <= set(cable_system(edge_lengths(cable.edges, [recording]), cable, options).parameters.names)

@@ -1,4 +1,4 @@
-"""Configuration files: YAML read with line numbers, checked against the settings, and the JSON Schema for editors."""
+"""Configuration files: YAML read with line numbers and checked against the settings."""
 
 from __future__ import annotations
 
@@ -7,24 +7,21 @@ import functools
 import json
 import math
 import re
-import types
-import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any
 
-import annotated_types
 from pydantic import TypeAdapter, ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
+from yid_ocp.config.keys import Sections, sections_of, unknown_key
 from yid_ocp.config.settings import Run
-from yid_ocp.config.settings import dump_config as dump_config
 from yid_ocp.errors import ConfigError, nearest
-from yid_ocp.options import About
+from yid_ocp.options import About, entries_of, members, options_of, stripped, values_of, words
 
 KeyPath = tuple[str | int, ...]
 DEFAULT = "dual_arm_vision.yaml"
@@ -65,12 +62,6 @@ def load_config(path: str | Path | None = None, overrides: Sequence[str] = (), d
         _override(data, places, override)
     run = _Reader(places, origin, base).build(Run, data, ())
     return dataclasses.replace(run, name=name, file=file, places=places)
-
-
-def schema() -> dict[str, Any]:
-    """JSON Schema of configuration files, for editors that complete and check while typing."""
-    head = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "yid-ocp configuration"}
-    return head | _schema(Run)
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------
@@ -137,7 +128,7 @@ def _override(data: dict[str, Any], places: dict[KeyPath, str], text: str) -> No
     origin = f"--set {key.strip()}"
     if not equals or not key.strip():
         raise ConfigError(
-            f"'{text}' does not set anything", where="--set", allowed="KEY=VALUE, for example solver.time_step=0.005"
+            f"'{text}' does not set anything", where="--set", allowed="KEY=VALUE, for example problem.time_step=0.005"
         )
     path = _key_path(Run, key.strip().split("."), origin, data)
     try:
@@ -162,111 +153,33 @@ def _key_path(hint: Any, parts: list[str], origin: str, raw: Any) -> tuple[str, 
     """Split a dotted key by the settings' types: names such as T1.bend keep their dots."""
     if not parts:
         return ()
-    kind = _member(hint, raw)
-    if dataclasses.is_dataclass(kind) and isinstance(kind, type):
-        fields = _fields(kind, raw)
-        if parts[0] not in fields:
-            raise ConfigError(
-                f"there is no key '{parts[0]}'",
-                where=origin,
-                allowed=", ".join(fields),
-                hint=nearest(parts[0], fields),
-            )
-        inner = raw.get(parts[0]) if isinstance(raw, dict) else None
-        return (parts[0], *_key_path(fields[parts[0]].hint, parts[1:], origin, inner))
-    entries = _mapping_of(hint)
-    if entries is None:
+    sections = sections_of(hint)
+    if sections is not None:
+        known = sections.keys(sections.word(raw))
+        if parts[0] not in known:
+            raise unknown_key(Run, parts[0], known, origin)
+        return (parts[0], *_key_path(known[parts[0]].hint, parts[1:], origin, _inner(raw, parts[0])))
+    values = values_of(hint)
+    if values is None:
         raise ConfigError(f"there are no keys below '{parts[0]}'", where=origin, hint="shorten the key")
-    member = _member(entries, None)
-    fields = _fields(member, None) if member is not None else {}
-    cut = next((i for i in range(len(parts) - 1, 0, -1) if parts[i] in fields), len(parts))
-    if isinstance(raw, dict) and ".".join(parts[:-1]) in raw and cut == len(parts) and fields:
-        raise ConfigError(
-            f"there is no key '{parts[-1]}'", where=origin, allowed=", ".join(fields), hint=nearest(parts[-1], fields)
-        )
+    inner = sections_of(values)
+    if inner is not None and inner.key == "name":
+        inner = inner.of(parts[0], origin)
+        own = () if len(parts) == 1 else _key_path(next(iter(inner.classes.values())), parts[1:], origin, None)
+        return (parts[0], *own)
+    known = {} if inner is None else inner.keys()
+    cut = next((i for i in range(len(parts) - 1, 0, -1) if parts[i] in known), len(parts))
+    if isinstance(raw, dict) and ".".join(parts[:-1]) in raw and cut == len(parts) and known:
+        raise unknown_key(Run, parts[-1], known, origin)
     name = ".".join(parts[:cut])
-    inner = raw.get(name) if isinstance(raw, dict) else None
-    return (name, *_key_path(entries, parts[cut:], origin, inner))
+    return (name, *_key_path(values, parts[cut:], origin, _inner(raw, name)))
 
 
-# -- types ------------------------------------------------------------------------------------------------------------
+def _inner(raw: Any, name: str) -> Any:
+    return raw.get(name) if isinstance(raw, dict) else None
 
 
-@dataclass(frozen=True)
-class _Field:
-    hint: Any
-    default: Any
-    holder: str  # the attribute whose flattened value the key belongs to, empty for a key of one's own
-
-
-def _fields(kind: type, raw: Any) -> dict[str, _Field]:
-    """Keys of a settings class; those of a flattened member (a solver's own settings) among them."""
-    hints = _hints(kind)
-    result: dict[str, _Field] = {}
-    for entry in dataclasses.fields(kind):
-        if entry.metadata.get("internal"):
-            continue
-        if "choose" in entry.metadata:
-            chosen = entry.metadata["choose"](raw if isinstance(raw, dict) else {})
-            own = {n: f for n, f in _fields(chosen, None).items() if n not in result and n != "name"}
-            result |= {n: dataclasses.replace(f, holder=entry.name) for n, f in own.items()}
-            continue
-        default = entry.default if entry.default_factory is MISSING else entry.default_factory()
-        result[entry.name] = _Field(hints[entry.name], default, "")
-    return result
-
-
-@functools.cache
-def _hints(kind: type) -> dict[str, Any]:
-    return get_type_hints(kind, include_extras=True)
-
-
-def _stripped(hint: Any) -> tuple[Any, list[Any]]:
-    markers: list[Any] = []
-    while get_origin(hint) is Annotated:
-        markers += hint.__metadata__
-        hint = get_args(hint)[0]
-    return hint, markers
-
-
-def _options(hint: Any) -> tuple[Any, ...]:
-    """Members of a union, without None."""
-    bare, _ = _stripped(hint)
-    if get_origin(bare) in (Union, types.UnionType):
-        return tuple(member for member in get_args(bare) if member is not type(None))
-    return (bare,)
-
-
-def _member(hint: Any, raw: Any) -> Any:
-    """The settings class that a value is meant for, chosen by its `kind` among several; None for other types."""
-    bare = [_stripped(member)[0] for member in _options(hint)]
-    classes = [member for member in bare if dataclasses.is_dataclass(member)]
-    if len(classes) > 1:
-        wanted = raw.get("kind") if isinstance(raw, dict) else None
-        return next((member for member in classes if _kind(member) == wanted), classes[0])
-    return classes[0] if classes else None
-
-
-def _kind(member: Any) -> str:
-    return str(get_args(_stripped(_hints(member)["kind"])[0])[0])
-
-
-def _sequence_of(hint: Any) -> Any:
-    """Settings class of the entries of a list; None for other types."""
-    bare, _ = _stripped(hint)
-    arguments = get_args(bare)
-    if get_origin(bare) is tuple and len(arguments) == 2 and arguments[1] is Ellipsis:
-        return arguments[0] if _member(arguments[0], None) is not None else None
-    return None
-
-
-def _mapping_of(hint: Any) -> Any:
-    """Type of the values of a mapping; None for other types."""
-    for member in _options(hint):
-        bare, _ = _stripped(member)
-        if get_origin(bare) is Mapping:
-            return get_args(bare)[1]
-    return None
+# -- values -----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -287,82 +200,45 @@ class _Reader:
 
     def build(self, hint: Any, raw: Any, path: KeyPath) -> Any:
         """A value of the given type."""
-        kind = _member(hint, raw)
-        nullable = type(None) in get_args(_stripped(hint)[0])
-        if raw is None and (nullable or kind is not None):
-            return None if nullable else self._settings(kind, {}, path)
-        if kind is not None:
-            return self._settings(self._chosen(hint, raw, path), raw, path)
-        entries = _sequence_of(hint)
-        if entries is not None:
+        sections, entries, values = sections_of(hint), entries_of(hint), values_of(hint)
+        if sections is not None:
+            return None if raw is None and sections.nullable else self._section(sections, raw, path)
+        if entries is not None and sections_of(entries) is not None:
             if not isinstance(raw, list):
                 raise self._wrong(raw, hint, path)
             return tuple(self.build(entries, value, (*path, i)) for i, value in enumerate(raw))
-        inner = _mapping_of(hint)
-        if inner is not None and _member(inner, None) is not None:
+        inner = sections_of(values)
+        if inner is not None:
             if raw is not None and not isinstance(raw, dict):
                 raise self._wrong(raw, hint, path)
-            return {name: self.build(inner, value, (*path, name)) for name, value in (raw or {}).items()}
+            return {
+                name: self._section(inner.of(name, self.where((*path, name))), value, (*path, name))
+                for name, value in (raw or {}).items()
+            }
         return self._leaf(hint, raw, path)
 
-    def _chosen(self, hint: Any, raw: Any, path: KeyPath) -> type:
-        classes = [_stripped(member)[0] for member in _options(hint)]
-        if len(classes) == 1 or not isinstance(raw, dict):
-            return typing.cast(type, classes[0])
-        kinds = {_kind(member): member for member in classes}
-        wanted = raw.get("kind")
-        if wanted not in kinds:
-            what = "the key 'kind' is missing" if wanted is None else f"there is no kind '{wanted}'"
-            raise ConfigError(
-                what,
-                where=self.where((*path, "kind") if "kind" in raw else path),
-                allowed=", ".join(kinds),
-                hint="" if wanted is None else nearest(str(wanted), kinds),
-            )
-        return typing.cast(type, kinds[wanted])
-
-    def _settings(self, kind: type, raw: Any, path: KeyPath) -> Any:
+    def _section(self, sections: Sections, raw: Any, path: KeyPath) -> Any:
+        raw = {} if raw is None else raw
         if not isinstance(raw, dict):
-            allowed = "keys: " + ", ".join(_fields(kind, None))
             raise ConfigError(
-                f"{self._name(path)} = {_shown(raw)} is not a section", where=self.where(path), allowed=allowed
+                f"{self._name(path)} = {_shown(raw)} is not a section",
+                where=self.where(path),
+                allowed="keys: " + ", ".join(sections.keys(sections.default)),
             )
-        fields = _fields(kind, raw)
+        word = sections.word(raw)
+        if not isinstance(word, str) or word not in sections.classes:
+            raise sections.unknown(word, self.where((*path, sections.key) if sections.key in raw else path))
+        known, kind = sections.keys(word), sections.classes[word]
         for name in raw:
-            if name not in fields:
-                raise ConfigError(
-                    f"there is no key '{name}'" + (f" in {'.'.join(map(str, path))}" if path else ""),
-                    where=self.where((*path, name)),
-                    allowed=", ".join(fields),
-                    hint=nearest(name, fields),
-                )
+            if name not in known:
+                raise unknown_key(Run, name, known, self.where((*path, name)), ".".join(map(str, path)))
         values: dict[str, Any] = {}
-        flat: dict[str, dict[str, Any]] = {}
-        for name, entry in fields.items():
+        for name, option in options_of(kind).items():
             if name in raw:
-                value = self.build(entry.hint, raw[name], (*path, name))
-            elif entry.default is MISSING:
-                raise ConfigError(
-                    f"the key '{name}' is missing", where=self.where(path), allowed=_described(entry.hint)
-                )
-            else:
-                value = entry.default
-            (flat.setdefault(entry.holder, {}) if entry.holder else values)[name] = value
-        for member in dataclasses.fields(kind):
-            if "choose" in member.metadata:
-                self._known_choice(member, raw, path)
-                values[member.name] = member.metadata["choose"](raw)(**flat.get(member.name, {}))
+                values[name] = self.build(option.hint, raw[name], (*path, name))
+            elif option.default is MISSING:
+                raise ConfigError(f"the key '{name}' is missing", where=self.where(path), allowed=words(option.hint))
         return kind(**values)
-
-    def _known_choice(self, entry: dataclasses.Field, raw: Mapping[str, Any], path: KeyPath) -> None:
-        among = entry.metadata["among"]
-        if "name" in raw and raw["name"] not in among:
-            raise ConfigError(
-                f"there is no {among.noun} '{raw['name']}'",
-                where=self.where((*path, "name")),
-                allowed=", ".join(among),
-                hint=nearest(str(raw["name"]), among),
-            )
 
     def _leaf(self, hint: Any, raw: Any, path: KeyPath) -> Any:
         try:
@@ -375,7 +251,7 @@ class _Reader:
         return _absolute(value, hint, self.base)
 
     def _wrong(self, raw: Any, hint: Any, path: KeyPath) -> ConfigError:
-        unit = next((m.unit for m in _stripped(hint)[1] if isinstance(m, About) and m.unit), "")
+        unit = next((m.unit for m in stripped(hint)[1] if isinstance(m, About) and m.unit), "")
         hint_text = ""
         if isinstance(raw, str) and (match := re.fullmatch(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*([^\d\s].*)", raw)):
             hint_text = f"write the number alone, in {unit}" if unit else "write the number alone"
@@ -384,7 +260,7 @@ class _Reader:
         return ConfigError(
             f"{self._name(path)} = {_shown(raw)} is not allowed",
             where=self.where(path),
-            allowed=_described(hint),
+            allowed=words(hint),
             hint=hint_text,
         )
 
@@ -393,15 +269,8 @@ class _Reader:
         return ".".join(map(str, path)) or "the configuration"
 
 
-def _adapter(hint: Any) -> TypeAdapter[Any]:
-    try:
-        return _cached_adapter(hint)
-    except TypeError:
-        return TypeAdapter(hint)
-
-
 @functools.cache
-def _cached_adapter(hint: Any) -> TypeAdapter[Any]:
+def _adapter(hint: Any) -> TypeAdapter[Any]:
     return TypeAdapter(hint)
 
 
@@ -414,106 +283,17 @@ def _has_nan(raw: Any) -> bool:
 
 
 def _absolute(value: Any, hint: Any, base: Path) -> Any:
-    bare, markers = _stripped(hint)
-    if isinstance(value, str):
-        is_path = any(isinstance(marker, About) and marker.path for marker in markers)
-        is_path = is_path or any(
-            isinstance(marker, About) and marker.path for member in _options(hint) for marker in _stripped(member)[1]
-        )
-        if is_path and not value.startswith(("package:", "default:")):
-            return str((base / Path(value).expanduser()).resolve())
+    """Paths within a value, relative to the configuration no longer."""
+    if isinstance(value, tuple):
+        entries = entries_of(hint)
+        return value if entries is None else tuple(_absolute(entry, entries, base) for entry in value)
+    markers = [marker for part in (hint, *members(hint)) for marker in stripped(part)[1]]
+    is_path = any(isinstance(marker, About) and marker.path for marker in markers)
+    if not isinstance(value, str) or not is_path or value.startswith(("package:", "default:")):
         return value
-    if isinstance(value, tuple) and get_origin(bare) is tuple and get_args(bare)[-1] is Ellipsis:
-        return tuple(_absolute(entry, get_args(bare)[0], base) for entry in value)
-    return value
+    return str((base / Path(value).expanduser()).resolve())
 
 
 def _shown(raw: Any) -> str:
     text = json.dumps(raw, default=str)
     return text if len(text) <= 60 else text[:57] + "..."
-
-
-def _described(hint: Any) -> str:
-    """A type in words, with its range and unit."""
-    bare, markers = _stripped(hint)
-    unit = next((m.unit for m in markers if isinstance(m, About) and m.unit), "")
-    limits = [
-        f"{word} {getattr(marker, name):g}"
-        for marker in markers
-        for cls, name, word in (
-            (annotated_types.Gt, "gt", "above"),
-            (annotated_types.Ge, "ge", "from"),
-            (annotated_types.Lt, "lt", "below"),
-            (annotated_types.Le, "le", "up to"),
-        )
-        if isinstance(marker, cls)
-    ]
-    text = " or ".join(dict.fromkeys(map(_bare_words, _options(bare))))
-    return " ".join([text, *limits]) + (f" [{unit}]" if unit else "")
-
-
-def _bare_words(hint: Any) -> str:
-    bare, markers = _stripped(hint)
-    if markers:
-        return _described(hint)
-    words = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
-    if bare in words:
-        return words[bare]
-    origin, arguments = get_origin(bare), get_args(bare)
-    if origin is Literal:
-        return ", ".join(map(str, arguments))
-    if origin is tuple and arguments[-1] is Ellipsis:
-        return f"a list, each {_bare_words(arguments[0])}"
-    if origin is tuple:
-        return f"a list of {len(arguments)}, each {_bare_words(arguments[0])}"
-    if _mapping_of(bare) is not None:
-        return f"names, each with {_bare_words(_mapping_of(bare))}"
-    return "a section"
-
-
-# -- schema -----------------------------------------------------------------------------------------------------------
-
-
-def _schema(hint: Any) -> dict[str, Any]:
-    """JSON Schema of a type, from the same walk as the reader's."""
-    bare, markers = _stripped(hint)
-    about = next((marker for marker in markers if isinstance(marker, About)), None)
-    text = "" if about is None else about.text + (f" [{about.unit}]" if about.unit else "")
-    note = {"description": text} if text else {}
-    classes = [_stripped(member)[0] for member in _options(bare)]
-    if classes and all(map(dataclasses.is_dataclass, classes)):
-        parts = [_class_schema(member) for member in classes]
-        if type(None) in get_args(bare):
-            parts.append({"type": "null"})
-        return (parts[0] if len(parts) == 1 else {"anyOf": parts}) | note
-    entries = _sequence_of(bare)
-    if entries is not None:
-        return {"type": "array", "items": _schema(entries)} | note
-    inner = _mapping_of(bare)
-    if inner is not None and _member(inner, None) is not None:
-        return {"type": "object", "additionalProperties": _schema(inner)} | note
-    return _adapter(hint).json_schema() | note
-
-
-def _class_schema(kind: Any) -> dict[str, Any]:
-    properties: dict[str, Any] = {}
-    required = []
-    for name, entry in _fields(kind, None).items():
-        properties[name] = _schema(entry.hint)
-        if entry.default is MISSING:
-            required.append(name)
-        elif isinstance(entry.default, (bool, int, str)) or (
-            isinstance(entry.default, float) and math.isfinite(entry.default)
-        ):
-            properties[name]["default"] = entry.default
-    for field in dataclasses.fields(kind):
-        if "choose" in field.metadata:
-            among = field.metadata["among"]
-            properties["name"] = {"enum": list(among), "default": "gauss_newton", "description": f"the {among.noun}"}
-            for method in among:
-                for name, entry in _fields(among[method], None).items():
-                    properties.setdefault(name, _schema(entry.hint))
-    result: dict[str, Any] = {"type": "object", "properties": properties, "additionalProperties": False}
-    if kind.__doc__:
-        result["description"] = kind.__doc__.splitlines()[0]
-    return result | ({"required": required} if required else {})

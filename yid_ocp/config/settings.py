@@ -1,14 +1,13 @@
-"""The settings of one run: what a configuration file may say, with units, defaults and allowed values.
+"""The settings of one run: the sections of a configuration file, and the options that belong to no other package.
 
-Plain frozen dataclasses; `config` fills them from YAML and the JSON Schema follows from them. A new key is one line
-here and one use in `build`.
+Plain frozen dataclasses, filled by `reader`. Options of solvers, problem, sensors, cables, tracking and diagnosis are
+defined where they are used (`yid_ocp.options`); the sections here hold those classes.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import io
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
@@ -17,10 +16,13 @@ from annotated_types import Ge, Gt, Le, Len, Lt
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedSeq
 
+from yid_ocp.diagnosis.verdict import Thresholds
 from yid_ocp.errors import ConfigError
 from yid_ocp.integrator.discrete import ForceSplit
-from yid_ocp.options import About
-from yid_ocp.solvers import SOLVERS, GaussNewton
+from yid_ocp.model.cable import CableOptions
+from yid_ocp.options import About, Among, options_of, stripped
+from yid_ocp.problem.options import ProblemOptions, SensorOptions
+from yid_ocp.solvers import SOLVERS, GaussNewton, Lifted, MultipleShooting, SingleShooting, SteepestDescent
 from yid_ocp.solvers.base import Solver
 from yid_ocp.vision.track import TrackOptions
 
@@ -46,7 +48,7 @@ class MountSettings:
 class YObject:
     """The paper's foam letter Y."""
 
-    kind: Literal["y"] = "y"
+    kind: Annotated[Literal["y"], About("what the object is")] = "y"
     links: Annotated[int, Ge(1), Le(64), About("rigid links of every tube")] = 4
     gravity_fraction: Annotated[float, Ge(0), Le(1), About("part of its weight that it has; its inertia is whole")] = (
         1.0
@@ -56,7 +58,7 @@ class YObject:
 
 @dataclass(frozen=True, kw_only=True)
 class SegmentSettings:
-    """One tube, branch or beam of a chain of rigid links."""
+    """One tube, branch or beam of a chain of rigid links; its stiffness and damping stand under `parameters`."""
 
     length: Annotated[float | None, Gt(0), Le(50), About("length; not needed beside link_lengths", "m")] = None
     mass: Annotated[float, Gt(0), About("mass of the whole segment", "kg")]
@@ -66,25 +68,22 @@ class SegmentSettings:
         About("extents of a rectangular cross section along the links' x and y axes", "m"),
     ] = None
     links: Annotated[int, Ge(1), Le(64), About("number of equal links")] = 4
-    link_lengths: Annotated[tuple[float, ...] | None, About("unequal links, base to tip", "m")] = None
+    link_lengths: Annotated[tuple[Annotated[float, Gt(0)], ...] | None, About("unequal links, base to tip", "m")] = None
     parent: Annotated[str | None, About("segment on which it grows; the mount when absent")] = None
     at_link: Annotated[int | None, Ge(0), About("it leaves at the tip of this link of the parent; the last")] = None
     rpy: Annotated[Triple, About("turn of its first link at rest against what carries it", "rad")] = (0.0, 0.0, 0.0)
-    bend: Annotated[float, Ge(0), About("bending stiffness of every joint, or rigidity", "N m/rad or N m^2")] = 3.0
-    twist: Annotated[float, Ge(0), About("twisting stiffness of every joint, or rigidity", "N m/rad or N m^2")] = 3.0
-    damping: Annotated[float | None, Ge(0), About("damping; model.damping when absent", "N m s/rad or N m^2 s")] = None
-    twist_damping: Annotated[float | None, Ge(0), About("of twists, where another", "N m s/rad or N m^2 s")] = None
+    twist_damping: Annotated[bool, About("whether twists have a damping parameter of their own")] = False
     rigidity: Annotated[bool, About("whether stiffness and damping are per curvature")] = False
     clamped: Annotated[bool, About("whether it starts at a rigid wall or gripper")] = False
     joint_order: Annotated[str, About("axes of the turns at a joint, base to tip; rigid about the others")] = "xyz"
-    separate_lengths: Annotated[bool, About("whether every link has a length parameter of its own")] = False
+    link_length_parameters: Annotated[bool, About("whether every link has a length parameter of its own")] = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class SegmentedObject:
     """Any object of segments: a beam, a tube with branches."""
 
-    kind: Literal["segments"] = "segments"
+    kind: Annotated[Literal["segments"], About("what the object is")] = "segments"
     segments: Annotated[Mapping[str, SegmentSettings], About("by name, parents first")] = field(default_factory=dict)
     gravity_fraction: Annotated[float, Ge(0), Le(1), About("part of its weight that it has; its inertia is whole")] = (
         1.0
@@ -93,36 +92,15 @@ class SegmentedObject:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BranchSettings:
-    """Nominal properties of one branch of a cable."""
-
-    bend: Annotated[float, Ge(0), About("bending rigidity", "N m^2")] = 1.5e-3
-    twist: Annotated[float, Ge(0), About("twisting rigidity", "N m^2")] = 1.0e-3
-    damping: Annotated[float, Ge(0), About("viscous, per curvature rate", "N m^2 s")] = 5e-5
-    twist_damping: Annotated[float | None, Ge(0), About("of twists, where another", "N m^2 s")] = None
-    density: Annotated[float, Gt(0), About("mass per length; results are per unit of it", "kg/m")] = 0.05
-
-
-@dataclass(frozen=True, kw_only=True)
-class CableObject:
+class CableObject(CableOptions):
     """A branched cable held at both ends by clamps that follow measured points; its edges come from the recordings."""
 
-    kind: Literal["cable"] = "cable"
+    kind: Annotated[Literal["cable"], About("what the object is")] = "cable"
     parent: Annotated[tuple[str, ...], Len(5), About("points from clamp to clamp, two held at each end")]
     children: Annotated[
         Mapping[str, tuple[str, ...]], About("points of every branch, the first one the parent's at which it leaves")
     ] = field(default_factory=dict)
-    undeformed: Annotated[FilePath, About("CSV table with the columns point, x, y, z", "m")]
-    branches: Annotated[Mapping[str, BranchSettings], About("by name, parent and children")] = field(
-        default_factory=dict
-    )
-    radius: Annotated[float, Gt(0), Le(1), About("of the links' cylinders", "m")] = 0.005
-    end: Annotated[Literal["axis", "weld"], About("whether the end clamp leaves the roll free or holds it")] = "axis"
-    rest_shape: Annotated[bool, About("whether branches rest in their undeformed shape, or straight")] = True
-    rigid_clamp: Annotated[bool, About("whether the first edge is rigid up to its second point")] = False
-    separate_lengths: Annotated[bool, About("whether every recording has edge lengths of its own")] = True
-    memory: Annotated[float | None, Ge(0), Le(1), About("how far a recording's start is its rest shape")] = None
-    rest_angles: Annotated[bool, About("whether every joint has a rest angle parameter")] = False
+    undeformed: Annotated[FilePath, About("CSV table with the columns point, x, y, z [m]")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,7 +160,11 @@ class ModelSettings:
     springs: Annotated[Mapping[str, SpringSettings], About("by joint of the robot")] = field(default_factory=dict)
     damping: Annotated[
         Annotated[float, Ge(0)] | Mapping[str, Annotated[float, Ge(0)]],
-        About("viscous damping of every coordinate, or of the robot's joints by name", "N m s/rad"),
+        About(
+            "viscous damping of every coordinate; or by joint of the robot (0.05 for those not named) and by the name "
+            "`object`",
+            "N m s/rad",
+        ),
     ] = 0.05
     gravity: Annotated[Triple, About("acceleration of free fall in the world", "m/s^2")] = (0.0, 0.0, -9.81)
     points: Annotated[tuple[str, ...] | None, About("frames that sensors may see; the segments' tips")] = None
@@ -198,84 +180,34 @@ class RecordingSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SensorSettings:
-    """How one group of the recordings is used: points, points_NAME or joints.effort."""
-
-    use: Annotated[bool, About("whether the estimation sees it")] = True
-    std: Annotated[
-        Annotated[float, Gt(0)] | Mapping[str, Annotated[float, Gt(0)]] | None,
-        About("noise deviation instead of the recorded one, by joint where they differ", "m or N m"),
-    ] = None
-    position_std: Annotated[
-        Annotated[float, Gt(0)] | Mapping[str, Annotated[float, Gt(0)]] | None,
-        About("noise deviation of the encoders whose motion is prescribed (joints.effort only)", "rad"),
-    ] = None
-    frames: Annotated[Mapping[str, str], About("frame of the model that a point marks")] = field(default_factory=dict)
-    points: Annotated[tuple[str, ...] | None, About("points to use; all that the model has")] = None
-
-
-@dataclass(frozen=True, kw_only=True)
 class ParameterSettings:
-    """What is presumed of one parameter, or of all that a pattern such as T*.bend names."""
+    """What is known of one parameter, or of all that a pattern such as T*.bend names."""
 
     initial: Annotated[float | None, About("value, or where the search starts", "that of the parameter")] = None
     bounds: Annotated[Interval | None, About("lower and upper bound", "that of the parameter")] = None
     free: Annotated[bool | None, About("whether it is estimated")] = None
-    prior: Annotated[float | None, Gt(0), About("deviation of a Gaussian prior", "that of the parameter")] = None
+    prior: Annotated[float | None, Gt(0), About("standard deviation of a Gaussian prior", "that of the parameter")] = (
+        None
+    )
     local: Annotated[bool | None, About("whether it has a value of its own in every recording")] = None
 
 
-def _method(raw: Mapping[str, Any]) -> type:
-    name = raw.get("name", "gauss_newton")
-    return SOLVERS[name] if isinstance(name, str) and name in SOLVERS else GaussNewton
-
-
 @dataclass(frozen=True, kw_only=True)
-class SolverSettings:
-    """How the cost is made up and lowered; the settings of the named method stand beside these."""
+class ProblemSettings(ProblemOptions):
+    """What is compared with the recordings and how, and the time step with which the model moves."""
 
-    name: Annotated[str, About("the method")] = "gauss_newton"
     time_step: Annotated[float, Gt(0), Le(0.1), About("of the integrator", "s")] = 0.01
     force_split: Annotated[ForceSplit, About("rule for forces; left is the paper's")] = "symmetric"
-    feedback: Annotated[Literal["none", "proportional", "lqr"], About("tracking filter of driven arms")] = "lqr"
-    gains: Annotated[tuple[Annotated[float, Ge(0)], ...], Len(1), About("of the proportional filter", "N m/rad")] = (
-        80.0,
-        80.0,
-        60.0,
-        60.0,
-        15.0,
-        15.0,
-        8.0,
-    )
-    initial_state: Annotated[
-        Literal["equilibrium", "estimated", "fitted_to_points"],
-        About("at rest; at rest plus a free deviation; fitted to points"),
-    ] = "equilibrium"
-    start_window: Annotated[float, Gt(0), About("how long points that fix a fitted start may reach", "s")] = 0.02
-    start_std: Annotated[float | None, Gt(0), About("noise of the points that fix a fitted start", "m")] = None
-    start_parameters: Annotated[tuple[str, ...], About("fitted along with a fitted start in every recording")] = ()
-    configuration_std: Annotated[float, Gt(0), About("prior of an estimated start", "rad")] = 0.05
-    velocity_std: Annotated[float, Gt(0), About("prior of an estimated start", "rad/s")] = 0.2
-    weighting: Annotated[Literal["whitened", "paper"], About("cost in deviations, or the paper's")] = "whitened"
-    huber_threshold: Annotated[float, Gt(0), About("Huber scale in deviations; .inf for squares")] = math.inf
-    weak_prior_factor: Annotated[
-        float, Ge(0), About("factor within which parameters stay that nothing informs; 0 for none")
-    ] = 10.0
-    path_cutoff: Annotated[float, Gt(0), About("low-pass cutoff of prescribed paths and efforts", "Hz")] = 10.0
-    duration: Annotated[float | None, Gt(0), About("use only the first seconds of every recording", "s")] = None
     compiler: Annotated[bool, About("whether to compile the step where a C compiler is found")] = True
-    method: Solver = field(default_factory=GaussNewton, metadata={"choose": _method, "among": SOLVERS})
 
 
 @dataclass(frozen=True, kw_only=True)
-class DiagnosisSettings:
+class DiagnosisSettings(Thresholds):
     """How the gap between model and recordings is searched for its cause."""
 
     candidates: Annotated[
         Literal["all"] | tuple[str, ...], About("effects to try: all, or a list of kind or kind@location")
     ] = "all"
-    level: Annotated[float, Gt(0), Lt(1), About("significance below which a gap counts as one")] = 0.01
-    effects: Annotated[int, Ge(1), Le(10), About("how many effects may be added")] = 3
     noise_fraction: Annotated[
         float,
         Gt(0),
@@ -284,18 +216,22 @@ class DiagnosisSettings:
     ] = 1.0
 
 
+def _compared() -> dict[str, Solver]:
+    return {
+        "steepest_descent": SteepestDescent(trial="spectral", memory=10, iterations=800, gradient_tolerance=1e-4),
+        "single_shooting": SingleShooting(),
+        "gauss_newton": GaussNewton(),
+        "multiple_shooting": MultipleShooting(node_interval=10),
+        "lifted": Lifted(),
+    }
+
+
 @dataclass(frozen=True, kw_only=True)
 class CompareSettings:
     """Which methods are compared, each with settings of its own."""
 
-    methods: Annotated[Mapping[str, Mapping[str, Any]], About("settings of each method, by name")] = field(
-        default_factory=lambda: {
-            "steepest_descent": {"trial": "spectral", "memory": 10, "iterations": 800, "gradient_tolerance": 1e-4},
-            "single_shooting": {},
-            "gauss_newton": {},
-            "multiple_shooting": {"node_interval": 10},
-            "lifted": {},
-        }
+    methods: Annotated[Mapping[str, Annotated[Solver, Among(SOLVERS)]], About("settings of each method, by name")] = (
+        field(default_factory=_compared)
     )
     published: Annotated[str | None, About("experiment of the source paper whose answer stands beside")] = None
 
@@ -313,10 +249,10 @@ class VirtualFramesSettings:
     eye: Annotated[Triple, About("where the camera stands", "m")] = (2.6, 0.0, 0.45)
     target: Annotated[Triple, About("where it looks", "m")] = (0.85, 0.0, -0.1)
     rate: Annotated[float, Gt(0), Le(60), About("mean rate of frames", "Hz")] = 3.0
-    dropped: Annotated[float, Ge(0), Lt(1), About("share of frames that are lost")] = 0.0
+    dropped: Annotated[float, Ge(0), Lt(1), About("fraction of frames that are lost")] = 0.0
     latency: Annotated[float, About("stamp minus time of the picture", "s")] = 0.0
-    latency_std: Annotated[float, Ge(0), About("deviation of the latency", "s")] = 0.0
-    outliers: Annotated[float, Ge(0), Lt(1), About("share of pixels with a wrong depth")] = 0.0
+    latency_std: Annotated[float, Ge(0), About("standard deviation of the latency", "s")] = 0.0
+    outliers: Annotated[float, Ge(0), Lt(1), About("fraction of pixels with a wrong depth")] = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -368,18 +304,23 @@ class Run:
     description: Annotated[str, About("one sentence for the report")] = ""
     model: Annotated[ModelSettings, About("what the world is made of")] = field(default_factory=ModelSettings)
     recordings: Annotated[RecordingSettings, About("the data")] = field(default_factory=RecordingSettings)
-    sensors: Annotated[Mapping[str, SensorSettings], About("by group of the recordings")] = field(default_factory=dict)
+    sensors: Annotated[Mapping[str, SensorOptions], About("by group of the recordings: points, joints.effort")] = field(
+        default_factory=dict
+    )
     parameters: Annotated[Mapping[str, ParameterSettings], About("by name or pattern")] = field(default_factory=dict)
-    solver: Annotated[SolverSettings, About("how the cost is lowered")] = field(default_factory=SolverSettings)
+    problem: Annotated[ProblemSettings, About("what is compared with the recordings and how")] = field(
+        default_factory=ProblemSettings
+    )
+    solver: Annotated[Solver, Among(SOLVERS, "gauss_newton"), About("how the cost is lowered")] = field(
+        default_factory=GaussNewton
+    )
     compare: Annotated[CompareSettings, About("which methods are compared")] = field(default_factory=CompareSettings)
     diagnosis: Annotated[DiagnosisSettings, About("how a gap is diagnosed")] = field(default_factory=DiagnosisSettings)
     track: Annotated[TrackSettings, About("how a camera's frames are tracked")] = field(default_factory=TrackSettings)
     output: Annotated[OutputSettings, About("where results go")] = field(default_factory=OutputSettings)
-    name: str = field(default="run", metadata={"internal": True})
-    file: str = field(default="", metadata={"internal": True}, compare=False)
-    places: Mapping[tuple[str | int, ...], str] = field(
-        default_factory=dict, metadata={"internal": True}, compare=False, repr=False
-    )
+    name: str = "run"
+    file: str = field(default="", compare=False)
+    places: Mapping[tuple[str | int, ...], str] = field(default_factory=dict, compare=False, repr=False)
 
     def where(self, *path: str | int) -> str:
         """File, line and key of a setting, for the `where` of an error."""
@@ -406,14 +347,11 @@ def dump_config(run: Run) -> str:
 def _plain(value: Any) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         result: dict[str, Any] = {}
-        for entry in dataclasses.fields(value):
-            item = getattr(value, entry.name)
-            if entry.metadata.get("internal"):
-                continue
-            if "choose" in entry.metadata:
-                result |= {name: v for name, v in _plain(item).items() if name not in result}
-            elif item is not None:
-                result[entry.name] = _plain(item)
+        for name, option in options_of(type(value)).items():
+            item = getattr(value, name)
+            if item is not None or option.default is not None:
+                chosen = any(isinstance(marker, Among) for marker in stripped(option.hint)[1])
+                result[name] = {"name": item.name, **_plain(item)} if chosen else _plain(item)
         return result
     if isinstance(value, Mapping):
         return {name: _plain(item) for name, item in value.items()}

@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
+
+from annotated_types import Ge, Gt, Le, Lt
 
 from yid_ocp.diagnosis.localise import Place
 from yid_ocp.diagnosis.null_test import Floor, NullTest
@@ -13,6 +15,7 @@ from yid_ocp.diagnosis.screening import Confusability, Score, Visibility
 from yid_ocp.diagnosis.select import Closure, Fit, closure
 from yid_ocp.diagnosis.smoother import Smoothed
 from yid_ocp.effects import EffectBase
+from yid_ocp.options import About
 
 FORMAT = "yid-diagnosis/1"
 SHAPELESS = 0.01
@@ -21,36 +24,32 @@ SHAPELESS = 0.01
 
 @dataclass(frozen=True)
 class Thresholds:
-    """All that a verdict depends on besides the data.
+    """All that a verdict depends on besides the data."""
 
-    Attributes
-    ----------
-    level : float
-        Significance below which a residual is more than noise.
-    smallest_gap : float
-        chi2/n - 1 below which a gap is not worth a name, however sure.
-    closure : float
-        A held-out closure whose lower end is below this is no improvement.
-    explained : float
-        Part of what the smoother explains of the residual which effects have to explain.
-    alike : float
-        Part of a signature explained by another candidate from which both are refitted.
-    refits : int
-        Candidates refitted in a round, and once more as many that are like them.
-    effects : int
-        How many may be added.
-    samples_per_unknown : float
-        Effective samples for every unknown below which nothing is said.
-    """
-
-    level: float = 0.01
-    smallest_gap: float = 0.1
-    closure: float = 0.05
-    explained: float = 0.5
-    alike: float = 0.9
-    refits: int = 6
-    effects: int = 3
-    samples_per_unknown: float = 3.0
+    level: Annotated[float, Gt(0), Lt(1), About("significance below which a residual is more than noise")] = 0.01
+    smallest_gap: Annotated[
+        float, Ge(0), About("excess of chi2 per sample over one below which a gap is not worth a name, however sure")
+    ] = 0.1
+    closure: Annotated[
+        float, Ge(0), Lt(1), About("a held-out closure whose lower end is below this is no improvement")
+    ] = 0.05
+    explained: Annotated[
+        float,
+        Ge(0),
+        Le(1),
+        About("fraction of what the smoother explains of the residual which effects have to explain"),
+    ] = 0.5
+    alike: Annotated[
+        float,
+        Ge(0),
+        Le(1),
+        About("fraction of a signature explained by another candidate from which on both are refitted"),
+    ] = 0.9
+    refits: Annotated[int, Ge(1), About("candidates refitted in a round, and once more as many that are like them")] = 6
+    effects: Annotated[int, Ge(1), Le(10), About("how many effects may be added")] = 3
+    samples_per_unknown: Annotated[
+        float, Ge(0), About("effective samples for every unknown below which nothing is said")
+    ] = 3.0
 
 
 @dataclass(frozen=True)

@@ -20,10 +20,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import casadi as ca
 import numpy as np
+from annotated_types import Ge, Gt, Le
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import DataError, ModelError, nearest
@@ -32,6 +33,7 @@ from yid_ocp.model.flexible import FlexibleObject, Segment, polyline_rotations
 from yid_ocp.model.mechanism import Frame, Placement
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.system import floating_clamp
+from yid_ocp.options import About
 
 Array = NDArray[np.float64]
 START, END = "clamp_start", "clamp_end"
@@ -155,61 +157,57 @@ class BranchOptions:
     Attributes
     ----------
     bend, twist : float
-        Rigidity [N m^2].
-    damping, twist_damping : float
-        Viscous damping per curvature rate of bends and of twists [N m^2 s].
-    density : float
-        Mass per length [kg/m].
+        Rigidity [N m^2]; in a configuration under `parameters`.
+    damping : float
+        Viscous damping per curvature rate [N m^2 s]; in a configuration under `parameters`.
     """
 
     bend: float = 1.5e-3
     twist: float = 1.0e-3
     damping: float = 5e-5
-    twist_damping: float | None = None
-    density: float = 0.05
+    twist_damping: Annotated[bool, About("whether twists have a damping parameter of their own")] = False
+    density: Annotated[float, Gt(0), About("mass per length; results are per unit of it", "kg/m")] = 0.05
 
 
 @dataclass(frozen=True)
 class CableOptions:
     """How a cable is modelled.
 
+    With a `memory` each joint rests at (1 - memory) x undeformed + memory x (start angle - load/stiffness), the load
+    being what the joint bears at the recording's start if the cable is at rest there. It becomes the parameter
+    `SEGMENT.memory` and counts less for a recording that starts in motion, by the factor
+    1/(1 + (start speed/`start.speed_scale`)^2).
+
     Attributes
     ----------
-    branches : mapping of str to BranchOptions
-        By segment name; the default for those that are not named.
     default : BranchOptions
-    radius : float
-        Of the solid cylinders that give the links' inertia [m].
-    end : "axis" or "weld"
-        Whether the end clamp leaves the roll free or holds it at the parameter `clamp_end.roll`.
-    rest_shape : bool
-        Whether the undeformed shape of every branch is its rest shape; else each branch is straight at rest and only
-        the directions in which children leave are kept.
-    rigid_clamp : bool
-        Whether the cable is clamped rigidly up to the second vertex, so that the first joint bends over half of the
-        next edge only; else over half of both.
-    separate_lengths : bool
-        Whether every edge has a length parameter of its own.
-    memory : float, optional
-        How far the rest shape is that of the recording's start rather than the undeformed one: each joint then rests at
-        (1 - memory) x undeformed + memory x (start angle - load/stiffness), the load being what the joint bears at the
-        start if the cable is at rest there. Becomes the parameter `SEGMENT.memory`; it counts less for a recording that
-        starts in motion, by the factor 1/(1 + (start speed/`start.speed_scale`)^2).
-    rest_angles : bool
-        Whether every bend has a parameter `JOINT.rest` [rad], its rest angle beside the undeformed shape's.
+        Of branches that are not named.
     gravity : tuple of float
         [m/s^2]
     """
 
-    branches: Mapping[str, BranchOptions] = field(default_factory=dict)
+    branches: Annotated[Mapping[str, BranchOptions], About("by name, parent and children")] = field(
+        default_factory=dict
+    )
     default: BranchOptions = field(default_factory=BranchOptions)
-    radius: float = 0.005
-    end: Literal["axis", "weld"] = "axis"
-    rest_shape: bool = True
-    rigid_clamp: bool = False
-    separate_lengths: bool = True
-    memory: float | None = None
-    rest_angles: bool = False
+    radius: Annotated[float, Gt(0), Le(1), About("of the solid cylinders that give the links' inertia", "m")] = 0.005
+    end: Annotated[
+        Literal["axis", "weld"],
+        About("whether the end clamp leaves the roll free or holds it at the parameter clamp_end.roll"),
+    ] = "axis"
+    rest_shape: Annotated[bool, About("whether branches rest in their undeformed shape, or straight")] = True
+    rigid_clamp: Annotated[
+        bool, About("whether the first edge is rigid up to its second point, so that half of the next one bends alone")
+    ] = False
+    lengths_per_recording: Annotated[
+        bool, About("whether every recording has edge lengths of its own; every edge then has a length parameter")
+    ] = True
+    memory: Annotated[
+        float | None, Ge(0), Le(1), About("how far the rest shape is that of the recording's start; none when absent")
+    ] = None
+    rest_angles: Annotated[
+        bool, About("whether every bend has a parameter JOINT.rest, its rest angle beside the undeformed shape's")
+    ] = False
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
 
 
@@ -248,7 +246,7 @@ def free_parameters(cable: Cable, options: CableOptions | None = None) -> tuple[
     names: list[str] = []
     for name in cable.chains:
         names += [f"{name}.bend", f"{name}.twist", f"{name}.damping"]
-        if options.branches.get(name, options.default).twist_damping is not None:
+        if options.branches.get(name, options.default).twist_damping:
             names.append(f"{name}.twist_damping")
         if options.memory is not None:
             names.append(f"{name}.memory")
@@ -400,11 +398,11 @@ def _segments(cable: Cable, lengths: Mapping[tuple[str, str], float], options: C
                 bend=branch.bend,
                 twist=branch.twist,
                 damping=branch.damping,
-                twist_damping=branch.twist_damping,
+                twist_damping=branch.damping if branch.twist_damping else None,
                 rigidity=True,
                 clamped=options.rigid_clamp and at is None,
                 length_before=before,
-                separate_lengths=options.separate_lengths,
+                link_length_parameters=options.lengths_per_recording,
             )
         )
     return segments

@@ -60,7 +60,7 @@ class Segment:
         Axes of the turns at each joint, base to tip; about those left out the segment is rigid.
     section : (float, float), optional
         Extents of a rectangular cross section along the links' x and y axes [m], in place of `radius`.
-    separate_lengths : bool
+    link_length_parameters : bool
         Whether every link has a length parameter of its own (`SEGMENT.length_0`, ...) in place of `SEGMENT.length`,
         for markers that sit elsewhere in every recording; masses do not follow them.
     length_before : float, optional
@@ -86,7 +86,7 @@ class Segment:
     clamped: bool = False
     joint_order: str = "xyz"
     section: tuple[float, float] | None = None
-    separate_lengths: bool = False
+    link_length_parameters: bool = False
     length_before: float | None = None
 
 
@@ -180,7 +180,7 @@ def flexible_object(
         parameters += own.values()
         mass, cross = own["mass"].symbol, _cross_section(own)
         shares = _shares(segment)
-        if segment.separate_lengths:
+        if segment.link_length_parameters:
             lengths = tuple(own[f"length_{i}"].symbol for i in range(len(shares)))
         else:
             lengths = tuple(own["length"].symbol * float(share) for share in shares)
@@ -338,7 +338,7 @@ def _segment_parameters(segment: Segment) -> dict[str, Parameter]:
                 f"length_{i}": (length * float(share), "m", small, f"length of link {i}")
                 for i, share in enumerate(_shares(segment))
             }
-            if segment.separate_lengths
+            if segment.link_length_parameters
             else {"length": (length, "m", small, "length of the segment")}
         ),
         "mass": (segment.mass, "kg", small, "mass of the segment"),

@@ -14,7 +14,6 @@ import numpy as np
 import threadpoolctl
 from numpy.typing import NDArray
 
-from yid_ocp.errors import SolverError
 from yid_ocp.problem.problem import EstimationProblem, Evaluation, WarmStart
 from yid_ocp.registry import Registry
 
@@ -364,9 +363,3 @@ def projected_gradient(x: Array, gradient: Array, lower: Array, upper: Array, sc
     """Largest component of scale * gradient that does not push against a bound."""
     free = ~(((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0)))
     return float(np.max(np.abs(scale * gradient)[free], initial=0.0))
-
-
-def check_positive(name: str, value: float) -> None:
-    """Raise `SolverError` unless a setting is a positive number."""
-    if not (math.isfinite(value) and value > 0):
-        raise SolverError(f"{name} = {value}", where="solver", allowed="a positive number")

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated, ClassVar
 
 import numpy as np
 import scipy.linalg
 import scipy.optimize
+from annotated_types import Ge, Gt
 from numpy.typing import NDArray
 
+from yid_ocp.options import About, check
 from yid_ocp.problem.problem import EstimationProblem, Evaluation
 from yid_ocp.solvers.base import SOLVERS, Callback, Outcome, Recorder, Status, projected_gradient
 
@@ -23,27 +26,25 @@ class GaussNewton:
     Every iteration solves  min |J d + r|^2 + mu |d/s|^2  with  lower <= x + d <= upper, and accepts d when the cost
     falls by a fair part of what the linear model promised.
 
-    Attributes
-    ----------
-    iterations : int
-        Limit on accepted steps.
-    step_tolerance : float
-        Converged when no unknown moves by more than this fraction of its size.
-    cost_tolerance : float
-        Converged when the promised relative reduction of the cost is below this.
-    damping : float
-        Initial mu, in units of the largest diagonal entry of the scaled normal matrix.
-
     References
     ----------
     Nocedal and Wright (2006), Numerical Optimization, chapter 10, doi:10.1007/978-0-387-40065-5.
     """
 
-    iterations: int = 60
-    step_tolerance: float = 1e-5
-    cost_tolerance: float = 1e-8
-    damping: float = 1e-6
-    name: str = "gauss_newton"
+    iterations: Annotated[int, Ge(1), About("limit on accepted steps")] = 60
+    step_tolerance: Annotated[
+        float, Gt(0), About("converged when no unknown moves by more than this fraction of its size")
+    ] = 1e-5
+    cost_tolerance: Annotated[
+        float, Gt(0), About("converged when the promised relative reduction of the cost is below this")
+    ] = 1e-8
+    damping: Annotated[
+        float, Gt(0), About("initial mu, in units of the largest diagonal entry of the scaled normal matrix")
+    ] = 1e-6
+    name: ClassVar[str] = "gauss_newton"
+
+    def __post_init__(self) -> None:
+        check(self, f"solver {self.name}")
 
     def run(self, problem: EstimationProblem, start: Array, callback: Callback | None) -> Outcome:
         """See `Solver.run`."""

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
+from annotated_types import Ge, Gt
 from numpy.typing import NDArray
 
 from yid_ocp.integrator.step import Directions
+from yid_ocp.options import About, check
 from yid_ocp.problem.prediction import Start
 from yid_ocp.problem.problem import EstimationProblem
 from yid_ocp.solvers.base import SOLVERS, Callback, Outcome, Recorder, Status, projected_gradient
@@ -77,28 +79,25 @@ class Lifted:
     node steps by the parameters' step (condensing), so that an iteration costs one sweep with one direction more
     than single shooting's. A filter decides whether a step is good: it must improve the cost or the defects.
 
-    Attributes
-    ----------
-    node_interval : int
-        Steps between nodes.
-    iterations : int
-    step_tolerance, cost_tolerance : float
-        As in `GaussNewton`.
-    defect_tolerance : float
-        Largest defect [rad, m or N m s] that counts as closed.
-
     References
     ----------
     Albersmeyer and Diehl (2010), SIAM J. Optim. 20(3):1655, doi:10.1137/080724885.
     """
 
-    node_interval: int = 10
-    iterations: int = 80
-    step_tolerance: float = 1e-5
-    cost_tolerance: float = 1e-5
-    defect_tolerance: float = 1e-7
-    name: str = "lifted"
+    node_interval: Annotated[int, Ge(1), About("steps between nodes")] = 10
+    iterations: Annotated[int, Ge(1), About("limit on accepted steps")] = 80
+    step_tolerance: Annotated[
+        float, Gt(0), About("converged when no unknown moves by more than this fraction of its size")
+    ] = 1e-5
+    cost_tolerance: Annotated[
+        float, Gt(0), About("converged when the promised relative reduction of the cost is below this")
+    ] = 1e-5
+    defect_tolerance: Annotated[float, Gt(0), About("largest defect that counts as closed", "rad, m or N m s")] = 1e-7
+    name: ClassVar[str] = "lifted"
     needs_rollout: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        check(self, f"solver {self.name}")
 
     def run(self, problem: EstimationProblem, start: Array, callback: Callback | None) -> Outcome:
         """See `Solver.run`."""

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import casadi as ca
 import numpy as np
 import scipy.sparse
+from annotated_types import Ge, Gt
 from numpy.typing import NDArray
 
 from yid_ocp.errors import SolverError
+from yid_ocp.options import About, check
 from yid_ocp.problem.problem import EstimationProblem
-from yid_ocp.solvers.base import SOLVERS, Callback, Outcome, Recorder, Status, check_positive
+from yid_ocp.solvers.base import SOLVERS, Callback, Outcome, Recorder, Status
 from yid_ocp.solvers.transcription import Transcription
 
 Array = NDArray[np.float64]
@@ -33,20 +35,8 @@ class MultipleShooting:
     and IPOPT's own scaling is off. In these units IPOPT's first bound multipliers, which are one, weigh as much as the
     cost, so that the first steps change no parameter by much more than a factor.
 
-    Attributes
-    ----------
-    node_interval : int
-        Steps between nodes; 1 makes every DEL equation and multiplier part of the NLP.
-    hessian : "gauss_newton" or "exact"
-        Of the Lagrangian. Exact adds the curvature of the constraints, by differences of their compiled Jacobian.
-    iterations : int
-    tolerance : float
-        IPOPT's `tol`.
-    mu_init : float
-        Initial barrier parameter, in units of the initial cost: a larger one pushes parameters that the data hardly
-        inform away from their bounds, and time is lost in bringing them back.
-    ipopt : mapping
-        Further IPOPT options, which win.
+    A barrier parameter much above the default pushes parameters that the data hardly inform away from their bounds, and
+    time is lost in bringing them back.
 
     References
     ----------
@@ -54,19 +44,24 @@ class MultipleShooting:
     Waechter and Biegler (2006), Math. Programming 106:25, doi:10.1007/s10107-004-0559-y.
     """
 
-    node_interval: int = 1
-    hessian: Hessian = "gauss_newton"
-    iterations: int = 200
-    tolerance: float = 1e-6
-    mu_init: float = 1e-7
-    ipopt: dict[str, Any] = field(default_factory=dict)
-    name: str = "multiple_shooting"
+    node_interval: Annotated[
+        int, Ge(1), About("steps between nodes; 1 makes every equation of motion and multiplier part of the program")
+    ] = 1
+    hessian: Annotated[
+        Hessian, About("of the Lagrangian; exact adds the constraints' curvature, by differences of their Jacobian")
+    ] = "gauss_newton"
+    iterations: Annotated[int, Ge(1), About("limit on IPOPT's iterations")] = 200
+    tolerance: Annotated[float, Gt(0), About("IPOPT's tol")] = 1e-6
+    mu_init: Annotated[float, Gt(0), About("initial barrier parameter, in units of the initial cost")] = 1e-7
+    ipopt: Annotated[dict[str, Any], About("further options of IPOPT, which win")] = field(default_factory=dict)
+    name: ClassVar[str] = "multiple_shooting"
     needs_rollout: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        check(self, f"solver {self.name}")
 
     def run(self, problem: EstimationProblem, start: Array, callback: Callback | None) -> Outcome:
         """See `Solver.run`."""
-        check_positive("tolerance", self.tolerance)
-        check_positive("mu_init", self.mu_init)
         if self.hessian not in ("gauss_newton", "exact"):
             raise SolverError(
                 f"hessian = '{self.hessian}'",

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated, ClassVar
 
 import numpy as np
 import scipy.optimize
+from annotated_types import Ge, Gt
 from numpy.typing import NDArray
 
+from yid_ocp.options import About, check
 from yid_ocp.problem.problem import EstimationProblem
 from yid_ocp.solvers.base import SOLVERS, Callback, Outcome, Recorder, Status, projected_gradient
 
@@ -19,20 +22,19 @@ Array = NDArray[np.float64]
 class SingleShooting:
     """Minimise the cost by SciPy's L-BFGS-B on unknowns scaled to order one.
 
-    Attributes
-    ----------
-    iterations : int
-    cost_tolerance : float
-        Converged when the cost falls by less than this fraction in an iteration.
-
     References
     ----------
     Zhu, Byrd, Lu, Nocedal (1997), ACM Trans. Math. Softw. 23(4):550, doi:10.1145/279232.279236.
     """
 
-    iterations: int = 200
-    cost_tolerance: float = 1e-9
-    name: str = "single_shooting"
+    iterations: Annotated[int, Ge(1), About("limit on iterations")] = 200
+    cost_tolerance: Annotated[
+        float, Gt(0), About("converged when the cost falls by less than this fraction in an iteration")
+    ] = 1e-9
+    name: ClassVar[str] = "single_shooting"
+
+    def __post_init__(self) -> None:
+        check(self, f"solver {self.name}")
 
     def run(self, problem: EstimationProblem, start: Array, callback: Callback | None) -> Outcome:
         """See `Solver.run`."""

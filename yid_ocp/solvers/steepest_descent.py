@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
+from annotated_types import Ge, Gt, Lt
 from numpy.typing import NDArray
 
-from yid_ocp.errors import SolverError
+from yid_ocp.options import About, check
 from yid_ocp.problem.problem import EstimationProblem, Evaluation
 from yid_ocp.solvers.base import SOLVERS, Callback, Outcome, Recorder, Status, projected_gradient
 
@@ -22,21 +23,9 @@ class SteepestDescent:
 
     The gradient comes from the adjoint. Unscaled on purpose: this is what the paper did.
 
-    Attributes
-    ----------
-    iterations : int
-    gradient_tolerance : float
-        Converged when the projected gradient, times the size of the unknowns and over the cost, is below this.
-    sufficient_decrease : float
-        Armijo's constant.
-    shrink : float
-        Backtracking factor.
-    trial : "last" or "spectral"
-        First length tried in an iteration: twice the last accepted one, as in the paper, or Barzilai and Borwein's from
-        the change of the gradient, which needs far fewer iterations.
-    memory : int
-        Armijo's rule demands less than the largest of so many last costs: with 1 every step lowers the cost, as in the
-        paper; spectral lengths, most of which pay only a few steps later, want about 10.
+    The first length tried in an iteration is twice the last accepted one, as in the paper, or Barzilai and Borwein's
+    from the change of the gradient (`spectral`), which needs far fewer iterations; most of these pay only a few steps
+    later and want a `memory` of about 10.
 
     References
     ----------
@@ -45,18 +34,27 @@ class SteepestDescent:
     Birgin, Martinez, Raydan (2000), SIAM J. Optim. 10(4):1196, doi:10.1137/S1052623497330963 (spectral, memory).
     """
 
-    iterations: int = 200
-    gradient_tolerance: float = 1e-5
-    sufficient_decrease: float = 1e-4
-    shrink: float = 0.5
-    trial: Literal["last", "spectral"] = "last"
-    memory: int = 1
-    name: str = "steepest_descent"
+    iterations: Annotated[int, Ge(1), About("limit on accepted steps")] = 200
+    gradient_tolerance: Annotated[
+        float,
+        Gt(0),
+        About("converged when the projected gradient times the unknowns' size is below this part of the cost"),
+    ] = 1e-5
+    sufficient_decrease: Annotated[float, Gt(0), Lt(1), About("Armijo's constant")] = 1e-4
+    shrink: Annotated[float, Gt(0), Lt(1), About("backtracking factor")] = 0.5
+    trial: Annotated[Literal["last", "spectral"], About("first length tried in an iteration; last is the paper's")] = (
+        "last"
+    )
+    memory: Annotated[
+        int, Ge(1), About("the cost must fall below the largest of so many last ones; 1 is the paper's")
+    ] = 1
+    name: ClassVar[str] = "steepest_descent"
+
+    def __post_init__(self) -> None:
+        check(self, f"solver {self.name}")
 
     def run(self, problem: EstimationProblem, start: Array, callback: Callback | None) -> Outcome:
         """See `Solver.run`."""
-        if self.memory < 1:
-            raise SolverError(f"memory = {self.memory}", where="steepest_descent", allowed="a whole number from 1")
         lower, upper = problem.bounds
         recorder = Recorder(callback)
         x = start.copy()

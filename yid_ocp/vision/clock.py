@@ -15,11 +15,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge, Gt
 from numpy.typing import NDArray
 
-from yid_ocp.errors import ConfigError
+from yid_ocp.options import About, check
 from yid_ocp.vision.filters import Cloud, weighted_median
 from yid_ocp.vision.meshes import Surfaces
 
@@ -41,33 +43,26 @@ _STEP = 0.01  # over which velocities are taken [s]
 
 @dataclass(frozen=True)
 class ClockOptions:
-    """How the camera's clock is compared with the joints'.
+    """How the camera's clock is compared with the joints'."""
 
-    Attributes
-    ----------
-    offset : float
-        Stamp minus joint time, as far as known [s].
-    search : float
-        How far from there the offset is looked for [s]; zero to take it as it is.
-    reach : float
-        Distance at which a point stops to be the arm's [m].
-    determined : float
-        An offset of larger deviation is not used [s].
-    late : float
-        A frame whose own offset differs from the common one by more, and by more than four deviations, is dropped [s].
-    """
-
-    offset: float = 0.0
-    search: float = 0.3
-    reach: float = 0.04
-    determined: float = 0.02
-    late: float = 0.03
+    offset: Annotated[float, About("stamp minus joint time, as far as known", "s")] = 0.0
+    search: Annotated[
+        float, Ge(0), About("how far from there the offset is looked for; 0 to take it as it is", "s")
+    ] = 0.3
+    reach: Annotated[float, Gt(0), About("distance at which a point stops to be the arm's", "m")] = 0.04
+    determined: Annotated[float, Gt(0), About("an offset of larger standard deviation is not used", "s")] = 0.02
+    late: Annotated[
+        float,
+        Gt(0),
+        About(
+            "a frame whose own offset differs from the common one by more, and by more than four standard deviations, "
+            "is dropped",
+            "s",
+        ),
+    ] = 0.03
 
     def __post_init__(self) -> None:
-        if self.search < 0 or not (self.reach > 0 and self.determined > 0 and self.late > 0):
-            raise ConfigError(
-                "a setting of the clock is not positive", where="clock options", allowed="positive; search from 0"
-            )
+        check(self, "clock options")
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import casadi as ca
 import numpy as np
+from annotated_types import Ge, Gt
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from yid_ocp.errors import ConfigError
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
+from yid_ocp.options import About, check
 from yid_ocp.vision.meshes import Surfaces, numeric_mechanism
 
 Array = NDArray[np.float64]
+Triple = tuple[float, float, float]
 Mask = NDArray[np.bool_]
 
 _TO_SIGMA = 1.4826  # from the median absolute deviation of a normal distribution to its deviation
@@ -46,55 +49,53 @@ class Cloud:
 
 @dataclass(frozen=True)
 class FilterOptions:
-    """What counts as the object.
+    """What counts as the object."""
 
-    Attributes
-    ----------
-    voxel : float
-        Edge of the cubes in which points are averaged [m].
-    padding : float
-        Points this near to the robot's surface belong to it [m]; about five deviations of the depth.
-    lower, upper : (float, float, float), optional
-        Corners of a box in the world outside of which points are left out [m].
-    floor : float, optional
-        Points below this height are left out [m]; where absent, `floor_margin` above the foot of an object that stands
-        on one, else nothing.
-    floor_margin : float
-        [m]
-    reach_margin : float
-        Points further from the object's root than its longest branch reaches, plus this, are left out [m].
-    behind : float, optional
-        Points that are further from the camera than the robot's base by more than this, seen in the horizontal, are
-        behind the robot and left out [m]; None to keep them.
-    neighbours : int
-        Of every point, whose mean distance tells whether it is alone.
-    outlier_ratio : float
-        A point is an outlier where that distance exceeds the median by so many (robust) deviations.
-    least : int
-        A frame with fewer points left is of no use.
-    most : int
-        Of more points left, so many are drawn at random, to bound the time that a frame takes.
-    """
-
-    voxel: float = 0.008
-    padding: float = 0.03
-    lower: tuple[float, float, float] | None = None
-    upper: tuple[float, float, float] | None = None
-    floor: float | None = None
-    floor_margin: float = 0.05
-    reach_margin: float = 0.1
-    behind: float | None = 0.0
-    neighbours: int = 12
-    outlier_ratio: float = 4.0
-    least: int = 150
-    most: int = 6000
+    voxel: Annotated[float, Gt(0), About("edge of the cubes in which points are averaged", "m")] = 0.008
+    padding: Annotated[
+        float,
+        Gt(0),
+        About("points this near to the robot's surface belong to it; about five standard deviations of the depth", "m"),
+    ] = 0.03
+    lower: Annotated[Triple | None, About("corner of a box in the world outside of which points are left out", "m")] = (
+        None
+    )
+    upper: Annotated[Triple | None, About("the opposite corner", "m")] = None
+    floor: Annotated[
+        float | None,
+        About(
+            "points below this height are left out; when absent, those below floor_margin above the foot of an object "
+            "that stands on one",
+            "m",
+        ),
+    ] = None
+    floor_margin: Annotated[float, About("height above the foot of an object", "m")] = 0.05
+    reach_margin: Annotated[
+        float,
+        Gt(0),
+        About("points further from the object's root than its longest branch reaches, plus this, are left out", "m"),
+    ] = 0.1
+    behind: Annotated[
+        float | None,
+        About(
+            "points that are further from the camera than the robot's base by more than this, seen in the horizontal, "
+            "are behind the robot and left out; null to keep them",
+            "m",
+        ),
+    ] = 0.0
+    neighbours: Annotated[int, Ge(1), About("of every point, whose mean distance tells whether it is alone")] = 12
+    outlier_ratio: Annotated[
+        float,
+        Gt(0),
+        About("a point is an outlier where that distance exceeds the median by so many (robust) standard deviations"),
+    ] = 4.0
+    least: Annotated[int, Ge(0), About("a frame with fewer points left is of no use")] = 150
+    most: Annotated[
+        int, Ge(1), About("of more points left, so many are drawn at random, to bound the time that a frame takes")
+    ] = 6000
 
     def __post_init__(self) -> None:
-        for name in ("voxel", "padding", "reach_margin", "outlier_ratio"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(
-                    f"{name} = {getattr(self, name)}", where="filter options", allowed="a positive number"
-                )
+        check(self, "filter options")
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,14 +15,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import casadi as ca
 import numpy as np
+from annotated_types import Ge, Gt, Le
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
+from yid_ocp.options import About, check
 from yid_ocp.vision.meshes import numeric_mechanism
 
 Array = NDArray[np.float64]
@@ -40,51 +43,48 @@ _LEAST_STIFFNESS = 1e-2  # of the mean; softer bends are still held this much
 
 @dataclass(frozen=True)
 class FitOptions:
-    """How a shape is fitted.
+    """How a shape is fitted."""
 
-    Attributes
-    ----------
-    scales : tuple of float
-        Scale of the robust loss on the nodes, one pass after the other [m]: wide first, so that a start some
-        decimetres off is caught.
-    surface_scales : tuple of float
-        The same on the points of the cloud; empty for a fit to the nodes alone, as in the source paper [m].
-    noise : float
-        Deviation of one averaged point from the surface [m].
-    noise_correlation : float
-        Of how many points the errors are alike; divides the weight of all points together.
-    grasp_std : float
-        Deviation between a gripper, by its joint angles, and what it holds [m].
-    direction_std : float
-        The same of the axes that grasps of kind `axis` and `weld` make coincide [rad].
-    bend_std : float
-        Bend of a joint of mean stiffness that costs as much as one deviation [rad].
-    rate_std : float
-        Change of a bend since the previous frame that costs as much, per time between them [rad/s].
-    iterations : int
-        At most so many in a pass.
-    weight_cap : float
-        A point counts at most for so many of the camera's.
-    least_coverage : float
-        A link with points along a smaller share of its length is hidden, or not where the fit has it.
-    """
-
-    scales: tuple[float, ...] = (0.15, 0.05)
-    surface_scales: tuple[float, ...] = (0.03, 0.015)
-    noise: float = 0.006
-    noise_correlation: float = 8.0
-    grasp_std: float = 0.004
-    direction_std: float = 0.05
-    bend_std: float = 0.3
-    rate_std: float = 3.0
-    iterations: int = 25
-    weight_cap: float = 6.0
-    least_coverage: float = 0.5
+    scales: Annotated[
+        tuple[Annotated[float, Gt(0)], ...],
+        About(
+            "scale of the robust loss on the nodes, pass after pass: wide first, to catch a start some decimetres off",
+            "m",
+        ),
+    ] = (0.15, 0.05)
+    surface_scales: Annotated[
+        tuple[Annotated[float, Gt(0)], ...],
+        About("the same on the points of the cloud; empty for a fit to the nodes alone, as in the source paper", "m"),
+    ] = (0.03, 0.015)
+    noise: Annotated[
+        float, Gt(0), About("standard deviation of one averaged point's distance from the surface", "m")
+    ] = 0.006
+    noise_correlation: Annotated[
+        float, Gt(0), About("of how many points the errors are alike; divides the weight of all points together")
+    ] = 8.0
+    grasp_std: Annotated[
+        float, Gt(0), About("standard deviation between a gripper, by its joint angles, and what it holds", "m")
+    ] = 0.004
+    direction_std: Annotated[
+        float, Gt(0), About("the same of the axes that grasps of kind axis and weld make coincide", "rad")
+    ] = 0.05
+    bend_std: Annotated[
+        float, Gt(0), About("bend of a joint of mean stiffness that costs as much as one standard deviation", "rad")
+    ] = 0.3
+    rate_std: Annotated[
+        float, Gt(0), About("change of a bend since the previous frame that costs as much, per time between", "rad/s")
+    ] = 3.0
+    iterations: Annotated[int, Ge(1), About("at most so many in a pass")] = 25
+    weight_cap: Annotated[float, Gt(0), About("a point counts at most for so many of the camera's")] = 6.0
+    least_coverage: Annotated[
+        float,
+        Ge(0),
+        Le(1),
+        About("a link with points along a smaller fraction of its length is hidden, or not where the fit has it"),
+    ] = 0.5
 
     def __post_init__(self) -> None:
-        for name in ("noise", "noise_correlation", "grasp_std", "direction_std", "bend_std", "rate_std", "weight_cap"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"{name} = {getattr(self, name)}", where="fit options", allowed="a positive number")
+        check(self, "fit options")
         if not self.scales and not self.surface_scales:
             raise ConfigError("there is no pass to fit in", where="fit options: scales", allowed="one scale or more")
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge, Gt, Le
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
-from yid_ocp.errors import ConfigError
+from yid_ocp.options import About, check
 from yid_ocp.vision.filters import Cloud
 
 Array = NDArray[np.float64]
@@ -19,40 +21,26 @@ Integers = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class WalkOptions:
-    """How a cloud is thinned.
+    """How a cloud is thinned."""
 
-    Attributes
-    ----------
-    neighbours : int
-        k1: points of a segment.
-    radius : float
-        Points further away are no neighbours [m]; somewhat more than the thickest tube's diameter.
-    least : int
-        A segment of fewer points gives no node.
-    links : int
-        Neighbours of a node in the graph.
-    link_length : float
-        Nodes further apart are not joined [m].
-    least_share : float
-        A connected part of the graph that holds a smaller share of the points is not the object.
-    """
-
-    neighbours: int = 50
-    radius: float = 0.07
-    least: int = 15
-    links: int = 4
-    link_length: float = 0.15
-    least_share: float = 0.04
+    neighbours: Annotated[int, Ge(2), About("points of a segment, k1 in the source paper")] = 50
+    radius: Annotated[
+        float,
+        Gt(0),
+        About("points further away are no neighbours; somewhat more than the thickest tube's diameter", "m"),
+    ] = 0.07
+    least: Annotated[int, Ge(1), About("a segment of fewer points gives no node")] = 15
+    links: Annotated[int, Ge(1), About("neighbours of a node in the graph")] = 4
+    link_length: Annotated[float, Gt(0), About("nodes further apart are not joined", "m")] = 0.15
+    least_share: Annotated[
+        float,
+        Ge(0),
+        Le(1),
+        About("a connected part of the graph that holds a smaller fraction of the points is not the object"),
+    ] = 0.04
 
     def __post_init__(self) -> None:
-        if self.neighbours < 2 or self.least < 1 or self.links < 1:
-            raise ConfigError(
-                f"neighbours = {self.neighbours}, least = {self.least}, links = {self.links}",
-                where="walk options",
-                allowed="neighbours from 2, least and links from 1",
-            )
-        if not (self.radius > 0 and self.link_length > 0):
-            raise ConfigError(f"radius = {self.radius}, link_length = {self.link_length}", allowed="positive metres")
+        check(self, "walk options")
 
 
 @dataclass(frozen=True, eq=False)

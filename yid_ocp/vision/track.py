@@ -11,14 +11,17 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge, Gt, Le
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from yid_ocp.data.recording import PointGroup, Recording, validate
 from yid_ocp.errors import ConfigError, DataError, ModelError, nearest
 from yid_ocp.model.system import System
+from yid_ocp.options import About, check
 from yid_ocp.vision.clock import Clock, ClockOptions, estimate_clock
 from yid_ocp.vision.filters import Cloud, FilterOptions, ObjectRegion, voxel_grid, without_outliers, without_robot
 from yid_ocp.vision.fit import Fit, FitOptions, ShapeFit, Sight
@@ -36,59 +39,55 @@ _SAME_TIME = 1e-6  # [s]
 
 @dataclass(frozen=True)
 class TrackOptions:
-    """How a frame sequence is turned into measured points.
+    """How a frame sequence is turned into measured points, and which of its frames are good."""
 
-    Attributes
-    ----------
-    filters : FilterOptions
-    walk : WalkOptions
-    fit : FitOptions
-    clock : ClockOptions
-    d_max : float
-        A frame whose points are further from the fitted shape than this on average is dropped [m].
-    largest_bend : float
-        As is one whose shape has a joint that is bent further [rad].
-    worse : float
-        As is one where this distance is so many times the median of all good frames.
-    gap_max : float
-        As is one where an end is further from the gripper that holds it than usual by more [m]: its time is not what
-        its stamp says.
-    least_inliers : float
-        As is one of which a smaller share of the points lies on the shape.
-    point_std_max : float
-        A point that is known less well than this in a frame counts as not seen there [m].
-    std_floor : float
-        Deviation that no fit is better than: of the camera's calibration and of the model's straight links [m].
-    stamp_std : float
-        Deviation of a frame's time stamp, beyond the common offset [s].
-    points : tuple of str, optional
-        Points to write down; those of the system that no arm holds where absent, as the arms know theirs better.
-    mesh : "visual" or "collision"
-        Meshes of the robot's self-filter.
-    seed : int
-        Of the walk's random points and of all subsampling.
-    """
-
-    filters: FilterOptions = field(default_factory=FilterOptions)
-    walk: WalkOptions = field(default_factory=WalkOptions)
-    fit: FitOptions = field(default_factory=FitOptions)
-    clock: ClockOptions = field(default_factory=ClockOptions)
-    d_max: float = 0.012
-    largest_bend: float = 1.2
-    worse: float = 1.7
-    gap_max: float = 0.008
-    least_inliers: float = 0.6
-    point_std_max: float = 0.02
-    std_floor: float = 0.003
-    stamp_std: float = 0.003
-    points: tuple[str, ...] | None = None
-    mesh: MeshKind = "visual"
-    seed: int = 0
+    filters: Annotated[FilterOptions, About("what counts as the object")] = field(default_factory=FilterOptions)
+    walk: Annotated[WalkOptions, About("how a cloud is thinned")] = field(default_factory=WalkOptions)
+    fit: Annotated[FitOptions, About("how a shape is fitted")] = field(default_factory=FitOptions)
+    clock: Annotated[ClockOptions, About("how the camera's clock is compared with the joints'")] = field(
+        default_factory=ClockOptions
+    )
+    d_max: Annotated[
+        float, Gt(0), About("a frame whose points are further from the fitted shape on average is dropped", "m")
+    ] = 0.012
+    largest_bend: Annotated[
+        float, Gt(0), About("a frame whose shape has a joint that is bent further is dropped", "rad")
+    ] = 1.2
+    worse: Annotated[
+        float, Gt(0), About("a frame whose distance is so many times the median of all good frames is dropped")
+    ] = 1.7
+    gap_max: Annotated[
+        float,
+        Gt(0),
+        About(
+            "a frame in which an end is further from the gripper that holds it than usual by more is dropped: its time "
+            "is not what its stamp says",
+            "m",
+        ),
+    ] = 0.008
+    least_inliers: Annotated[
+        float, Ge(0), Le(1), About("a frame of which a smaller fraction of the points lies on the shape is dropped")
+    ] = 0.6
+    point_std_max: Annotated[
+        float, Gt(0), About("a point that is known less well in a frame counts as not seen there", "m")
+    ] = 0.02
+    std_floor: Annotated[
+        float,
+        Gt(0),
+        About("standard deviation that no fit is better than: of the camera's pose and of straight links", "m"),
+    ] = 0.003
+    stamp_std: Annotated[
+        float, Ge(0), About("standard deviation of a frame's time stamp, beyond the common offset", "s")
+    ] = 0.003
+    points: Annotated[
+        tuple[str, ...] | None,
+        About("points to write down; those that no arm holds when absent, as arms know theirs better"),
+    ] = None
+    mesh: Annotated[MeshKind, About("meshes of the robot's self-filter")] = "visual"
+    seed: Annotated[int, Ge(0), About("of the walk's random points and of all subsampling")] = 0
 
     def __post_init__(self) -> None:
-        for name in ("d_max", "worse", "gap_max", "largest_bend", "point_std_max", "std_floor"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"{name} = {getattr(self, name)}", where="track options", allowed="a positive number")
+        check(self, "track options")
 
 
 @dataclass(frozen=True, eq=False)

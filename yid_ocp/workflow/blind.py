@@ -12,7 +12,6 @@ from typing import Any
 
 from yid_ocp.config.settings import Run, dump_config
 from yid_ocp.data.recording import new_file, read_recording, write_recording
-from yid_ocp.diagnosis import Thresholds
 from yid_ocp.diagnosis.blind import Case, Ensemble, Label, answer, best_closure, mark, opened, score, seal
 from yid_ocp.errors import OutputError, YidError
 from yid_ocp.workflow.build import build_problem, build_system
@@ -71,7 +70,6 @@ def run_blind(
     finer = (lambda times: build_system(run, links * times)) if links else None
     ensemble = Ensemble(problem, seed, finer, run.diagnosis.candidates)
     cases = _made(run, ensemble, folder, count, seed, watcher)
-    limits = Thresholds(level=run.diagnosis.level, effects=run.diagnosis.effects)
     for i, case in enumerate(cases):
         watcher.advance(i, len(cases), f"diagnosing {case.name}")
         path = folder / "answers" / f"{case.name}.json"
@@ -79,7 +77,7 @@ def run_blind(
             continue
         begun = time.perf_counter()
         try:
-            result = answer(ensemble, case, run.diagnosis.candidates, limits).to_dict()
+            result = answer(ensemble, case, run.diagnosis.candidates, run.diagnosis).to_dict()
         except YidError as error:
             result = _nothing(str(error))
         _write(path, {"seconds": time.perf_counter() - begun, "result": result})

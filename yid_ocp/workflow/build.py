@@ -21,7 +21,7 @@ from yid_ocp.effects import make_effect
 from yid_ocp.errors import DataError, ModelError, YidError, nearest
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model import FlexibleObject, Grasp, Mechanism, Segment, System, flexible_object
-from yid_ocp.model.cable import BranchOptions, Cable, CableOptions, cable_system, length_values, read_vertices
+from yid_ocp.model.cable import Cable, cable_system, length_values, read_vertices
 from yid_ocp.model.parameters import Parameters
 from yid_ocp.model.rotations import roll_pitch_yaw
 from yid_ocp.model.system import Spring, placement_matrix
@@ -32,6 +32,8 @@ from yid_ocp.problem.episodes import Episode
 
 GIVEN_FRAMES = 2  # of a cable's free points, from which every prediction starts
 LARGEST_GAP = 0.01  # what encoder noise and a slightly wrong length of the object can make of a grasp [m]
+OBJECT = "object"  # key of the object's damping beside those of the joints
+JOINT_DAMPING = 0.05  # of joints that a damping by name does not mention [N m s/rad]
 Placed = tuple[FlexibleObject, str | None, np.ndarray | None]
 
 
@@ -70,21 +72,15 @@ def build_system(run: Run, links: int | None = None) -> System:
     if isinstance(model.object, CableObject):
         return _cable_model(run)
     robot = _robot(run)
-    by_name = dict(model.damping) if isinstance(model.damping, Mapping) else None
-    everywhere = 0.05 if by_name is not None else float(model.damping)  # type: ignore[arg-type]
     joints = () if robot is None else robot.joint_names
-    if by_name is not None:
-        for name in by_name:
-            if name not in joints:
-                raise run.refuse(f"there is no joint '{name}'", "model", "damping", name, hint=nearest(name, joints))
-    damping = dict.fromkeys(joints, everywhere) | (by_name or {})
+    damping, of_object = _dampings(run, joints)
     for name, spring in model.springs.items():
         if name not in joints:
             raise run.refuse(f"there is no joint '{name}'", "model", "springs", name, hint=nearest(name, joints))
         if spring.damping is not None:
             damping[name] = spring.damping
     with located(run, "model", "object"):
-        objects = _objects(run, everywhere, links)
+        objects = _objects(run, of_object, links)
     mode = model.arms.mode
     for i, name in enumerate(model.arms.passive):
         if name not in joints:
@@ -108,15 +104,35 @@ def build_system(run: Run, links: int | None = None) -> System:
             points=model.points,
             springs={name: Spring(s.stiffness, s.rest) for name, s in model.springs.items()},
         )
-    return _completed(run, system)
+    return _completed(run, system, links)
 
 
-def _completed(run: Run, system: System) -> System:
+def _dampings(run: Run, joints: Sequence[str]) -> tuple[dict[str, float], float]:
+    """Damping of every joint of the robot, and of the object's joints."""
+    said = run.model.damping
+    if not isinstance(said, Mapping):
+        return dict.fromkeys(joints, said), said
+    known = (*joints, OBJECT) if run.model.object is not None else joints
+    for name in said:
+        if name not in known:
+            raise run.refuse(f"there is no joint '{name}'", "model", "damping", name, hint=nearest(name, known))
+    if run.model.object is not None and OBJECT not in said:
+        raise run.refuse(
+            "the damping is given by joint, but not that of the object",
+            "model",
+            "damping",
+            allowed=f"joints of the robot and `{OBJECT}`, for all joints of the object",
+            hint=f"set model.damping.{OBJECT}",
+        )
+    return {name: said.get(name, JOINT_DAMPING) for name in joints}, said.get(OBJECT, JOINT_DAMPING)
+
+
+def _completed(run: Run, system: System, links: int | None = None) -> System:
     """The system with its effects, its parameters at the values and bounds of the settings."""
     for i, said in enumerate(run.model.effects):
         with located(run, "model", "effects", i):
             system = system.with_effects([make_effect(said.kind, said.location, system, dict(said.values))])
-    return replace(system, parameters=_set_parameters(run, system.parameters))
+    return replace(system, parameters=_set_parameters(run, system.parameters, links))
 
 
 def _cable_model(run: Run) -> System:
@@ -134,19 +150,8 @@ def _cable_model(run: Run) -> System:
     recordings = read_recordings(run, "estimate")
     if not recordings:
         raise run.refuse("a cable's lengths come from recordings", "recordings", "estimate", hint="list at least one")
-    options = CableOptions(
-        {name: BranchOptions(**vars(branch)) for name, branch in item.branches.items()},
-        radius=item.radius,
-        end=item.end,
-        rest_shape=item.rest_shape,
-        rigid_clamp=item.rigid_clamp,
-        separate_lengths=item.separate_lengths,
-        memory=item.memory,
-        rest_angles=item.rest_angles,
-        gravity=run.model.gravity,
-    )
     with located(run, "model", "object"):
-        system = cable_system(edge_lengths(cable.edges, recordings), cable, options)
+        system = cable_system(edge_lengths(cable.edges, recordings), cable, replace(item, gravity=run.model.gravity))
     return _completed(run, system)
 
 
@@ -215,10 +220,16 @@ def _objects(run: Run, damping: float, links: int | None) -> list[Placed]:
     if item is None or isinstance(item, CableObject):
         return []
     if isinstance(item, YObject):
-        count = item.links if links is None else links
-        factor = count / item.links
+        factor = _stiffening(item, "", links)
         segments = [
-            replace(s, links=count, bend=s.bend * factor, twist=s.twist * factor, damping=damping) for s in y_segments()
+            replace(
+                segment,
+                links=item.links if links is None else links,
+                bend=segment.bend * factor,
+                twist=segment.twist * factor,
+                damping=damping,
+            )
+            for segment in y_segments()
         ]
         if item.mount is None:
             made = flexible_object(segments, placement_matrix(Y_FOOT), "y_object", item.gravity_fraction)
@@ -241,8 +252,7 @@ def _segments(item: SegmentedObject, damping: float, links: int | None) -> list[
                 f"segment '{name}' has no length", where=f"segments.{name}", hint="set length or link_lengths"
             )
         count = s.links if links is None or s.link_lengths is not None else links
-        # a rigidity does not depend on the number of links, a stiffness per joint does
-        factor = 1.0 if s.rigidity else count / s.links
+        factor = _stiffening(item, name, links)
         result.append(
             Segment(
                 name,
@@ -254,18 +264,29 @@ def _segments(item: SegmentedObject, damping: float, links: int | None) -> list[
                 s.parent,
                 s.at_link,
                 roll_pitch_yaw(*s.rpy),
-                bend=s.bend * factor,
-                twist=s.twist * factor,
-                damping=damping if s.damping is None else s.damping,
-                twist_damping=s.twist_damping,
+                bend=Segment.bend * factor,
+                twist=Segment.twist * factor,
+                damping=damping,
+                twist_damping=damping if s.twist_damping else None,
                 rigidity=s.rigidity,
                 clamped=s.clamped,
                 joint_order=s.joint_order,
                 section=s.section,
-                separate_lengths=s.separate_lengths,
+                link_length_parameters=s.link_length_parameters,
             )
         )
     return result
+
+
+def _stiffening(item: YObject | SegmentedObject, name: str, links: int | None) -> float:
+    """How many times as stiff every joint of a segment is with other links than those of the settings."""
+    if links is None:
+        return 1.0
+    if isinstance(item, YObject):
+        return links / item.links
+    said = item.segments[name]
+    # a rigidity does not depend on the number of links, a stiffness per joint does
+    return 1.0 if said.rigidity or said.link_lengths is not None else links / said.links
 
 
 # -- parameters -------------------------------------------------------------------------------------------------------
@@ -295,14 +316,14 @@ def parameter_settings(run: Run, parameters: Parameters) -> dict[str, ParameterS
     return result
 
 
-def _set_parameters(run: Run, parameters: Parameters) -> Parameters:
+def _set_parameters(run: Run, parameters: Parameters, links: int | None) -> Parameters:
     chosen = parameter_settings(run, parameters)
     entries = []
     for entry in parameters:
         if entry.name in chosen:
-            said = chosen[entry.name]
-            lower, upper = (entry.lower, entry.upper) if said.bounds is None else said.bounds
-            value = entry.value if said.initial is None else said.initial
+            said, factor = chosen[entry.name], _parameter_factor(run, entry.name, links)
+            lower, upper = (entry.lower, entry.upper) if said.bounds is None else (factor * b for b in said.bounds)
+            value = entry.value if said.initial is None else factor * said.initial
             key = _key_of(run, entry.name)
             if lower < entry.lower or upper > entry.upper or lower > upper:
                 raise run.refuse(
@@ -316,6 +337,14 @@ def _set_parameters(run: Run, parameters: Parameters) -> Parameters:
                 entry = replace(entry, value=value, lower=lower, upper=upper)
         entries.append(entry)
     return Parameters(entries)
+
+
+def _parameter_factor(run: Run, name: str, links: int | None) -> float:
+    """By what a setting of a parameter is multiplied with other links than those of the settings."""
+    item, (owner, _, quantity) = run.model.object, name.rpartition(".")
+    if item is None or isinstance(item, CableObject) or quantity not in ("bend", "twist") or "@" in owner:
+        return 1.0
+    return _stiffening(item, owner, links)
 
 
 def _key_of(run: Run, name: str) -> str:
@@ -355,13 +384,9 @@ def read_recordings(run: Run, which: str) -> list[Recording]:
 
 def build_step(run: Run, system: System | None = None) -> Step:
     """The compiled step of a run."""
-    solver = run.solver
-    return compile_step(
-        build_system(run) if system is None else system,
-        solver.time_step,
-        solver.force_split,
-        use_compiler=solver.compiler,
-    )
+    said = run.problem
+    system = build_system(run) if system is None else system
+    return compile_step(system, said.time_step, said.force_split, use_compiler=said.compiler)
 
 
 def problem_options(run: Run, parameters: Parameters, recordings: Sequence[Recording] = ()) -> ProblemOptions:
@@ -375,44 +400,30 @@ def problem_options(run: Run, parameters: Parameters, recordings: Sequence[Recor
     recordings : sequence of Recording
         Where values differ from recording to recording (a cable's edges), those of these.
     """
-    solver, chosen = run.solver, parameter_settings(run, parameters)
-    for name in solver.start_parameters:
+    chosen = parameter_settings(run, parameters)
+    for name in run.problem.start_parameters:
         if name not in parameters:
             raise run.refuse(
-                f"there is no parameter '{name}'", "solver", "start_parameters", hint=nearest(name, parameters.names)
+                f"there is no parameter '{name}'", "problem", "start_parameters", hint=nearest(name, parameters.names)
             )
-    sensors = {
-        name: SensorOptions(s.use, s.std, dict(s.frames), s.points, s.position_std) for name, s in run.sensors.items()
-    }
+    sensors = dict(run.sensors)
     cable = build_cable(run)
     own: dict[str, dict[str, float]] = {}
     if cable is not None and isinstance(run.model.object, CableObject):
         for group in {group.name for recording in recordings for group in recording.points}:
             said = sensors.get(group, SensorOptions())
             sensors[group] = said if said.points is not None else replace(said, points=cable.free)
-        if run.model.object.separate_lengths:
+        if run.model.object.lengths_per_recording:
             own = {
                 recording.name: length_values(cable, edge_lengths(cable.edges, [recording], GIVEN_FRAMES))
                 for recording in recordings
             }
-    return ProblemOptions(
-        initial_state=solver.initial_state,
-        feedback=solver.feedback,
-        gains=tuple(solver.gains),
-        weighting=solver.weighting,
-        huber_threshold=solver.huber_threshold,
-        path_cutoff=solver.path_cutoff,
+    return replace(
+        run.problem,
         sensors=sensors,
         clamps=() if cable is None else cable.clamps,
         local=tuple(name for name, said in chosen.items() if said.local),
         priors={name: said.prior for name, said in chosen.items() if said.prior is not None},
-        weak_prior_factor=solver.weak_prior_factor,
-        configuration_std=solver.configuration_std,
-        velocity_std=solver.velocity_std,
-        duration=solver.duration,
-        start_window=solver.start_window,
-        start_std=solver.start_std,
-        start_parameters=solver.start_parameters,
         recording_values=own,
     )
 

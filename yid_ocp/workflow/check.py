@@ -56,7 +56,7 @@ def run_check(run: Run, out: str | Path | None = None, monitor: Monitor | None =
         warnings: list[str] = []
         watcher.stage("building the model")
         # the equations are the same compiled or not, and a check needs only a few steps
-        plain = replace(run, solver=replace(run.solver, compiler=False))
+        plain = replace(run, problem=replace(run.problem, compiler=False))
         step = build_step(plain)
         model = {"name": step.system.mechanism.name, **step.sizes}
         recordings, problem = [], None
@@ -136,11 +136,11 @@ def refine(run: Run, problem: EstimationProblem | None, warnings: list[str]) -> 
         `links` and `time_step`: lists of {value, hertz, growing, message}; empty where there is nothing to vary.
     """
     system = build_system(run)
-    h = run.solver.time_step
+    h = run.problem.time_step
     posture = _posture(system, problem)
     if posture is None:
         return {"links": [], "time_step": [], "message": "no posture is known: the run names no recording"}
-    theta, split, guess = system.parameters.vector(), run.solver.force_split, None
+    theta, split, guess = system.parameters.vector(), run.problem.force_split, None
     if problem is not None:
         first = problem.episodes[0]
         theta = problem.predictor.own_theta(first, theta)
@@ -149,9 +149,9 @@ def refine(run: Run, problem: EstimationProblem | None, warnings: list[str]) -> 
     if own.message:
         return {"links": [], "time_step": [], "message": own.message}
     if own.growing:
-        remedy = "solver.force_split: left_damping, " if split == "symmetric" else ""
+        remedy = "problem.force_split: left_damping, " if split == "symmetric" else ""
         warnings.append(
-            f"{own.growing} modes grow from step to step about the first posture: take a shorter solver.time_step, "
+            f"{own.growing} modes grow from step to step about the first posture: take a shorter problem.time_step, "
             f"{remedy}or more damping"
         )
     values = dict(zip(system.parameters.names, theta, strict=True))

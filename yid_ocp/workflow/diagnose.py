@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 
 from yid_ocp.config.settings import Run, dump_config
-from yid_ocp.diagnosis import Finding, Thresholds, diagnose
+from yid_ocp.diagnosis import Finding, diagnose
 from yid_ocp.diagnosis.localise import units
 from yid_ocp.errors import OutputError
 from yid_ocp.problem import EstimationProblem, SensorOptions
@@ -87,13 +87,12 @@ def run_diagnose(run: Run, out: str | Path | None = None, monitor: Monitor | Non
         if run.diagnosis.noise_fraction < 1 and problem.held_out:
             # in units of noise the solver would take any fit for a bad one and start again elsewhere
             note("solving the nominal model")
-            nominal = solve(problem, run.solver.method)
-        said = run.diagnosis
+            nominal = solve(problem, run.solver)
         try:
             finding = diagnose(
                 in_units_of_noise(problem, run),
-                said.candidates,
-                thresholds=Thresholds(level=said.level, effects=said.effects),
+                run.diagnosis.candidates,
+                thresholds=run.diagnosis,
                 solution=nominal,
                 progress=note,
                 store=refits,

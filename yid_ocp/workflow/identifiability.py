@@ -111,7 +111,7 @@ def run_identifiability(
             def note(entry: Any) -> None:
                 folder.log("iterate", iteration=entry.iteration, cost=entry.cost, seconds=entry.seconds)
 
-            solution = solve(problem, run.solver.method, callback=both(note, watcher.iterate))
+            solution = solve(problem, run.solver, callback=both(note, watcher.iterate))
         if solution is None or solution.status != Status.FAILED:
             watcher.stage("Fisher information")
             known = identifiability(problem, solution, start="known", grasp_std=None)

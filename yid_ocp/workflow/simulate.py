@@ -99,7 +99,7 @@ def _virtual(run: Run, watcher: Monitor, seed: int) -> Recording:
 
     system = build_system(run)
     watcher.stage("simulating a virtual experiment in MuJoCo")
-    duration = run.solver.duration or DURATION
+    duration = run.problem.duration or DURATION
     return virtual_experiment(system, None, duration=duration, seed=seed, name=run.name, description=run.description)
 
 

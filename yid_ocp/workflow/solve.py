@@ -86,7 +86,7 @@ def run_solve(run: Run, out: str | Path | None = None, monitor: Monitor | None =
             values = {name: float(value) for name, value in zip(problem.shared, entry.x, strict=False)}
             folder.log("iterate", iteration=entry.iteration, cost=entry.cost, gradient=entry.gradient, x=values)
 
-        solution = solve(problem, run.solver.method, callback=both(note, watcher.iterate))
+        solution = solve(problem, run.solver, callback=both(note, watcher.iterate))
         watcher.stage("predicting the held-out recordings")
         held_out = problem.validate(solution.x)
         result = solve_result(problem, solution, held_out, build_cable(run)) | {

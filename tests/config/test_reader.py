@@ -1,0 +1,286 @@
+"""Reading: defaults, numbers, paths, settings over the file, and what is refused with which words."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import math
+from dataclasses import MISSING
+
+import pytest
+from ruamel.yaml import YAML
+
+from yid_ocp.config.keys import sections_of
+from yid_ocp.config.reader import DEFAULT, load_config
+from yid_ocp.config.settings import Run
+from yid_ocp.errors import ConfigError
+from yid_ocp.options import BOUNDS, entries_of, members, options_of, stripped, values_of, words
+from yid_ocp.solvers import GaussNewton, SteepestDescent
+
+
+def test_the_embedded_default_is_the_one_in_configs(repository):
+    embedded = repository / "yid_ocp" / "data" / "defaults" / DEFAULT
+    assert embedded.read_bytes() == (repository / "configs" / DEFAULT).read_bytes()
+    assert load_config() == dataclasses.replace(load_config(repository / "configs" / DEFAULT))
+
+
+def test_numbers_as_in_yaml_1_2(written):
+    run = load_config(
+        written(
+            "problem: {time_step: 1e-3, huber_threshold: .inf, path_cutoff: 5}\n"
+            "solver: {iterations: 010}\ndescription: 'yes'\n"
+        )
+    )
+    assert run.problem.time_step == 1e-3
+    assert math.isinf(run.problem.huber_threshold)
+    assert run.solver == GaussNewton(iterations=10)
+    assert run.problem.path_cutoff == 5.0
+    assert run.description == "yes"
+
+
+def test_a_solver_has_the_settings_of_its_method(written):
+    run = load_config(written("solver: {name: steepest_descent, iterations: 7, shrink: 0.3}\n"))
+    assert run.solver == SteepestDescent(iterations=7, shrink=0.3)
+    with pytest.raises(ConfigError, match="there is no key 'shrink'"):
+        load_config(written("solver: {name: gauss_newton, shrink: 0.3}\n"))
+
+
+def test_paths_are_relative_to_the_file(written, tmp_path):
+    run = load_config(
+        written(
+            "model: {robot: ../arm.urdf}\n"
+            "recordings: {estimate: [a/b.h5, default:x.h5], held_out: [/elsewhere/c.h5]}\n"
+            "output: {folder: results}\n"
+        )
+    )
+    assert run.model.robot == str((tmp_path.parent / "arm.urdf").resolve())
+    assert run.recordings.estimate == (str(tmp_path.resolve() / "a" / "b.h5"), "default:x.h5")
+    assert run.recordings.held_out == ("/elsewhere/c.h5",)
+    assert run.output.folder == str(tmp_path.resolve() / "results")
+    assert load_config(written("model: {robot: package:panda}\n")).model.robot == "package:panda"
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ("parameters.T1.bend.initial=5", ("parameters", "T1.bend", "initial", 5.0)),
+        ("parameters.kelvin_voigt@T3.tau.free=true", ("parameters", "kelvin_voigt@T3.tau", "free", True)),
+        ("parameters.T*.bend.bounds=[0, 9]", ("parameters", "T*.bend", "bounds", (0.0, 9.0))),
+        ("sensors.joints.effort.std=0.1", ("sensors", "joints.effort", "std", 0.1)),
+        ("sensors.joints.effort.std={a: 0.1}", ("sensors", "joints.effort", "std", {"a": 0.1})),
+        ("model.grasp.left.kind=weld", ("model", "grasp", "left", "kind", "weld")),
+        ("solver.iterations=3", ("solver", "iterations", 3)),
+        ("model.object={kind: y, links: 2}", ("model", "object", "links", 2)),
+        ("model.object.links=6", ("model", "object", "links", 6)),
+        ("model.damping=0.1", ("model", "damping", 0.1)),
+        ("model.springs.left_s1={stiffness: 20}", ("model", "springs", "left_s1", "stiffness", 20.0)),
+        ("parameters.T1.bend={initial: 5, free: false}", ("parameters", "T1.bend", "free", False)),
+        (
+            "diagnosis.candidates=[density, kelvin_voigt@T3]",
+            ("diagnosis", "candidates", ("density", "kelvin_voigt@T3")),
+        ),
+    ],
+)
+def test_settings_over_the_file(setting, value):
+    node = load_config(None, [setting])
+    for key in value[:-1]:
+        node = node[key] if isinstance(node, dict) else getattr(node, key)
+    assert node == value[-1]
+
+
+def test_settings_over_the_file_keep_what_they_do_not_touch():
+    run = load_config(None, ["parameters.T1.bend.initial=5"])
+    assert run.parameters["T1.bend"].free
+    assert len(run.parameters) == 6
+    assert run.where("parameters", "T1.bend", "initial").startswith("--set parameters.T1.bend.initial")
+    assert "line" in run.where("parameters", "T2.bend", "free")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("model:\n  object: {links: 4}\n", "line 2: model.object"),
+        ("model:\n  object: {kind: cube}\n", "there is no kind 'cube'"),
+        ("model:\n  object: 3\n", "model.object = 3 is not a section"),
+        ("model:\n  object:\n    kind: segments\n    segments: {a: {length: 1, radius: 0.1}}\n", "'mass' is missing"),
+        ("model:\n  grasp: {left: {holder: x}}\n", "'held' is missing"),
+        ("model:\n  grasp: [left]\n", "model.grasp"),
+        ("model:\n  gravity: [0, 0]\n", "a list of 3"),
+        ("model:\n  arms: {joints: left_s0}\n", "a list"),
+        ("problem:\n  duration: true\n", "a number"),
+        ("problem:\n  time_step: '0.01'\n", "a number"),
+        ("problem:\n  gains: []\n", "problem.gains"),
+        ("description: 2024-01-01\n", "description"),
+        ("sensors:\n  points: {std: 0}\n", "above 0"),
+    ],
+)
+def test_refusals(written, text, message):
+    with pytest.raises(ConfigError) as caught:
+        load_config(written(text))
+    assert message in str(caught.value)
+    assert "run.yaml" in str(caught.value)
+    assert "line" in str(caught.value)
+
+
+def test_old_or_misplaced_keys_are_told_their_section(written):
+    for key in ("time_step", "force_split", "compiler", "initial_state", "path_cutoff", "weighting", "huber_threshold"):
+        with pytest.raises(ConfigError, match=f"there is no key '{key}' in solver") as caught:
+            load_config(written(f"solver: {{{key}: 1}}\n"))
+        assert f"'{key}' is a key of `problem`" in caught.value.hint
+        with pytest.raises(ConfigError) as caught:
+            load_config(None, [f"solver.{key}=1"])
+        assert f"'{key}' is a key of `problem`" in caught.value.hint
+    with pytest.raises(ConfigError) as caught:
+        load_config(written("problem: {iteration: 3}\n"))
+    assert caught.value.hint == "did you mean 'duration'?"
+    with pytest.raises(ConfigError) as caught:
+        load_config(written("problem: {iterations: 3}\n"))
+    assert "'iterations' is a key of `solver`, `compare.methods.NAME`, `track.options.fit`" in caught.value.hint
+    with pytest.raises(ConfigError) as caught:
+        load_config(written("solver: {name: steepest_descent, step_tolerance: 1}\n"))
+    assert "'step_tolerance' is a key of `solver` with name: gauss_newton, lifted" in caught.value.hint
+    with pytest.raises(ConfigError) as caught:
+        load_config(written("solver: {held_out: []}\n"))
+    assert caught.value.hint == "'held_out' is a key of `recordings`"
+    with pytest.raises(ConfigError) as caught:
+        load_config(written("solver: {parameters: {}}\n"))
+    assert caught.value.hint == "'parameters' is a key of the file itself"
+    with pytest.raises(ConfigError) as caught:
+        load_config(written("xyzzy: 3\n"))
+    assert (caught.value.hint, "solver" in caught.value.allowed) == ("", True)
+
+
+def test_what_only_code_sets_is_no_key(written):
+    for text in ("problem: {known_start: {}}\n", "problem: {priors: {a: 1}}\n", "places: {}\n", "name: a\n"):
+        with pytest.raises(ConfigError, match="there is no key"):
+            load_config(written(text))
+
+
+METHODS = "compare:\n  methods:\n    gauss_newton: {}\n    lifted:\n      VALUE\n"
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        ("iterations: abc", ("compare.methods.lifted.iterations", "a whole number from 1", "line 5")),
+        ("iterations: -3", ("compare.methods.lifted.iterations = -3", "a whole number from 1", "line 5")),
+        ("iterations: 3.0", ("a whole number from 1",)),
+        ("defect_tolerance: 0", ("a number above 0 [rad, m or N m s]",)),
+        ("iteration: 3", ("there is no key 'iteration' in compare.methods.lifted", "did you mean 'iterations'?")),
+        ("trial: last", ("there is no key 'trial'", "node_interval", "line 5")),
+        ("name: lifted", ("there is no key 'name'",)),
+    ],
+)
+def test_compared_methods_are_typed_like_the_solver(written, value, words):
+    with pytest.raises(ConfigError) as caught:
+        load_config(written(METHODS.replace("VALUE", value)))
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_compared_methods(written):
+    run = load_config(written(METHODS.replace("VALUE", "iterations: 7")))
+    assert list(run.compare.methods) == ["gauss_newton", "lifted"]
+    assert (run.compare.methods["lifted"].iterations, run.compare.methods["lifted"].name) == (7, "lifted")
+    with pytest.raises(ConfigError, match="there is no solver 'newton'") as caught:
+        load_config(written("compare: {methods: {newton: {}}}\n"))
+    assert caught.value.hint == "did you mean 'gauss_newton'?"
+    assert "line 1: compare.methods.newton" in caught.value.where
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("compare.methods.gauss_newton.iterations=abc", "a whole number from 1"),
+        ("compare.methods.gauss_newton.iterations=0", "a whole number from 1"),
+        ("compare.methods.gauss_newton.iteration=3", "did you mean 'iterations'?"),
+        ("compare.methods.newton.iterations=3", "did you mean 'gauss_newton'?"),
+        ("solver.iterations=-3", "a whole number from 1"),
+        ("solver.time_step=0.01", "'time_step' is a key of `problem`"),
+    ],
+)
+def test_refused_settings_over_the_file(setting, message):
+    with pytest.raises(ConfigError) as caught:
+        load_config(None, [setting])
+    assert message in str(caught.value)
+    assert f"--set {setting.split('=')[0]}" in str(caught.value)
+
+
+# Numbers that may have any value: places, angles, offsets.
+ANY_NUMBER = {
+    "model.arms.locked.NAME",
+    "model.springs.NAME.rest",
+    "model.effects.values.NAME",
+    "parameters.NAME.initial",
+    "track.virtual.latency",
+    "track.options.filters.floor",
+    "track.options.filters.floor_margin",
+    "track.options.filters.behind",
+    "track.options.clock.offset",
+}
+
+
+def numbers(hint, wrap=lambda value: value, path=(), option=None):
+    """Every number that a file may hold: its key, what the file around it looks like, its option's type, its bounds."""
+    sections = sections_of(hint)
+    for word, kind in (sections.classes if sections is not None else {}).items():
+        options = options_of(kind)
+        needed = {name: needed_value(entry.hint) for name, entry in options.items() if entry.default is MISSING}
+        needed |= {sections.key: word} if sections.key else {}
+        for name, entry in options.items():
+            yield from numbers(entry.hint, within(wrap, name, needed), (*path, name), entry.hint)
+    if sections is not None:
+        return
+    values = values_of(hint)
+    named = sections_of(values)
+    if named is not None and named.key == "name":
+        for name in named.classes:
+            yield from numbers(named.of(name, "").classes[""], within(wrap, name), (*path, name))
+    elif values is not None:
+        yield from numbers(values, within(wrap, "NAME"), (*path, "NAME"), option)
+    for member in members(hint):
+        entries, (bare, markers) = entries_of(member), stripped(member)
+        if entries is not None:
+            yield from numbers(entries, lambda value: wrap([value]), path, option)
+        if bare in (int, float):
+            kinds = tuple(kind for kind, *_ in BOUNDS)
+            bounds = [marker for marker in (*stripped(hint)[1], *markers) if isinstance(marker, kinds)]
+            yield ".".join(path), wrap, option, bounds
+
+
+def within(wrap, name, beside=None):
+    return lambda value: wrap({**(beside or {}), name: value})
+
+
+def needed_value(hint):
+    bare, _ = stripped(hint)
+    return 1.0 if bare is float else [*"abcde"] if entries_of(hint) is not None else "a"
+
+
+NUMBERS = list(numbers(Run))
+
+
+def outside():
+    """A wrong value for every bound."""
+    for key, wrap, option, bounds in NUMBERS:
+        for bound in bounds:
+            [value] = [getattr(bound, name) for kind, name, *_ in BOUNDS if isinstance(bound, kind)]
+            wrong = {"Gt": value, "Lt": value, "Ge": value - 1, "Le": value + 1}[type(bound).__name__]
+            yield pytest.param(key, wrap(wrong), option, id=f"{key}={wrong}")
+
+
+def test_every_number_has_bounds_or_may_be_anything():
+    assert {key for key, _, _, bounds in NUMBERS if not bounds} == ANY_NUMBER
+    assert len({key for key, *_ in NUMBERS}) > 100
+
+
+@pytest.mark.parametrize(("key", "data", "option"), list(outside()))
+def test_a_number_outside_its_bounds_is_refused(written, key, data, option):
+    stream = io.StringIO()
+    YAML(typ="safe").dump(data, stream)
+    with pytest.raises(ConfigError) as caught:
+        load_config(written(stream.getvalue()))
+    assert caught.value.allowed == words(option)
+    assert "line" in caught.value.where
+    last = [part for part in key.split(".") if part != "NAME"][-1]
+    assert last in caught.value.where

@@ -1,0 +1,65 @@
+"""The JSON Schema that editors use."""
+
+from __future__ import annotations
+
+import json
+
+import jsonschema
+import pytest
+from ruamel.yaml import YAML
+
+from yid_ocp.config.schema import schema, settings_page
+
+
+def test_the_one_beside_the_configurations_is_current(repository):
+    kept = json.loads((repository / "configs" / "schema.json").read_text(encoding="utf-8"))
+    assert kept == schema(), "regenerate it with  yid-ocp schema --out configs/schema.json"
+
+
+def test_the_page_in_the_docs_is_current(repository):
+    page = settings_page()
+    assert (repository / "docs" / "settings.md").read_text(encoding="utf-8") == page, (
+        "CONTRIBUTING.md says how to make it"
+    )
+    for line in (
+        "| `time_step` | of the integrator | a number above 0 up to 0.1 [s] | `0.01` |",
+        "## solver, name: lifted",
+        "## model.object.segments.NAME",
+        "| `mass` | mass of the whole segment | a number above 0 [kg] | needed |",
+    ):
+        assert f"\n{line}\n" in page
+    assert "known_start" not in page
+
+
+def test_the_schema_accepts_every_configuration_and_refuses_typos(repository):
+    rules = schema()
+    jsonschema.Draft202012Validator.check_schema(rules)
+    files = sorted((repository / "configs").glob("*.yaml"))
+    assert len(files) >= 5
+    for file in files:
+        jsonschema.validate(YAML(typ="safe").load(file.read_text()), rules)
+    for wrong in (
+        {"sovler": {}},
+        {"problem": {"time_step": "fast"}},
+        {"problem": {"known_start": {}}},
+        {"model": {"object": {"kind": "cube"}}},
+        {"model": {"object": {"links": 4}}},
+        {"model": {"effects": [{"kind": "density"}]}},
+        {"solver": {"iterations": -3}},
+        {"solver": {"shrink": 0.3}},
+        {"solver": {"name": "lifted", "trial": "last"}},
+        {"compare": {"methods": {"gauss_newton": {"iterations": "abc"}}}},
+        {"compare": {"methods": {"newton": {}}}},
+    ):
+        with pytest.raises(jsonschema.ValidationError):
+            jsonschema.validate(wrong, rules)
+    for right in (
+        {"solver": {"name": "steepest_descent", "shrink": 0.3}},
+        {"solver": {"iterations": 3}},
+        {"compare": {"methods": {"gauss_newton": {"iterations": 3}, "lifted": {}}}},
+        {"model": {"object": None}},
+    ):
+        jsonschema.validate(right, rules)
+    described = rules["properties"]["problem"]["properties"]["time_step"]
+    assert described["description"] == "of the integrator [s]"
+    assert described["default"] == 0.01

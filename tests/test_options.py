@@ -1,0 +1,74 @@
+"""Options say of themselves what is allowed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass
+from typing import Annotated, Literal
+
+import pytest
+from annotated_types import Ge, Gt, Le, Len, Lt
+
+from yid_ocp.errors import ConfigError
+from yid_ocp.options import About, check, options_of, words
+from yid_ocp.solvers import GaussNewton, Lifted, SteepestDescent
+
+
+@dataclass(frozen=True)
+class Wheel:
+    """An example."""
+
+    radius: Annotated[float, Gt(0), Le(2), About("of the tyre", "m")]
+    spokes: Annotated[int | None, Ge(3), About("none when absent")] = None
+    wear: Annotated[tuple[Annotated[float, Ge(0), Lt(1)], ...], Len(1), About("of each tread")] = (0.5,)
+    tyre: Annotated[Literal["slick", "grooved"], About("kind of tyre")] = "slick"
+    load: Annotated[Annotated[float, Ge(0)] | Mapping[str, float], About("by axle", "N")] = 0.0
+    serial: int = -1
+
+    def __post_init__(self) -> None:
+        check(self, "wheel")
+
+
+def test_options_are_the_fields_that_say_what_they_are():
+    options = options_of(Wheel)
+    assert list(options) == ["radius", "spokes", "wear", "tyre", "load"]
+    assert (options["radius"].default, options["spokes"].default) == (MISSING, None)
+
+
+def test_words():
+    told = {name: words(option.hint) for name, option in options_of(Wheel).items()}
+    assert told == {
+        "radius": "a number above 0 up to 2 [m]",
+        "spokes": "a whole number from 3",
+        "wear": "a list, each a number from 0 below 1, 1 at least",
+        "tyre": "slick, grooved",
+        "load": "a number from 0 or names, each with a number [N]",
+    }
+
+
+@pytest.mark.parametrize(
+    ("values", "allowed"),
+    [
+        ({"radius": 0.0}, "a number above 0 up to 2 [m]"),
+        ({"radius": 2.1}, "a number above 0 up to 2 [m]"),
+        ({"radius": float("nan")}, "a number above 0 up to 2 [m]"),
+        ({"radius": 1.0, "spokes": 2}, "a whole number from 3"),
+        ({"radius": 1.0, "wear": (0.2, 1.0)}, "a list, each a number from 0 below 1, 1 at least"),
+        ({"radius": 1.0, "load": -1.0}, "a number from 0 or names, each with a number [N]"),
+    ],
+)
+def test_numbers_outside_their_bounds_are_refused(values, allowed):
+    with pytest.raises(ConfigError) as caught:
+        Wheel(**values)
+    assert (caught.value.where, caught.value.allowed) == ("wheel", allowed)
+
+
+def test_numbers_on_their_bounds_and_none_are_allowed():
+    Wheel(2.0)
+    Wheel(1.0, 3, (0.0,), load={"rear": -1.0}, serial=-5)
+
+
+@pytest.mark.parametrize("kind", [GaussNewton, Lifted, SteepestDescent])
+def test_solvers_refuse_them_too(kind):
+    with pytest.raises(ConfigError, match="iterations = -3"):
+        kind(iterations=-3)

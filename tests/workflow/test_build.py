@@ -1,0 +1,221 @@
+"""From settings to systems and problems: the paper's, segments, springs, effects, and errors that name the setting."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import yid_ocp as yid
+from yid_ocp.config.reader import load_config
+from yid_ocp.config.settings import SegmentedObject, YObject, dump_config
+from yid_ocp.errors import ConfigError, ModelError
+from yid_ocp.workflow.build import build_problem, build_system, load_problem, load_system, problem_options
+
+
+@pytest.mark.parametrize(("name", "size", "constraints"), [("single_arm_vision", 43, 3), ("dual_arm_vision", 50, 6)])
+def test_the_papers_systems(repository, paper_systems, name, size, constraints):
+    system = yid.load_system(repository / "configs" / f"{name}.yaml")
+    assert (system.size, system.constraint_count) == (size, constraints)
+    reference = paper_systems["single" if size == 43 else "dual"]
+    assert system.mechanism.joint_names == reference.mechanism.joint_names
+    assert system.parameters.names == reference.parameters.names
+    np.testing.assert_array_equal(system.parameters.vector(), reference.parameters.vector())
+    assert system.parameters.vector({"T1.bend": 22.0})[system.parameters.index("T1.bend")] == 22.0
+
+
+def test_parameters_of_a_run(written):
+    run = load_config(
+        written(
+            "model: {object: {kind: y}}\n"
+            "parameters:\n"
+            "  T*.bend: {initial: 5, free: true, bounds: [0, 50]}\n"
+            "  T2.bend: {initial: 7, prior: 2.0}\n"
+            "  T1.mass: {initial: 0.07}\n"
+        )
+    )
+    system = build_system(run)
+    assert [system.parameters[f"T{i}.bend"].value for i in (1, 2, 3)] == [5, 7, 5]
+    assert system.parameters["T3.bend"].upper == 50
+    assert system.parameters["T1.mass"].value == 0.07
+    options = problem_options(run, system.parameters)
+    assert options.priors == {"T2.bend": 2.0}
+
+
+def test_an_object_of_segments_on_a_robots_hand(written):
+    run = load_config(
+        written(
+            "model:\n"
+            "  robot: package:panda\n"
+            "  arms:\n"
+            f"    joints: [{', '.join(f'panda_joint{i}' for i in range(1, 8))}]\n"
+            "    mode: prescribed\n"
+            "  object:\n"
+            "    kind: segments\n"
+            "    mount: {frame: panda_hand, xyz: [0, 0, 0.1], rpy: [0, 1.5708, 0]}\n"
+            "    segments:\n"
+            "      beam: {length: 0.5, mass: 0.3, radius: 0.01, links: 5, rigidity: true, clamped: true}\n"
+            "      tip: {link_lengths: [0.1, 0.05], mass: 0.01, radius: 0.01, parent: beam}\n"
+            "parameters: {beam.bend: {initial: 1.3}, tip.damping: {initial: 0.001}}\n"
+        )
+    )
+    assert isinstance(run.model.object, SegmentedObject)
+    system = build_system(run)
+    assert system.size == 7 + 15 + 6
+    assert len(system.prescribed) == 7
+    assert system.parameters["beam.bend"].unit == "N m^2"
+    assert system.parameters["tip.damping"].value == 0.001
+    finer = build_system(run, links=10)
+    assert finer.size == 7 + 30 + 6
+    assert finer.parameters["beam.bend"].value == 1.3
+    assert finer.parameters["tip.bend"].value == 3.0
+
+
+def test_more_links_keep_the_stiffness_of_a_tube(written):
+    run = load_config(written("model: {object: {kind: y, mount: {xyz: [0, 0, 1]}}, damping: 0.02}\n"))
+    assert isinstance(run.model.object, YObject)
+    finer = build_system(run, links=8)
+    assert finer.parameters["T1.bend"].value == 6.0
+    assert finer.parameters["T1.damping"].value == 0.02
+    assert finer.size == 72
+
+
+def test_springs_on_joints(written, urdf_folder):
+    run = load_config(
+        written(
+            f"model:\n  robot: {urdf_folder / 'mixed_joints.urdf'}\n  arms: {{mode: passive}}\n"
+            "  springs:\n    hinge: {stiffness: 2.0, rest: 0.1, damping: 0.3}\n    slide: {stiffness: 50.0}\n"
+            "  damping: {spin: 0.2}\n"
+        )
+    )
+    system = build_system(run)
+    parameters = system.parameters
+    assert (parameters["hinge.stiffness"].unit, parameters["hinge.rest"].value) == ("N m/rad", 0.1)
+    assert (parameters["slide.stiffness"].unit, parameters["slide.rest"].unit) == ("N/m", "m")
+    assert [parameters[f"{joint}.damping"].value for joint in ("hinge", "spin", "slide")] == [0.3, 0.2, 0.05]
+    assert (system.driven, system.prescribed) == ((), ())
+
+
+def test_effects_bring_their_parameters(written):
+    text = (
+        "model:\n"
+        "  object: {kind: y}\n"
+        "  effects:\n"
+        "    - {kind: kelvin_voigt, location: T3}\n"
+        "    - {kind: density, location: T2, values: {scale: 1.1}}\n"
+        "parameters:\n"
+        "  kelvin_voigt@T3.tau: {free: true, initial: 0.02}\n"
+    )
+    run = load_config(written(text))
+    system = build_system(run)
+    assert [(effect.kind, effect.location) for effect in system.effects] == [("kelvin_voigt", "T3"), ("density", "T2")]
+    assert system.parameters["kelvin_voigt@T3.tau"].value == 0.02
+    assert system.parameters["density@T2.scale"].value == 1.1
+    assert load_config(written(dump_config(run))) == run
+    for old, new, message in (
+        ("kelvin_voigt, loc", "kelvin_voight, loc", "line 4: model.effects.0"),
+        ("location: T2", "location: T9", "line 5: model.effects.1"),
+        ("location: T3", "locaton: T3", "did you mean 'location'?"),
+        ("scale: 1.1", "scale: much", "model.effects.1.values"),
+    ):
+        with pytest.raises((ConfigError, ModelError)) as caught:
+            load_system(written(text.replace(old, new)))
+        assert message in str(caught.value)
+
+
+def test_errors_of_the_model_name_the_setting(written):
+    for text, message in (
+        ("model:\n  robot: package:baxterr\n", "line 2: model.robot"),
+        ("model:\n  robot: package:baxter\n  damping: {left_s9: 1}\n", "line 3: model.damping.left_s9"),
+        ("model:\n  object: {kind: segments, segments: {a: {mass: 1, radius: 0.1}}}\n", "line 2: model.object"),
+        ("model:\n  object: {kind: y}\n  points: [w_T9]\n", "line 1: model"),
+    ):
+        with pytest.raises((ConfigError, ModelError)) as caught:
+            load_system(written(text))
+        assert message in str(caught.value)
+
+
+def test_a_problem_from_a_file(repository):
+    problem = load_problem(
+        repository / "configs" / "single_arm_vision.yaml",
+        ["model.object.links=1", "problem.compiler=false", "problem.duration=0.3", "sensors.points_camera.use=false"],
+    )
+    assert problem.free == tuple(f"T{i}.{kind}" for i in (1, 2, 3) for kind in ("bend", "twist"))
+    assert [s.sensor.group for s in problem.episodes[0].samples] == ["points_arm"]
+    assert len(problem.held_out) == 1
+    assert (
+        build_problem(load_config(repository / "configs" / "single_arm_vision.yaml"), problem.step).free == problem.free
+    )
+
+
+SEGMENTED = (
+    "model:\n  object:\n    kind: segments\n    segments:\n"
+    "      a: {length: 0.4, mass: 0.1, radius: 0.01, links: 2}\n"
+    "      b: {length: 0.4, mass: 0.1, radius: 0.01, links: 2, parent: a, rigidity: true, twist_damping: true}\n"
+    "parameters:\n  '*.bend': {initial: 5, bounds: [1, 8]}\n  a.twist: {initial: 2}\n  b.damping: {initial: 0.3}\n"
+)
+
+
+def test_a_stiffness_stands_under_parameters_alone(written):
+    for key in ("bend", "twist", "damping"):
+        with pytest.raises(ConfigError, match=f"there is no key '{key}'"):
+            load_config(written(SEGMENTED.replace("links: 2,", f"links: 2, {key}: 1,")))
+    parameters = build_system(load_config(written(SEGMENTED))).parameters
+    assert [parameters[name].value for name in ("a.bend", "b.bend", "a.twist", "b.twist")] == [5, 5, 2, 3]
+    assert [parameters[name].value for name in ("a.damping", "b.damping", "b.twist_damping")] == [0.05, 0.3, 0.05]
+    assert "a.twist_damping" not in parameters
+
+
+def test_more_links_scale_what_is_said_of_a_stiffness_per_joint(written):
+    finer = build_system(load_config(written(SEGMENTED)), links=6).parameters
+    assert [finer[name].value for name in ("a.bend", "a.twist", "b.bend", "b.damping")] == [15, 6, 5, 0.3]
+    assert (finer["a.bend"].lower, finer["a.bend"].upper) == (3, 24)
+    assert (finer["b.bend"].lower, finer["b.bend"].upper) == (1, 8)
+    foam = load_config(written("model: {object: {kind: y}}\nparameters: {T1.bend: {initial: 10}}\n"))
+    finer = build_system(foam, links=8).parameters
+    assert [finer[name].value for name in ("T1.bend", "T2.bend")] == [20, 6]
+
+
+def test_link_lengths_as_parameters(written):
+    names = build_system(load_config(written(SEGMENTED))).parameters.names
+    assert "a.length" in names
+    run = load_config(written(SEGMENTED.replace("links: 2}", "links: 2, link_length_parameters: true}")))
+    names = build_system(run).parameters.names
+    assert {"a.length_0", "a.length_1", "b.length"} <= set(names)
+    assert "a.length" not in names
+
+
+BY_JOINT = (
+    "model:\n  robot: {urdf}\n  arms: {{mode: passive}}\n  object: {{kind: y}}\n  damping: {{hinge: 0.2{more}}}\n"
+)
+
+
+def test_damping_by_joint_says_that_of_the_object_too(written, urdf_folder):
+    urdf = urdf_folder / "mixed_joints.urdf"
+    system = build_system(load_config(written(BY_JOINT.format(urdf=urdf, more=", object: 0.01"))))
+    assert [system.parameters[f"{name}.damping"].value for name in ("hinge", "slide")] == [0.2, 0.05]
+    assert [system.parameters[f"T{i}.damping"].value for i in (1, 2, 3)] == [0.01] * 3
+    with pytest.raises(ConfigError, match="not that of the object") as caught:
+        load_system(written(BY_JOINT.format(urdf=urdf, more="")))
+    assert "line 5: model.damping" in caught.value.where
+    assert "`object`" in caught.value.allowed
+    with pytest.raises(ConfigError, match="there is no joint 'object'"):
+        load_system(written(BY_JOINT.format(urdf=urdf, more=", object: 1").replace("object: {kind: y}", "points: []")))
+
+
+def test_a_problem_has_the_options_of_its_section(written):
+    run = load_config(
+        written(
+            "model: {object: {kind: y}}\n"
+            "sensors: {points: {std: 0.1}}\n"
+            "problem: {weighting: paper, huber_threshold: 3, start_parameters: [T1.mass], duration: 2}\n"
+            "parameters: {T1.bend: {prior: 2, local: true}}\n"
+        )
+    )
+    options = problem_options(run, build_system(run).parameters)
+    assert (options.weighting, options.huber_threshold, options.duration) == ("paper", 3.0, 2.0)
+    assert (options.start_parameters, options.local, options.priors) == (("T1.mass",), ("T1.bend",), {"T1.bend": 2.0})
+    assert options.sensors["points"].std == 0.1
+    wrong = load_config(written("model: {object: {kind: y}}\nproblem: {start_parameters: [T1.mas]}\n"))
+    with pytest.raises(ConfigError, match=r"there is no parameter 'T1.mas'") as caught:
+        problem_options(wrong, build_system(wrong).parameters)
+    assert "line 2: problem.start_parameters" in caught.value.where

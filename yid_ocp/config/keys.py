@@ -1,0 +1,111 @@
+"""Which keys stand where: the settings' classes as a configuration file sees them, for reader, `--set` and schema."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+from yid_ocp.errors import ConfigError, nearest
+from yid_ocp.options import Among, Option, entries_of, members, options_of, stripped, values_of
+
+
+@dataclass(frozen=True)
+class Sections:
+    """Settings classes for which a section may be meant.
+
+    Attributes
+    ----------
+    classes : mapping of str to type
+        By the word that chooses one; a single one under the empty word.
+    key : str
+        Which key holds the word, empty where there is no choice.
+    default : str
+        The word where the key is absent, empty where it must be given.
+    noun : str
+        What the classes are.
+    nullable : bool
+        Whether there may be none.
+    """
+
+    classes: Mapping[str, type]
+    key: str = ""
+    default: str = ""
+    noun: str = ""
+    nullable: bool = False
+
+    def word(self, raw: Any) -> Any:
+        """What a section says about the choice."""
+        return raw.get(self.key, self.default) if self.key and isinstance(raw, dict) else self.default
+
+    def keys(self, word: Any = "") -> Mapping[str, Option]:
+        """Keys of the section of a word, of the first one for another word."""
+        known = isinstance(word, str) and word in self.classes
+        options = options_of(self.classes[word] if known else next(iter(self.classes.values())))
+        if self.key in ("", *options):
+            return options
+        return {self.key: Option(Literal[tuple(self.classes)], self.default), **options}
+
+    def of(self, name: str, where: str) -> Sections:
+        """What stands under a name in a mapping of such sections; of a registry's, the class of that name."""
+        if self.key != "name":
+            return self
+        if name not in self.classes:
+            raise self.unknown(name, where)
+        return Sections({"": self.classes[name]})
+
+    def unknown(self, word: object, where: str) -> ConfigError:
+        """That a word chooses nothing."""
+        what = f"there is no {self.noun} '{word}'" if word else f"the key '{self.key}' is missing"
+        hint = nearest(str(word), self.classes) if word else ""
+        return ConfigError(what, where=where, allowed=", ".join(self.classes), hint=hint)
+
+
+def sections_of(hint: Any) -> Sections | None:
+    """The settings classes of a type; None for other types."""
+    bare, markers = stripped(hint)
+    nullable = type(None) in get_args(bare)
+    among = next((marker for marker in markers if isinstance(marker, Among)), None)
+    if among is not None:
+        classes = {name: among.registry[name] for name in among.registry}
+        return Sections(classes, "name", among.default, among.registry.noun, nullable)
+    kinds = [stripped(member)[0] for member in members(bare)]
+    if not kinds or not all(map(dataclasses.is_dataclass, kinds)):
+        return None
+    if len(kinds) == 1:
+        return Sections({"": kinds[0]}, nullable=nullable)
+    return Sections({options_of(kind)["kind"].default: kind for kind in kinds}, "kind", "", "kind", nullable)
+
+
+def unknown_key(root: type, name: str, known: Iterable[str], where: str, within: str = "") -> ConfigError:
+    """That a section has no such key, with the nearest one that it has and the sections that have this one."""
+    names = list(known)
+    close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+    homes = list(dict.fromkeys(homes_of(root, name)))
+    hints = [f"did you mean '{close[0]}'?"] if close else []
+    hints += [f"'{name}' is a key of {', '.join(homes[:3])}"] if homes else []
+    return ConfigError(
+        f"there is no key '{name}'" + (f" in {within}" if within else ""),
+        where=where,
+        allowed=", ".join(names),
+        hint="; ".join(hints),
+    )
+
+
+def homes_of(hint: Any, name: str, at: str = "") -> Iterator[str]:
+    """Sections that have a key, in words; NAME stands for a name that users choose."""
+    for inner, step in ((values_of(hint), ".NAME"), (entries_of(hint), "")):
+        if inner is not None:
+            yield from homes_of(inner, name, at + step)
+    sections = sections_of(hint)
+    if sections is None:
+        return
+    having = [word for word, kind in sections.classes.items() if name in options_of(kind)]
+    if having:
+        choice = "" if len(having) == len(sections.classes) else f" with {sections.key}: {', '.join(having)}"
+        yield (f"`{at}`" if at else "the file itself") + choice
+    for kind in sections.classes.values():
+        for key, option in options_of(kind).items():
+            yield from homes_of(option.hint, name, f"{at}.{key}" if at else key)

@@ -1,0 +1,119 @@
+"""What a configuration may say: as JSON Schema for editors, and as tables for people."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import MISSING
+from typing import Any
+
+from pydantic import TypeAdapter
+
+from yid_ocp.config.keys import Sections, sections_of
+from yid_ocp.config.settings import Run
+from yid_ocp.options import About, Option, entries_of, options_of, stripped, values_of, words
+
+
+def schema() -> dict[str, Any]:
+    """JSON Schema of a configuration file."""
+    head = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "yid-ocp configuration"}
+    return head | _of(Run)
+
+
+def _of(hint: Any) -> dict[str, Any]:
+    about = _about(hint)
+    text = about.text + (f" [{about.unit}]" if about.unit else "")
+    return _bare(hint) | ({"description": text} if text else {})
+
+
+def _bare(hint: Any) -> dict[str, Any]:
+    sections, entries, values = sections_of(hint), entries_of(hint), values_of(hint)
+    if sections is not None:
+        parts = [_section(sections, word) for word in sections.classes]
+        parts += [{"type": "null"}] if sections.nullable else []
+        return parts[0] if len(parts) == 1 else {"anyOf": parts}
+    if entries is not None and sections_of(entries) is not None:
+        return {"type": "array", "items": _of(entries)}
+    inner = sections_of(values)
+    if inner is not None and inner.key == "name":
+        named = {name: _section(inner.of(name, ""), "") for name in inner.classes}
+        return {"type": "object", "properties": named, "additionalProperties": False}
+    if inner is not None:
+        return {"type": "object", "additionalProperties": _of(values)}
+    return TypeAdapter(hint).json_schema()
+
+
+def _section(sections: Sections, word: str) -> dict[str, Any]:
+    kind = sections.classes[word]
+    properties: dict[str, Any] = {}
+    required = []
+    if sections.key == "name":
+        properties["name"] = {"const": word, "description": f"the {sections.noun}"}
+    for name, option in options_of(kind).items():
+        properties[name] = _of(option.hint)
+        default = option.default
+        if default is MISSING:
+            required.append(name)
+        elif isinstance(default, (bool, int, str)) or (isinstance(default, float) and math.isfinite(default)):
+            properties[name]["default"] = default
+    if sections.key and word != sections.default:
+        required.append(sections.key)
+    result: dict[str, Any] = {"type": "object", "properties": properties, "additionalProperties": False}
+    if kind.__doc__:
+        result["description"] = kind.__doc__.splitlines()[0]
+    return result | ({"required": required} if required else {})
+
+
+def _about(hint: Any) -> About:
+    """What the outermost marker says."""
+    return next((marker for marker in reversed(stripped(hint)[1]) if isinstance(marker, About)), About())
+
+
+# -- for people -------------------------------------------------------------------------------------------------------
+
+
+def settings_page() -> str:
+    """Every key with what it means, what is allowed and its default, in Markdown."""
+    lines = [
+        "# Settings",
+        "",
+        "Every key of a configuration file. NAME stands for a name of yours or of the model.",
+        "This page is made from the code; CONTRIBUTING.md has the command.",
+    ]
+    tables = {title: (text, rows) for title, text, rows in _tables(Run, "")}
+    for title, (text, rows) in tables.items():
+        lines += ["", f"## {title}", "", text, "", "| key | meaning | allowed | default |", "|---|---|---|---|", *rows]
+    return "\n".join(lines) + "\n"
+
+
+def _tables(hint: Any, path: str) -> Iterator[tuple[str, str, list[str]]]:
+    """Title, first sentence and rows of a section and of all below it."""
+    sections = sections_of(hint)
+    for word, kind in sections.classes.items() if sections is not None else ():
+        options = options_of(kind)
+        title = f"{path}, {sections.key}: {word}" if sections is not None and sections.key else path or "The file"
+        yield title, (kind.__doc__ or "").splitlines()[0], [_row(*item) for item in options.items()]
+        for name, option in options.items():
+            yield from _tables(option.hint, f"{path}.{name}" if path else name)
+    values, entries = values_of(hint), entries_of(hint)
+    named = sections_of(values)
+    if values is not None and (named is None or named.key != "name"):
+        yield from _tables(values, f"{path}.NAME")
+    if entries is not None:
+        yield from _tables(entries, path)
+
+
+def _row(name: str, option: Option) -> str:
+    default = "needed" if option.default is MISSING else _default(option.default)
+    cells = (f"`{name}`", _about(option.hint).text, words(option.hint), default)
+    return "| " + " | ".join(cells) + " |"
+
+
+def _default(value: Any) -> str:
+    if value is None or value in ({}, "") or dataclasses.is_dataclass(value):
+        return ""
+    if isinstance(value, Mapping):
+        return ", ".join(f"`{name}`" for name in value)
+    return "`.inf`" if value == math.inf else f"`{json.dumps(value)}`"
