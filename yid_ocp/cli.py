@@ -219,7 +219,8 @@ def _import_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _export(arguments: argparse.Namespace) -> int:
-    from yid_ocp.data import export_csv, read_recording
+    from yid_ocp.data import read_recording
+    from yid_ocp.export.csv import export_csv
 
     recording = read_recording(arguments.recording, allow_nan_effort=True)
     files = export_csv(recording, arguments.out)

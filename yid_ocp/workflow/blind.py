@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import Any
 
 from yid_ocp.config.settings import Run, dump_config
-from yid_ocp.data.recording import new_file, read_recording, write_recording
+from yid_ocp.data.recording import read_recording, write_recording
 from yid_ocp.diagnosis import Thresholds
 from yid_ocp.diagnosis.blind import Case, Ensemble, Label, answer, best_closure, mark, opened, score, seal
 from yid_ocp.errors import OutputError, YidError
+from yid_ocp.files import jsonable, new_file
 from yid_ocp.workflow.build import build_problem, build_system
-from yid_ocp.workflow.folder import Monitor, Silent, jsonable, versions
+from yid_ocp.workflow.folder import Monitor, Silent, versions
 
 COMMITMENT, LABELS, RESULT, TABLE = "commitment.json", "sealed/labels.json", "result.json", "table.md"
 

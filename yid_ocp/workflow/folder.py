@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
-import math
 import os
 import platform
 import secrets
@@ -17,11 +16,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Protocol, TextIO
 
-import numpy as np
-
 from yid_ocp.config.settings import Run
-from yid_ocp.data.recording import file_sha256
 from yid_ocp.errors import OutputError
+from yid_ocp.files import file_sha256, jsonable, write_text
 from yid_ocp.solvers import Iterate
 from yid_ocp.workflow.build import input_files
 
@@ -83,7 +80,7 @@ class RunFolder:
 
     def write(self, name: str, text: str) -> None:
         """Write a text file."""
-        (self.path / name).write_text(text, encoding="utf-8")
+        write_text(self.path / name, text)
 
     def write_json(self, name: str, data: Mapping[str, Any]) -> dict[str, Any]:
         """Write JSON without infinities: they become null, and `notes` says where; returns what was written."""
@@ -102,21 +99,6 @@ class _Lines(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         self._folder.log("message", level=record.levelname, source=record.name, text=record.getMessage())
-
-
-def jsonable(value: Any, notes: list[str] | None = None, path: str = "") -> Any:
-    """A value in JSON's types; numbers that are not finite become None and a line in `notes`."""
-    if isinstance(value, Mapping):
-        return {str(k): jsonable(v, notes, f"{path}.{k}" if path else str(k)) for k, v in value.items()}
-    if isinstance(value, (list, tuple, np.ndarray)):
-        return [jsonable(v, notes, f"{path}[{i}]") for i, v in enumerate(value)]
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float) and not math.isfinite(value):
-        if notes is not None:
-            notes.append(f"{path} is {'not known' if math.isnan(value) else 'infinite'}")
-        return None
-    return value if value is None or isinstance(value, (bool, int, float, str)) else str(value)
 
 
 def _grouped(notes: list[str]) -> list[str]:

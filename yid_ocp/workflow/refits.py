@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import logging
 import math
 import threading
 from collections.abc import Mapping
 
-from yid_ocp.data.recording import new_file
 from yid_ocp.diagnosis import Refitted
 from yid_ocp.errors import OutputError
+from yid_ocp.files import content_hash, write_json
 from yid_ocp.workflow.folder import RunFolder
 
 FORMAT = "yid-refits/1"
@@ -33,7 +32,7 @@ class Refits:
     def __init__(self, folder: RunFolder, *made_from: Mapping[str, str] | str) -> None:
         self.file = folder.partial / "refits.json"
         self._folder = folder
-        self._key = hashlib.sha256(json.dumps(made_from, sort_keys=True).encode()).hexdigest()
+        self._key = content_hash(made_from)
         self._lock = threading.Lock()
         self._warned = False
         self._known = self._read()
@@ -56,11 +55,9 @@ class Refits:
                 key: {"values": _texts(fit.values), "std": _texts(fit.std), "message": fit.message}
                 for key, fit in self._known.items()
             }
-            text = json.dumps({"format": FORMAT, "key": self._key, "refits": refits}, indent=1, allow_nan=False)
             try:
                 self.file.parent.mkdir(parents=True, exist_ok=True)
-                with new_file(self.file) as fresh:
-                    fresh.write_text(text + "\n", encoding="utf-8")
+                write_json(self.file, {"format": FORMAT, "key": self._key, "refits": refits})
             except (OSError, OutputError) as error:
                 if not self._warned:
                     log.warning("finished refits cannot be kept (%s); the diagnosis goes on without", error)
