@@ -114,13 +114,13 @@ def test_an_interrupted_diagnosis_takes_up_its_finished_refits(rubbing, tmp_path
         run_diagnose(run, tmp_path / "run", Interrupting(after=1))
     done, counted.count = counted.count, 0
     assert 0 < done <= once
-    assert "the same command takes them up" in caplog.text
+    assert "the same command resumes them" in caplog.text
     assert [path.name for path in tmp_path.iterdir() if path.name.startswith("run")] == ["run.partial"]
     again = run_diagnose(run, tmp_path / "run")
     assert counted.count == once - done
     assert close(without_times(again.folder), without_times(whole.folder))
     lines = [json.loads(line) for line in (again.folder / "log.jsonl").read_text().splitlines()]
-    assert {"the nominal model"} < {line["refit"] for line in lines if line["event"] == "taken_up"}
+    assert {"the nominal model"} < {line["refit"] for line in lines if line["event"] == "resumed"}
     assert any("took up the refit with" in line.get("text", "") for line in lines)
     assert not (tmp_path / "run.partial").exists()
     assert not list(tmp_path.glob(".*"))
@@ -133,8 +133,8 @@ def test_a_changed_configuration_takes_nothing_up(rubbing, tmp_path, monkeypatch
     assert (tmp_path / "runs" / "rubbing-diagnose.partial" / "refits.json").is_file()
     caplog.clear()
     outcome = run_diagnose(load_config(rubbing, ["diagnosis.level=0.02"]))
-    assert sum("not taken up" in record.getMessage() for record in caplog.records) == 1
-    assert "taken_up" not in (outcome.folder / "log.jsonl").read_text()
+    assert sum("not resumed" in record.getMessage() for record in caplog.records) == 1
+    assert '"resumed"' not in (outcome.folder / "log.jsonl").read_text()
     assert list((tmp_path / "runs").iterdir()) == [outcome.folder]
 
 

@@ -49,9 +49,9 @@ def test_springs_that_cannot_be_told_apart(cli, repository, tmp_path):
         "identifiability", repository / "configs" / "springs_torsion.yaml", "--out", tmp_path / "run", "--what-if"
     )
     assert done.code == 0, done.err
-    assert "none of 2 parameters identifiable" in done.out
+    assert "none of 2 parameters can be found" in done.out
     assert "1/spring_1.stiffness + 1/spring_2.stiffness, as springs in series are" in done.out
-    assert "fewest changes that make all of them identifiable: coupling_marker, seen by the camera" in done.out
+    assert "fewest changes with which all of them can be found: coupling_marker, seen by the camera" in done.out
     result = read(tmp_path / "run")
     jsonschema.validate(result, RESULT)
     assert result["start"] == "unknown"
@@ -62,7 +62,7 @@ def test_springs_that_cannot_be_told_apart(cli, repository, tmp_path):
         assert upper is None
     report = (tmp_path / "run" / "report.html").read_text()
     assert "What another experiment would tell" in report
-    assert "not identifiable" in report
+    assert "cannot be found" in report
     assert {"config.yaml", "log.jsonl"} <= {entry.name for entry in (tmp_path / "run").iterdir()}
 
 
@@ -71,7 +71,7 @@ def test_springs_that_can(cli, repository, tmp_path):
     options = ("--intervals", "spring_1.stiffness", "--known-start", "--known-grasp", "--set", "output.report=false")
     done = cli("identifiability", file, "--out", tmp_path / "run", *options)
     assert done.code == 0, done.err
-    assert "2 of 2 parameters identifiable" in done.out
+    assert "2 of 2 parameters can be found" in done.out
     result = read(tmp_path / "run")
     jsonschema.validate(result, RESULT)
     assert result["what_if"] is None

@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from yid_ocp.config.reader import DIAGNOSIS_DEFAULT, load_config
 from yid_ocp.config.settings import Run, dump_config
 from yid_ocp.data.recording import read_recording, write_recording
 from yid_ocp.diagnosis import Thresholds
 from yid_ocp.diagnosis.blind import Case, Ensemble, Label, answer, best_closure, mark, opened, score, seal
 from yid_ocp.errors import OutputError, YidError
 from yid_ocp.files import jsonable, new_file
+from yid_ocp.report.tables import blind_table
+from yid_ocp.report.terminal import blind_summary
 from yid_ocp.workflow.build import build_problem, build_system
-from yid_ocp.workflow.folder import Monitor, Silent, versions
+from yid_ocp.workflow.command import DONE, carry_out
+from yid_ocp.workflow.folder import versions
+from yid_ocp.workflow.progress import SILENT, Progress
 
 COMMITMENT, LABELS, RESULT, TABLE = "commitment.json", "sealed/labels.json", "result.json", "table.md"
 
@@ -30,9 +36,19 @@ class BlindOutcome:
     result: dict[str, Any]
 
 
-def run_blind(
-    run: Run, out: str | Path, count: int = 20, seed: int = 1, monitor: Monitor | None = None
-) -> BlindOutcome:
+def run(arguments: argparse.Namespace) -> int:
+    """The command."""
+    settings = load_config(arguments.config, arguments.overrides, DIAGNOSIS_DEFAULT)
+    out = arguments.out or f"{settings.name}-blind-{arguments.seed}"
+
+    def proved(shown: Progress) -> BlindOutcome:
+        return run_blind(settings, out, arguments.cases, arguments.seed, shown)
+
+    carry_out(proved, blind_summary, arguments.quiet)
+    return DONE
+
+
+def run_blind(run: Run, out: str | Path, count: int = 20, seed: int = 1, progress: Progress = SILENT) -> BlindOutcome:
     """Prove a diagnosis blind; what a folder of the same name holds already is not done again.
 
     Parameters
@@ -45,7 +61,7 @@ def run_blind(
     count : int
         Number of cases.
     seed : int
-    monitor : Monitor, optional
+    progress : Progress, optional
 
     Returns
     -------
@@ -57,7 +73,6 @@ def run_blind(
     OutputError
         The folder holds another ensemble.
     """
-    watcher = monitor or Silent()
     folder = Path(out)
     if count < 1:
         raise run.refuse(f"an ensemble of {count} cases", "diagnosis", hint="give --cases from 1")
@@ -71,10 +86,10 @@ def run_blind(
     links = len(problem.system.segments[0].links) if problem.system.segments else 0
     finer = (lambda times: build_system(run, links * times)) if links else None
     ensemble = Ensemble(problem, seed, finer, run.diagnosis.candidates)
-    cases = _made(run, ensemble, folder, count, seed, watcher)
+    cases = _made(run, ensemble, folder, count, seed, progress)
     limits = Thresholds(level=run.diagnosis.level, effects=run.diagnosis.effects)
     for i, case in enumerate(cases):
-        watcher.advance(i, len(cases), f"diagnosing {case.name}")
+        progress.advance(i, len(cases), f"diagnosing {case.name}")
         path = folder / "answers" / f"{case.name}.json"
         if path.exists():
             continue
@@ -87,7 +102,7 @@ def run_blind(
     labels = opened((folder / LABELS).read_text("utf-8"), json.loads((folder / COMMITMENT).read_text())["sha256"])
     marks = []
     for i, (case, label) in enumerate(zip(cases, labels, strict=True)):
-        watcher.advance(i, len(cases), f"scoring {case.name}")
+        progress.advance(i, len(cases), f"scoring {case.name}")
         marks.append(_marked(ensemble, folder, case, label, run))
     result = score(marks) | {"seed": seed, "versions": versions(), "candidates": run.diagnosis.candidates}
     written = _write(folder / RESULT, result)
@@ -95,7 +110,7 @@ def run_blind(
     return BlindOutcome(folder, written)
 
 
-def _made(run: Run, ensemble: Ensemble, folder: Path, count: int, seed: int, watcher: Monitor) -> list[Case]:
+def _made(run: Run, ensemble: Ensemble, folder: Path, count: int, seed: int, progress: Progress) -> list[Case]:
     """The ensemble's cases, from the folder or made now; their labels are sealed before this returns."""
     config = dump_config(run)
     commitment = folder / COMMITMENT
@@ -116,7 +131,7 @@ def _made(run: Run, ensemble: Ensemble, folder: Path, count: int, seed: int, wat
         raise OutputError(f"the folder cannot be made: {error}", where=str(folder)) from error
     cases, labels = [], []
     for number in range(count):
-        watcher.advance(number, count, f"making case {number}")
+        progress.advance(number, count, f"making case {number}")
         case, label = ensemble.draw(number, count)
         for recording in (case.estimate, case.held_out):
             write_recording(recording, folder / "cases" / f"{recording.name}.h5")
@@ -165,57 +180,3 @@ def _write(path: Path, data: Any) -> Any:
     with new_file(path) as temporary:
         temporary.write_text(json.dumps(clean, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     return clean
-
-
-def blind_table(result: Mapping[str, Any]) -> list[str]:
-    """The score and every case, as Markdown."""
-
-    def share(value: float | None, digits: int = 0) -> str:
-        return "-" if value is None else f"{100 * value:.{digits}f} %"
-
-    def row(*cells: str) -> str:
-        return f"| {' | '.join(cells)} |"
-
-    lines = [row("what", "value"), row("---", "---")]
-    lines += [
-        row("false alarms on clean data", share(result["false_alarms"])),
-        row("true kind and place first, of the gaps found", share(result["kind_first"])),
-        row("among the first two", share(result["kind_in_two"])),
-        row("place first", share(result["location_first"])),
-        row("sets named as not separable hold the truth", share(result["confusable_covers"])),
-        row("their size", "-" if result["confusable_size"] is None else f"{result['confusable_size']:.1f}"),
-        row("unknown said of effects outside the library", share(result["unknown_recall"])),
-        row("their place", share(result["unknown_location"])),
-        row("pairs found", share(result["pairs_right"])),
-        row("closure over that of the true effect refitted", share(result["closure_of_best"])),
-        row("median error of the effects' parameters", share(result["parameter_error"], 1)),
-        row("their 95 % intervals that hold the truth", share(result["interval_coverage"])),
-        row("time of one diagnosis", "-" if result["seconds"] is None else f"{result['seconds']:.0f} s"),
-    ]
-    lines += ["", row("size / detectable", "cases", "gap seen", "right"), row(*["---"] * 4)]
-    for size, entry in result["detection"].items():
-        lines.append(row(size, str(entry["cases"]), share(entry["gap"]), share(entry["right"])))
-    head = ("case", "sort", "truth", "size", "verdict", "added", "not separable", "place", "closure", "best", "time")
-    lines += ["", row(*head), row(*["---"] * len(head))]
-    for entry in result["marks"]:
-        lines.append(
-            row(
-                entry["case"],
-                entry["category"],
-                entry["truth"],
-                "-" if entry["multiple"] is None else f"{entry['multiple']:.3g}",
-                entry["verdict"] + ("" if entry["right"] or entry["category"] == "finer_chain" else " (wrong)"),
-                entry["answer"],
-                ", ".join(entry["confusable"]) or "-",
-                "right" if entry["location_first"] else "-",
-                share(entry["closure"]),
-                share(entry["best"]),
-                "-" if entry["seconds"] is None else f"{entry['seconds']:.0f} s",
-            )
-        )
-    return lines
-
-
-def summary_lines(result: Mapping[str, Any]) -> Sequence[str]:
-    """The table for people: the score alone."""
-    return [line.strip("| ").replace(" | ", ": ") for line in blind_table(result)[2:15]]

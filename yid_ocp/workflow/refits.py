@@ -22,7 +22,10 @@ class Refits:
     """A store of refits in one JSON file: {format, key, refits: {name: {values, std, message}}}.
 
     The file is replaced as a whole after every refit. One that was made from other inputs, by another configuration or
-    by another version is passed over with a notice.
+    by another version is skipped with a notice.
+
+    Refits run in threads, not as tasks of `yid_ocp.parallel`: all of one diagnosis share a compiled step and what was
+    worked out from the recordings, and a refit takes less time than to build these in another process.
 
     Attributes
     ----------
@@ -41,10 +44,10 @@ class Refits:
         return len(self._known)
 
     def get(self, name: str) -> Refitted | None:
-        """See `yid_ocp.diagnosis.select.Store`; what is taken up is said in the log."""
+        """See `yid_ocp.diagnosis.select.Store`; what is resumed is said in the log."""
         found = self._known.get(name)
         if found is not None:
-            self._folder.log("taken_up", refit=name)
+            self._folder.log("resumed", refit=name)
         return found
 
     def put(self, name: str, refitted: Refitted) -> None:
@@ -83,7 +86,7 @@ class Refits:
             return {}
         except (OSError, ValueError, LookupError, TypeError, AttributeError):
             reason = "something that cannot be read"
-        log.warning("the refits in %s are from %s and are not taken up", self.file, reason)
+        log.warning("the refits in %s are from %s and are not resumed", self.file, reason)
         return {}
 
 
