@@ -145,7 +145,7 @@ def run_tasks(
     kept = {key: job.kept() for key, job in unique.items()}
     found = {key: replace(result, resumed=True) for key, result in kept.items() if result is not None}
     if found and progress is not None:
-        progress(len(found), len(unique), f"{len(found)} were done before")
+        progress(len(found), len(unique), f"{len(found)} done before")
 
     def finished(job: _Job, result: TaskResult) -> None:
         found[job.key] = result
