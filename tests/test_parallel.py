@@ -105,7 +105,14 @@ def half(text: str) -> str:
 
 
 @pytest.mark.parametrize(
-    "spoiled", [half, lambda text: "", lambda text: "[1]", lambda text: text.replace('"number": 0', '"number": 9')]
+    "spoiled",
+    [
+        half,
+        lambda text: "",
+        lambda text: "[1]",
+        lambda text: text.replace('"number": 0', '"number": 9'),
+        lambda text: text.replace("yid-task/1", "yid-task/0"),
+    ],
 )
 def test_a_result_that_is_not_whole_is_not_taken(tmp_path, threads, spoiled):
     calls, folder = tmp_path / "calls", tmp_path / "results"

@@ -44,7 +44,7 @@ def counted(monkeypatch):
 
 
 class Interrupting:
-    """A monitor that presses Ctrl-C after so many refits."""
+    """Progress that presses Ctrl-C after so many refits."""
 
     def __init__(self, after: int) -> None:
         self.left = after
