@@ -1,10 +1,11 @@
-"""InjectedEffect effects in data from MuJoCo: what the diagnosis says of each, failures included.
+"""Injected effects in data from MuJoCo: what the diagnosis says of each, failures included.
 
-    python benchmarks/diagnosis_cases.py [CASE ...] [--seeds 1 7] [--json FILE]
+    python benchmarks/diagnosis_cases.py [CASE ...] [--seeds 1 7] [--json FILE] [--workers 2] [--keep DIR]
 
 Every case is one arm that moves the foam Y (43 variables, 5 s to estimate on, 5 s of another motion held out, arm and
 camera points), all candidates of the library in play. Effects are done in the simulator's own terms
-(`yid_ocp.virtual.injected`).
+(`yid_ocp.virtual.injected`). With `--keep`, what a folder holds is not done again; it counts for one version of the
+package only, so take another folder after a change of the code.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import sys
+import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -26,6 +29,7 @@ from yid_ocp.diagnosis import Finding, Thresholds, diagnose
 from yid_ocp.diagnosis.blind import finer_values
 from yid_ocp.diagnosis.hypotheses import CandidateProblem, chosen_effects
 from yid_ocp.diagnosis.select import refit
+from yid_ocp.parallel import Task, process_pool, run_tasks
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.virtual.experiment import Motion, initial_posture
 from yid_ocp.virtual.injected import InjectedEffect, injected_experiment
@@ -36,7 +40,7 @@ NOISE_SEEDS = (401, 402)
 
 @dataclass(frozen=True)
 class Case:
-    """What is done in the simulator, the verdict that it deserves, and what the library is robbed of."""
+    """What is done in the simulator, the verdict that it deserves, and what is left out of the library."""
 
     withheld: tuple[InjectedEffect, ...]
     verdict: str = "effect"
@@ -156,22 +160,31 @@ def run(name: str, seeds: Sequence[int]) -> dict[str, str]:
     }
 
 
-def main() -> None:
+def main() -> int:
     parser = argparse.ArgumentParser(description="Diagnose withheld effects in data from MuJoCo.")
     parser.add_argument("cases", nargs="*", default=list(CASES), help=", ".join(CASES))
     parser.add_argument("--seeds", nargs=2, type=int, default=(1, 7), help="of the two motions")
     parser.add_argument("--json", type=Path, metavar="FILE", help="store the table")
+    parser.add_argument("--workers", type=int, default=1, help="cases at once; the times are then longer")
+    parser.add_argument("--keep", type=Path, metavar="DIR", help="folder of results, which are not worked out again")
     arguments = parser.parse_args()
-    rows: list[dict[str, str]] = []
-    for name in arguments.cases:
-        rows.append(run(name, arguments.seeds))
-        if len(rows) == 1:
-            print("| " + " | ".join(rows[0]) + " |")
-            print("|" + "---|" * len(rows[0]))
-        print("| " + " | ".join(rows[-1].values()) + " |", flush=True)
+    tasks = [Task(name, {"name": name, "seeds": list(arguments.seeds)}) for name in arguments.cases]
+    with tempfile.TemporaryDirectory() as folder, process_pool(arguments.workers) as pool:
+        results = run_tasks(run, tasks, arguments.keep or Path(folder), pool, show)
+    rows = [result.value for result in results if not result.error]
+    for i, row in enumerate(rows):
+        if i == 0:
+            print("| " + " | ".join(row) + " |")
+            print("|" + "---|" * len(row))
+        print("| " + " | ".join(row.values()) + " |")
     if arguments.json is not None:
         arguments.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    return int(len(rows) < len(results))
+
+
+def show(done: int, total: int, name: str) -> None:
+    print(f"{done} of {total}: {name}", file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

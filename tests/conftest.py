@@ -11,6 +11,10 @@ import casadi as ca
 import hypothesis
 import numpy as np
 import pytest
+from pendulum_run import cli as cli
+from pendulum_run import left_nothing as left_nothing
+from pendulum_run import pendulum as pendulum
+from pendulum_run import pendulum_data as pendulum_data
 
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Grasp, System

@@ -25,7 +25,7 @@ LAYERS = (
     ("solvers",),
     ("analysis",),
     ("diagnosis",),
-    ("report",),
+    ("export", "report"),
     ("config",),
     ("workflow",),
     ("cli",),

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from twins import twin_recording
 
 from yid_ocp.data import Recording
 from yid_ocp.data.recording import JointGroup, PointGroup
@@ -61,21 +61,7 @@ def springs(repository):
 def twin():
     """twin(problem, x, seed): the problem's recording as the model itself would measure it, with the sensors' noise."""
 
-    def make(problem: EstimationProblem, x: np.ndarray, seed: int) -> Recording:
-        rng = np.random.default_rng(seed)
-        evaluation = problem.evaluate(x, derivatives=False)
-        assert evaluation.ok, evaluation.message
-        recording = problem.episodes[0].recording
-        groups = []
-        for group, predicted in zip(recording.points, evaluation.episodes[0].predicted, strict=True):
-            count = len(predicted)
-            position, std = group.position[:count], group.std[:count]
-            seen = predicted.reshape(position.shape) + std * rng.standard_normal(position.shape)
-            seen[~np.isfinite(position)] = np.nan
-            groups.append(replace(group, t=group.t[:count], position=seen, std=std))
-        return replace(recording, points=tuple(groups))
-
-    return make
+    return twin_recording
 
 
 @pytest.fixture(scope="session")

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-import multiprocessing
-from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from twins import twin_recording
 
 from yid_ocp.analysis.identifiability import identifiability
+from yid_ocp.parallel import Task, run_tasks
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import GaussNewton, solve
 from yid_ocp.workflow.build import load_problem
 
 TWINS = 100
+SEEN = ("T1.bend", "T1.twist", "T2.bend", "T3.bend")
 TRUTH = {"T1.bend": 22.0, "T1.twist": 13.6, "T2.bend": 10.7, "T2.twist": 8.2, "T3.bend": 11.5, "T3.twist": 9.7}
 
 
@@ -23,20 +25,14 @@ def holds(interval: tuple[float | None, float | None], truth: float) -> bool:
     return (lower is None or lower <= truth) and (upper is None or truth <= upper)
 
 
-_judge: list[Callable[[int], Any]] = []
-
-
-def _judged(seed: int) -> Any:
-    return _judge[-1](seed)
-
-
-def of_all_twins(judge: Callable[[int], Any]) -> list[Any]:
-    """judge(seed) of every twin, on all cores where processes can be forked: problems cannot be sent to others."""
-    if "fork" not in multiprocessing.get_all_start_methods():
-        return [judge(seed) for seed in range(TWINS)]
-    _judge.append(judge)
-    with multiprocessing.get_context("fork").Pool() as pool:
-        return pool.map(_judged, range(TWINS), chunksize=2)
+def judged(config: Path, seed: int) -> dict[str, Any]:
+    """Of a twin: which of the intervals hold the truth, and which parameters are called identifiable."""
+    made = load_problem(config, ["problem.duration=3.0"])
+    recording = twin_recording(made, np.array([TRUTH[name] for name in made.names]), seed)
+    problem = EstimationProblem(made.step, [recording], made.free, made.options, dict.fromkeys(TRUTH, 10.0))
+    info = identifiability(problem, solve(problem, GaussNewton()), start="known", intervals=list(SEEN))
+    held = [holds(info.parameters[name].interval, TRUTH[name]) for name in SEEN]
+    return {"held": held, "identifiable": list(info.identifiable)}
 
 
 def report(record_property, hits: dict[str, list[bool]]) -> float:
@@ -65,19 +61,13 @@ def test_coverage_on_a_pendulum(pendulum, twin, record_property):
 
 
 @pytest.mark.slow
-def test_coverage_on_one_arm_and_the_y(repository, twin, record_property):
+def test_coverage_on_one_arm_and_the_y(repository, tmp_path, record_property):
     """43 coordinates, 3 s: bends to a percent, T1.twist and T3.bend so weakly that only profiles are honest."""
-    made = load_problem(repository / "configs" / "single_arm_vision.yaml", ["problem.duration=3.0"])
-    truth = np.array([TRUTH[name] for name in made.names])
-    seen = [name for name in TRUTH if name not in ("T2.twist", "T3.twist")]
-
-    def judge(seed: int) -> tuple[list[bool], tuple[str, ...]]:
-        recording = twin(made, truth, seed)
-        problem = EstimationProblem(made.step, [recording], made.free, made.options, dict.fromkeys(TRUTH, 10.0))
-        info = identifiability(problem, solve(problem, GaussNewton()), start="known", intervals=seen)
-        return [holds(info.parameters[name].interval, TRUTH[name]) for name in seen], info.identifiable
-
-    found = of_all_twins(judge)
-    assert all({"T2.twist", "T3.twist"}.isdisjoint(identifiable) for _, identifiable in found)
-    hits = {name: [held[i] for held, _ in found] for i, name in enumerate(seen)}
+    config = repository / "configs" / "single_arm_vision.yaml"
+    tasks = [Task(f"twin {seed}", {"config": config, "seed": seed}) for seed in range(TWINS)]
+    results = run_tasks(judged, tasks, tmp_path)
+    assert [entry.error for entry in results if entry.error] == []
+    found = [entry.value for entry in results]
+    assert all({"T2.twist", "T3.twist"}.isdisjoint(entry["identifiable"]) for entry in found)
+    hits = {name: [entry["held"][i] for entry in found] for i, name in enumerate(SEEN)}
     assert 0.92 <= report(record_property, hits) <= 0.98

@@ -26,7 +26,7 @@ TRUTH = {"T1.bend": 22.0, "T1.twist": 13.6, "T2.bend": 10.7, "T2.twist": 8.2, "T
 @pytest.fixture(scope="module")
 def tube_ranking(held_tube):
     told: list[str] = []
-    return what_if(held_tube, tell=told.append), told
+    return what_if(held_tube, progress=told.append), told
 
 
 def test_the_experiment_as_it_is_agrees_with_the_analysis(held_tube, tube_ranking):

@@ -10,6 +10,7 @@ import time
 import h5py
 import pytest
 
+from yid_ocp.cli import COMMANDS
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.schema import schema
 from yid_ocp.data import read_recording
@@ -40,6 +41,13 @@ def test_as_a_module():
     done = subprocess.run([sys.executable, "-m", "yid_ocp", "--version"], capture_output=True, text=True, check=False)
     assert done.returncode == 0
     assert done.stdout.startswith("yid-ocp ")
+
+
+def test_every_command_is_a_file_of_workflow(repository):
+    for row in COMMANDS:
+        source = (repository / "yid_ocp" / "workflow" / f"{row.module}.py").read_text()
+        assert "\ndef run(arguments: argparse.Namespace) -> int:\n" in source
+    assert len({row.name for row in COMMANDS}) == len({row.module for row in COMMANDS}) == len(COMMANDS)
 
 
 def test_no_command_and_unknown_command(cli):

@@ -21,7 +21,6 @@ from yid_ocp.data.recording import (
     PointGroup,
     Recording,
     check_names,
-    new_file,
     read_recording,
     validate,
     write_recording,
@@ -530,17 +529,6 @@ def test_a_failure_leaves_the_old_file_alone(file: Path, monkeypatch: pytest.Mon
         write_recording(example().slice(0.0, 0.1), file)
     assert [entry.name for entry in file.parent.iterdir()] == ["run.h5"]
     assert file.read_bytes() == before
-
-
-def test_an_interruption_leaves_nothing(tmp_path: Path) -> None:
-    def interrupted() -> None:
-        with new_file(tmp_path / "run.h5") as temporary:
-            temporary.write_text("half")
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        interrupted()
-    assert not list(tmp_path.iterdir())
 
 
 # ------------------------------------------------------------------------------------------------- real recordings

@@ -126,8 +126,13 @@ def test_a_small_ensemble_runs_resumes_and_keeps_its_labels_sealed(tmp_path, cap
     assert first["format"] == "yid-blind/1"
     for path in (folder / "cases").iterdir():
         assert b"kelvin" not in path.read_bytes()
-    (folder / "answers" / "case_001.json").unlink()
+    answers = {json.loads(path.read_text())["name"]: path for path in (folder / "answers").iterdir()}
+    assert set(answers) == {"case_000", "case_001"}
+    kept = answers["case_000"].stat().st_mtime_ns
+    answers["case_001"].unlink()
     assert main(command) == 0
+    assert answers["case_000"].stat().st_mtime_ns == kept
+    assert answers["case_001"].is_file()
     again = json.loads((folder / "result.json").read_text())
     assert [m["verdict"] for m in again["marks"]] == [m["verdict"] for m in first["marks"]]
     assert main([*command[:-1], "--seed", "12", "--quiet"]) == 2

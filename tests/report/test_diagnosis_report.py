@@ -114,7 +114,7 @@ def test_a_map_without_a_sure_value_shows_what_was_expected_beforehand(found, tm
     prior = np.sqrt([smoothed.variance[source] for source in trace.sources])
     vague = replace(trace, std=np.broadcast_to(0.9 * prior, trace.std.shape))
     page = page_of(replace(finding, smoothed=replace(smoothed, traces=(vague,))), tmp_path / "r.html")
-    assert "value in deviations expected beforehand" in page
+    assert "value in standard deviations expected beforehand" in page
     assert "take the picture for a hint only" in text_of(page)
 
 

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import importlib
 import logging
 import re
+import sys
 from dataclasses import replace
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from yid_ocp.errors import OutputError
-from yid_ocp.report import figures
+from yid_ocp.report import figures, sections
 from yid_ocp.report.html import number, write_report
 from yid_ocp.report.sections import SECTIONS, Findings
 from yid_ocp.workflow.solve import solve_result
@@ -107,6 +110,31 @@ def test_a_failed_solve_gets_no_verdicts(solved, tmp_path):
 def test_sections_may_have_nothing_to_say():
     empty = Findings("x", "", {"format": "other/1"})
     assert all(SECTIONS[name].prepare(empty) is None for name in SECTIONS)
+
+
+def test_a_new_section_is_a_file_and_a_template(solved, tmp_path, monkeypatch):
+    (tmp_path / "weather_section.py").write_text(
+        "from yid_ocp.report.sections import section\n\n\n"
+        "@section('weather', 15, 'The weather')\n"
+        "def prepare(findings):\n"
+        "    return {'sky': 'blue & dry'} if 'parameters' in findings.result else None\n"
+    )
+    (tmp_path / "weather.html").write_text("<p>The sky was {{ sky }}.</p>")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(SECTIONS, "_entries", dict(SECTIONS._entries))
+    importlib.import_module("weather_section")
+    monkeypatch.delitem(sys.modules, "weather_section")
+    assert write_report(tmp_path / "r.html", findings(solved))
+    body = (tmp_path / "r.html").read_text(encoding="utf-8").split("<body>")[1]
+    assert "<h2>The weather</h2>" in body
+    assert "The sky was blue &amp; dry." in body
+    assert body.index('id="summary"') < body.index('id="weather"') < body.index('id="fit"')
+    assert SECTIONS["weather"].prepare(Findings("x", "", {"format": "other/1"})) is None
+
+
+def test_every_file_of_sections_is_found():
+    folder = Path(sections.__file__).parent
+    assert set(SECTIONS) == {path.stem for path in folder.glob("*.py")} - {"__init__"}
 
 
 def test_without_the_extra_there_is_a_notice_and_no_report(solved, tmp_path, monkeypatch, caplog):

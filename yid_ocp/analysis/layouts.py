@@ -262,20 +262,20 @@ class LayoutBuilder:
     Parameters
     ----------
     setting : Setting
-    tell : callable, optional
+    progress : callable, optional
         Told what takes time.
     """
 
-    def __init__(self, setting: Setting, tell: Callable[[str], None] | None = None) -> None:
+    def __init__(self, setting: Setting, progress: Callable[[str], None] | None = None) -> None:
         self.setting = setting
-        self._tell = tell or (lambda text: None)
+        self._progress = progress or (lambda text: None)
         self._layouts: dict[frozenset[str], Layout | str] = {}
 
     def layout(self, mechanics: frozenset[str]) -> Layout | str:
         """The experiment with changes of mechanics, or why there is none."""
         if mechanics not in self._layouts:
             if mechanics:
-                self._tell("working out " + " and ".join(MECHANICS[name] for name in sorted(mechanics)))
+                self._progress("working out " + " and ".join(MECHANICS[name] for name in sorted(mechanics)))
             try:
                 self._layouts[mechanics] = self._build(mechanics)
             except YidError as error:

@@ -133,7 +133,7 @@ def what_if(
     seed: int = 11,
     largest: int = LARGEST_SET,
     only: Iterable[str] | None = None,
-    tell: Callable[[str], None] | None = None,
+    progress: Callable[[str], None] | None = None,
 ) -> WhatIf:
     """Rank changes of an experiment by how many parameters they would make identifiable.
 
@@ -158,7 +158,7 @@ def what_if(
         Largest set of changes to search for one that makes all parameters identifiable.
     only : iterable of str, optional
         Names of changes to consider, all when absent.
-    tell : callable, optional
+    progress : callable, optional
         Told what takes time.
 
     Returns
@@ -176,7 +176,7 @@ def what_if(
     fit = None if solution is None else identifiability(problem, x, start=start, grasp_std=grasp_std)
     inflation = 1.0 if fit is None else max(1.0, fit.chi2_per_dof)
     setting = Setting(problem, x, start, grasp_std, second_arm, torque_std, seed)
-    judge = _Judge(setting, LayoutBuilder(setting, tell), inflation)
+    judge = _Judge(setting, LayoutBuilder(setting, progress), inflation)
     base = judge(())
     if not base.verdicts:
         raise SolverError(base.message)

@@ -1,7 +1,6 @@
 """Recordings in memory and on disk; a new file format is a reader in `readers.py` and touches nothing else."""
 
 from yid_ocp.data.readers import READERS as READERS
-from yid_ocp.data.readers import export_csv as export_csv
 from yid_ocp.data.readers import read_any as read_any
 from yid_ocp.data.readers import read_bag as read_bag
 from yid_ocp.data.readers import read_csv as read_csv

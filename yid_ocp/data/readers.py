@@ -1,4 +1,4 @@
-"""Readers that turn other formats (CSV, rosbag, MCAP) into a recording, and the CSV export."""
+"""Readers that turn other formats (CSV, rosbag, MCAP) into a recording."""
 
 from __future__ import annotations
 
@@ -20,12 +20,11 @@ from yid_ocp.data.recording import (
     JointGroup,
     PointGroup,
     Recording,
-    file_sha256,
-    new_file,
     read_recording,
     validate,
 )
-from yid_ocp.errors import DataError, OutputError, nearest
+from yid_ocp.errors import DataError, nearest
+from yid_ocp.files import file_sha256
 from yid_ocp.registry import Registry
 
 Reader = Callable[..., Recording]
@@ -155,49 +154,6 @@ def read_csv(
         seen = factors["points"] * position[point_rows]
         points = [PointGroup("points", point_names, t[point_rows], seen, None, sensor, frame, None, clock)]
     return validate(Recording(joints, tuple(points), description, path.name, path.stem, digest))
-
-
-def export_csv(recording: Recording, folder: str | os.PathLike[str]) -> tuple[Path, ...]:
-    """Write one table per group, `<group>.csv`, with the columns that `read_csv` knows and all digits.
-
-    Standard deviations, sensor, frame, pose and clock are not in the tables; a point not seen is an empty cell.
-
-    Parameters
-    ----------
-    recording : Recording
-        What to write, in SI units.
-    folder : path-like
-        Where to; made where absent.
-
-    Returns
-    -------
-    tuple of Path
-        The files written, joints first.
-
-    Raises
-    ------
-    OutputError
-        If the folder or a file cannot be written.
-    """
-    folder = Path(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"the folder cannot be made ({error.strerror})", where=str(folder)) from error
-    written = []
-    for group in recording.groups:
-        if isinstance(group, JointGroup):
-            stem, columns = "joints", [f"{channel}_{name}" for channel in group.channels for name in group.names]
-            table = np.column_stack([group.t, *group.channels.values()])
-        else:
-            stem, columns = group.name, [f"{name}_{axis}" for name in group.names for axis in _AXES]
-            table = np.column_stack([group.t, group.position.reshape(len(group.t), -1)])
-        written.append(folder / f"{stem}.csv")
-        with new_file(written[-1]) as temporary, temporary.open("x", encoding="utf-8", newline="") as file:
-            writer = csv.writer(file)
-            writer.writerow(["t", *columns])
-            writer.writerows([["" if math.isnan(value) else repr(value) for value in row] for row in table.tolist()])
-    return tuple(written)
 
 
 def read_bag(

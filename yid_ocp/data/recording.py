@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
 import json
 import numbers
 import os
 import re
-import secrets
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -18,7 +15,8 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from yid_ocp.errors import DataError, OutputError, nearest
+from yid_ocp.errors import DataError, nearest
+from yid_ocp.files import file_sha256, new_file, reason
 
 Array = NDArray[np.float64]
 Clock = Literal["recorded", "nominal"]
@@ -352,7 +350,7 @@ def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = Fal
         with h5py.File(path, "r") as file:
             recording = _from_file(file, path, digest)
     except (OSError, RuntimeError, KeyError, TypeError) as error:  # all of them come from h5py on damaged files
-        what = f"the HDF5 file is truncated or damaged ({_reason(error)})"
+        what = f"the HDF5 file is truncated or damaged ({reason(error)})"
         raise DataError(what, where=str(path), hint="copy or record it again") from error
     _validate(recording, str(path), allow_nan_effort)
     return recording
@@ -385,81 +383,6 @@ def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
         for group in recording.points:
             attributes = [name for name in _POINT_ATTRIBUTES if name != "std"]
             _write_group(file.create_group(group.name), group, _POINT_UNITS, attributes)
-
-
-@contextlib.contextmanager
-def new_file(path: Path) -> Iterator[Path]:
-    """Give a temporary name beside `path`; what is written there takes its place when the block ends without error.
-
-    Parameters
-    ----------
-    path : Path
-        The file to make or replace.
-
-    Yields
-    ------
-    Path
-        Where to write meanwhile.
-
-    Raises
-    ------
-    OutputError
-        If the folder is missing or the file cannot be written.
-    """
-    if path.is_dir() or not path.parent.is_dir():
-        what = "the name of the file is that of a folder" if path.is_dir() else "the folder to write to does not exist"
-        raise OutputError(what, where=str(path), hint="make the folder first, or choose another name")
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
-    try:
-        yield temporary
-        with temporary.open("rb+") as file:
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except (OSError, RuntimeError) as error:
-        what, hint = (
-            f"the file cannot be written ({_reason(error)})",
-            "choose a writable folder on a disk with room",
-        )
-        raise OutputError(what, where=str(path), hint=hint) from error
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
-
-
-def file_sha256(path: Path) -> str:
-    """Hash a file, or the files of a folder in the order of their names.
-
-    Parameters
-    ----------
-    path : Path
-        The file or folder.
-
-    Returns
-    -------
-    str
-        SHA-256, 64 hexadecimal digits.
-
-    Raises
-    ------
-    DataError
-        If it is missing or cannot be read.
-    """
-    digest = hashlib.sha256()
-    try:
-        for entry in sorted(item for item in path.rglob("*") if item.is_file()) if path.is_dir() else [path]:
-            with entry.open("rb") as file:
-                while block := file.read(1 << 20):
-                    digest.update(block)
-    except FileNotFoundError as error:
-        raise DataError("there is no such file", where=str(path), hint="check the path") from error
-    except OSError as error:
-        raise DataError(f"the file cannot be read ({_reason(error)})", where=str(path)) from error
-    return digest.hexdigest()
-
-
-def _reason(error: Exception) -> str:
-    number = getattr(error, "errno", None)
-    return os.strerror(number) if number else str(error).strip("'\"")
 
 
 def _check(ok: bool, what: str, where: str, allowed: str = "", hint: str = "") -> None:

@@ -196,7 +196,7 @@ def profiles(
 
 @dataclass(frozen=True)
 class Change:
-    """A number before and after something was done, with deviations, and a mark for comparison.
+    """A number before and after something was done, with standard deviations, and a mark for comparison.
 
     Attributes
     ----------
@@ -298,7 +298,7 @@ def time_map(edges: Array, rows: Sequence[Row], axis: str) -> plotly.graph_objec
 
     values = np.array([row.values for row in rows])
     seen = np.abs(values[np.isfinite(values)])
-    # even to the eye from one deviation to thousands
+    # even to the eye from one standard deviation to thousands
     limit = max(3.0, float(np.quantile(seen, 0.98))) if seen.size else 3.0
     marks = [m for m in ((0, 1, 3, 10) if limit < 20 else (0, 10, 100, 1000, 10000)) if m <= limit]
     marks = sorted({-m for m in marks} | set(marks))

@@ -7,7 +7,7 @@ from importlib import util
 from pathlib import Path
 
 from yid_ocp.errors import OutputError
-from yid_ocp.report.sections import Findings, written_sections
+from yid_ocp.report.sections import SECTIONS, Findings, written_sections
 
 log = logging.getLogger(__name__)
 
@@ -35,9 +35,9 @@ def write_report(path: Path, findings: Findings) -> bool:
     import jinja2
     import plotly.offline
 
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("yid_ocp.report"), autoescape=True, undefined=jinja2.StrictUndefined
-    )
+    beside = {str(SECTIONS[name].folder) for name in SECTIONS}
+    loader = jinja2.ChoiceLoader([jinja2.PackageLoader("yid_ocp.report"), jinja2.FileSystemLoader(sorted(beside))])
+    environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
     environment.filters["number"] = number
     sections = written_sections(findings, environment)
     page = environment.get_template("page.html").render(

@@ -58,3 +58,52 @@ def medians(rows: Sequence[HeldOutRow]) -> list[HeldOutRow]:
             median = statistics.median(row.rmse for row in own)
             result.append(HeldOutRow(f"median of {len(own)}", channel, median, own[0].unit, baselines))
     return result
+
+
+def blind_table(result: Mapping[str, Any]) -> list[str]:
+    """The score and every case, as Markdown."""
+
+    def share(value: float | None, digits: int = 0) -> str:
+        return "-" if value is None else f"{100 * value:.{digits}f} %"
+
+    def row(*cells: str) -> str:
+        return f"| {' | '.join(cells)} |"
+
+    lines = [row("what", "value"), row("---", "---")]
+    lines += [
+        row("false alarms on clean data", share(result["false_alarms"])),
+        row("true kind and place first, of the gaps found", share(result["kind_first"])),
+        row("among the first two", share(result["kind_in_two"])),
+        row("place first", share(result["location_first"])),
+        row("sets named as not separable hold the truth", share(result["confusable_covers"])),
+        row("their size", "-" if result["confusable_size"] is None else f"{result['confusable_size']:.1f}"),
+        row("unknown said of effects outside the library", share(result["unknown_recall"])),
+        row("their place", share(result["unknown_location"])),
+        row("pairs found", share(result["pairs_right"])),
+        row("closure over that of the true effect refitted", share(result["closure_of_best"])),
+        row("median error of the effects' parameters", share(result["parameter_error"], 1)),
+        row("their 95 % intervals that hold the truth", share(result["interval_coverage"])),
+        row("time of one diagnosis", "-" if result["seconds"] is None else f"{result['seconds']:.0f} s"),
+    ]
+    lines += ["", row("size / detectable", "cases", "gap seen", "right"), row(*["---"] * 4)]
+    for size, entry in result["detection"].items():
+        lines.append(row(size, str(entry["cases"]), share(entry["gap"]), share(entry["right"])))
+    head = ("case", "sort", "truth", "size", "verdict", "added", "not separable", "place", "closure", "best", "time")
+    lines += ["", row(*head), row(*["---"] * len(head))]
+    for entry in result["marks"]:
+        lines.append(
+            row(
+                entry["case"],
+                entry["category"],
+                entry["truth"],
+                "-" if entry["multiple"] is None else f"{entry['multiple']:.3g}",
+                entry["verdict"] + ("" if entry["right"] or entry["category"] == "finer_chain" else " (wrong)"),
+                entry["answer"],
+                ", ".join(entry["confusable"]) or "-",
+                "right" if entry["location_first"] else "-",
+                share(entry["closure"]),
+                share(entry["best"]),
+                "-" if entry["seconds"] is None else f"{entry['seconds']:.0f} s",
+            )
+        )
+    return lines

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from yid_ocp.data.recording import new_file
 from yid_ocp.errors import DataError, OutputError, nearest
+from yid_ocp.files import new_file
 
 Array = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from yid_ocp.data.recording import new_file
 from yid_ocp.errors import OutputError
+from yid_ocp.files import new_file
 from yid_ocp.vision.track import Stages, Track
 
 Array = NDArray[np.float64]

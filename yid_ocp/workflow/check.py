@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -9,12 +10,16 @@ from typing import Any
 import numpy as np
 
 from yid_ocp.analysis.convergence import Frequencies, natural_frequencies
-from yid_ocp.config.settings import Run, dump_config
+from yid_ocp.config.reader import load_config
+from yid_ocp.config.settings import Run
 from yid_ocp.data.recording import Recording
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
+from yid_ocp.report.terminal import check_summary
 from yid_ocp.workflow.build import build_problem, build_step, build_system, first_gaps
-from yid_ocp.workflow.folder import Monitor, Silent, input_hashes, new_run_folder, versions
+from yid_ocp.workflow.command import DONE, carry_out
+from yid_ocp.workflow.folder import new_run_folder
+from yid_ocp.workflow.progress import SILENT, Progress
 
 FORMAT = "yid-check/1"
 TOLERATED = 0.02  # a frequency that moves by more than this fraction when links or steps are refined is worth a warning
@@ -29,14 +34,21 @@ class CheckOutcome:
     result: dict[str, Any]
 
 
-def run_check(run: Run, out: str | Path | None = None, monitor: Monitor | None = None) -> CheckOutcome:
+def run(arguments: argparse.Namespace) -> int:
+    """The command."""
+    settings = load_config(arguments.config, arguments.overrides)
+    carry_out(lambda shown: run_check(settings, arguments.out, shown), check_summary, arguments.quiet)
+    return DONE
+
+
+def run_check(run: Run, out: str | Path | None = None, progress: Progress = SILENT) -> CheckOutcome:
     """Validate a run without solving it.
 
     Parameters
     ----------
     run : Run
     out : str or Path, optional
-    monitor : Monitor, optional
+    progress : Progress, optional
 
     Returns
     -------
@@ -48,24 +60,21 @@ def run_check(run: Run, out: str | Path | None = None, monitor: Monitor | None =
     ConfigError, DataError, ModelError, OutputError
         Whatever would stop `solve`.
     """
-    watcher = monitor or Silent()
     with new_run_folder(run, out, "check") as folder:
-        folder.write("config.yaml", dump_config(run))
-        inputs = input_hashes(run)
-        folder.log("start", command="check", versions=versions(), inputs=inputs)
+        folder.begin(run, "check")
         warnings: list[str] = []
-        watcher.stage("building the model")
+        progress.stage("building the model")
         # the equations are the same compiled or not, and a check needs only a few steps
         plain = replace(run, problem=replace(run.problem, compiler=False))
         step = build_step(plain)
         model = {"name": step.system.mechanism.name, **step.sizes}
         recordings, problem = [], None
         if run.recordings.estimate:
-            watcher.stage("placing the recordings on the model")
+            progress.stage("placing the recordings on the model")
             problem = build_problem(plain, step)
             for role, episodes in (("estimate", problem.episodes), ("held_out", problem.held_out)):
                 recordings += [_recording(problem, role, episode, warnings) for episode in episodes]
-        watcher.stage("refining links and time step")
+        progress.stage("refining links and time step")
         convergence = refine(run, problem, warnings)
         result = {
             "format": FORMAT,
@@ -73,10 +82,8 @@ def run_check(run: Run, out: str | Path | None = None, monitor: Monitor | None =
             "recordings": recordings,
             "convergence": convergence,
             "warnings": warnings,
-            "inputs": inputs,
-            "versions": versions(),
         }
-        written = folder.write_json("result.json", result)
+        written = folder.finish(result)
     return CheckOutcome(folder.path, written)
 
 

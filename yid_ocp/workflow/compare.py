@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import argparse
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from yid_ocp.analysis.compare import PUBLISHED, Comparison, compare
-from yid_ocp.config.settings import Run, dump_config
+from yid_ocp.config.reader import load_config
+from yid_ocp.config.settings import Run
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.report.pictures import draw_convergence
+from yid_ocp.report.terminal import compare_summary
 from yid_ocp.solvers import SOLVERS, Iterate
 from yid_ocp.solvers.base import Solver
 from yid_ocp.workflow.build import build_problem
-from yid_ocp.workflow.folder import Monitor, Silent, input_hashes, new_run_folder, versions
+from yid_ocp.workflow.command import DONE, FAILED, carry_out
+from yid_ocp.workflow.folder import new_run_folder
+from yid_ocp.workflow.progress import SILENT, Progress
 from yid_ocp.workflow.solve import solve_result
 
 FORMAT = "yid-compare/1"
@@ -46,7 +51,14 @@ def chosen_solvers(run: Run) -> list[Solver]:
     return list(run.compare.methods.values())
 
 
-def run_compare(run: Run, out: str | Path | None = None, monitor: Monitor | None = None) -> CompareOutcome:
+def run(arguments: argparse.Namespace) -> int:
+    """The command."""
+    settings = load_config(arguments.config, arguments.overrides)
+    outcome = carry_out(lambda shown: run_compare(settings, arguments.out, shown), compare_summary, arguments.quiet)
+    return DONE if outcome.ok else FAILED
+
+
+def run_compare(run: Run, out: str | Path | None = None, progress: Progress = SILENT) -> CompareOutcome:
     """Run every method, compare, and write the run folder.
 
     Parameters
@@ -54,7 +66,7 @@ def run_compare(run: Run, out: str | Path | None = None, monitor: Monitor | None
     run : Run
     out : str or Path, optional
         The run folder; see `new_run_folder`.
-    monitor : Monitor, optional
+    progress : Progress, optional
 
     Returns
     -------
@@ -64,35 +76,32 @@ def run_compare(run: Run, out: str | Path | None = None, monitor: Monitor | None
     ------
     ConfigError, DataError, ModelError, OutputError
     """
-    watcher = monitor or Silent()
     solvers = chosen_solvers(run)
     published = published_answers(run)
     with new_run_folder(run, out, "compare") as folder:
-        inputs = input_hashes(run)
-        folder.write("config.yaml", dump_config(run))
-        watcher.stage("building the model and its compiled step")
+        folder.begin(run, "compare")
+        progress.stage("building the model and its compiled step")
         problem = build_problem(run)
         truth = _truth(problem)
         current = [""]
 
-        def note(name: str, entry: Iterate) -> None:
+        def iterate(name: str, entry: Iterate) -> None:
             if name != current[0]:
                 current[0] = name
-                watcher.stage(f"solving by {name}")
+                progress.stage(f"solving by {name}")
             folder.log("iterate", method=name, iteration=entry.iteration, cost=entry.cost, seconds=entry.seconds)
-            watcher.iterate(entry)
+            progress.iterate(entry)
 
-        comparison = compare(problem, solvers, truth, note)
-        result = compare_result(problem, comparison, published, truth) | {"inputs": inputs, "versions": versions()}
+        comparison = compare(problem, solvers, truth, iterate)
         draw_convergence(folder.path / "convergence.png", comparison)
-        written = folder.write_json("result.json", result)
+        written = folder.finish(compare_result(problem, comparison, published, truth))
     return CompareOutcome(folder.path, written, comparison)
 
 
 def compare_result(
     problem: EstimationProblem, comparison: Comparison, published: dict[str, float], truth: dict[str, float]
 ) -> dict[str, Any]:
-    """`yid-compare/1` without inputs and versions: one `yid-solve/1` for each method, with its price."""
+    """`yid-compare/1` without inputs and versions: one `yid-solve/1` for each method, with its cost in time."""
     methods = {}
     for run in comparison.runs:
         methods[run.method] = solve_result(problem, run.solution, run.held_out) | {

@@ -2,35 +2,33 @@
 
 from __future__ import annotations
 
+import argparse
 import logging
 import os
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 
+from yid_ocp.config.reader import DIAGNOSIS_DEFAULT, load_config
 from yid_ocp.config.settings import Run, dump_config
 from yid_ocp.diagnosis import Finding, diagnose
-from yid_ocp.diagnosis.localise import units
-from yid_ocp.errors import OutputError
 from yid_ocp.problem import EstimationProblem, SensorOptions
-from yid_ocp.problem.episodes import Episode
-from yid_ocp.problem.prediction import EpisodeResult
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import Findings
+from yid_ocp.report.terminal import diagnose_summary
 from yid_ocp.solvers import Solution, solve
 from yid_ocp.workflow.build import build_problem
-from yid_ocp.workflow.folder import Monitor, Silent, input_hashes, new_run_folder, versions
+from yid_ocp.workflow.command import DONE, carry_out
+from yid_ocp.workflow.folder import new_run_folder, versions
+from yid_ocp.workflow.progress import SILENT, Progress
 from yid_ocp.workflow.refits import Refits
+from yid_ocp.workflow.trajectories import Prediction, write_diagnosis_trajectories
 
-TRAJECTORIES = "yid-diagnosis-trajectories/1"
 log = logging.getLogger(__name__)
-Prediction = tuple[Episode, EpisodeResult, EpisodeResult]
-"""A held-out recording, its prediction by the nominal model and that with the effects."""
 
 
 @dataclass(frozen=True)
@@ -51,16 +49,22 @@ class DiagnoseOutcome:
     finding: Finding
 
 
-def run_diagnose(run: Run, out: str | Path | None = None, monitor: Monitor | None = None) -> DiagnoseOutcome:
-    """Diagnose and write the run folder; refits that an interrupted run of the same kind finished are taken up.
+def run(arguments: argparse.Namespace) -> int:
+    """The command."""
+    settings = load_config(arguments.config, arguments.overrides, DIAGNOSIS_DEFAULT)
+    carry_out(lambda shown: run_diagnose(settings, arguments.out, shown), diagnose_summary, arguments.quiet)
+    return DONE
+
+
+def run_diagnose(run: Run, out: str | Path | None = None, progress: Progress = SILENT) -> DiagnoseOutcome:
+    """Diagnose and write the run folder; finished refits of an interrupted run of the same kind are used again.
 
     Parameters
     ----------
     run : Run
     out : str or Path, optional
         The run folder; see `new_run_folder`.
-    monitor : Monitor, optional
-        Told about stages.
+    progress : Progress, optional
 
     Returns
     -------
@@ -70,48 +74,49 @@ def run_diagnose(run: Run, out: str | Path | None = None, monitor: Monitor | Non
     ------
     ConfigError, DataError, ModelError, SolverError, OutputError
     """
-    watcher = monitor or Silent()
     with new_run_folder(run, out, "diagnose") as folder:
-        inputs, config = input_hashes(run), dump_config(run)
-        folder.write("config.yaml", config)
-        watcher.stage("building the model and its compiled step")
-        folder.log("start", command="diagnose", versions=versions(), inputs=inputs)
-        refits = Refits(folder, inputs, config, versions())
-        problem = build_problem(run)
+        folder.begin(run, "diagnose")
+        refits = Refits(folder, folder.inputs, dump_config(run), versions())
 
-        def note(text: str) -> None:
+        def stage(text: str) -> None:
             folder.log("stage", text=text)
-            watcher.stage(text)
+            progress.stage(text)
 
-        nominal: Solution | None = None
-        if run.diagnosis.noise_fraction < 1 and problem.held_out:
-            # in units of noise the solver would take any fit for a bad one and start again elsewhere
-            note("solving the nominal model")
-            nominal = solve(problem, run.solver)
+        progress.stage("building the model and its compiled step")
+        problem = build_problem(run)
         try:
-            finding = diagnose(
-                in_units_of_noise(problem, run),
-                run.diagnosis.candidates,
-                thresholds=run.diagnosis,
-                solution=nominal,
-                progress=note,
-                store=refits,
-            )
+            finding = _found(run, problem, refits, stage)
         except KeyboardInterrupt:
             if len(refits):
-                log.warning("%d finished refits are in %s; the same command takes them up", len(refits), refits.file)
+                log.warning("%d finished refits are in %s; the same command resumes them", len(refits), refits.file)
             raise
         folder.log("end", verdict=finding.verdict, effects=[effect.label for effect in finding.effects])
         predicted = predictions(finding)
-        write_trajectories(folder.path / "trajectories.h5", finding, predicted)
-        result = finding.to_dict() | {"command": reproducing(run, folder.target)}
-        written = folder.write_json("result.json", result | {"inputs": inputs, "versions": versions()})
+        write_diagnosis_trajectories(folder.path / "trajectories.h5", finding, predicted)
+        written = folder.finish(finding.to_dict() | {"command": reproducing(run, folder.target)})
         if run.output.report:
-            watcher.stage("writing the report")
+            progress.stage("writing the report")
             more = {"finding": finding, "predictions": predicted}
             write_report(folder.path / "report.html", Findings(run.name, run.description, written, problem, more=more))
     refits.clear()
     return DiagnoseOutcome(folder.path, written, finding)
+
+
+def _found(run: Run, problem: EstimationProblem, refits: Refits, stage: Callable[[str], None]) -> Finding:
+    said = run.diagnosis
+    nominal: Solution | None = None
+    if said.noise_fraction < 1 and problem.held_out:
+        # in units of noise the solver would take any fit for a bad one and start again elsewhere
+        stage("solving the nominal model")
+        nominal = solve(problem, run.solver)
+    return diagnose(
+        in_units_of_noise(problem, run),
+        said.candidates,
+        thresholds=said,
+        solution=nominal,
+        progress=stage,
+        store=refits,
+    )
 
 
 def reproducing(run: Run, folder: Path) -> str:
@@ -197,64 +202,3 @@ def predictions(finding: Finding) -> list[Prediction]:
         for (episode, first), (_, last) in zip(before, after, strict=True)
         if not isinstance(first, str) and not isinstance(last, str)
     ]
-
-
-def write_trajectories(path: Path, finding: Finding, predicted: Sequence[Prediction]) -> None:
-    """Predictions and what the smoother found, as `yid-diagnosis-trajectories/1` (HDF5).
-
-    `RECORDING/GROUP/` for every held-out recording: `t` (M,) [s], `measured`, `before`, `after`, `std` (M, k) and the
-    attributes `channels`, `unit`.
-
-    `where/RECORDING/` for every recording that was estimated on, where there was a gap to locate: `edges` (J + 1,) [s]
-    since its first node, of the intervals over which unknowns are constant; `mean` and `std` (J, nd) of the unknown
-    forces, offsets and biases about the nominal model and `prior` (nd,), the deviation at the largest evidence, zero
-    where a group was not taken in; the attributes `unknowns`, `locations`, `kinds`, `units` (nd,) each.
-
-    Raises
-    ------
-    OutputError
-    """
-    try:
-        with h5py.File(path, "w") as file:
-            file.attrs["format"] = TRAJECTORIES
-            for episode, before, after in predicted:
-                for k, samples in enumerate(episode.samples):
-                    group = file.create_group(f"{episode.name}/{samples.sensor.group}")
-                    group.attrs["channels"] = np.array(samples.sensor.channels, dtype=h5py.string_dtype())
-                    group.attrs["unit"] = samples.sensor.unit
-                    arrays = {
-                        "t": episode.grid.start + episode.grid.time_step * (samples.node + samples.fraction),
-                        "measured": samples.value,
-                        "before": before.predicted[k],
-                        "after": after.predicted[k],
-                        "std": samples.std,
-                    }
-                    for name, array in arrays.items():
-                        group.create_dataset(name, data=array, compression="gzip", shuffle=True)
-            _write_unknowns(file, finding)
-    except OSError as error:
-        raise OutputError(f"the trajectories cannot be written: {error}", where=str(path)) from error
-
-
-def _write_unknowns(file: h5py.File, finding: Finding) -> None:
-    if finding.smoothed is None:
-        return
-    for trace in finding.smoothed.traces:
-        group = file.create_group(f"where/{trace.recording}")
-        texts = {
-            "unknowns": trace.unknowns,
-            "locations": [source.location for source in trace.sources],
-            "kinds": [source.kind for source in trace.sources],
-            "units": units(finding.nominal.problem.system, trace),
-        }
-        for name, values in texts.items():
-            group.attrs[name] = np.array(values, dtype=h5py.string_dtype())
-        variance = np.array([finding.smoothed.variance[source] for source in trace.sources])
-        arrays = {
-            "edges": trace.edges,
-            "mean": trace.mean * trace.reference,
-            "std": trace.std * trace.reference,
-            "prior": np.sqrt(variance) * trace.reference,
-        }
-        for name, array in arrays.items():
-            group.create_dataset(name, data=array, compression="gzip", shuffle=True)

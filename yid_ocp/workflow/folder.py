@@ -5,54 +5,21 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
-import math
 import os
 import platform
 import secrets
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Protocol, TextIO
+from typing import Any, TextIO
 
-import numpy as np
-
-from yid_ocp.config.settings import Run
-from yid_ocp.data.recording import file_sha256
+from yid_ocp.config.settings import Run, dump_config
 from yid_ocp.errors import OutputError
-from yid_ocp.solvers import Iterate
+from yid_ocp.files import file_sha256, jsonable, write_text
 from yid_ocp.workflow.build import input_files
-
-
-class Monitor(Protocol):
-    """Whoever wants to know how a long run is doing."""
-
-    def stage(self, text: str) -> None:
-        """A new part of the work begins."""
-        ...
-
-    def iterate(self, entry: Iterate) -> None:
-        """A solver accepted a point."""
-        ...
-
-    def advance(self, done: int, total: int, text: str) -> None:
-        """So many of so many parts of the stage are done, and what comes next."""
-        ...
-
-
-class Silent:
-    """A monitor that tells nobody."""
-
-    def stage(self, text: str) -> None:
-        """Nothing."""
-
-    def iterate(self, entry: Iterate) -> None:
-        """Nothing."""
-
-    def advance(self, done: int, total: int, text: str) -> None:
-        """Nothing."""
 
 
 @dataclass
@@ -67,13 +34,26 @@ class RunFolder:
         Where it is now; the same as `target` in the end.
     partial : Path
         Where an interrupted run may leave what the next one with the same name, or none, can use; not made here.
+    inputs : dict of str to str
+        SHA-256 of every file that the run reads, by name; see `begin`.
     """
 
     target: Path
     path: Path
     partial: Path
     _log: TextIO = field(repr=False)
+    inputs: dict[str, str] = field(default_factory=dict)
     _begun: float = field(default_factory=time.perf_counter, repr=False)
+
+    def begin(self, run: Run, command: str) -> None:
+        """Write config.yaml, hash what the run reads and log the start; errors as `input_files`."""
+        self.write("config.yaml", dump_config(run))
+        self.inputs |= {name: file_sha256(path) for name, path in input_files(run).items()}
+        self.log("start", command=command, versions=versions(), inputs=self.inputs)
+
+    def finish(self, result: Mapping[str, Any]) -> dict[str, Any]:
+        """Write result.json with inputs and versions; returns what was written."""
+        return self.write_json("result.json", {**result, "inputs": self.inputs, "versions": versions()})
 
     def log(self, event: str, **entries: Any) -> None:
         """Add a line to log.jsonl."""
@@ -83,7 +63,7 @@ class RunFolder:
 
     def write(self, name: str, text: str) -> None:
         """Write a text file."""
-        (self.path / name).write_text(text, encoding="utf-8")
+        write_text(self.path / name, text)
 
     def write_json(self, name: str, data: Mapping[str, Any]) -> dict[str, Any]:
         """Write JSON without infinities: they become null, and `notes` says where; returns what was written."""
@@ -102,21 +82,6 @@ class _Lines(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         self._folder.log("message", level=record.levelname, source=record.name, text=record.getMessage())
-
-
-def jsonable(value: Any, notes: list[str] | None = None, path: str = "") -> Any:
-    """A value in JSON's types; numbers that are not finite become None and a line in `notes`."""
-    if isinstance(value, Mapping):
-        return {str(k): jsonable(v, notes, f"{path}.{k}" if path else str(k)) for k, v in value.items()}
-    if isinstance(value, (list, tuple, np.ndarray)):
-        return [jsonable(v, notes, f"{path}[{i}]") for i, v in enumerate(value)]
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float) and not math.isfinite(value):
-        if notes is not None:
-            notes.append(f"{path} is {'not known' if math.isnan(value) else 'infinite'}")
-        return None
-    return value if value is None or isinstance(value, (bool, int, float, str)) else str(value)
 
 
 def _grouped(notes: list[str]) -> list[str]:
@@ -159,19 +124,12 @@ def new_run_folder(run: Run, out: str | Path | None = None, command: str = "") -
         log = (temporary / "log.jsonl").open("w", encoding="utf-8")
     except OSError as error:
         _clear(temporary, made)
-        raise OutputError(
-            f"the run folder cannot be made: {error.strerror or error}",
-            where=str(target),
-            hint="choose a writable folder with --out",
-        ) from error
+        raise _refusal("made", error, target, "choose a writable folder with --out") from error
     partial = target.with_name(f"{_stem(run, command) if out is None else target.name}.partial")
     folder = RunFolder(target, temporary, partial, log)
-    lines, logger = _Lines(folder), logging.getLogger("yid_ocp")
-    level = logger.level
-    logger.addHandler(lines)
-    logger.setLevel(min(logger.getEffectiveLevel(), logging.INFO))
     try:
-        yield folder
+        with _logged(folder):
+            yield folder
         log.close()
         if target.is_dir():
             target.rmdir()
@@ -180,18 +138,29 @@ def new_run_folder(run: Run, out: str | Path | None = None, command: str = "") -
     except OSError as error:
         log.close()
         _clear(temporary, made)
-        raise OutputError(
-            f"the run folder cannot be written: {error.strerror or error}",
-            where=str(target),
-            hint="choose a folder on a disk with room, with --out",
-        ) from error
+        raise _refusal("written", error, target, "choose a folder on a disk with room, with --out") from error
     except BaseException:
         log.close()
         _clear(temporary, made)
         raise
+
+
+@contextlib.contextmanager
+def _logged(folder: RunFolder) -> Iterator[None]:
+    """Enter the library's messages in log.jsonl while the block runs."""
+    lines, logger = _Lines(folder), logging.getLogger("yid_ocp")
+    level = logger.level
+    logger.addHandler(lines)
+    logger.setLevel(min(logger.getEffectiveLevel(), logging.INFO))
+    try:
+        yield
     finally:
         logger.removeHandler(lines)
         logger.setLevel(level)
+
+
+def _refusal(what: str, error: OSError, target: Path, hint: str) -> OutputError:
+    return OutputError(f"the run folder cannot be {what}: {error.strerror or error}", where=str(target), hint=hint)
 
 
 def _target(run: Run, out: str | Path | None, command: str) -> Path:
@@ -224,11 +193,6 @@ def _clear(temporary: Path, made: list[Path]) -> None:
             parent.rmdir()
 
 
-def input_hashes(run: Run) -> dict[str, str]:
-    """SHA-256 of every file that a run reads; errors as `input_files`."""
-    return {name: file_sha256(path) for name, path in input_files(run).items()}
-
-
 def versions() -> dict[str, str]:
     """Versions of Python, this package and what its numbers depend on."""
     result = {"python": platform.python_version(), "platform": f"{platform.system()} {platform.machine()}"}
@@ -238,13 +202,3 @@ def versions() -> dict[str, str]:
         except metadata.PackageNotFoundError:
             result[package] = "not installed"
     return result
-
-
-def both(*callbacks: Callable[[Iterate], None]) -> Callable[[Iterate], None]:
-    """One callback that calls several."""
-
-    def call(entry: Iterate) -> None:
-        for callback in callbacks:
-            callback(entry)
-
-    return call

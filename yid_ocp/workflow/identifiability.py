@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -15,15 +16,19 @@ from yid_ocp.analysis.identifiability import (
     with_grasp_offsets,
 )
 from yid_ocp.analysis.what_if import Outcome, WhatIf, what_if
-from yid_ocp.config.settings import GraspSettings, Run, dump_config
+from yid_ocp.config.reader import load_config
+from yid_ocp.config.settings import GraspSettings, Run
 from yid_ocp.errors import YidError
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import Findings
-from yid_ocp.solvers import Solution, Status, solve
+from yid_ocp.report.terminal import identifiability_summary
+from yid_ocp.solvers import Iterate, Solution, Status, solve
 from yid_ocp.workflow.build import build_problem, build_step, build_system
-from yid_ocp.workflow.folder import Monitor, Silent, both, input_hashes, new_run_folder, versions
+from yid_ocp.workflow.command import DONE, FAILED, carry_out
+from yid_ocp.workflow.folder import RunFolder, new_run_folder
+from yid_ocp.workflow.progress import SILENT, Progress
 
 FORMAT = "yid-identifiability/1"
 MOST_INTERVALS, MOST_UNKNOWNS = 12, 300  # beyond, profiles take long and are worked out only where asked for
@@ -41,7 +46,7 @@ class Question:
     start : "unknown" or "known"
         Whether initial states are estimated along.
     grasp_std : float or None
-        Prior deviation of where the grasps sit [m]; None for grasps that are known.
+        Prior standard deviation of where the grasps sit [m]; None for grasps that are known.
     intervals : "auto", "all" or sequence of str
         Parameters whose interval by profile likelihood is wanted; `auto` for all of a small problem, none of a large
         one.
@@ -70,8 +75,27 @@ class IdentifiabilityOutcome:
         return self.information is not None
 
 
+def run(arguments: argparse.Namespace) -> int:
+    """The command."""
+    settings = load_config(arguments.config, arguments.overrides)
+    names = [name for name in arguments.intervals.split(",") if name]
+    asked = Question(
+        at="initial" if arguments.initial else "solution",
+        start="known" if arguments.known_start else "unknown",
+        grasp_std=None if arguments.known_grasp else Question().grasp_std,
+        intervals={"auto": "auto", "all": "all", "none": ()}.get(arguments.intervals, names),
+        what_if=arguments.what_if,
+    )
+
+    def judged(shown: Progress) -> IdentifiabilityOutcome:
+        return run_identifiability(settings, arguments.out, shown, asked)
+
+    outcome = carry_out(judged, identifiability_summary, arguments.quiet)
+    return DONE if outcome.ok else FAILED
+
+
 def run_identifiability(
-    run: Run, out: str | Path | None = None, monitor: Monitor | None = None, question: Question | None = None
+    run: Run, out: str | Path | None = None, progress: Progress = SILENT, question: Question | None = None
 ) -> IdentifiabilityOutcome:
     """Solve, judge and write the run folder.
 
@@ -80,7 +104,7 @@ def run_identifiability(
     run : Run
     out : str or Path, optional
         The run folder; see `new_run_folder`.
-    monitor : Monitor, optional
+    progress : Progress, optional
     question : Question, optional
 
     Returns
@@ -93,56 +117,66 @@ def run_identifiability(
     ConfigError, DataError, ModelError, SolverError, OutputError
     """
     asked = question or Question()
-    watcher = monitor or Silent()
     with new_run_folder(run, out, "identifiability") as folder:
-        inputs = input_hashes(run)
-        folder.write("config.yaml", dump_config(run))
-        watcher.stage("building the model and its compiled step")
-        folder.log("start", command="identifiability", versions=versions(), inputs=inputs)
+        folder.begin(run, "identifiability")
+        progress.stage("building the model and its compiled step")
         system = build_system(run)
         problem = build_problem(run, build_step(run, _nuisanced(system, asked)))
-        solution: Solution | None = None
-        information: Identifiability | None = None
-        ranking: WhatIf | None = None
-        known: Identifiability | None = None
-        if asked.at == "solution":
-            watcher.stage(f"solving for {len(problem.start)} unknowns by {run.solver.name}")
-
-            def note(entry: Any) -> None:
-                folder.log("iterate", iteration=entry.iteration, cost=entry.cost, seconds=entry.seconds)
-
-            solution = solve(problem, run.solver, callback=both(note, watcher.iterate))
+        solution = _solved(run, problem, folder, progress) if asked.at == "solution" else None
+        known = information = ranking = None
         if solution is None or solution.status != Status.FAILED:
-            watcher.stage("Fisher information")
+            progress.stage("Fisher information")
             known = identifiability(problem, solution, start="known", grasp_std=None)
-            information = identifiability(problem, solution, start=asked.start, grasp_std=asked.grasp_std)
-            wanted = _wanted(information, asked)
-            if wanted:
-                watcher.stage(f"intervals of {len(wanted)} parameters by profile likelihood")
-                information = identifiability(
-                    problem, solution, start=asked.start, grasp_std=asked.grasp_std, intervals=wanted
-                )
-        if information is not None and asked.what_if:
-            other = second_arm(run, system)
-            ranking = what_if(
-                problem,
-                solution,
-                start=asked.start,
-                grasp_std=asked.grasp_std,
-                second_arm=None if other is None else _nuisanced(other, asked),
-                tell=watcher.stage,
-            )
-        result = identifiability_result(problem, solution, information, known, ranking, asked) | {
-            "inputs": inputs,
-            "versions": versions(),
-        }
+            information = _information(problem, solution, asked, progress)
+            ranking = _ranking(run, system, problem, solution, asked, progress) if asked.what_if else None
+        result = identifiability_result(problem, solution, information, known, ranking, asked)
         folder.log("end", status=result["status"], message=result["message"])
-        written = folder.write_json("result.json", result)
+        written = folder.finish(result)
         if run.output.report:
-            watcher.stage("writing the report")
+            progress.stage("writing the report")
             findings = Findings(run.name, run.description, written, solution=solution)
             write_report(folder.path / "report.html", findings)
     return IdentifiabilityOutcome(folder.path, written, information)
+
+
+def _solved(run: Run, problem: EstimationProblem, folder: RunFolder, progress: Progress) -> Solution:
+    progress.stage(f"solving for {len(problem.start)} unknowns by {run.solver.name}")
+
+    def iterate(entry: Iterate) -> None:
+        folder.log("iterate", iteration=entry.iteration, cost=entry.cost, seconds=entry.seconds)
+        progress.iterate(entry)
+
+    return solve(problem, run.solver, callback=iterate)
+
+
+def _information(
+    problem: EstimationProblem, solution: Solution | None, asked: Question, progress: Progress
+) -> Identifiability:
+    information = identifiability(problem, solution, start=asked.start, grasp_std=asked.grasp_std)
+    wanted = _wanted(information, asked)
+    if not wanted:
+        return information
+    progress.stage(f"intervals of {len(wanted)} parameters by profile likelihood")
+    return identifiability(problem, solution, start=asked.start, grasp_std=asked.grasp_std, intervals=wanted)
+
+
+def _ranking(
+    run: Run,
+    system: System,
+    problem: EstimationProblem,
+    solution: Solution | None,
+    asked: Question,
+    progress: Progress,
+) -> WhatIf:
+    other = second_arm(run, system)
+    return what_if(
+        problem,
+        solution,
+        start=asked.start,
+        grasp_std=asked.grasp_std,
+        second_arm=None if other is None else _nuisanced(other, asked),
+        progress=progress.stage,
+    )
 
 
 def _wanted(information: Identifiability, asked: Question) -> Sequence[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,13 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.analysis.inspection import Linearisation, inspect_step, linearise, sparsity_picture
-from yid_ocp.config.settings import Run, dump_config
+from yid_ocp.config.reader import load_config
+from yid_ocp.config.settings import Run
 from yid_ocp.errors import ModelError
 from yid_ocp.integrator.statics import Statics
 from yid_ocp.integrator.step import Step
 from yid_ocp.problem import EstimationProblem
+from yid_ocp.report.terminal import inspect_summary
 from yid_ocp.workflow.build import build_problem, build_step, parameter_settings
-from yid_ocp.workflow.folder import Monitor, Silent, input_hashes, new_run_folder, versions
+from yid_ocp.workflow.command import DONE, carry_out
+from yid_ocp.workflow.folder import new_run_folder
+from yid_ocp.workflow.progress import SILENT, Progress
 
 FORMAT = "yid-inspect/1"
 Array = NDArray[np.float64]
@@ -32,70 +37,72 @@ class InspectOutcome:
     result: dict[str, Any]
 
 
-def run_inspect(run: Run, out: str | Path | None = None, monitor: Monitor | None = None) -> InspectOutcome:
+def run(arguments: argparse.Namespace) -> int:
+    """The command."""
+    settings = load_config(arguments.config, arguments.overrides)
+    carry_out(lambda shown: run_inspect(settings, arguments.out, shown), inspect_summary, arguments.quiet)
+    return DONE
+
+
+def run_inspect(run: Run, out: str | Path | None = None, progress: Progress = SILENT) -> InspectOutcome:
     """Write result.json, sparsity.png and linearisation.h5 of a run's model.
 
     Parameters
     ----------
     run : Run
     out : str or Path, optional
-    monitor : Monitor, optional
+    progress : Progress, optional
 
     Raises
     ------
     ConfigError, DataError, ModelError, OutputError
     """
-    watcher = monitor or Silent()
     with new_run_folder(run, out, "inspect") as folder:
-        folder.write("config.yaml", dump_config(run))
-        inputs = input_hashes(run)
-        folder.log("start", command="inspect", versions=versions(), inputs=inputs)
-        watcher.stage("building the model and its compiled step")
+        folder.begin(run, "inspect")
+        progress.stage("building the model and its compiled step")
         begun = time.perf_counter()
         step = build_step(run)
         seconds = time.perf_counter() - begun
         free = {name for name, said in parameter_settings(run, step.system.parameters).items() if said.free}
-        watcher.stage("linearising")
+        progress.stage("linearising")
         problem = build_problem(run, step) if run.recordings.estimate and free else None
         at, linearisation, torque = _linearised(step, problem)
         sparsity_picture(step, folder.path / "sparsity.png")
         _write_matrices(folder.path / "linearisation.h5", step, linearisation, torque)
-        inspection = inspect_step(step)
         result = {
             "format": FORMAT,
             "build_seconds": seconds,
             "compiled": step.compiled,
             "variables": _variables(step),
-            "parameters": {
-                entry.name: {
-                    "value": entry.value,
-                    "unit": entry.unit,
-                    "lower": entry.lower,
-                    "upper": entry.upper,
-                    "free": entry.name in free,
-                    "description": entry.description,
-                }
-                for entry in step.system.parameters
-            },
-            "equations": asdict(inspection),
+            "parameters": _parameters(step, free),
+            "equations": asdict(inspect_step(step)),
             "linearisation": {
                 "at": at,
                 "spectral_radius": linearisation.spectral_radius,
                 "norms": {
-                    name: float(np.linalg.norm(matrix))
-                    for name, matrix in (
-                        ("A", linearisation.a),
-                        ("B_u", linearisation.b_input),
-                        ("B_theta", linearisation.b_theta),
-                    )
+                    "A": float(np.linalg.norm(linearisation.a)),
+                    "B_u": float(np.linalg.norm(linearisation.b_input)),
+                    "B_theta": float(np.linalg.norm(linearisation.b_theta)),
                 },
                 "finite_difference_errors": linearisation.errors,
             },
-            "inputs": inputs,
-            "versions": versions(),
         }
-        written = folder.write_json("result.json", result)
+        written = folder.finish(result)
     return InspectOutcome(folder.path, written)
+
+
+def _parameters(step: Step, free: set[str]) -> dict[str, dict[str, Any]]:
+    return {
+        entry.name: {
+            "value": entry.value,
+            "unit": entry.unit,
+            "lower": entry.lower,
+            "upper": entry.upper,
+            "free": entry.name in free,
+            "description": entry.description,
+        }
+        for entry in step.system.parameters
+    }
 
 
 def _variables(step: Step) -> list[dict[str, str]]:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import logging
 import math
 import threading
 from collections.abc import Mapping
 
-from yid_ocp.data.recording import new_file
 from yid_ocp.diagnosis import Refitted
 from yid_ocp.errors import OutputError
+from yid_ocp.files import content_hash, write_json
 from yid_ocp.workflow.folder import RunFolder
 
 FORMAT = "yid-refits/1"
@@ -23,7 +22,10 @@ class Refits:
     """A store of refits in one JSON file: {format, key, refits: {name: {values, std, message}}}.
 
     The file is replaced as a whole after every refit. One that was made from other inputs, by another configuration or
-    by another version is passed over with a notice.
+    by another version is skipped with a notice.
+
+    Refits run in threads, not as tasks of `yid_ocp.parallel`: all of one diagnosis share a compiled step and what was
+    worked out from the recordings, and a refit takes less time than to build these in another process.
 
     Attributes
     ----------
@@ -33,7 +35,7 @@ class Refits:
     def __init__(self, folder: RunFolder, *made_from: Mapping[str, str] | str) -> None:
         self.file = folder.partial / "refits.json"
         self._folder = folder
-        self._key = hashlib.sha256(json.dumps(made_from, sort_keys=True).encode()).hexdigest()
+        self._key = content_hash(made_from)
         self._lock = threading.Lock()
         self._warned = False
         self._known = self._read()
@@ -42,10 +44,10 @@ class Refits:
         return len(self._known)
 
     def get(self, name: str) -> Refitted | None:
-        """See `yid_ocp.diagnosis.select.Store`; what is taken up is said in the log."""
+        """See `yid_ocp.diagnosis.select.Store`; what is resumed is said in the log."""
         found = self._known.get(name)
         if found is not None:
-            self._folder.log("taken_up", refit=name)
+            self._folder.log("resumed", refit=name)
         return found
 
     def put(self, name: str, refitted: Refitted) -> None:
@@ -56,11 +58,9 @@ class Refits:
                 key: {"values": _texts(fit.values), "std": _texts(fit.std), "message": fit.message}
                 for key, fit in self._known.items()
             }
-            text = json.dumps({"format": FORMAT, "key": self._key, "refits": refits}, indent=1, allow_nan=False)
             try:
                 self.file.parent.mkdir(parents=True, exist_ok=True)
-                with new_file(self.file) as fresh:
-                    fresh.write_text(text + "\n", encoding="utf-8")
+                write_json(self.file, {"format": FORMAT, "key": self._key, "refits": refits})
             except (OSError, OutputError) as error:
                 if not self._warned:
                     log.warning("finished refits cannot be kept (%s); the diagnosis goes on without", error)
@@ -86,7 +86,7 @@ class Refits:
             return {}
         except (OSError, ValueError, LookupError, TypeError, AttributeError):
             reason = "something that cannot be read"
-        log.warning("the refits in %s are from %s and are not taken up", self.file, reason)
+        log.warning("the refits in %s are from %s and are not resumed", self.file, reason)
         return {}
 
 

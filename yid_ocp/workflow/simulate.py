@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -9,13 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.config.settings import Run, dump_config
+from yid_ocp.config.reader import load_config
+from yid_ocp.config.settings import Run
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate, write_recording
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.prediction import EpisodeResult
+from yid_ocp.report.terminal import simulate_summary
 from yid_ocp.workflow.build import build_step, build_system, problem_options, read_recordings
-from yid_ocp.workflow.folder import Monitor, Silent, input_hashes, new_run_folder, versions
+from yid_ocp.workflow.command import DONE, FAILED, carry_out
+from yid_ocp.workflow.folder import new_run_folder
+from yid_ocp.workflow.progress import SILENT, Progress
 
 FORMAT = "yid-simulate/1"
 DURATION = 5.0  # of a virtual experiment whose configuration does not say [s]
@@ -45,8 +50,19 @@ class SimulateOutcome:
         return self.recording is not None
 
 
+def run(arguments: argparse.Namespace) -> int:
+    """The command."""
+    settings = load_config(arguments.config, arguments.overrides)
+
+    def simulated(shown: Progress) -> SimulateOutcome:
+        return run_simulate(settings, arguments.out, shown, arguments.seed, arguments.noise)
+
+    outcome = carry_out(simulated, simulate_summary, arguments.quiet)
+    return DONE if outcome.ok else FAILED
+
+
 def run_simulate(
-    run: Run, out: str | Path | None = None, monitor: Monitor | None = None, seed: int = 0, noise: bool = False
+    run: Run, out: str | Path | None = None, progress: Progress = SILENT, seed: int = 0, noise: bool = False
 ) -> SimulateOutcome:
     """Write `recording.h5`: the model moved by the inputs of the first recording, or a virtual experiment without one.
 
@@ -58,26 +74,23 @@ def run_simulate(
     ----------
     run : Run
     out : str or Path, optional
-    monitor : Monitor, optional
+    progress : Progress, optional
     seed : int
         Of the motion and the noise.
     noise : bool
-        Whether noise of the recorded deviations is added to what the model predicts (a virtual experiment always has
-        noise).
+        Whether noise of the recorded standard deviations is added to what the model predicts (a virtual experiment
+        always has noise).
 
     Raises
     ------
     ConfigError, DataError, ModelError, OutputError
     """
-    watcher = monitor or Silent()
     with new_run_folder(run, out, "simulate") as folder:
-        folder.write("config.yaml", dump_config(run))
-        inputs = input_hashes(run)
-        folder.log("start", command="simulate", versions=versions(), inputs=inputs)
+        folder.begin(run, "simulate")
         if run.recordings.estimate:
-            made = _predicted(run, watcher, seed if noise else None)
+            made = _predicted(run, progress, seed if noise else None)
         else:
-            made = _virtual(run, watcher, seed)
+            made = _virtual(run, progress, seed)
         result: dict[str, Any] = {"format": FORMAT, "status": "done", "message": "", "seed": seed}
         if isinstance(made, str):
             result |= {"status": "failed", "message": made}
@@ -90,28 +103,28 @@ def run_simulate(
                 "groups": {getattr(g, "name", "joints"): {"samples": len(g.t)} for g in recording.groups},
                 "truth": dict(recording.truth),
             }
-        written = folder.write_json("result.json", result | {"inputs": inputs, "versions": versions()})
+        written = folder.finish(result)
     return SimulateOutcome(folder.path, written, recording)
 
 
-def _virtual(run: Run, watcher: Monitor, seed: int) -> Recording:
+def _virtual(run: Run, progress: Progress, seed: int) -> Recording:
     from yid_ocp.virtual.experiment import virtual_experiment
 
     system = build_system(run)
-    watcher.stage("simulating a virtual experiment in MuJoCo")
+    progress.stage("simulating a virtual experiment in MuJoCo")
     duration = run.problem.duration or DURATION
     return virtual_experiment(system, None, duration=duration, seed=seed, name=run.name, description=run.description)
 
 
-def _predicted(run: Run, watcher: Monitor, seed: int | None) -> Recording | str:
-    watcher.stage("building the model and its compiled step")
+def _predicted(run: Run, progress: Progress, seed: int | None) -> Recording | str:
+    progress.stage("building the model and its compiled step")
     step = build_step(run)
     first = replace(run, recordings=replace(run.recordings, estimate=run.recordings.estimate[:1]))
     recordings = read_recordings(first, "estimate")
     options = replace(problem_options(run, step.system.parameters, recordings), local=(), priors={})
     problem = EstimationProblem(step, recordings, (), options)
     episode = problem.episodes[0]
-    watcher.stage(f"rolling out {episode.grid.steps} steps")
+    progress.stage(f"rolling out {episode.grid.steps} steps")
     outcome = problem.predictor.run(episode, problem.theta, np.zeros(len(problem.start)), False)
     if isinstance(outcome, str):
         return outcome
@@ -130,7 +143,7 @@ def as_recording(
     episode : Episode
     outcome : EpisodeResult
     seed : int, optional
-        Of noise with the recorded deviations; none when absent.
+        Of noise with the recorded standard deviations; none when absent.
     """
     rng = None if seed is None else np.random.default_rng(seed)
     system, source = problem.system, episode.recording

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,17 +11,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.config.settings import Run, VirtualFramesSettings, dump_config
-from yid_ocp.data.recording import Recording, file_sha256, read_recording, write_recording
+from yid_ocp.config.reader import load_config
+from yid_ocp.config.settings import Run, VirtualFramesSettings
+from yid_ocp.data.recording import Recording, read_recording, write_recording
 from yid_ocp.errors import ConfigError
+from yid_ocp.files import file_sha256
 from yid_ocp.model.system import System
+from yid_ocp.report.terminal import track_summary
 from yid_ocp.vision.camera import DepthCamera, FrameTiming, VirtualFrames, virtual_frames
 from yid_ocp.vision.fit import ShapeFit
 from yid_ocp.vision.frames import FrameSequence, look_at, read_frames, write_frames
 from yid_ocp.vision.pictures import draw_stages, draw_track
 from yid_ocp.vision.track import Track, track
 from yid_ocp.workflow.build import build_system, located, recording_file
-from yid_ocp.workflow.folder import Monitor, Silent, input_hashes, new_run_folder, versions
+from yid_ocp.workflow.command import DONE, carry_out
+from yid_ocp.workflow.folder import new_run_folder
+from yid_ocp.workflow.progress import SILENT, Progress
 
 FORMAT = "yid-track/1"
 Array = NDArray[np.float64]
@@ -47,7 +53,14 @@ class TrackOutcome:
     recording: Recording
 
 
-def run_track(run: Run, out: str | Path | None = None, monitor: Monitor | None = None) -> TrackOutcome:
+def run(arguments: argparse.Namespace) -> int:
+    """The command."""
+    settings = load_config(arguments.config, arguments.overrides)
+    carry_out(lambda shown: run_track(settings, arguments.out, shown), track_summary, arguments.quiet)
+    return DONE
+
+
+def run_track(run: Run, out: str | Path | None = None, progress: Progress = SILENT) -> TrackOutcome:
     """Track the frames of `track.frames`, or of a virtual camera where there are none.
 
     The joint angles are those of the first recording under `recordings.estimate`; a virtual frame sequence has its own.
@@ -56,7 +69,7 @@ def run_track(run: Run, out: str | Path | None = None, monitor: Monitor | None =
     ----------
     run : Run
     out : str or Path, optional
-    monitor : Monitor, optional
+    progress : Progress, optional
 
     Returns
     -------
@@ -66,23 +79,21 @@ def run_track(run: Run, out: str | Path | None = None, monitor: Monitor | None =
     ------
     ConfigError, DataError, ModelError, OutputError
     """
-    watcher, settings = monitor or Silent(), run.track
+    settings = run.track
     with new_run_folder(run, out, "track") as folder:
-        folder.write("config.yaml", dump_config(run))
-        inputs = input_hashes(run)
+        folder.begin(run, "track")
         system = build_system(run)
         made: VirtualFrames | None = None
         if settings.frames is None:
-            watcher.stage("simulating a virtual experiment in MuJoCo")
+            progress.stage("simulating a virtual experiment in MuJoCo")
             recording, made = virtual_film(run, system, settings.virtual)
             seen = made.sequence
             if settings.keep_frames:
                 write_frames(seen, folder.path / "frames")
         else:
             recording, seen = _recorded(run, settings.frames)
-            inputs |= {settings.frames: file_sha256(Path(settings.frames))}
-        folder.log("start", command="track", versions=versions(), inputs=inputs)
-        watcher.stage("tracking")
+            folder.inputs[settings.frames] = file_sha256(Path(settings.frames))
+        progress.stage("tracking")
         drawn = sorted({int(i) for i in np.linspace(0, len(seen) - 1, settings.pictures + 2)[1:-1]})
         with located(run, "track"):
             found = track(
@@ -92,16 +103,16 @@ def run_track(run: Run, out: str | Path | None = None, monitor: Monitor | None =
                 urdf=run.model.robot,
                 options=settings.options,
                 stages=drawn,
-                progress=watcher.advance,
+                progress=progress.advance,
             )
-        watcher.stage("drawing")
+        progress.stage("drawing")
         for stages in found.stages:
             draw_stages(stages, folder.path / "pictures")
         draw_track(found, folder.path / "track.png")
         tracked = found.recording(recording)
         write_recording(tracked, folder.path / "recording.h5")
         result = track_result(found) | {"truth_errors": {} if made is None else truth_errors(system, found, made)}
-        written = folder.write_json("result.json", result | {"inputs": inputs, "versions": versions()})
+        written = folder.finish(result)
     return TrackOutcome(folder.path, written, found, tracked)
 
 

@@ -1,12 +1,17 @@
 """Report sections: each is one file here that registers a function, with a template of the same name.
 
-The function turns `Findings` into what its template needs, or into None where it has nothing to say.
+The function turns `Findings` into what its template needs, or into None where it has nothing to say. A file outside the
+package does as well, once it is imported; its template `NAME.html` stands beside it.
 """
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from pkgutil import iter_modules
 from typing import TYPE_CHECKING, Any
 
 from yid_ocp.problem import EstimationProblem
@@ -54,26 +59,30 @@ class Findings:
         return found + [("held_out", e, r) for e, r in self.held_out if not isinstance(r, str)]
 
 
+Prepare = Callable[[Findings], Mapping[str, Any] | None]
+
+
 @dataclass(frozen=True)
 class Section:
     """One part of the page: place, heading and the function that prepares its template."""
 
     order: int
     title: str
-    prepare: Callable[[Findings], Mapping[str, Any] | None]
+    prepare: Prepare
+
+    @property
+    def folder(self) -> Path:
+        """Where a template may stand beside the function; those of the package have a folder of their own."""
+        return Path(inspect.getfile(self.prepare)).parent
 
 
 SECTIONS: Registry[Section] = Registry("report section")
 
 
-def section(
-    name: str, order: int, title: str
-) -> Callable[[Callable[[Findings], Mapping[str, Any] | None]], Callable[[Findings], Mapping[str, Any] | None]]:
-    """Register a function as the section `name`, drawn by `templates/NAME.html`, lower orders first."""
+def section(name: str, order: int, title: str) -> Callable[[Prepare], Prepare]:
+    """Register a function as the section `name`, drawn by the template `NAME.html`, lower orders first."""
 
-    def enter(
-        prepare: Callable[[Findings], Mapping[str, Any] | None],
-    ) -> Callable[[Findings], Mapping[str, Any] | None]:
+    def enter(prepare: Prepare) -> Prepare:
         SECTIONS.register(name)(Section(order, title, prepare))
         return prepare
 
@@ -91,5 +100,6 @@ def written_sections(findings: Findings, environment: jinja2.Environment) -> lis
     return result
 
 
-# the sections register themselves
-from yid_ocp.report.sections import diagnosis, fit, identifiability, inputs, search, summary  # noqa: E402, F401
+# every file of this folder registers its section when it is imported
+for _file in iter_modules(__path__):
+    import_module(f"{__name__}.{_file.name}")

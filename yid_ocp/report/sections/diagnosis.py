@@ -173,7 +173,7 @@ def _where(finding: Finding) -> Chapter | None:
         if blank:
             prior = np.sqrt([smoothed.variance[source] for source in trace.sources])
             values = trace.mean / np.where(prior > 0, prior, np.nan)
-            axis = "value in deviations expected beforehand"
+            axis = "value in standard deviations expected beforehand"
         rows = []
         for k in kept:
             size, unit = trace.reference[k], shown[k]
@@ -220,7 +220,7 @@ def _surest(smoothed: Smoothed, shown: Sequence[str], blank: bool) -> str:
     if blank:
         return (
             "Nowhere do the data say more than half of what can be said of a single value, so that values are shown in "
-            "units of the deviation expected beforehand: take the picture for a hint only."
+            "units of the standard deviation expected beforehand: take the picture for a hint only."
         )
     ratio = informed_map(smoothed)[2]
     j, k = divmod(int(np.nanargmax(np.abs(ratio))), ratio.shape[1])
@@ -345,7 +345,7 @@ def _curves(finding: Finding, predicted: Sequence[Prediction]) -> Chapter | None
     what = "change most with the effects" if changed else "the nominal model misses most"
     sentences = [
         f"The {len(chosen)} held-out coordinates or joints that {what}, measured and predicted; below each "
-        "the error, with two deviations of the noise shaded: what is right stays within.",
+        "the error, with two standard deviations of the noise shaded: what is right stays within.",
     ]
     return Chapter("Measured and predicted", sentences, pictures)
 

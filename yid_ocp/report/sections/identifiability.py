@@ -8,8 +8,7 @@ from typing import Any
 from yid_ocp.analysis.profile import LEVEL
 from yid_ocp.report import figures
 from yid_ocp.report.sections import Findings, section
-
-WORDS = {"identifiable": "identifiable", "weak": "weak", "not_identifiable": "not identifiable"}
+from yid_ocp.solvers.words import VERDICT_WORDS
 
 
 @section("identifiability", 10, "What can be told")
@@ -25,7 +24,7 @@ def prepare(findings: Findings) -> Mapping[str, Any] | None:
             curves[name] = ([value / best for value in profile["values"]], profile["delta_chi2"])
     return {
         "result": result,
-        "words": WORDS,
+        "words": VERDICT_WORDS,
         "hidden": [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"],
         "picture": figures.html(figures.profiles(curves, LEVEL)) if curves else None,
     }

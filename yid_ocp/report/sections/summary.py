@@ -7,13 +7,12 @@ from typing import Any
 
 from yid_ocp.report import figures
 from yid_ocp.report.sections import Findings, section
-
-WORDS = {"identifiable": "found", "weak": "weakly determined", "not_identifiable": "cannot be found"}
+from yid_ocp.solvers.words import VERDICT_WORDS
 
 
 @section("summary", 10, "What was found")
 def prepare(findings: Findings) -> Mapping[str, Any] | None:
-    """Free parameters with deviations and verdicts."""
+    """Free parameters with standard deviations and verdicts."""
     result = findings.result
     if not any("free" in entry for entry in result.get("parameters", {}).values()):
         return None
@@ -22,11 +21,11 @@ def prepare(findings: Findings) -> Mapping[str, Any] | None:
     for name, entry in free.items():
         found = entry["verdict"] != "not_identifiable" and result["status"] != "failed"
         by_unit.setdefault(entry["unit"], {})[name] = (entry["value"], entry["std"], entry["initial"], found)
-    by_verdict = {word: [n for n, e in free.items() if e["verdict"] == key] for key, word in WORDS.items()}
+    by_verdict = {verdict: [n for n, e in free.items() if e["verdict"] == verdict] for verdict in VERDICT_WORDS}
     return {
         "result": result,
         "free": free,
-        "words": WORDS,
+        "words": VERDICT_WORDS,
         "by_verdict": by_verdict,
         "pictures": [figures.html(figures.estimates(values, unit)) for unit, values in by_unit.items()],
     }

@@ -1,0 +1,124 @@
+"""Tables and sentences at the end of a command; a parameter's verdict reads alike wherever it stands."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from yid_ocp.data import JointGroup, Recording
+from yid_ocp.report import terminal
+from yid_ocp.report.sections import SECTIONS, Findings
+from yid_ocp.solvers.base import verdict
+from yid_ocp.solvers.words import PREDICATES, VERDICT_WORDS
+
+
+def parameter(said: str, value: float = 2.0) -> dict:
+    return {
+        "value": value, "std": 0.1, "unit": "N m/rad", "initial": 3.0, "lower": 0.0, "upper": None,
+        "free": said != "fixed", "verdict": said,
+    }  # fmt: skip
+
+
+def solved(**changes) -> dict:
+    verdicts = ("identifiable", "weak", "not_identifiable", "fixed")
+    return {
+        "format": "yid-solve/1", "status": "converged", "message": "done", "iterations": 4, "evaluations": 9,
+        "seconds": 1.0, "parameters": {f"p_{said}": parameter(said) for said in verdicts}, "residuals": {},
+        "held_out": [], "whitened_cost": 5.0, "wall_seconds": 1.0, "cpu_seconds": 1.0, "peak_memory_mib": 50.0,
+        "disagreements": [],
+    } | changes  # fmt: skip
+
+
+def judged(said: str) -> dict:
+    return {
+        "value": 2.0, "unit": "N m/rad", "std_relative": 0.5, "std_relative_known": 0.4, "std_alone": 0.3,
+        "verdict": said, "interval": None,
+    }  # fmt: skip
+
+
+def line_of(lines: list[str], name: str) -> str:
+    return next(line for line in lines if line.startswith(f"{name} "))
+
+
+def test_every_verdict_has_its_words():
+    possible = {verdict(1.0, std) for std in (0.01, 1.0, 100.0, float("inf"))} | {"fixed"}
+    assert set(PREDICATES) == set(VERDICT_WORDS) == possible
+    assert VERDICT_WORDS["identifiable"] == "found"
+
+
+@pytest.mark.parametrize("said", ["identifiable", "weak", "not_identifiable"])
+def test_a_verdict_reads_alike_in_every_command(said):
+    words, name = VERDICT_WORDS[said], f"p_{said}"
+    assert words in line_of(terminal.solve_summary(solved()), name)
+    compared = {
+        "methods": {"gauss_newton": solved()}, "reference": "gauss_newton", "published": {}, "truth": {},
+        "explained": [], "agree": True,
+    }  # fmt: skip
+    assert words in line_of(terminal.compare_summary(compared), name)
+    information = {
+        "format": "yid-identifiability/1", "status": "converged", "message": "", "parameters": {name: judged(said)},
+        "directions": [], "profiles": {}, "what_if": None,
+    }  # fmt: skip
+    assert words in line_of(terminal.identifiability_summary(information), name)
+    for section, result in (("summary", solved()), ("identifiability", information)):
+        assert SECTIONS[section].prepare(Findings("x", "", result))["words"][said] == words
+
+
+def test_a_solve_says_what_is_not_found():
+    lines = terminal.solve_summary(solved())
+    assert "cannot be found from these recordings: p_not_identifiable" in lines
+    assert "only weakly determined: p_weak" in lines
+    assert lines[-1] == "converged: done (4 iterations, 1.0 s)"
+    assert not any("p_fixed" in line for line in lines)
+
+
+def test_a_failed_solve_says_nothing_of_its_parameters():
+    lines = terminal.solve_summary(solved(status="failed", message="step 3"))
+    assert not any(word in line for line in lines for word in VERDICT_WORDS.values())
+    assert "the values are the best point that was reached; nothing can be said about how sure they are" in lines
+
+
+def test_a_comparison_without_a_parameter_that_is_found_has_nothing_to_agree_on():
+    weak = solved(parameters={"a": parameter("weak")})
+    compared = {
+        "methods": {"lifted": weak, "other": weak | {"status": "failed", "whitened_cost": None}},
+        "reference": "lifted", "published": {"a": 1.0}, "truth": {}, "explained": [], "agree": True,
+    }  # fmt: skip
+    lines = terminal.compare_summary(compared)
+    assert "no parameter can be found from these recordings, so there is nothing to agree on" in lines
+    assert line_of(lines, "cost (whitened)").split()[-2:] == ["5", "failed"]
+    assert "published" in lines[0]
+    assert "truth" not in lines[0]
+    found = compared | {"methods": {"lifted": solved()}}
+    assert "all methods agree within their uncertainty on the parameters that are found" in terminal.compare_summary(
+        found
+    )
+
+
+def test_what_if_names_the_fewest_changes_or_that_there_are_none():
+    base = {"words": "as it is", "identifiable": 0, "gain": None, "message": ""}
+    asked = {"base": base, "singles": [base | {"words": "a camera", "gain": 2.0}], "smallest": []}
+    result = {"status": "", "parameters": {"a": judged("weak")}, "directions": [], "profiles": {}, "what_if": asked}
+    lines = terminal.identifiability_summary(result)
+    assert "with no set of up to three changes can all of them be found" in lines
+    assert lines[-1] == "none of 1 parameters can be found from these recordings"
+    result["what_if"] = asked | {"smallest": [base | {"words": "a weld"}]}
+    assert "fewest changes with which all of them can be found: a weld" in terminal.identifiability_summary(result)
+
+
+def test_a_simulation_that_failed_and_one_that_did_not():
+    assert terminal.simulate_summary({"status": "failed", "message": "step 3"}) == ["failed: step 3"]
+    done = {"status": "done", "groups": {"joints": {"samples": 12}}, "duration": 0.5}
+    assert terminal.simulate_summary(done)[-1] == "0.5 s in recording.h5"
+
+
+def test_a_recording_in_a_table():
+    recording = Recording(JointGroup(("a", "b"), np.array([0.0, 0.1]), np.zeros((2, 2))))
+    lines = terminal.recording_summary(recording)
+    assert lines[2].split() == ["joints", "2", "a,", "b"]
+    assert lines[-1] == "0.1 s"
+
+
+def test_a_table_leaves_out_columns_without_an_entry():
+    lines = terminal.table([("a", "", "long head"), ("1", "", "x"), ("22", "", "")])
+    assert lines == ["a   long head", "--  ---------", "1   x", "22"]

@@ -1,0 +1,328 @@
+"""Tasks: finished ones are kept and not done again, failing and dying ones take no other with them."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from yid_ocp.errors import DataError, OutputError
+from yid_ocp.parallel import Task, map_threads, process_pool, run_tasks
+
+# -- what tasks do ----------------------------------------------------------------------------------------------------
+
+
+def counted(number: int, calls: Path | str) -> dict[str, Any]:
+    """Twice a number; every call leaves a line in a file that does not count as an input."""
+    with Path(calls).open("a", encoding="utf-8") as file:
+        file.write(f"{number}\n")
+    return {"twice": 2 * number, "pair": (number, None)}
+
+
+def length(file: Path, unit: str = "characters") -> str:
+    return f"{file.name}: {len(file.read_text())} {unit}"
+
+
+def fragile(number: int, broken: str = "") -> int:
+    if number == 3 or Path(broken).is_file():
+        raise ZeroDivisionError(f"no {number}")
+    return number
+
+
+def lethal(number: int, deadly: int) -> int:
+    if number == deadly:
+        os._exit(7)
+    time.sleep(0.05)
+    return 10 * number
+
+
+def slow(number: int) -> int:
+    time.sleep(0.02 * (5 - number))
+    return number
+
+
+def strange(number: int) -> Any:
+    return {"set": {number}} if number else float("nan")
+
+
+def process_name(number: int) -> str:
+    del number
+    return multiprocessing.current_process().name
+
+
+def tasks_of(count: int, **arguments: Any) -> list[Task]:
+    return [Task(f"task {i}", {"number": i, **arguments}) for i in range(count)]
+
+
+@pytest.fixture
+def threads():
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        yield pool
+
+
+# -- kept and resumed -------------------------------------------------------------------------------------------------
+
+
+def test_results_come_in_the_order_of_the_tasks(tmp_path, threads):
+    found = run_tasks(slow, tasks_of(5), tmp_path, threads)
+    assert [(entry.name, entry.value) for entry in found] == [(f"task {i}", i) for i in range(5)]
+    assert not any(entry.error or entry.resumed for entry in found)
+    assert found[0].seconds >= 0.1
+
+
+def test_what_is_done_is_not_done_again(tmp_path, threads):
+    calls, folder = tmp_path / "calls", tmp_path / "results"
+    first = run_tasks(counted, tasks_of(3, calls=str(calls)), folder, threads)
+    again = run_tasks(counted, tasks_of(4, calls=str(calls)), folder, threads)
+    assert sorted(calls.read_text().split()) == ["0", "1", "2", "3"]
+    assert [entry.resumed for entry in again] == [True, True, True, False]
+    assert [entry.value for entry in again[:3]] == [entry.value for entry in first]
+    assert again[2].value == {"twice": 4, "pair": [2, None]}
+    assert again[0].seconds == first[0].seconds
+
+
+def test_the_name_does_not_count_and_equal_tasks_are_done_once(tmp_path, threads):
+    calls = tmp_path / "calls"
+    pair = [Task(name, {"number": 1, "calls": str(calls)}) for name in ("a", "b")]
+    found = run_tasks(counted, pair, tmp_path / "results", threads)
+    assert [entry.name for entry in found] == ["a", "b"]
+    assert found[0].value == found[1].value
+    assert calls.read_text().split() == ["1"]
+
+
+def half(text: str) -> str:
+    return text[: len(text) // 2]
+
+
+@pytest.mark.parametrize(
+    "spoiled",
+    [
+        half,
+        lambda text: "",
+        lambda text: "[1]",
+        lambda text: text.replace('"number": 0', '"number": 9'),
+        lambda text: text.replace("yid-task/1", "yid-task/0"),
+    ],
+)
+def test_a_result_that_is_not_whole_is_not_taken(tmp_path, threads, spoiled):
+    calls, folder = tmp_path / "calls", tmp_path / "results"
+    tasks = tasks_of(2, calls=str(calls))
+    run_tasks(counted, tasks, folder, threads)
+    (file,) = (path for path in folder.iterdir() if '"number": 0' in path.read_text())
+    file.write_text(spoiled(file.read_text()))
+    (folder / f".{file.name}.1234.tmp").write_text("{")
+    again = run_tasks(counted, tasks, folder, threads)
+    assert [entry.resumed for entry in again] == [False, True]
+    assert [entry.value["twice"] for entry in again] == [0, 2]
+    assert sorted(calls.read_text().split()) == ["0", "0", "1"]
+
+
+def test_a_changed_input_is_done_again(tmp_path, threads):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    file = tmp_path / "a" / "text"
+    file.write_text("four")
+
+    def resumed(file: Path, **arguments: Any) -> bool:
+        (result,) = run_tasks(length, [Task("", {"file": file, **arguments})], tmp_path / "results", threads)
+        assert result.value == f"{file.name}: {len(file.read_text())} {arguments.get('unit', 'characters')}"
+        return result.resumed
+
+    assert [resumed(file), resumed(file)] == [False, True]
+    file.write_text("five!")
+    assert [resumed(file), resumed(file)] == [False, True]
+    assert not resumed(file, unit="letters")
+    # the same file elsewhere is the same, under another name it is not
+    moved = file.rename(tmp_path / "b" / "text")
+    assert resumed(moved)
+    assert not resumed(moved.rename(tmp_path / "b" / "other"))
+
+
+def test_another_version_and_another_function_do_not_count(tmp_path, threads, monkeypatch):
+    def resumed(function: Any) -> bool:
+        (result,) = run_tasks(function, tasks_of(1), tmp_path, threads)
+        return result.resumed
+
+    assert [resumed(slow), resumed(slow), resumed(fragile)] == [False, True, False]
+    monkeypatch.setattr("yid_ocp.__version__", "99", raising=False)
+    assert [resumed(slow), resumed(slow)] == [False, True]
+
+
+def test_progress_is_told_of_every_task(tmp_path, threads):
+    told: list[tuple[int, int, str]] = []
+    run_tasks(slow, tasks_of(1), tmp_path, threads)
+    run_tasks(slow, tasks_of(3), tmp_path, threads, lambda *what: told.append(what))
+    assert [entry[:2] for entry in told] == [(1, 3), (2, 3), (3, 3)]
+    assert {entry[2] for entry in told[1:]} == {"task 1", "task 2"}
+
+
+# -- what is wrong ----------------------------------------------------------------------------------------------------
+
+
+def test_a_failing_task_is_recorded_and_the_others_go_on(tmp_path, threads, caplog):
+    broken = tmp_path / "broken"
+    found = run_tasks(fragile, tasks_of(5, broken=str(broken)), tmp_path / "results", threads)
+    assert [entry.value for entry in found] == [0, 1, 2, None, 4]
+    assert [entry.error for entry in found] == ["", "", "", "ZeroDivisionError: no 3", ""]
+    assert [record.getMessage() for record in caplog.records] == ["task 3 failed: ZeroDivisionError: no 3"]
+    (file,) = (tmp_path / "results").glob("*.error.json")
+    assert json.loads(file.read_text())["name"] == "task 3"
+    assert "no 3" in json.loads(file.read_text())["error"]
+
+
+def test_a_failed_task_is_tried_again_and_its_record_goes(tmp_path, threads):
+    broken, folder = tmp_path / "broken", tmp_path / "results"
+    broken.write_text("")
+    (failed,) = run_tasks(fragile, tasks_of(1, broken=str(broken)), folder, threads)
+    assert failed.error
+    broken.unlink()
+    (done,) = run_tasks(fragile, tasks_of(1, broken=str(broken)), folder, threads)
+    assert (done.value, done.error, done.resumed) == (0, "", False)
+    assert [path.name.count(".") for path in folder.iterdir()] == [1]
+
+
+def test_a_result_that_json_cannot_hold_is_a_failure(tmp_path, threads):
+    found = run_tasks(strange, tasks_of(2), tmp_path, threads)
+    assert "not JSON compliant" in found[0].error
+    assert "not JSON serializable" in found[1].error
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_what_cannot_be_a_task_is_refused_before_any_runs(tmp_path, threads):
+    calls = tmp_path / "calls"
+    good = Task("", {"number": 1, "calls": str(calls)})
+    with pytest.raises(TypeError, match="not set"):
+        run_tasks(counted, [good, Task("", {"number": {1}, "calls": ""})], tmp_path, threads)
+    with pytest.raises(DataError, match="no such file"):
+        run_tasks(counted, [good, Task("", {"number": 1, "calls": tmp_path / "absent"})], tmp_path, threads)
+    with pytest.raises(ValueError, match="top of a module"):
+        run_tasks(lambda number: number, tasks_of(1), tmp_path, threads)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="cannot be made"):
+        run_tasks(counted, [good], tmp_path / "file" / "results", threads)
+    assert not calls.exists()
+
+
+class Breaking(Executor):
+    """Does one task, then breaks."""
+
+    def __init__(self) -> None:
+        self.left = 1
+
+    def submit(self, function: Any, /, *arguments: Any, **named: Any) -> Future[Any]:
+        if self.left == 0:
+            raise BrokenExecutor
+        self.left -= 1
+        future: Future[Any] = Future()
+        future.set_result(function(*arguments, **named))
+        return future
+
+
+def test_an_executor_that_breaks_leaves_what_was_done(tmp_path):
+    found = run_tasks(slow, tasks_of(3), tmp_path, Breaking())
+    assert [entry.value for entry in found] == [0, None, None]
+    assert [entry.error for entry in found] == ["", "the executor broke", "the executor broke"]
+
+
+# -- processes --------------------------------------------------------------------------------------------------------
+
+
+def test_one_worker_and_two_find_the_same(tmp_path):
+    results = []
+    for workers in (1, 2):
+        with process_pool(workers) as pool:
+            results.append(run_tasks(slow, tasks_of(4), tmp_path / str(workers), pool))
+    assert [entry.value for entry in results[0]] == [entry.value for entry in results[1]] == [0, 1, 2, 3]
+    names = [sorted(path.name for path in (tmp_path / folder).iterdir()) for folder in ("1", "2")]
+    assert names[0] == names[1]
+    assert len(names[0]) == 4
+
+
+def test_tasks_run_in_processes_of_their_own(tmp_path):
+    (found,) = run_tasks(process_name, tasks_of(1), tmp_path)
+    assert found.value != multiprocessing.current_process().name
+
+
+def test_a_task_that_ends_its_process_takes_no_other_with_it(tmp_path, caplog):
+    found = run_tasks(lethal, tasks_of(5, deadly=1), tmp_path)
+    assert [entry.value for entry in found] == [0, None, 20, 30, 40]
+    assert found[1].error == "its process ended abruptly"
+    assert [record.getMessage() for record in caplog.records] == ["task 1 failed: its process ended abruptly"]
+
+
+SLEEPERS = """
+import sys, time
+from pathlib import Path
+from yid_ocp.parallel import Task, run_tasks
+
+def sleeping(seconds, mark):
+    Path(mark).with_suffix(".begun").write_text("")
+    time.sleep(seconds)
+    return seconds
+
+if __name__ == "__main__":
+    folder = Path(sys.argv[1])
+    tasks = [Task(str(s), {"seconds": s, "mark": str(folder / str(i))}) for i, s in enumerate((0.0, 60.0, 60.0))]
+    try:
+        run_tasks(sleeping, tasks, folder / "results")
+    except KeyboardInterrupt:
+        sys.exit(130)
+"""
+
+
+def begun(folder: Path, count: int) -> None:
+    """Wait until so many tasks began."""
+    until = time.monotonic() + 60
+    while len(list(folder.glob("*.begun"))) < count:
+        assert time.monotonic() < until, "the tasks do not begin"
+        time.sleep(0.05)
+
+
+def workers_of(parent: int) -> set[int]:
+    found = set()
+    for status in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = status.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if int(fields[1]) == parent and fields[0] != "Z":
+            found.add(int(status.parent.name))
+    return found
+
+
+def gone(processes: set[int]) -> bool:
+    until = time.monotonic() + 20
+    while any(Path(f"/proc/{process}").exists() for process in processes):
+        if time.monotonic() > until:
+            return False
+        time.sleep(0.05)
+    return True
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks processes up in /proc")
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_an_interrupted_or_killed_run_leaves_its_results_and_no_process(tmp_path, how):
+    (tmp_path / "sleepers.py").write_text(textwrap.dedent(SLEEPERS))
+    process = subprocess.Popen([sys.executable, str(tmp_path / "sleepers.py"), str(tmp_path)])
+    begun(tmp_path, 2 if (os.cpu_count() or 1) > 1 else 1)
+    workers = workers_of(process.pid)
+    assert workers
+    process.send_signal(how)
+    assert process.wait(timeout=20) == (130 if how == signal.SIGINT else -signal.SIGKILL)
+    assert gone(workers)
+    names = [json.loads(path.read_text())["name"] for path in (tmp_path / "results").glob("*.json")]
+    assert names == ["0.0"]
+
+
+def test_threads_keep_the_order():
+    assert map_threads(lambda x: x * x, range(7)) == [x * x for x in range(7)]

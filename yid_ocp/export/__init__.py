@@ -1,0 +1,1 @@
+"""Recordings written in other formats; one file a format."""

@@ -1,0 +1,124 @@
+"""Files that appear whole or not at all, hashes of files and of plain data, and plain data for JSON."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import math
+import os
+import secrets
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from yid_ocp.errors import DataError, OutputError
+
+
+@contextlib.contextmanager
+def new_file(path: Path) -> Iterator[Path]:
+    """Give a temporary name beside `path`; what is written there takes its place when the block ends without error.
+
+    Parameters
+    ----------
+    path : Path
+        The file to make or replace.
+
+    Yields
+    ------
+    Path
+        Where to write meanwhile.
+
+    Raises
+    ------
+    OutputError
+        If the folder is missing or the file cannot be written.
+    """
+    if path.is_dir() or not path.parent.is_dir():
+        what = "the name of the file is that of a folder" if path.is_dir() else "the folder to write to does not exist"
+        raise OutputError(what, where=str(path), hint="make the folder first, or choose another name")
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        yield temporary
+        with temporary.open("rb+") as file:
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except (OSError, RuntimeError) as error:
+        what, hint = (
+            f"the file cannot be written ({reason(error)})",
+            "choose a writable folder on a disk with room",
+        )
+        raise OutputError(what, where=str(path), hint=hint) from error
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file as a whole, in UTF-8; errors as `new_file`."""
+    with new_file(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Write plain data as a whole, as indented JSON; errors as `new_file`, and ValueError for infinities and NaN."""
+    write_text(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
+
+
+def file_sha256(path: Path) -> str:
+    """Hash a file, or the files of a folder in the order of their names.
+
+    Parameters
+    ----------
+    path : Path
+        The file or folder.
+
+    Returns
+    -------
+    str
+        SHA-256, 64 hexadecimal digits.
+
+    Raises
+    ------
+    DataError
+        If it is missing or cannot be read.
+    """
+    digest = hashlib.sha256()
+    try:
+        for entry in sorted(item for item in path.rglob("*") if item.is_file()) if path.is_dir() else [path]:
+            with entry.open("rb") as file:
+                while block := file.read(1 << 20):
+                    digest.update(block)
+    except FileNotFoundError as error:
+        raise DataError("there is no such file", where=str(path), hint="check the path") from error
+    except OSError as error:
+        raise DataError(f"the file cannot be read ({reason(error)})", where=str(path)) from error
+    return digest.hexdigest()
+
+
+def content_hash(data: Any) -> str:
+    """SHA-256 of plain data (what JSON can hold), whatever the order of its keys; 64 hexadecimal digits."""
+    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
+
+
+def jsonable(value: Any, notes: list[str] | None = None, path: str = "") -> Any:
+    """A value in JSON's types; numbers that are not finite become None and a line in `notes`."""
+    if isinstance(value, Mapping):
+        return {str(k): jsonable(v, notes, f"{path}.{k}" if path else str(k)) for k, v in value.items()}
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [jsonable(v, notes, f"{path}[{i}]") for i, v in enumerate(value)]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        if notes is not None:
+            notes.append(f"{path} is {'not known' if math.isnan(value) else 'infinite'}")
+        return None
+    return value if value is None or isinstance(value, (bool, int, float, str)) else str(value)
+
+
+def reason(error: Exception) -> str:
+    """Why the system or HDF5 refused something, in words."""
+    number = getattr(error, "errno", None)
+    return os.strerror(number) if number else str(error).strip("'\"")

@@ -1,0 +1,295 @@
+"""Tables and sentences with which a command ends, one function for each format of result."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from yid_ocp.data import Recording
+from yid_ocp.report.tables import blind_table, held_out_rows, medians
+from yid_ocp.solvers.words import VERDICT_WORDS
+
+Rows = list[Sequence[str]]
+
+
+def solve_summary(result: Mapping[str, Any]) -> list[str]:
+    """Lines that tell a person what a `yid-solve/1` result says."""
+    free = {name: entry for name, entry in result["parameters"].items() if entry["free"]}
+    failed = result["status"] == "failed"
+    rows: Rows = [("parameter", "value", "± std", "unit", "verdict", "start")]
+    for name, entry in free.items():
+        std = "unknown" if entry["std"] is None else f"{entry['std']:.2g}"
+        verdict = "" if failed else VERDICT_WORDS[entry["verdict"]]
+        rows.append((name, f"{entry['value']:.4g}", std, entry["unit"], verdict, f"{entry['initial']:.4g}"))
+    lines = [*table(rows), ""]
+    rows = [("channel", "error (rms)", "unit", "samples")]
+    rows += [(c, f"{e['rmse']:.3g}", e["unit"], str(e["n"])) for c, e in result["residuals"].items()]
+    if len(rows) > 1:
+        lines += [*table(rows), ""]
+    for entry in result["held_out"]:
+        if "message" in entry:
+            lines += [f"held-out recording {entry['recording']} could not be predicted: {entry['message']}", ""]
+    rows = [("held-out recording", "channel", "error (rms)", "unit", "without a model")]
+    predicted = held_out_rows(result)
+    for row in [*predicted, *medians(predicted)]:
+        without = ", ".join(f"{error:.3g} ({name})" for name, error in row.baselines.items())
+        rows.append((row.recording, row.channel, f"{row.rmse:.3g}", row.unit, without))
+    lines += [*table(rows), ""] if len(rows) > 1 else []
+    if failed:
+        lines.append("the values are the best point that was reached; nothing can be said about how sure they are")
+    else:
+        lines += _unsure(free)
+    lines.append(
+        f"{result['status']}: {result['message']} ({result['iterations']} iterations, {result['seconds']:.1f} s)"
+    )
+    return lines
+
+
+def _unsure(free: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Sentences on parameters that are not found."""
+    lost, weak = (
+        [name for name, entry in free.items() if entry["verdict"] == verdict]
+        for verdict in ("not_identifiable", "weak")
+    )
+    lines = [f"{VERDICT_WORDS['not_identifiable']} from these recordings: {', '.join(lost)}"] if lost else []
+    if weak:
+        lines.append(f"only {VERDICT_WORDS['weak']}: {', '.join(weak)}")
+        lines.append("their standard deviations are too small on one side; `yid-ocp identifiability` gives intervals")
+    return lines
+
+
+def track_summary(result: Mapping[str, Any]) -> list[str]:
+    """Lines that tell a person what a `yid-track/1` result says."""
+    truth = result["truth_errors"]
+    heads = ("error, median [mm]", "error, largest [mm]") if truth else ("", "")
+    rows: Rows = [("point", "frames", "± std [mm]", *heads)]
+    for name, entry in result["points"].items():
+        cells = ["" if entry["std"] is None else f"{1e3 * entry['std']:.1f}"]
+        cells += [f"{1e3 * truth[name][key]:.1f}" if name in truth else "" for key in ("median", "largest")]
+        rows.append((name, str(entry["frames"]), *cells))
+    lines = [*table(rows), ""]
+    good = sum(not frame["reason"] for frame in result["frames"])
+    spent = 1e3 * result["fit_seconds"]
+    lines.append(f"{good} of {len(result['frames'])} frames are good, the fit took {spent:.0f} ms each")
+    lines += [f"dropped {number}: {reason}" for reason, number in result["dropped"].items()]
+    lines.append(result["clock"]["message"])
+    return lines
+
+
+def compare_summary(result: Mapping[str, Any]) -> list[str]:
+    """Lines that tell a person what a `yid-compare/1` result says."""
+    methods: dict[str, Any] = result["methods"]
+    free = [name for name, entry in methods[result["reference"]]["parameters"].items() if entry["free"]]
+    beside = [key for key in ("published", "truth") if result[key]]
+    rows: Rows = [("parameter", *methods, *beside, "verdict")]
+    for name in free:
+        cells = []
+        for entry in methods.values():
+            found = entry["parameters"][name]
+            cells.append(f"{found['value']:.4g}" + ("" if found["std"] is None else f" ± {found['std']:.2g}"))
+        known = [f"{result[key][name]:.4g}" if name in result[key] else "" for key in beside]
+        rows.append((name, *cells, *known, VERDICT_WORDS[methods[result["reference"]]["parameters"][name]["verdict"]]))
+    lines = [*table(rows), "", *table(_efforts(methods)), ""]
+    for name, entry in methods.items():
+        if entry["status"] != "converged":
+            lines.append(f"{name} did not converge: {entry['message']}")
+        lines += [f"{name} differs: {sentence}" for sentence in entry["disagreements"]]
+    lines += result["explained"]
+    if not any(methods[result["reference"]]["parameters"][name]["verdict"] == "identifiable" for name in free):
+        lines.append("no parameter can be found from these recordings, so there is nothing to agree on")
+        lines.append("`yid-ocp identifiability CONFIG --what-if` says what would have to be measured")
+    elif result["agree"]:
+        lines.append("all methods agree within their uncertainty on the parameters that are found")
+    return lines
+
+
+def _efforts(methods: Mapping[str, Mapping[str, Any]]) -> Rows:
+    """What every method reached and what it took."""
+    entries = methods.values()
+    costs = [entry["whitened_cost"] for entry in entries]
+    rows: Rows = [("", *methods)]
+    rows.append(("status", *(entry["status"] for entry in entries)))
+    rows.append(("cost (whitened)", *("failed" if cost is None else f"{cost:.6g}" for cost in costs)))
+    for channel in sorted({c for e in entries for h in e["held_out"] for c in h.get("rmse", {})}):
+        errors = [[h["rmse"][channel] for h in e["held_out"] if channel in h.get("rmse", {})] for e in entries]
+        rows.append((f"held out: {channel}", *(f"{sum(e) / len(e):.3g}" if e else "failed" for e in errors)))
+    rows.append(("iterations", *(str(entry["iterations"]) for entry in entries)))
+    rows.append(("evaluations", *(str(entry["evaluations"]) for entry in entries)))
+    rows.append(("wall time [s]", *(f"{entry['wall_seconds']:.2f}" for entry in entries)))
+    rows.append(("CPU time [s]", *(f"{entry['cpu_seconds']:.2f}" for entry in entries)))
+    rows.append(("peak memory [MiB]", *(f"{entry['peak_memory_mib']:.0f}" for entry in entries)))
+    return rows
+
+
+def identifiability_summary(result: Mapping[str, Any]) -> list[str]:
+    """Lines that tell a person what a `yid-identifiability/1` result says."""
+    if not result["parameters"]:
+        return [f"{result['status']}: {result['message']}; there is no point at which to judge"]
+    rows: Rows = [("parameter", "value", "±", "± if start and grasps were known", "95 % interval", "unit", "verdict")]
+    for name, entry in result["parameters"].items():
+        spread = (_percent(entry["std_relative"]), _percent(entry["std_relative_known"]))
+        interval = "" if entry["interval"] is None else _interval(*entry["interval"])
+        rows.append((name, f"{entry['value']:.4g}", *spread, interval, entry["unit"], VERDICT_WORDS[entry["verdict"]]))
+    lines = [*table(rows), ""]
+    hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"]
+    if len(hidden) > 8:
+        hidden = [*hidden[:8], f"and {len(hidden) - 8} more directions, in result.json"]
+    lines += [*hidden, ""] if hidden else []
+    if not result["profiles"]:
+        lines.append("intervals of parameters are worked out on request: --intervals NAME,NAME or --intervals all")
+    lines += [f"{name}: {note}" for name, entry in result["profiles"].items() for note in entry["notes"]]
+    lines += [] if result["what_if"] is None else _what_if_lines(result["what_if"], len(result["parameters"]))
+    found = sum(entry["verdict"] == "identifiable" for entry in result["parameters"].values())
+    lines.append(f"{found or 'none'} of {len(result['parameters'])} parameters can be found from these recordings")
+    return lines
+
+
+def _what_if_lines(asked: Mapping[str, Any], total: int) -> list[str]:
+    rows: Rows = [("what if", "found", "gain [nat]", "")]
+    for entry in [asked["base"], *asked["singles"]]:
+        gain = "" if entry["gain"] is None else f"{entry['gain']:.1f}"
+        rows.append((entry["words"], f"{entry['identifiable']} of {total}", gain, entry["message"]))
+    if not asked["smallest"]:
+        return [*table(rows), "", "with no set of up to three changes can all of them be found"]
+    return [*table(rows), "", f"fewest changes with which all of them can be found: {asked['smallest'][0]['words']}"]
+
+
+def _percent(value: float | None) -> str:
+    return "unknown" if value is None else f"{100 * value:.2g} %" if value < 10 else f"{value:.2g} times"
+
+
+def _interval(lower: float | None, upper: float | None) -> str:
+    if lower is None and upper is None:
+        return "open"
+    if lower is None:
+        return f"below {upper:.4g}"
+    return f"above {lower:.4g}" if upper is None else f"{lower:.4g} to {upper:.4g}"
+
+
+def diagnose_summary(result: Mapping[str, Any]) -> list[str]:
+    """Lines that tell a person what a `yid-diagnosis/1` result says."""
+    lines = [*textwrap.wrap(result["summary"], 100), ""]
+    before, after, units = (result["gap"][a][b] for a, b in (("before", "rmse"), ("after", "rmse"), ("before", "unit")))
+    rows: Rows = [("held-out channel", "before", "after", "unit")]
+    rows += [(c, f"{e:.3g}", f"{after[c]:.3g}" if c in after else "", units[c]) for c, e in before.items()]
+    lines += [*table(rows), ""]
+    rows = [("candidate", "parameters", "closure alone", "score", "p")]
+    for entry in result["which"][:8]:
+        known = {name: q for name, q in entry["parameters"].items() if q["value"] is not None}
+        spread = {name: "" if q["std"] is None else f" ± {q['std']:.2g}" for name, q in known.items()}
+        values = ", ".join(f"{name} = {q['value']:.3g}{spread[name]} {q['unit']}" for name, q in known.items())
+        closed = "" if entry["closure"] is None else f"{100 * entry['closure']:.3g} %"
+        label = f"{entry['kind']}@{entry['location']}"
+        rows.append((label, values, closed, f"{entry['score']:.3g}", f"{entry['p_value']:.2g}"))
+    lines += [*table(rows), ""] if len(rows) > 1 else []
+    return [*lines, f"verdict: {result['verdict']} ({sum(result['seconds'].values()):.1f} s)"]
+
+
+def check_summary(result: Mapping[str, Any]) -> list[str]:
+    """Lines that tell a person what a `yid-check/1` result says."""
+    model = result["model"]
+    lines = [
+        f"model: {model['n']} coordinates, {model['m']} constraints, {model['nu']} driven, {model['nc']} prescribed, "
+        f"{model['ntheta']} parameters",
+        "",
+    ]
+    rows: Rows = [("recording", "use", "group", "samples", "rate", "longest gap", "noise (median)")]
+    for entry in result["recordings"]:
+        for name, group in entry["groups"].items():
+            noise = entry["noise"].get(name) or entry["noise"].get(f"{name}.effort")
+            shown = "" if noise is None or noise["std"] is None else f"{noise['std']:.3g} {noise['unit']}"
+            rows.append(
+                (
+                    entry["recording"],
+                    "held out" if entry["role"] == "held_out" else "estimate",
+                    name,
+                    str(group["samples"]),
+                    f"{group['rate']:.4g} Hz",
+                    f"{group['longest_gap']:.3g} s",
+                    shown,
+                )
+            )
+    lines += [*table(rows), ""] if len(rows) > 1 else []
+    for entry in result["recordings"]:
+        gaps = [f"{name} {1e3 * gap:.2g} mm" for name, gap in entry["grasp_gaps"].items()]
+        rest = entry.get("equilibrium")
+        said = [] if rest is None else ["equilibrium found" if rest["found"] else f"no equilibrium: {rest['message']}"]
+        if gaps or said:
+            lines.append(
+                f"{entry['recording']}: " + "; ".join([*said, *(["grasp gaps " + ", ".join(gaps)] if gaps else [])])
+            )
+    lines += _convergence_lines(result["convergence"])
+    lines += ["", *(f"warning: {text}" for text in result["warnings"])]
+    lines.append(
+        "nothing stands in the way of a run" if not result["warnings"] else "a run is possible; see the warnings"
+    )
+    return lines
+
+
+def _convergence_lines(convergence: Mapping[str, Any]) -> list[str]:
+    lines: list[str] = []
+    for key, head in (("links", "links"), ("time_step", "time step [s]")):
+        rows: Rows = [(head, "lowest frequencies [Hz]", "")]
+        for row in convergence[key]:
+            remark = row["message"] or (f"{row['growing']} modes grow" if row["growing"] else "")
+            rows.append((f"{row['value']:g}", ", ".join(f"{f:.4g}" for f in row["hertz"]), remark))
+        lines += ["", *table(rows)] if len(rows) > 1 else []
+    return [*lines, "", f"frequencies: {convergence['message']}"] if convergence["message"] else lines
+
+
+def inspect_summary(result: Mapping[str, Any]) -> list[str]:
+    """Lines that tell a person what a `yid-inspect/1` result says."""
+    roles = [entry["role"] for entry in result["variables"]]
+    counts = [f"{roles.count(role)} {role}" for role in ("driven", "prescribed", "free") if role in roles]
+    equations = result["equations"]
+    lines = [f"coordinates: {len(roles)} ({', '.join(counts)}), constraints: {equations['sizes']['m']}", ""]
+    rows: Rows = [("parameter", "value", "unit", "bounds", "")]
+    for name, entry in result["parameters"].items():
+        low, high = ("inf" if entry[key] is None else f"{entry[key]:g}" for key in ("lower", "upper"))
+        low = "-inf" if entry["lower"] is None else low
+        rows.append((name, f"{entry['value']:.6g}", entry["unit"], f"{low} to {high}", "free" if entry["free"] else ""))
+    lines += [*table(rows), ""]
+    rows = [("function", "operations", "nonzeros")]
+    rows += [(f["name"], str(f["operations"]), str(f["nonzeros"])) for f in equations["functions"]]
+    count = equations["unknowns"]
+    lines += [*table(rows), ""]
+    lines.append(f"Jacobian of the step: {count} x {count}, {equations['jacobian_nonzeros']} nonzeros (sparsity.png)")
+    linear = result["linearisation"]
+    lines.append(f"linearised at {linear['at']}: spectral radius of A {linear['spectral_radius']:.6g}")
+    rows = [("matrix", "norm", "largest difference from finite differences")]
+    rows += [
+        (name, f"{norm:.4g}", f"{linear['finite_difference_errors'][name]:.1e}")
+        for name, norm in linear["norms"].items()
+    ]
+    return [*lines, *table(rows), "matrices: linearisation.h5"]
+
+
+def simulate_summary(result: Mapping[str, Any]) -> list[str]:
+    """Lines that tell a person what a `yid-simulate/1` result says."""
+    if result["status"] == "failed":
+        return [f"failed: {result['message']}"]
+    rows: Rows = [("group", "samples")]
+    rows += [(name, str(entry["samples"])) for name, entry in result["groups"].items()]
+    return [*table(rows), "", f"{result['duration']:g} s in recording.h5"]
+
+
+def blind_summary(result: Mapping[str, Any]) -> list[str]:
+    """Lines that tell a person what a `yid-blind/1` result says: the score alone."""
+    return [line.strip("| ").replace(" | ", ": ") for line in blind_table(result)[2:15]]
+
+
+def recording_summary(recording: Recording) -> list[str]:
+    """Lines that tell a person what a recording holds."""
+    rows: Rows = [("group", "samples", "names")]
+    for group in recording.groups:
+        rows.append((getattr(group, "name", "joints"), str(len(group.t)), ", ".join(group.names)))
+    return [*table(rows), "", f"{recording.duration:g} s"]
+
+
+def table(rows: Rows) -> list[str]:
+    """Rows as aligned lines, the first one as head; columns without an entry are left out."""
+    kept = [i for i in range(len(rows[0])) if any(row[i] for row in rows)]
+    widths = [max(len(row[i]) for row in rows) for i in kept]
+    lines = ["  ".join(row[i].ljust(width) for i, width in zip(kept, widths, strict=True)).rstrip() for row in rows]
+    return [lines[0], "  ".join("-" * width for width in widths), *lines[1:]]

@@ -1,0 +1,62 @@
+"""What commands do around their work: progress while it runs, the table for people, and where the run folder is."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+from yid_ocp.workflow.progress import Progress, shown
+
+DONE, FAILED = 0, 1
+"""Exit codes of commands that ran to their end."""
+
+
+class Outcome(Protocol):
+    """What the work of a command leaves."""
+
+    @property
+    def folder(self) -> Path:
+        """The finished run folder."""
+        ...
+
+    @property
+    def result(self) -> dict[str, Any]:
+        """Contents of result.json."""
+        ...
+
+
+Left = TypeVar("Left", bound=Outcome)
+
+
+def carry_out(
+    work: Callable[[Progress], Left], summary: Callable[[Mapping[str, Any]], Sequence[str]], quiet: bool
+) -> Left:
+    """Do the work of a command and print for a person what it found and where it is; quietly, only where it is.
+
+    Parameters
+    ----------
+    work : callable
+        The work, given the progress to report to.
+    summary : callable
+        From the result to the lines to print.
+    quiet : bool
+
+    Returns
+    -------
+    Outcome
+        Of the work.
+    """
+    with shown(quiet) as progress:
+        outcome = work(progress)
+    if not quiet:
+        print_lines(summary(outcome.result))
+    near = os.path.relpath(outcome.folder)
+    print(outcome.folder if quiet or near.startswith("..") else f"run folder: {near}")
+    return outcome
+
+
+def print_lines(lines: Sequence[str]) -> None:
+    """Print lines on standard output."""
+    print("\n".join(lines))

@@ -1,0 +1,22 @@
+"""The command `schema`: the JSON Schema of configuration files, for editors."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from yid_ocp.config.schema import schema
+from yid_ocp.files import write_text
+from yid_ocp.workflow.command import DONE
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """The command."""
+    text = json.dumps(schema(), indent=1)
+    if arguments.out is None:
+        print(text)
+        return DONE
+    write_text(Path(arguments.out), text + "\n")
+    print(arguments.out)
+    return DONE

@@ -1,0 +1,134 @@
+"""Trajectories and predictions of a run as HDF5."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from yid_ocp.diagnosis import Finding
+from yid_ocp.diagnosis.localise import units
+from yid_ocp.errors import OutputError
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.measurements import Measurements
+from yid_ocp.problem.problem import Episode, EpisodeResult
+from yid_ocp.solvers import Solution
+
+SOLVED = "yid-trajectories/1"
+DIAGNOSED = "yid-diagnosis-trajectories/1"
+Prediction = tuple[Episode, EpisodeResult, EpisodeResult]
+"""A held-out recording, its prediction by the nominal model and that with the effects."""
+
+
+def write_trajectories(
+    path: Path, problem: EstimationProblem, solution: Solution, held_out: Sequence[tuple[Episode, EpisodeResult | str]]
+) -> None:
+    """Trajectories, predictions and the unknowns with their covariance, as `yid-trajectories/1`.
+
+    `unknowns/`: names, x, covariance. `recordings/NAME/`: `t` (N+1,) [s], `q`, `p` (N+1, n), `multipliers` (N, m)
+    [N s], `torque` (N, nu) [N m], `effort` (N, nc) [N m], and for every sensor `GROUP/` with `t`, `measured`,
+    `predicted`, `std` and the attributes `channels`, `unit`.
+
+    Raises
+    ------
+    OutputError
+    """
+    pairs: list[tuple[str, Episode, EpisodeResult | str]] = [("held_out", *pair) for pair in held_out]
+    if solution.evaluation is not None:
+        done = solution.evaluation.episodes
+        pairs = [("estimate", e, r) for e, r in zip(problem.episodes, done, strict=True)] + pairs
+    with _file(path, SOLVED) as file:
+        unknowns = file.create_group("unknowns")
+        unknowns.attrs["names"] = _texts(solution.names)
+        unknowns.create_dataset("x", data=solution.x)
+        unknowns.create_dataset("covariance", data=solution.covariance)
+        for role, episode, outcome in pairs:
+            group = file.require_group("recordings").create_group(episode.name)
+            group.attrs["role"] = role
+            group.attrs["joints"] = _texts(problem.system.mechanism.joint_names)
+            if isinstance(outcome, str):
+                group.attrs["message"] = outcome
+                continue
+            n, rollout = problem.system.size, outcome.rollout
+            arrays = {
+                "t": episode.grid.times,
+                "q": rollout.state[:, :n],
+                "p": rollout.state[:, n : 2 * n],
+                "multipliers": rollout.multipliers,
+                "torque": rollout.torque,
+                "effort": rollout.effort,
+            }
+            _store(group, arrays)
+            for samples, predicted in zip(episode.samples, outcome.predicted, strict=True):
+                _store_sensor(group, episode, samples, {"predicted": predicted})
+
+
+def write_diagnosis_trajectories(path: Path, finding: Finding, predicted: Sequence[Prediction]) -> None:
+    """Predictions and what the smoother found, as `yid-diagnosis-trajectories/1`.
+
+    `RECORDING/GROUP/` for every held-out recording: `t` (M,) [s], `measured`, `before`, `after`, `std` (M, k) and the
+    attributes `channels`, `unit`.
+
+    `where/RECORDING/` for every recording that was estimated on, where there was a gap to locate: `edges` (J + 1,) [s]
+    since its first node, of the intervals over which unknowns are constant; `mean` and `std` (J, nd) of the unknown
+    forces, offsets and biases about the nominal model and `prior` (nd,), the standard deviation at the largest
+    evidence, zero where a group was not taken in; the attributes `unknowns`, `locations`, `kinds`, `units` (nd,) each.
+
+    Raises
+    ------
+    OutputError
+    """
+    with _file(path, DIAGNOSED) as file:
+        for episode, before, after in predicted:
+            for k, samples in enumerate(episode.samples):
+                both = {"before": before.predicted[k], "after": after.predicted[k]}
+                _store_sensor(file.require_group(episode.name), episode, samples, both)
+        for trace in () if finding.smoothed is None else finding.smoothed.traces:
+            assert finding.smoothed is not None
+            group = file.create_group(f"where/{trace.recording}")
+            group.attrs["unknowns"] = _texts(trace.unknowns)
+            group.attrs["locations"] = _texts([source.location for source in trace.sources])
+            group.attrs["kinds"] = _texts([source.kind for source in trace.sources])
+            group.attrs["units"] = _texts(units(finding.nominal.problem.system, trace))
+            variance = np.array([finding.smoothed.variance[source] for source in trace.sources])
+            arrays = {
+                "edges": trace.edges,
+                "mean": trace.mean * trace.reference,
+                "std": trace.std * trace.reference,
+                "prior": np.sqrt(variance) * trace.reference,
+            }
+            _store(group, arrays)
+
+
+@contextlib.contextmanager
+def _file(path: Path, form: str) -> Iterator[h5py.File]:
+    try:
+        with h5py.File(path, "w") as file:
+            file.attrs["format"] = form
+            yield file
+    except OSError as error:
+        raise OutputError(f"the trajectories cannot be written: {error}", where=str(path)) from error
+
+
+def _store_sensor(
+    parent: h5py.Group, episode: Episode, samples: Measurements, predicted: Mapping[str, NDArray[np.float64]]
+) -> None:
+    """What a sensor measured and what was predicted of it."""
+    group = parent.create_group(samples.sensor.group)
+    group.attrs["channels"] = _texts(samples.sensor.channels)
+    group.attrs["unit"] = samples.sensor.unit
+    times = episode.grid.start + episode.grid.time_step * (samples.node + samples.fraction)
+    _store(group, {"t": times, "measured": samples.value, **predicted, "std": samples.std})
+
+
+def _store(group: h5py.Group, arrays: Mapping[str, ArrayLike]) -> None:
+    for name, array in arrays.items():
+        group.create_dataset(name, data=array, compression="gzip", shuffle=True)
+
+
+def _texts(values: Sequence[str]) -> NDArray[np.object_]:
+    return np.array(values, dtype=h5py.string_dtype())
