@@ -1,15 +1,12 @@
-"""Steps six and seven: full refits, judged on held-out recordings; several effects one after the other.
+"""Step six: full refits of the nominal parameters and those of some effects, judged on held-out recordings.
 
 Every loss is a mean square of whitened residuals over blocks of held-out time, the same blocks for every model, so that
-differences between models are paired. G = max(0, chi2/n - 1) is the gap, 1 - G_after/G_before what was closed; its
-interval comes from resampling blocks (Kuensch 1989, doi:10.1214/aos/1176347265).
+differences between models are paired. G = max(0, chi2/n - 1) is the gap.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -18,23 +15,19 @@ from numpy.typing import NDArray
 
 from yid_ocp.diagnosis.hypotheses import CandidateProblem, describe, residual_series, sample_times
 from yid_ocp.diagnosis.screening import robust
+from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
 from yid_ocp.effects import EffectBase, Reported
+from yid_ocp.parallel import map_threads
 from yid_ocp.problem.problem import Evaluation
 from yid_ocp.solvers import GaussNewton
 from yid_ocp.solvers.base import Outcome, uncertainty
 
 Array = NDArray[np.float64]
 
+Progress = Callable[[str], None]
+
 SOLVER = GaussNewton(iterations=25, step_tolerance=1e-3, cost_tolerance=1e-5)
-"""A refit starts near its end and must be good to a small part of its deviation, and of `TIE`, only."""
-POOR, PROMISING = 1.1, 0.2
-"""A refit that ends above this chi2/n, but lowers the excess by this part or more, is tried again from the initial
-values of the nominal parameters."""
-STAND_IN = 0.05
-"""Part of chi2/n by which an effect of an unlikely shape must beat all others to count."""
-RESAMPLES = 1000
-TIE = 0.01
-"""Part of chi2/n by which two models may differ and still count as equal, however sure the difference."""
+"""A refit starts near its end and must be good to a small part of its standard deviation, and of the `tie`, only."""
 
 
 @dataclass(frozen=True)
@@ -75,14 +68,14 @@ class Fit:
     values : dict of str to float
         Unknowns.
     std : dict of str to float
-        Their deviations; see `deviations`.
+        Their standard deviations; see `deviations`.
     cost : float
     evaluation : Evaluation
     loss : Loss
         Held-out.
     message : str
         Why the solver ended.
-    taken_up : bool
+    resumed : bool
         Whether it comes from a store instead of the solver.
     """
 
@@ -94,7 +87,7 @@ class Fit:
     evaluation: Evaluation
     loss: Loss
     message: str
-    taken_up: bool = False
+    resumed: bool = False
 
     @property
     def size(self) -> int:
@@ -135,12 +128,22 @@ class Store(Protocol):
 
 
 @dataclass(frozen=True)
-class Closure:
-    """Part of the held-out gap that a model closes, with a 95 % interval; NaN where there was no gap."""
+class Search:
+    """What all refits of one diagnosis share.
 
-    value: float
-    low: float
-    high: float
+    Attributes
+    ----------
+    problem : CandidateProblem
+    limits : Thresholds
+    progress : callable
+        Told in words what is going on.
+    store : Store, optional
+    """
+
+    problem: CandidateProblem
+    limits: Thresholds
+    progress: Progress
+    store: Store | None = None
 
 
 def refit(
@@ -149,6 +152,7 @@ def refit(
     start: Mapping[str, float],
     store: Store | None = None,
     name: str = "",
+    limits: Thresholds = DEFAULTS,
 ) -> Fit | None:
     """Fit the nominal parameters and those of some effects, and predict the held-out recordings.
 
@@ -162,6 +166,8 @@ def refit(
         Asked before the solver is, and told what it finds.
     name : str
         In the store; the effects' labels where empty, which do for refits that differ by their effects alone.
+    limits : Thresholds
+        For when a refit is tried again.
 
     Returns
     -------
@@ -173,7 +179,7 @@ def refit(
         return known
     own = problem.freeing(effects)
     best = _attempt(own, effects, start)
-    if best is not None and _half_done(own, effects, start, best[1]):
+    if best is not None and _half_done(own, effects, start, best[1], limits):
         # the nominal fit may have driven its parameters to where this model cannot come back from
         nominal = {*problem.nominal}
         fresh = {
@@ -196,15 +202,19 @@ def refit(
 
 
 def _half_done(
-    own: CandidateProblem, effects: Sequence[EffectBase], start: Mapping[str, float], finish: Evaluation
+    own: CandidateProblem,
+    effects: Sequence[EffectBase],
+    start: Mapping[str, float],
+    finish: Evaluation,
+    limits: Thresholds,
 ) -> bool:
     """Whether a refit explains much of what the model without the effects leaves, but by far not all."""
     count = len(finish.residual)
     neutral = {name: value for effect in effects for name, value in effect.neutral.items()}
     before = own.evaluate(own.unknowns({**start, **neutral}), derivatives=False)
-    if 2 * finish.cost < POOR * count or not before.ok:
+    if 2 * finish.cost < limits.poor * count or not before.ok:
         return False
-    return before.cost - finish.cost > PROMISING * (before.cost - count / 2)
+    return before.cost - finish.cost > limits.promising * (before.cost - count / 2)
 
 
 def _attempt(
@@ -260,25 +270,32 @@ def deviations(problem: CandidateProblem, finish: Evaluation) -> Array:
 
 
 def refit_all(
-    problem: CandidateProblem,
+    search: Search,
     base: Sequence[EffectBase],
     tried: Sequence[tuple[EffectBase, Mapping[str, float]]],
     values: Mapping[str, float],
-    progress: Callable[[str], None] | None = None,
-    store: Store | None = None,
 ) -> list[Fit]:
-    """Refit the model with each of several effects added to those of `base`, two at a time; failures are left out."""
+    """Refit the model with each of several effects added to those of `base`; failures are left out.
+
+    Parameters
+    ----------
+    search : Search
+    base : sequence of EffectBase
+    tried : sequence of (EffectBase, mapping of parameter to float)
+        With the values at which each begins.
+    values : mapping of str to float
+        Where all other unknowns begin.
+    """
 
     def one(entry: tuple[EffectBase, Mapping[str, float]]) -> Fit | None:
         effect, step = entry
-        fit = refit(problem, (*base, effect), {**values, **step}, store)
-        if progress is not None and fit is not None:
-            done = "took up the refit" if fit.taken_up else "refitted"
-            progress(f"{done} with {effect.label}: held-out chi2/n {fit.loss.mean:.4g}")
+        fit = refit(search.problem, (*base, effect), {**values, **step}, search.store, limits=search.limits)
+        if fit is not None:
+            done = "resumed the refit" if fit.resumed else "refitted"
+            search.progress(f"{done} with {effect.label}: held-out chi2/n {fit.loss.mean:.4g}")
         return fit
 
-    with ThreadPoolExecutor(max_workers=min(2, os.cpu_count() or 1)) as pool:
-        return [fit for fit in pool.map(one, tried) if fit is not None]
+    return [fit for fit in map_threads(one, tried) if fit is not None]
 
 
 def block_length(problem: CandidateProblem) -> float:
@@ -314,64 +331,3 @@ def held_out_loss(problem: CandidateProblem, x: Array) -> Loss:
     errors = problem.channel_errors(results, episodes) if results else {}
     channels = {name: (float(entry["rmse"]), str(entry["unit"])) for name, entry in errors.items()}
     return Loss(np.concatenate(squares), np.concatenate(counts), channels)
-
-
-def closure(before: Loss, after: Loss, seed: int = 0) -> Closure:
-    """Part of the held-out gap that is closed, with a block-bootstrap interval."""
-    if before.gap <= 0 or not np.isfinite(after.mean):
-        return Closure(float("nan"), float("nan"), float("nan"))
-    rng = np.random.default_rng(seed)
-    draws = rng.integers(0, len(before.counts), (RESAMPLES, len(before.counts)))
-    n = before.counts[draws].sum(axis=1)
-    g0 = np.maximum(before.squares[draws].sum(axis=1) / n - 1.0, 0.0)
-    g1 = np.maximum(after.squares[draws].sum(axis=1) / n - 1.0, 0.0)
-    ratio = 1 - g1[g0 > 0] / g0[g0 > 0]
-    low, high = np.quantile(ratio, [0.025, 0.975]) if len(ratio) else (float("nan"), float("nan"))
-    return Closure(1 - after.gap / before.gap, float(low), float(high))
-
-
-def gain(before: Loss, after: Loss) -> tuple[float, float]:
-    """Held-out chi2/n that `after` is better by, and its standard error over blocks."""
-    total = float(before.counts.sum())
-    difference = before.squares - after.squares
-    if not np.all(np.isfinite(difference)):
-        return (-np.inf if np.isfinite(before.mean) else np.inf), 0.0
-    count = len(difference)
-    error = np.sqrt(count) * float(np.std(difference, ddof=1)) if count > 1 else np.inf
-    return float(difference.sum()) / total, float(error) / total
-
-
-def within_reach(fits: Sequence[Fit]) -> list[Fit]:
-    """Fits whose held-out loss is within one standard error of the best one's (or `TIE` of it), the simplest first.
-
-    An effect whose shape is far from what an engineer would expect (`out_of_shape`) counts only where no other comes
-    near it: a solid that relaxes in a tenth of the shortest time expected is a damper. One whose amplitude is
-    (`oversized`) comes last.
-    """
-    best = min(fits, key=lambda fit: fit.loss.mean)
-    shapely = [fit for fit in fits if not (fit.effects and out_of_shape(fit.effects[-1], fit.values))]
-    if shapely and min(fit.loss.mean for fit in shapely) <= (1 + STAND_IN) * best.loss.mean:
-        fits = shapely
-        best = min(fits, key=lambda fit: fit.loss.mean)
-    near = []
-    for fit in fits:
-        lost, error = gain(fit.loss, best.loss)
-        if fit is best or lost <= max(error, TIE * best.loss.mean):
-            near.append(fit)
-    return sorted(near, key=lambda f: (bool(f.effects) and oversized(f.effects[-1], f.values), f.size, f.loss.mean))
-
-
-def out_of_shape(effect: EffectBase, values: Mapping[str, float]) -> bool:
-    """Whether a shape parameter lies outside its range by more than a factor of two, or than the range's width."""
-    for name in effect.shapes:
-        low, high = effect.prior_range[name]
-        near, far = (low / 2, high * 2) if low > 0 else (2 * low - high, 2 * high - low)
-        if not near <= values[name] <= far:
-            return True
-    return False
-
-
-def oversized(effect: EffectBase, values: Mapping[str, float]) -> bool:
-    """Whether an amplitude lies outside its range by more than the range's width."""
-    ranges = ((values[name], *effect.prior_range[name]) for name in effect.amplitudes)
-    return any(not 2 * low - high <= value <= 2 * high - low for value, low, high in ranges)
