@@ -1,4 +1,4 @@
-"""Several methods on one problem: what each found, how sure, at what price, and whether they agree."""
+"""Several methods on one problem: what each found, how sure, at what cost, and whether they agree."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ PUBLISHED: dict[str, dict[str, float]] = {
 """The source paper's answers for its four experiments [N m/rad]; its data are not public."""
 
 SAMPLING_PERIOD = 0.02
-# Two estimates agree when they differ by less than this many of the larger deviation, or by this fraction of the value:
-# below that the methods' own stopping rules show.
+# Two estimates agree when they differ by less than this many of the larger standard deviation, or by this fraction of
+# the value: below that the methods' own stopping rules show.
 DEVIATIONS, FRACTION = 2.0, 0.005
 
 
@@ -115,13 +115,13 @@ def compare(
         if solver.name == "steepest_descent" and problem.options.weighting != "paper":
             own = problem.with_options(replace(problem.options, weighting="paper"))
 
-        def tell(entry: Iterate, name: str = solver.name) -> None:
+        def progress(entry: Iterate, name: str = solver.name) -> None:
             if callback is not None:
                 callback(name, entry)
 
         wall, cpu = time.perf_counter(), time.process_time()
         with _Memory() as memory:
-            solution = solve(own, solver, callback=tell)
+            solution = solve(own, solver, callback=progress)
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         cost = problem.evaluate(solution.x, derivatives=False).cost
         runs.append(MethodRun(solver.name, solution, cost, own.validate(solution.x), wall, cpu, memory.peak))
@@ -152,7 +152,7 @@ def _differences(run: MethodRun, best: MethodRun) -> list[str]:
 
 
 def _explanations(runs: Sequence[MethodRun], best: MethodRun, truth: Mapping[str, float]) -> list[str]:
-    """Where methods sent the parameters that the data do not identify, and where the paper's method went astray."""
+    """Where methods sent the parameters that the data do not identify, and where the paper's method went wrong."""
     sentences = []
     for name, reference in best.solution.parameters.items():
         if not reference.free or reference.verdict == "identifiable":
@@ -161,26 +161,26 @@ def _explanations(runs: Sequence[MethodRun], best: MethodRun, truth: Mapping[str
         places = ", ".join(f"{run.method} {run.solution.parameters[name].value:.3g}" for run in runs)
         verdict = {"weak": "weakly informed by", "not_identifiable": "not identifiable from"}[reference.verdict]
         sentences.append(f"{name}{known} is {verdict} these data: where it ends is the method's choice ({places})")
-    sentences += [_astray(run, best, truth) for run in runs if run.method == "steepest_descent" and truth]
+    sentences += [_far_from_truth(run, best, truth) for run in runs if run.method == "steepest_descent" and truth]
     return sentences
 
 
-def _astray(run: MethodRun, best: MethodRun, truth: Mapping[str, float]) -> str:
+def _far_from_truth(run: MethodRun, best: MethodRun, truth: Mapping[str, float]) -> str:
     """Which parameters a method left far from the truth, and whether these are the ones that the data do not tell."""
     known = {name: entry for name, entry in best.solution.parameters.items() if entry.free and name in truth}
     found = {name: run.solution.parameters[name].value for name in known}
-    # the same limit makes a deviation too large for an identifiable parameter
-    astray = [name for name in known if abs(found[name] - truth[name]) > IDENTIFIABLE * abs(truth[name])]
+    # the same limit makes a standard deviation too large for an identifiable parameter
+    wrong = [name for name in known if abs(found[name] - truth[name]) > IDENTIFIABLE * abs(truth[name])]
     verdicts = {name: entry.verdict.replace("_", " ") for name, entry in known.items()}
     hidden = [name for name in known if known[name].verdict != "identifiable"]
     within = f"within {100 * IDENTIFIABLE:.0f} % of the truth"
-    if not astray:
+    if not wrong:
         return f"{run.method} ended {within} everywhere"
-    places = ", ".join(f"{name} ({found[name]:.3g} for {truth[name]:.3g}, {verdicts[name]})" for name in astray)
+    places = ", ".join(f"{name} ({found[name]:.3g} for {truth[name]:.3g}, {verdicts[name]})" for name in wrong)
     text = f"where {run.method} did not end {within}: {places}"
-    if astray == hidden:
+    if wrong == hidden:
         return f"{text}; these are exactly the parameters that the data do not identify"
-    seen, lucky = [name for name in astray if name not in hidden], [name for name in hidden if name not in astray]
+    seen, lucky = [name for name in wrong if name not in hidden], [name for name in hidden if name not in wrong]
     if seen:
         text += f"; {', '.join(seen)} could be identified: the method stopped short ({run.solution.status.value})"
     if lucky:

@@ -89,7 +89,7 @@ class Setting:
         return dict(zip(self.problem.system.parameters.names, map(float, theta), strict=True))
 
     def camera(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
-        """The camera's group, the times of its frames since the start and its typical deviation [m]."""
+        """The camera's group, the times of its frames since the start and its typical standard deviation [m]."""
         for group in used_groups(self.problem, episode):
             if camera_pose(group) is not None:
                 std = self._std(group)
@@ -262,20 +262,20 @@ class LayoutBuilder:
     Parameters
     ----------
     setting : Setting
-    tell : callable, optional
+    progress : callable, optional
         Told what takes time.
     """
 
-    def __init__(self, setting: Setting, tell: Callable[[str], None] | None = None) -> None:
+    def __init__(self, setting: Setting, progress: Callable[[str], None] | None = None) -> None:
         self.setting = setting
-        self._tell = tell or (lambda text: None)
+        self._progress = progress or (lambda text: None)
         self._layouts: dict[frozenset[str], Layout | str] = {}
 
     def layout(self, mechanics: frozenset[str]) -> Layout | str:
         """The experiment with changes of mechanics, or why there is none."""
         if mechanics not in self._layouts:
             if mechanics:
-                self._tell("working out " + " and ".join(MECHANICS[name] for name in sorted(mechanics)))
+                self._progress("working out " + " and ".join(MECHANICS[name] for name in sorted(mechanics)))
             try:
                 self._layouts[mechanics] = self._build(mechanics)
             except YidError as error:
@@ -345,7 +345,7 @@ class LayoutBuilder:
                     fixed += block.T @ block
         names = tuple(name for name in problem.names if name.split("[")[0] in base.free)
         stated = evaluation.jacobian[row : row + problem.stated_prior_rows].copy()
-        # what is presumed of the parameters themselves stays out: what is asked is what sensors say
+        # what is assumed of the parameters themselves stays out: what is asked is what sensors say
         stated[:, [problem.names.index(name) for name in names]] = 0.0
         return Layout(problem, x, names, slopes, fixed + stated.T @ stated, tuple(notes))
 
@@ -431,7 +431,7 @@ class LayoutBuilder:
         return Recording(joints, source="what if", name=episode.name), notes
 
     def _dense(self, recording: Recording, index: int, seen: Sequence[Sight], torque: bool) -> Recording:
-        """The recording with every sight in view at every node, at unit deviation, and efforts to be predicted."""
+        """The recording with every sight in view at every node, of unit standard deviation, and efforts to predict."""
         setting = self.setting
         base = setting.problem
         episode = base.episodes[index % len(base.episodes)]

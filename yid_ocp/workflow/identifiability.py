@@ -130,7 +130,7 @@ def run_identifiability(
                 start=asked.start,
                 grasp_std=asked.grasp_std,
                 second_arm=None if other is None else _nuisanced(other, asked),
-                tell=watcher.stage,
+                progress=watcher.stage,
             )
         result = identifiability_result(problem, solution, information, known, ranking, asked) | {
             "inputs": inputs,
