@@ -171,12 +171,11 @@ def test_the_linear_model_predicts_what_a_small_push_does(driven, monkeypatch):
     episode = problem.episodes[0]
     torque = episode.torque.copy()
     torque[(np.arange(len(torque)) >= 50) & (np.arange(len(torque)) < 90), 1] += 1e-4
-    changed = problem_of(driven, recording)
-    changed.episodes = (replace(episode, torque=torque),)
+    changed = problem.on([replace(episode, torque=torque)], ())
     difference = changed.evaluate(x, False).residual - evaluation.residual
     rows = np.concatenate(moved)
     # with one sensor the residual's order is that of time, interval after interval
-    assert len(rows) == len(difference) - problem.weak_prior_rows
+    assert len(rows) == problem.rows.data.stop
     assert rows == pytest.approx(difference[: len(rows)], rel=1e-3, abs=1e-4 * np.abs(difference).max())
 
 

@@ -11,8 +11,8 @@ from yid_ocp.errors import DataError, SolverError
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.grid import Grid
-from yid_ocp.problem.inputs import camera_pose, held_torque, held_torque_slope, sensors_present
-from yid_ocp.sensors import sensor_function
+from yid_ocp.problem.inputs import held_torque, held_torque_slope, sensors_present
+from yid_ocp.sensors import camera_pose, sensor_function
 from yid_ocp.solvers.transcription import Transcription
 
 H, STEPS = 0.01, 24

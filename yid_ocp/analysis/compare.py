@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.problem import Episode, EpisodeResult
+from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.prediction import EpisodeResult
 from yid_ocp.solvers import Iterate, Solution, Status, solve
 from yid_ocp.solvers.base import IDENTIFIABLE, Solver
 
@@ -125,7 +126,6 @@ def compare(
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         cost = problem.evaluate(solution.x, derivatives=False).cost
         runs.append(MethodRun(solver.name, solution, cost, own.validate(solution.x), wall, cpu, memory.peak))
-        problem.forget_starts()
     best = min(runs, key=lambda run: run.whitened_cost)
     agreement = {run.method: _differences(run, best) for run in runs}
     return Comparison(tuple(runs), best.method, agreement, tuple(_explanations(runs, best, truth or {})))

@@ -316,18 +316,16 @@ def with_nuisances(
     values = {name: dict(entry) for name, entry in options.recording_values.items()}
     if initial == "fitted_to_points":
         # the fit's start stays where it is, and becomes the centre of a prior where it is unknown
-        for i, episode in enumerate(problem.episodes):
-            theta, _ = problem.split(x, i)
-            if episode.name not in known:
-                fitted = problem.fitted_start(episode, problem.own_theta(episode, theta))
-                known[episode.name] = fitted.state
-                values.setdefault(episode.name, {}).update(fitted.values)
+        for episode in problem.episodes:
+            if episode.name not in known and episode.start is not None:
+                known[episode.name] = episode.start.state
+                values.setdefault(episode.name, {}).update(episode.start.values)
     elif start == "known" and initial == "estimated":
         for i, episode in enumerate(problem.episodes):
-            state, _, message = problem.start_state(episode, *problem.split(x, i))
-            if message:
-                raise SolverError(f"there is no start to be known: {message}", where=episode.name)
-            known[episode.name] = state
+            begin = problem.start_state(episode, *problem.split(x, i))
+            if begin.message:
+                raise SolverError(f"there is no start to be known: {begin.message}", where=episode.name)
+            known[episode.name] = begin.state
     initial = "estimated" if start == "unknown" else "equilibrium" if initial == "estimated" else initial
     grasps = [
         entry.name
@@ -377,14 +375,11 @@ class SplitRows:
 
 def split_rows(problem: EstimationProblem, evaluation: Evaluation, chosen: NDArray[np.int64]) -> SplitRows:
     """Sensitivities of chosen unknowns, those of all others eliminated together with their priors."""
-    assert evaluation.jacobian is not None
-    total = len(evaluation.residual) - problem.weak_prior_rows
-    data = total - problem.stated_prior_rows
-    noise = problem.paper_noise if problem.options.weighting == "paper" else 1.0
-    jacobian = np.vstack([evaluation.jacobian[:data] / noise, evaluation.jacobian[data:total]])
+    _, jacobian = problem.informing(evaluation)
+    jacobian = jacobian.copy()
     others = np.setdiff1d(np.arange(jacobian.shape[1]), chosen)
     # what is known beforehand of the parameters themselves is not something that a sensor sees
-    jacobian[data:, chosen] = 0.0
+    jacobian[problem.rows.stated_priors, chosen] = 0.0
     alone, nuisance = jacobian[:, chosen], jacobian[:, others] * problem.scales[others]
     return SplitRows(alone, without(alone, nuisance), nuisance)
 
@@ -517,13 +512,12 @@ def _moved(view: _Sensitivities, changes: Mapping[str, float]) -> float:
     problem, x = view.problem, view.x.copy()
     for name, value in changes.items():
         x[problem.names.index(name)] = value
-    evaluation = problem.evaluate(x, derivatives=False)
+    evaluation = problem.evaluate(x, False, view.evaluation.warm)
     if not evaluation.ok:
         return math.inf
-    rows = len(view.split.alone) - problem.stated_prior_rows
-    noise = problem.paper_noise if problem.options.weighting == "paper" else 1.0
+    rows = problem.rows.data
     change = np.zeros((len(view.split.alone), 1))
-    change[:rows, 0] = (evaluation.residual[:rows] - view.evaluation.residual[:rows]) / noise
+    change[rows, 0] = (evaluation.residual[rows] - view.evaluation.residual[rows]) / problem.noise
     return float(np.linalg.norm(without(change, view.split.nuisance))) / view.inflation
 
 

@@ -21,7 +21,7 @@ from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem, SensorOptions
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.grid import Grid
-from yid_ocp.problem.inputs import camera_pose
+from yid_ocp.sensors import camera_pose
 from yid_ocp.virtual.experiment import Motion, initial_posture, simulate_in_mujoco
 
 Array = NDArray[np.float64]
@@ -292,7 +292,7 @@ class LayoutBuilder:
             found.append("second_arm")
         if system.driven:
             found += ["motion", "travel"]
-        measured = any("joints.effort" in s.sensor.group for e in setting.problem.episodes for s in e.samples)
+        measured = any(s.sensor.efforts for e in setting.problem.episodes for s in e.samples)
         if (system.driven or system.prescribed) and not measured and setting.problem.episodes[0].recording.joints:
             found.append("torque")
         return found
@@ -331,12 +331,10 @@ class LayoutBuilder:
             raise SolverError(f"the model cannot be rolled out: {evaluation.message}")
         slopes: dict[tuple[int, str, str], Array] = {}
         fixed = np.zeros((len(x), len(x)))
-        row = 0
         for i, episode in enumerate(problem.episodes):
-            for samples in episode.samples:
+            for samples, rows in zip(episode.samples, problem.rows.measurements[i], strict=True):
                 count, width = samples.value.shape
-                block = evaluation.jacobian[row : row + count * width]
-                row += count * width
+                block = evaluation.jacobian[rows]
                 if samples.sensor.width == 3:
                     parts = block.reshape(count, width // 3, 3, len(x))
                     for k, frame in enumerate(samples.sensor.frames):
@@ -344,7 +342,7 @@ class LayoutBuilder:
                 else:
                     fixed += block.T @ block
         names = tuple(name for name in problem.names if name.split("[")[0] in base.free)
-        stated = evaluation.jacobian[row : row + problem.stated_prior_rows].copy()
+        stated = evaluation.jacobian[problem.rows.stated_priors].copy()
         # what is assumed of the parameters themselves stays out: what is asked is what sensors say
         stated[:, [problem.names.index(name) for name in names]] = 0.0
         return Layout(problem, x, names, slopes, fixed + stated.T @ stated, tuple(notes))
@@ -388,9 +386,9 @@ class LayoutBuilder:
             raise SolverError(layout)
         problem = layout.problem
         episode = problem.episodes[0]
-        state, _, message = problem.start_state(episode, *problem.split(layout.x, 0))
-        if message:
-            raise SolverError(message)
+        start = problem.start_state(episode, *problem.split(layout.x, 0))
+        if start.message:
+            raise SolverError(start.message)
         q, parameters = ca.SX.sym("q", system.size), problem.system.parameters
         kinematics = forward_kinematics(problem.system.mechanism, q)
         turned = []
@@ -398,7 +396,7 @@ class LayoutBuilder:
             pose = kinematics.pose(grasp.holder).rotation.T @ kinematics.pose(grasp.held).rotation
             rotation = ca.Function("turn", [q, parameters.symbols], [pose])
             theta, _ = problem.split(layout.x, 0)
-            turned.append(replace(grasp, kind="weld", rotation=ca.SX(rotation(state[: system.size], theta))))
+            turned.append(replace(grasp, kind="weld", rotation=ca.SX(rotation(start.state[: system.size], theta))))
         return replace(system, grasps=tuple(turned))
 
     def _moved(self, system: System, episode: Episode, seed: int, twice: bool) -> tuple[Recording, list[str]]:

@@ -139,7 +139,7 @@ class _Walk:
         self.others = np.array([i for i in range(len(x)) if i != index], int)
         self.anchored = np.array([i for i in self.others if self.positive[i]], int)
         self.centre = self.coordinates(x)
-        self.noise = problem.paper_noise if problem.options.weighting == "paper" else 1.0
+        self.noise = problem.noise
         self.scale = max(1.0, uncertainty(problem, best)[1])
         self.first = self._chi2(best)
         self.base = 0.0
@@ -291,27 +291,19 @@ class _Walk:
         chi2 = (self._chi2(evaluation) - self.first) / self.scale
         return _Point(float(x[self.index]), s.copy(), chi2, rows, jacobian)
 
-    def _parts(self, evaluation: Evaluation) -> tuple[int, int]:
-        total = len(evaluation.residual) - self.problem.weak_prior_rows
-        return total - self.problem.stated_prior_rows, total
-
     def _chi2(self, evaluation: Evaluation) -> float:
-        """Twice the cost without the weak prior, in units of the noise."""
-        data, total = self._parts(evaluation)
-        priors, tied = evaluation.residual[data:total], evaluation.residual[total:]
-        stated = float(priors @ priors)
-        return (2.0 * evaluation.cost - float(tied @ tied) - stated) / self.noise**2 + stated
+        """Twice the cost without the weak priors, in units of the noise."""
+        stated, weak = (
+            float(np.sum(evaluation.residual[rows] ** 2))
+            for rows in (self.problem.rows.stated_priors, self.problem.rows.weak_priors)
+        )
+        return (2.0 * evaluation.cost - weak - stated) / self.noise**2 + stated
 
     def _rows(self, evaluation: Evaluation, s: Array) -> tuple[Array, Array]:
-        """Residual and Jacobian by the coordinates, with the anchors in place of the weak prior."""
-        assert evaluation.jacobian is not None
-        data, total = self._parts(evaluation)
+        """Residual and Jacobian by the coordinates, with the anchors in place of the weak priors."""
+        residual, jacobian = self.problem.informing(evaluation)
         slope = np.where(self.positive, self.unknowns(s), 1.0)
         anchors = np.zeros((len(self.anchored), len(s)))
         anchors[np.arange(len(self.anchored)), self.anchored] = 1.0 / ANCHOR
-        rows = [evaluation.residual[:data] / self.noise, evaluation.residual[data:total]]
-        jacobian = [evaluation.jacobian[:data] / self.noise, evaluation.jacobian[data:total]]
-        return (
-            np.concatenate([*rows, (s - self.centre)[self.anchored] / ANCHOR]),
-            np.vstack([*(block * slope for block in jacobian), anchors]),
-        )
+        held = (s - self.centre)[self.anchored] / ANCHOR
+        return np.concatenate([residual, held]), np.vstack([jacobian * slope, anchors])

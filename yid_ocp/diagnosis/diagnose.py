@@ -12,7 +12,7 @@ import threadpoolctl
 
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.finding import Finding, absorption
-from yid_ocp.diagnosis.hypotheses import CandidateProblem, Choice, Series, chosen_effects, residual_series
+from yid_ocp.diagnosis.hypotheses import CandidateProblem, Choice, chosen_effects, residual_series
 from yid_ocp.diagnosis.localise import Place, attributed, localise, merged
 from yid_ocp.diagnosis.null_test import NullTest, noise_floor, null_test
 from yid_ocp.diagnosis.refit import Fit, Progress, Search, Store, recalled, refit
@@ -79,11 +79,12 @@ def diagnose(
 
 
 def _diagnosed(problem: EstimationProblem, search: Search, solution: Solution | None, clock: _Clock) -> Finding:
-    composed, limits, progress = search.problem, search.limits, search.progress
+    limits, progress = search.limits, search.progress
     progress("fitting the nominal model")
-    nominal = nominal_fit(problem, composed, solution, search.store, limits)
+    nominal = nominal_fit(problem, search.problem, solution, search.store, limits)
     angles = largest_angles(nominal)
-    composed.effects = tuple(effect.expected(angles) for effect in composed.effects)
+    composed = replace(search.problem, effects=tuple(effect.expected(angles) for effect in search.problem.effects))
+    search = replace(search, problem=composed)
     clock.lap("nominal")
     before, held = fitted_test(nominal, limits), held_out_test(nominal, limits)
     clock.lap("null_test")
@@ -126,7 +127,7 @@ def _diagnosed(problem: EstimationProblem, search: Search, solution: Solution | 
         remaining_where=rest_where,
         absorbed=absorption(nominal, accepted[-1].fit if accepted else nominal),
         next_experiment=next_experiment(verdict, accepted, where, screened.unseen),
-        held_out=tuple(episode.name for episode in composed.held_out),
+        held_out=tuple(episode.name for episode in nominal.problem.held_out),
         in_blocks=composed.blocks,
         message=shortage(verdict, before, len(nominal.values), screened.visible, limits),
         limits=limits,
@@ -238,31 +239,22 @@ def held_out_test(fit: Fit, limits: Thresholds = DEFAULTS) -> NullTest:
         A held-out recording cannot be predicted by the nominal model.
     """
     problem = fit.problem
-    x = problem.unknowns(fit.values)
     residuals = []
-    for episode, result in problem.validate(x):
+    for episode, result in problem.validate(problem.vector(fit.values)):
         if isinstance(result, str):
             raise DataError(
                 f"the held-out recording cannot be predicted: {result}",
                 where=episode.name,
                 hint="hold out a recording that the nominal model can follow",
             )
-        for samples, predicted in zip(episode.samples, result.predicted, strict=True):
-            keep = samples.weight > 0
-            difference = np.where(keep, predicted - samples.value, 0.0)
-            residuals.append((samples.weight * difference)[keep])
-    return null_test(_held_series(problem), np.concatenate(residuals), 0, limits.level, limits.window)
-
-
-def _held_series(problem: CandidateProblem) -> tuple[Series, ...]:
-    swapped = problem.freeing(())
-    swapped.episodes = problem.held_out
-    return residual_series(swapped)
+        residuals += [s.rows(y).residual for s, y in zip(episode.samples, result.predicted, strict=True)]
+    series = residual_series(problem.on(problem.held_out, ()))
+    return null_test(series, np.concatenate(residuals), 0, limits.level, limits.window)
 
 
 def smooth_fit(fit: Fit, limits: Thresholds = DEFAULTS) -> Smoothed:
     """The weak-constraint smoother about a fitted model."""
-    return smooth(fit.problem, fit.problem.unknowns(fit.values), fit.evaluation, limits)
+    return smooth(fit.problem, fit.problem.vector(fit.values), fit.evaluation, limits)
 
 
 def _closed(added: Sequence[Added]) -> dict[str, float]:

@@ -18,8 +18,11 @@ from yid_ocp.diagnosis.screening import robust
 from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
 from yid_ocp.effects import EffectBase, Reported
 from yid_ocp.parallel import map_threads
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.problem import Evaluation
-from yid_ocp.solvers import GaussNewton
+from yid_ocp.problem.validation import channel_errors
+from yid_ocp.solvers import GaussNewton, Status
 from yid_ocp.solvers.base import Outcome, uncertainty
 
 Array = NDArray[np.float64]
@@ -64,7 +67,8 @@ class Fit:
     Attributes
     ----------
     effects : tuple of EffectBase
-    problem : CandidateProblem
+    problem : EstimationProblem
+        Of the composed system, with the nominal parameters and those of the effects free.
     values : dict of str to float
         Unknowns.
     std : dict of str to float
@@ -80,7 +84,7 @@ class Fit:
     """
 
     effects: tuple[EffectBase, ...]
-    problem: CandidateProblem
+    problem: EstimationProblem
     values: dict[str, float]
     std: dict[str, float]
     cost: float
@@ -202,7 +206,7 @@ def refit(
 
 
 def _half_done(
-    own: CandidateProblem,
+    own: EstimationProblem,
     effects: Sequence[EffectBase],
     start: Mapping[str, float],
     finish: Evaluation,
@@ -211,27 +215,23 @@ def _half_done(
     """Whether a refit explains much of what the model without the effects leaves, but by far not all."""
     count = len(finish.residual)
     neutral = {name: value for effect in effects for name, value in effect.neutral.items()}
-    before = own.evaluate(own.unknowns({**start, **neutral}), derivatives=False)
+    before = own.evaluate(own.vector({**start, **neutral}), False, finish.warm)
     if 2 * finish.cost < limits.poor * count or not before.ok:
         return False
     return before.cost - finish.cost > limits.promising * (before.cost - count / 2)
 
 
 def _attempt(
-    own: CandidateProblem, effects: Sequence[EffectBase], start: Mapping[str, float]
+    own: EstimationProblem, effects: Sequence[EffectBase], start: Mapping[str, float]
 ) -> tuple[Outcome, Evaluation] | None:
     """One run from one start and the evaluation at its end; None where the model cannot be rolled out."""
     neutral = {name: value for effect in effects for name, value in effect.neutral.items()}
-    x = own.unknowns(start)
     for pull in (1.0, 0.5, 0.2, 0.05, 0.0):
         drawn = {name: value + pull * (start.get(name, value) - value) for name, value in neutral.items()}
-        x = own.unknowns({**start, **drawn})
-        if own.evaluate(x, derivatives=False).ok:
+        outcome = SOLVER.run(own, own.vector({**start, **drawn}), None)
+        if outcome.status != Status.FAILED:
             break
-    else:
-        return None
-    outcome = SOLVER.run(own, x, None)
-    finish = own.evaluate(outcome.x)
+    finish = own.evaluate(outcome.x, warm=outcome.warm)
     return (outcome, finish) if finish.ok else None
 
 
@@ -243,7 +243,7 @@ def recalled(
     own = problem.freeing(effects)
     if known is None or not set(known.values) == set(known.std) == set(own.names):
         return None
-    x = own.unknowns(known.values)
+    x = own.vector(known.values)
     finish = own.evaluate(x)
     if not finish.ok:
         return None
@@ -251,7 +251,7 @@ def recalled(
     return Fit(tuple(effects), own, known.values, known.std, finish.cost, finish, loss, known.message, True)
 
 
-def deviations(problem: CandidateProblem, finish: Evaluation) -> Array:
+def deviations(problem: EstimationProblem, finish: Evaluation) -> Array:
     """Standard deviation of every unknown, shape (nx,): the larger of two.
 
     The first scales (J'J)^-1 by chi2 per degree of freedom; the second is the sandwich (J'J)^-1 S (J'J)^-1 with the
@@ -261,11 +261,11 @@ def deviations(problem: CandidateProblem, finish: Evaluation) -> Array:
     plain = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     if finish.jacobian is None or not plain.size:
         return plain
-    rows = len(finish.residual) - problem.weak_prior_rows
     scale = problem.scales
-    jacobian = finish.jacobian[:rows] * scale
+    residual, jacobian = problem.informing(finish)
+    jacobian = jacobian * scale
     inverse = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-10, hermitian=True)
-    middle = robust(jacobian, finish.residual[:rows], residual_series(problem))
+    middle = robust(jacobian, residual, residual_series(problem))
     return np.maximum(plain, scale * np.sqrt(np.maximum(np.diag(inverse @ middle @ inverse), 0.0)))
 
 
@@ -298,15 +298,15 @@ def refit_all(
     return [fit for fit in map_threads(one, tried) if fit is not None]
 
 
-def block_length(problem: CandidateProblem) -> float:
+def block_length(episodes: Sequence[Episode]) -> float:
     """Length of the blocks of held-out time [s]: some forty of them, between half a second and two seconds long."""
-    total = sum(episode.grid.steps * episode.grid.time_step for episode in problem.held_out)
+    total = sum(episode.grid.steps * episode.grid.time_step for episode in episodes)
     return float(np.clip(total / 40, 0.5, 2.0))
 
 
-def held_out_loss(problem: CandidateProblem, x: Array) -> Loss:
+def held_out_loss(problem: EstimationProblem, x: Array) -> Loss:
     """Predict the held-out recordings; initial states are found in the same way for every model."""
-    length = block_length(problem)
+    length = block_length(problem.held_out)
     squares: list[Array] = []
     counts: list[Array] = []
     results, episodes = [], []
@@ -315,10 +315,9 @@ def held_out_loss(problem: CandidateProblem, x: Array) -> Loss:
         total, count = np.zeros(number), np.zeros(number)
         for k, samples in enumerate(episode.samples):
             block = np.minimum((sample_times(episode, samples) / length).astype(int), number - 1)
-            good = samples.weight > 0
-            count += np.bincount(block, good.sum(axis=1), number)
+            count += np.bincount(block, samples.seen.sum(axis=1), number)
             if not isinstance(result, str):
-                r = samples.weight * np.where(good, result.predicted[k] - samples.value, 0.0)
+                r = samples.whitened(result.predicted[k])
                 total += np.bincount(block, np.sum(r**2, axis=1), number)
         if isinstance(result, str):
             total[:] = np.inf
@@ -328,6 +327,6 @@ def held_out_loss(problem: CandidateProblem, x: Array) -> Loss:
         keep = count > 0
         squares.append(total[keep])
         counts.append(count[keep])
-    errors = problem.channel_errors(results, episodes) if results else {}
+    errors = channel_errors(results, episodes) if results else {}
     channels = {name: (float(entry["rmse"]), str(entry["unit"])) for name, entry in errors.items()}
     return Loss(np.concatenate(squares), np.concatenate(counts), channels)

@@ -152,26 +152,25 @@ def linearise(
     grids = {effect.label: shape_grid(effect, grid) for effect in others}
     own = [name for effect in base for name in effect.parameters.names]
     residual, basis = np.zeros(0), np.zeros((0, 0))
-    series = residual_series(problem.freeing((), own))
+    series = residual_series(problem.problem)
+    warm = None
     signatures: list[Signature] = []
     for k in range(max((len(g) for g in grids.values()), default=0)):
         chosen = [effect for effect in others if k < len(grids[effect.label])]
         shape = {name: value for effect in chosen for name, value in grids[effect.label][k].items()}
         swept = [name for effect in chosen for name in effect.amplitudes]
-        trial = problem.at(shape).freeing((), [*own, *swept])
-        evaluation = trial.evaluate(trial.unknowns(values))
+        trial = problem.freeing((), [*own, *swept]).at(shape)
+        evaluation = trial.evaluate(trial.vector(values), warm=warm)
         if not evaluation.ok or evaluation.jacobian is None:
             raise SolverError(f"the model cannot be linearised: {evaluation.message}", where="diagnosis")
-        names = list(trial.names)
+        names, warm = list(trial.names), evaluation.warm
         places = [names.index(name) for name in swept]
         rest = np.setdiff1d(np.arange(len(names)), places)
-        rows = len(evaluation.residual) - trial.weak_prior_rows
+        data, jacobian = trial.informing(evaluation)
         if k == 0:
-            nuisance = evaluation.jacobian[:rows][:, rest]
-            basis = _basis(nuisance)
-            residual = evaluation.residual[:rows]
-            residual = residual - basis @ (basis.T @ residual)
-        moved = evaluation.jacobian[:rows][:, places]
+            basis = _basis(jacobian[:, rest])
+            residual = data - basis @ (basis.T @ data)
+        moved = jacobian[:, places]
         moved = moved - basis @ (basis.T @ moved)
         at = 0
         for effect in chosen:
@@ -369,5 +368,5 @@ def screen(
     """Linearise, then visibility, scores and confusability of all candidates but those of `base`."""
     point = linearise(problem, base, values, limits.shape_values)
     visible = visibility(point, limits.detection)
-    ranked = scores(point, residual_series(problem.freeing(())), visible)
+    ranked = scores(point, residual_series(problem.problem), visible)
     return Screened(visible, ranked, confusability(point, ranked))

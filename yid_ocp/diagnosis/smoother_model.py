@@ -23,13 +23,13 @@ from numpy.typing import NDArray
 
 from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
 from yid_ocp.effects.base import grasp_names, robot_joints
-from yid_ocp.integrator.step_model import Feedback, Rollout
+from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import apparent_inertia
-from yid_ocp.problem.measurements import huber
-from yid_ocp.problem.problem import Episode, EpisodeResult, Evaluation
-from yid_ocp.sensors import EffortSensor, Sensor
+from yid_ocp.problem.episodes import Episode, apparent_inertia
+from yid_ocp.problem.prediction import EpisodeResult
+from yid_ocp.problem.problem import Evaluation
+from yid_ocp.sensors import Sensor
 
 Array = NDArray[np.float64]
 Kind = Literal["force", "offset", "bias"]
@@ -138,18 +138,14 @@ def linear_model(
         For the reference size of unknowns.
     """
     assert evaluation.jacobian is not None
-    scale = problem.scales
-    found, row = [], 0
-    residual, slopes = problem.prior(x)
-    stated = slice(0, problem.stated_prior_rows)
-    prior = -np.column_stack([residual[stated], slopes[stated] * scale])
+    columns = -np.column_stack([evaluation.residual, evaluation.jacobian * problem.scales])
+    found = []
     for i, (episode, result) in enumerate(zip(problem.episodes, evaluation.episodes, strict=True)):
-        theta = problem.own_theta(episode, problem.split(x, i)[0])
-        count = sum(int(np.count_nonzero(s.weight > 0)) for s in episode.samples)
-        rows = slice(row, row + count)
-        observed = -np.column_stack([evaluation.residual[rows], evaluation.jacobian[rows] * scale])
-        row += count
+        theta = problem.predictor.own_theta(episode, problem.split(x, i)[0])
+        groups = problem.rows.measurements[i]
+        observed = columns[groups[0].start : groups[-1].stop]
         found.append(_recording(_Course(problem, episode, theta, result), observed, limits))
+    prior = columns[problem.rows.stated_priors]
     # stated priors of the free parameters are observations that no unknown reaches
     first, *later = found[0].intervals
     first = replace(first, rest=first.rest + prior.T @ prior)
@@ -180,10 +176,6 @@ class _Course:
     @property
     def rollout(self) -> Rollout:
         return self.result.rollout
-
-    @property
-    def feedback(self) -> Feedback | None:
-        return self.problem.feedback(self.episode)
 
     @property
     def fixed(self) -> NDArray[np.int64]:
@@ -241,15 +233,17 @@ def _unknowns(course: _Course, limits: Thresholds) -> _Unknowns:
         row += grasp.equations
     biased = []
     for k, samples in enumerate(course.episode.samples):
-        if isinstance(samples.sensor, EffortSensor):
+        sensor = samples.sensor
+        if sensor.efforts:
             continue  # at a prescribed joint a bias and a force are the same
         for column, channel in enumerate(samples.channel_of_column):
-            if not np.any(samples.weight[:, column] > 0):
+            if not np.any(samples.seen[:, column]):
                 continue
-            frame = samples.sensor.frames[column // samples.sensor.width]
+            axis = f".{'xyz'[column % 3]}" if sensor.width == 3 else ""
+            frame = sensor.frames[column // sensor.width] if sensor.frames else ""
             biased.append((k, column))
-            names.append(f"{channel}.{'xyz'[column % 3]}")
-            sources.append(Source(_seen_by(course.system, samples.sensor, frame), "bias"))
+            names.append(f"{channel}{axis}")
+            sources.append(Source(_seen_by(course.system, sensor, frame), "bias"))
             reference.append(limits.bias * float(np.nanmedian(samples.std[:, column])))
     return _Unknowns(tuple(names), tuple(sources), np.array(reference), forced, np.array(grasped, int), tuple(biased))
 
@@ -259,12 +253,7 @@ def _unknown_forces(course: _Course, part: float) -> tuple[list[str], list[Sourc
     system, joint_names = course.system, course.system.mechanism.joint_names
     place = {joint: s.name for s in system.segments for link in s.links for joint in link}
     place |= {joint: joint for joint in robot_joints(system)}
-    measured = {
-        joint
-        for samples in course.episode.samples
-        if isinstance(samples.sensor, EffortSensor)
-        for joint in samples.sensor.joints
-    }
+    measured = {joint for samples in course.episode.samples for joint in samples.sensor.efforts}
     silent = {joint_names[i] for i in course.fixed} - measured
     names = [n for n in joint_names if n in place and n not in silent and n not in system.compliant]
     forced = np.array([joint_names.index(name) for name in names], int)
@@ -360,7 +349,7 @@ def _steps(course: _Course, unknowns: _Unknowns, moving: _Moving, first: int, la
     for target, matrix in ((top, stages.rows_old), (bottom, stages.p1_old)):
         target[:, :, :n], target[:, :, 2 * n : nx] = matrix[:, :, :n], matrix[:, :, n:]
     top[:, np.arange(n), n + np.arange(n)] += 1.0
-    feedback = course.feedback
+    feedback = course.episode.feedback
     if feedback is not None:
         gain = feedback.gain[span]
         top[:, :, feedback.index] -= stages.rows_input @ gain
@@ -534,24 +523,23 @@ class _Reading:
 
 def _reading(course: _Course, moving: _Moving, edges: NDArray[np.int64]) -> _Reading:
     problem, theta, n = course.problem, course.theta, course.system.size
-    state, efforts = course.rollout.state, problem.efforts(course.rollout)
+    predictor, threshold = problem.predictor, problem.options.huber_threshold
+    state, efforts = course.rollout.state, predictor.efforts(course.rollout)
     group: list[NDArray[np.int64]] = []
     column, node, fraction, weight, slope, load = [], [], [], [], [], []
     for samples, predicted in zip(course.episode.samples, course.result.predicted, strict=True):
-        late = problem.lateness(samples, theta, ())
+        late = predictor.lateness(samples, theta, ())
         placed = samples if late is None else samples.late(late[0])
-        shape = samples.weight.shape
+        shape, keep = samples.weight.shape, samples.seen
         where = placed.node if placed.node.ndim > 1 else np.broadcast_to(placed.node[:, None], shape)
         beyond = placed.fraction if placed.node.ndim > 1 else np.broadcast_to(placed.fraction[:, None], shape)
-        _, by_q, by_z, by_e, _ = problem.sensor(samples.sensor, ())(state[:, :n], state[:, 2 * n :], efforts, theta)
-        keep = samples.weight > 0
-        raw = samples.weight * np.where(keep, predicted - samples.value, 0.0)
-        factor = huber(raw, problem.options.huber_threshold)[1]
-        group.append(np.full(int(keep.sum()), len(group)))
+        read = problem.functions.sensor(samples.sensor, ())
+        _, by_q, by_z, by_e, _ = read(state[:, :n], state[:, 2 * n :], efforts, theta)
+        group.append(np.full(samples.count, len(group)))
         column.append(np.broadcast_to(np.arange(shape[1]), shape)[keep])
         node.append(where[keep])
         fraction.append(beyond[keep])
-        weight.append((factor * samples.weight)[keep])
+        weight.append(samples.rows(predicted, threshold=threshold).weight)
         slope.append(np.concatenate([by_q, np.zeros((*by_q.shape[:2], n)), by_z], axis=2)[:, :, moving.states])
         load.append(by_e[:, :, course.fixed])
     nodes = np.concatenate(node)

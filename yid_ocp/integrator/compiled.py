@@ -23,6 +23,7 @@ from yid_ocp.integrator.step_model import (
     empty_linearization,
     status_of,
 )
+from yid_ocp.parallel import Once
 
 if TYPE_CHECKING:
     from yid_ocp.integrator.step import Step
@@ -77,25 +78,23 @@ class CompiledKernel:
     def __init__(self, step: Step, library: ctypes.CDLL) -> None:
         self._step = step
         self._library = library
-        self._columns: dict[tuple[str, ...], _CompiledColumns] = {}
+        self._theta_columns: Once[tuple[str, ...], _CompiledColumns] = Once(self._compiled_columns)
 
-    def _theta_columns(self, names: tuple[str, ...]) -> _CompiledColumns:
-        if names not in self._columns:
-            function = codegen.theta_function(self._step.equations, names)
-            library = compiler.compile_library(codegen.function_source(function), straight_line=True)
-            if library is None:
-                raise ModelError("the compiler worked for the step but not for its derivatives", hint="set CC=none")
-            address = ctypes.cast(library.by_theta, ctypes.c_void_p).value
-            assert address is not None
-            patterns = []
-            for out in range(3):
-                sparsity = function.sparsity_out(out)
-                patterns.append(
-                    np.array([sparsity.size1(), sparsity.size2(), *sparsity.colind(), *sparsity.row()], np.int64)
-                )
-            work = max(function.sz_w(), function.sz_iw(), 1)
-            self._columns[names] = _CompiledColumns(address, tuple(patterns), work, library)
-        return self._columns[names]
+    def _compiled_columns(self, names: tuple[str, ...]) -> _CompiledColumns:
+        function = codegen.theta_function(self._step.equations, names)
+        library = compiler.compile_library(codegen.function_source(function), straight_line=True)
+        if library is None:
+            raise ModelError("the compiler worked for the step but not for its derivatives", hint="set CC=none")
+        address = ctypes.cast(library.by_theta, ctypes.c_void_p).value
+        assert address is not None
+        patterns = []
+        for out in range(3):
+            sparsity = function.sparsity_out(out)
+            patterns.append(
+                np.array([sparsity.size1(), sparsity.size2(), *sparsity.colind(), *sparsity.row()], np.int64)
+            )
+        work = max(function.sz_w(), function.sz_iw(), 1)
+        return _CompiledColumns(address, tuple(patterns), work, library)
 
     def _directions(self, names: tuple[str, ...], count: int) -> tuple[_Directions, list[object]]:
         if not names:

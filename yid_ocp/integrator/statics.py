@@ -13,6 +13,7 @@ import scipy.linalg.lapack
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.integrator.step import Step, check_shape
+from yid_ocp.parallel import Once
 
 Array = NDArray[np.float64]
 
@@ -108,7 +109,7 @@ class Statics:
         self._residual = ca.Function("rest", inputs, [residual, ca.jacobian(residual, w)])
         self._outcome = ca.Function("outcome", inputs, [state, u, potential, give])
         self._symbols = (inputs, residual, state)
-        self._derivatives: dict[tuple[str, ...], ca.Function] = {}
+        self._derivatives: Once[tuple[str, ...], ca.Function] = Once(self._derivative)
 
     def solve(
         self,
@@ -195,15 +196,16 @@ class Statics:
         return starts
 
     def _differentiate(self, w: Array, arguments: list, names: tuple[str, ...]) -> tuple[Array, Array]:
-        if names not in self._derivatives:
-            inputs, residual, state = self._symbols
-            other = ca.vertcat(*(self.step.system.parameters[name].symbol for name in names), inputs[1])
-            outputs = [ca.jacobian(f, x) for f in (residual, state) for x in (inputs[0], other)]
-            self._derivatives[names] = ca.Function("by", inputs, outputs)
-        r_w, r_o, s_w, s_o = (np.array(ca.densify(x)) for x in self._derivatives[names](w, *arguments))
+        r_w, r_o, s_w, s_o = (np.array(ca.densify(x)) for x in self._derivatives(names)(w, *arguments))
         change = -np.linalg.lstsq(r_w, r_o, rcond=None)[0] if len(w) else np.zeros((0, r_o.shape[1]))
         total = s_w @ change + s_o
         return total[:, : len(names)], total[:, len(names) :]
+
+    def _derivative(self, names: tuple[str, ...]) -> ca.Function:
+        inputs, residual, state = self._symbols
+        other = ca.vertcat(*(self.step.system.parameters[name].symbol for name in names), inputs[1])
+        outputs = [ca.jacobian(f, x) for f in (residual, state) for x in (inputs[0], other)]
+        return ca.Function("by", inputs, outputs)
 
     def _explain(self, state: Array, theta: Array, error: float) -> str:
         system, step = self.step.system, self.step

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
-from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
@@ -13,11 +11,8 @@ from numpy.typing import NDArray
 from yid_ocp.integrator.codegen import Mapped
 from yid_ocp.integrator.step import Feedback
 from yid_ocp.model.system import RecordedEffect, System
-from yid_ocp.problem.inputs import held_torque, held_torque_slope
+from yid_ocp.parallel import Once
 from yid_ocp.sensors import Sensor
-
-if TYPE_CHECKING:
-    from yid_ocp.problem.problem import Episode
 
 Array = NDArray[np.float64]
 
@@ -102,45 +97,50 @@ class InputCorrections:
     Parameters
     ----------
     system : System
+    names : tuple of str
+        Parameters by which derivatives may be asked for; those wanted are some of them.
     use_compiler : bool
     """
 
-    def __init__(self, system: System, use_compiler: bool) -> None:
+    def __init__(self, system: System, names: tuple[str, ...], use_compiler: bool) -> None:
         self.system = system
-        self._compiled = use_compiler
+        self._names = names
         self._effects = tuple(e for e in system.effects if isinstance(e, RecordedEffect))
         self.joints = (*system.driven, *system.prescribed)
         count = len(self.joints)
-        self._angle, self._effort = ca.SX.sym("angle", count), ca.SX.sym("effort", count)
+        angle, effort = ca.SX.sym("angle", count), ca.SX.sym("effort", count)
+        true_angle, true_effort = self._corrected(angle, effort)
+        theta = system.parameters.symbols
+        late = ca.vertcat(ca.SX(0, 1), *(self._delay(f"torque.{joint}", False) for joint in system.driven))
+        self.corrects_angles = _depends(true_angle, theta)
+        self.corrects_efforts = _depends(true_effort, theta)
+        self.angles_need_effort = _depends(true_angle, effort)
+        self.delays_torque = _depends(late, theta)
+        chosen = ca.vertcat(ca.SX(0, 1), *(system.parameters[name].symbol for name in names))
+        self._late = ca.Function("delay", [theta], [late, ca.jacobian(late, chosen)])
+        slope = ca.vertcat(ca.SX(0, 1), *(ca.jacobian(true_effort[i], effort[i]) for i in range(count)))
+        outputs = [true_angle, true_effort, ca.densify(slope)]
+
+        def compiled(differentiated: bool) -> Mapped:
+            slopes = [ca.jacobian(x, chosen) for x in outputs[:2]] if differentiated else []
+            function = ca.Function("true", [angle, effort, theta], [*outputs, *slopes])
+            return Mapped(function, shared=(2,), use_compiler=use_compiler)
+
+        self._maps: Once[bool, Mapped] = Once(compiled)
+        self._sensor_delays: Once[Sensor, ca.Function | None] = Once(self._sensor_delay)
+
+    def _corrected(self, angle: ca.SX, effort: ca.SX) -> tuple[ca.SX, ca.SX]:
         angles, efforts = [], []
         for i, joint in enumerate(self.joints):
-            effort, angle = self._effort[i], self._angle[i]
             # the last effect is the nearest to the reading
+            true_effort, true_angle = effort[i], angle[i]
             for effect in reversed(self._effects):
-                effort = effect.correct(f"joints.effort.{joint}", effort, effort)
+                true_effort = effect.correct(f"joints.effort.{joint}", true_effort, true_effort)
             for effect in reversed(self._effects):
-                angle = effect.correct(f"joints.position.{joint}", angle, effort)
-            efforts.append(effort)
-            angles.append(angle)
-        self._true_angle = ca.vertcat(ca.SX(0, 1), *angles)
-        self._true_effort = ca.vertcat(ca.SX(0, 1), *efforts)
-        theta = system.parameters.symbols
-        self.corrects_angles = self._depends(self._true_angle, theta)
-        self.corrects_efforts = self._depends(self._true_effort, theta)
-        self.angles_need_effort = self._depends(self._true_angle, self._effort)
-        self._late = ca.vertcat(ca.SX(0, 1), *(self._delay(f"torque.{joint}", False) for joint in system.driven))
-        self.delays_torque = self._depends(self._late, theta)
-        self._maps: dict[tuple[str, ...], Mapped] = {}
-        self._delays: dict[tuple[Sensor | None, tuple[str, ...]], ca.Function] = {}
-
-    @property
-    def active(self) -> bool:
-        """Whether true inputs may differ from recorded ones."""
-        return self.corrects_angles or self.delays_torque or (self.corrects_efforts and bool(self.system.driven))
-
-    @staticmethod
-    def _depends(expression: ca.SX, symbols: ca.SX) -> bool:
-        return expression.numel() > 0 and symbols.numel() > 0 and bool(ca.depends_on(expression, symbols))
+                true_angle = effect.correct(f"joints.position.{joint}", true_angle, true_effort)
+            efforts.append(true_effort)
+            angles.append(true_angle)
+        return ca.vertcat(ca.SX(0, 1), *angles), ca.vertcat(ca.SX(0, 1), *efforts)
 
     def _delay(self, channel: str, camera: bool) -> ca.SX:
         total = sum((effect.delay(channel, camera) for effect in self._effects), ca.SX(0))
@@ -148,7 +148,7 @@ class InputCorrections:
         return total / self.system.time_scale
 
     def true(
-        self, angle: Array, effort: Array, theta: Array, names: tuple[str, ...]
+        self, angle: Array, effort: Array, theta: Array, wanted: tuple[str, ...]
     ) -> tuple[Array, Array, Array, Array, Array]:
         """True angles and efforts of `joints` behind readings.
 
@@ -156,7 +156,7 @@ class InputCorrections:
         ----------
         angle, effort : ndarray, shape (K, nj)
         theta : ndarray, shape (ntheta,)
-        names : tuple of str
+        wanted : tuple of str
             Parameters by which to differentiate, d of them.
 
         Returns
@@ -165,83 +165,34 @@ class InputCorrections:
         angle_by_theta, effort_by_theta : ndarray, shape (K, nj, d)
         effort_by_reading : ndarray, shape (K, nj)
         """
-        if names not in self._maps:
-            chosen = self._chosen(names)
-            slope = ca.vertcat(
-                ca.SX(0, 1), *(ca.jacobian(self._true_effort[i], self._effort[i]) for i in range(len(self.joints)))
-            )
-            outputs = [
-                self._true_angle,
-                self._true_effort,
-                ca.jacobian(self._true_angle, chosen),
-                ca.jacobian(self._true_effort, chosen),
-                ca.densify(slope),
-            ]
-            function = ca.Function("true", [self._angle, self._effort, self.system.parameters.symbols], outputs)
-            self._maps[names] = Mapped(function, shared=(2,), use_compiler=self._compiled)
-        a, e, a_theta, e_theta, e_reading = self._maps[names](angle, effort, theta)
+        a, e, e_reading, *slopes = self._maps(bool(wanted))(angle, effort, theta)
+        at = [self._names.index(name) for name in wanted]
+        a_theta, e_theta = (x[:, :, at] for x in slopes) if wanted else (np.zeros((*a.shape[:2], 0)),) * 2
         return a[:, :, 0], e[:, :, 0], a_theta, e_theta, e_reading[:, :, 0]
 
-    def inputs(self, episode: Episode, theta: Array, names: tuple[str, ...]) -> Inputs:
-        """What drives an episode's rollout: the recording, as far as no effect says that it reads something else.
-
-        Parameters
-        ----------
-        episode : Episode
-        theta : ndarray, shape (ntheta,)
-        names : tuple of str
-            Parameters by which to differentiate.
-        """
-        torque, arm, path = episode.torque, episode.measured_arm, episode.path
-        nu, nc = torque.shape[1], path.shape[1]
-        first = torque[0] if nu else np.zeros(0)
-        by_torque = by_first = by_arm = by_path = None
-        if nu and (self.delays_torque or self.corrects_efforts):
-            joints = episode.recording.joints
-            assert joints is not None
-            where = (joints, self.system.driven, episode.grid, episode.name)
-            delay, by_delay = self.torque_delay(theta, names)
-            if self.delays_torque:
-                torque = held_torque(*where, delay)
-            readings = np.pad(np.vstack([torque, first]), ((0, 0), (0, nc)))
-            _, true, _, by_theta, by_reading = self.true(np.zeros_like(readings), readings, theta, names)
-            by_theta = by_theta[:, :nu].copy()
-            if self.delays_torque and names:
-                slope = by_reading[:-1, :nu] * held_torque_slope(*where, delay)
-                by_theta[:-1] += slope[:, :, None] * by_delay
-            torque, first, by_torque, by_first = true[:-1, :nu], true[-1, :nu], by_theta[:-1], by_theta[-1]
-        if self.corrects_angles:
-            true, _, by_angle, _, _ = self.true(np.hstack([arm, path]), episode.load, theta, names)
-            arm, path, by_arm, by_path = true[:, :nu], true[:, nu:], by_angle[:, :nu], by_angle[:, nu:]
-        return Inputs(torque, first, path, arm, by_torque, by_first, by_path, by_arm)
-
-    def torque_delay(self, theta: Array, names: tuple[str, ...]) -> tuple[Array, Array]:
+    def torque_delay(self, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array]:
         """How long after it was recorded each driven joint's torque acts, shape (nu,) [s], and its derivative."""
-        return self._evaluate(None, self._late, theta, names)
+        return self._evaluate(self._late, theta, wanted)
 
-    def sensor_delay(self, sensor: Sensor, theta: Array, names: tuple[str, ...]) -> tuple[Array, Array] | None:
+    def sensor_delay(self, sensor: Sensor, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array] | None:
         """How long before its recorded time each output was true, shape (k,) [s], and its derivative; None if never."""
-        if sensor not in self._late_sensors:
-            camera = sensor.camera is not None
-            late = [self._delay(channel, camera) for channel in sensor.channels for _ in range(sensor.width)]
-            expression = ca.vertcat(ca.SX(0, 1), *late)
-            moved = self._depends(expression, self.system.parameters.symbols)
-            self._late_sensors[sensor] = expression if moved else None
-        found = self._late_sensors[sensor]
-        return None if found is None else self._evaluate(sensor, found, theta, names)
+        found = self._sensor_delays(sensor)
+        return None if found is None else self._evaluate(found, theta, wanted)
 
-    @cached_property
-    def _late_sensors(self) -> dict[Sensor, ca.SX | None]:
-        return {}
+    def _sensor_delay(self, sensor: Sensor) -> ca.Function | None:
+        camera, theta = sensor.camera is not None, self.system.parameters.symbols
+        late = [self._delay(channel, camera) for channel in sensor.channels for _ in range(sensor.width)]
+        expression = ca.vertcat(ca.SX(0, 1), *late)
+        if not _depends(expression, theta):
+            return None
+        chosen = ca.vertcat(ca.SX(0, 1), *(self.system.parameters[name].symbol for name in self._names))
+        return ca.Function("delay", [theta], [expression, ca.jacobian(expression, chosen)])
 
-    def _evaluate(
-        self, key: Sensor | None, expression: ca.SX, theta: Array, names: tuple[str, ...]
-    ) -> tuple[Array, Array]:
-        if (key, names) not in self._delays:
-            outputs = [expression, ca.jacobian(expression, self._chosen(names))]
-            self._delays[key, names] = ca.Function("delay", [self.system.parameters.symbols], outputs)
-        value, slope = self._delays[key, names](theta)
-        return np.array(ca.densify(value)).ravel(), np.array(ca.densify(slope)).reshape(expression.numel(), len(names))
+    def _evaluate(self, function: ca.Function, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array]:
+        value, slope = (np.array(ca.densify(x)) for x in function(theta))
+        at = [self._names.index(name) for name in wanted]
+        return value.ravel(), slope.reshape(value.size, len(self._names))[:, at]
 
-    def _chosen(self, names: tuple[str, ...]) -> ca.SX:
-        return ca.vertcat(ca.SX(0, 1), *(self.system.parameters[name].symbol for name in names))
+
+def _depends(expression: ca.SX, symbols: ca.SX) -> bool:
+    return expression.numel() > 0 and symbols.numel() > 0 and bool(ca.depends_on(expression, symbols))

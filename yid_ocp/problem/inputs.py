@@ -10,12 +10,13 @@ import scipy.interpolate
 import scipy.signal
 from numpy.typing import NDArray
 
-from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.errors import DataError, nearest
 from yid_ocp.model.cable import ClampPath
 from yid_ocp.model.system import System
 from yid_ocp.problem.grid import Grid
 from yid_ocp.problem.low_pass import LowPass
+from yid_ocp.sensors import camera_pose, joint_columns
 
 Array = NDArray[np.float64]
 
@@ -48,7 +49,7 @@ def held_torque(
             where=f"{where}: joints/effort",
             hint="prescribe the arms' motion instead (model.arms.mode: prescribed)",
         )
-    effort = joints.effort[:, columns(joints, driven, where)]
+    effort = joints.effort[:, joint_columns(joints, driven, where)]
     widths = np.diff(joints.t)
     total = np.vstack([np.zeros((1, effort.shape[1])), np.cumsum(effort[:-1] * widths[:, None], axis=0)])
     # the last sample is held as long as the one before it
@@ -66,7 +67,7 @@ def held_torque(
 def held_torque_slope(joints: JointGroup, driven: tuple[str, ...], grid: Grid, where: str, delay: Array) -> Array:
     """Derivative of `held_torque` by each joint's delay, shape (steps, nu) [N m/s]; at a jump the mean of two sides."""
     assert joints.effort is not None
-    effort = joints.effort[:, columns(joints, driven, where)]
+    effort = joints.effort[:, joint_columns(joints, driven, where)]
 
     def held(times: Array, column: Array, side: Literal["left", "right"]) -> Array:
         near = 1e-9 if side == "right" else -1e-9
@@ -79,7 +80,7 @@ def held_torque_slope(joints: JointGroup, driven: tuple[str, ...], grid: Grid, w
     return np.stack(result, axis=1)
 
 
-def joint_loads(recording: Recording, names: tuple[str, ...], grid: Grid, smoother: LowPass) -> Array:
+def joint_loads(recording: Recording, names: tuple[str, ...], grid: Grid, low_pass: LowPass) -> Array:
     """Smoothed recorded effort of joints at every node, shape (steps + 1, len(names)) [N m].
 
     Raises
@@ -94,21 +95,8 @@ def joint_loads(recording: Recording, names: tuple[str, ...], grid: Grid, smooth
             where=f"{recording.name}: joints/effort",
             hint="leave series_elasticity and backlash out",
         )
-    effort = smoother(joints.t, joints.effort[:, columns(joints, names, recording.name)])
+    effort = low_pass(joints.t, joints.effort[:, joint_columns(joints, names, recording.name)])
     return np.stack([np.interp(grid.times, joints.t, column) for column in effort.T], axis=1)
-
-
-def camera_pose(group: PointGroup) -> tuple[tuple[float, ...], ...] | None:
-    """Pose of the camera that saw a group of points, None where it was none.
-
-    A group is a camera's when it has a pose, or when its name or its sensor says `camera`; without a pose the camera
-    then counts as standing in the world's origin.
-    """
-    if group.pose is not None:
-        return tuple(tuple(float(x) for x in row) for row in group.pose)
-    if "camera" in group.name.lower() or "camera" in group.sensor.lower():
-        return tuple(tuple(row) for row in np.eye(4).tolist())
-    return None
 
 
 def sensors_present(recordings: Sequence[Recording]) -> frozenset[str]:
@@ -126,20 +114,8 @@ def sensors_present(recordings: Sequence[Recording]) -> frozenset[str]:
     return frozenset(found)
 
 
-def columns(joints: JointGroup, names: tuple[str, ...], where: str) -> list[int]:
-    """Columns of the named joints; `DataError` with the nearest recorded name where one is missing."""
-    for name in names:
-        if name not in joints.names:
-            raise DataError(
-                f"joint '{name}' of the model is not recorded",
-                where=f"{where}: joints",
-                hint=nearest(name, joints.names),
-            )
-    return [joints.names.index(name) for name in names]
-
-
 def prescribed_path(
-    recording: Recording, system: System, grid: Grid, smoother: LowPass, clamps: tuple[ClampPath, ...] = ()
+    recording: Recording, system: System, grid: Grid, low_pass: LowPass, clamps: tuple[ClampPath, ...] = ()
 ) -> Array:
     """Prescribed coordinates at every node, shape (steps + 1, nc).
 
@@ -154,7 +130,7 @@ def prescribed_path(
         return np.zeros((grid.steps + 1, 0))
     course: dict[str, Array] = {}
     for clamp in clamps:
-        course.update(_clamp_course(recording, clamp, grid, smoother))
+        course.update(_clamp_course(recording, clamp, grid, low_pass))
     remaining = tuple(name for name in system.prescribed if name not in course)
     if remaining:
         if recording.joints is None:
@@ -162,16 +138,16 @@ def prescribed_path(
                 f"joint '{remaining[0]}' is prescribed but the recording has no joints", where=recording.name
             )
         joints = recording.joints
-        values = smoother(joints.t, joints.position[:, columns(joints, remaining, recording.name)])
+        values = low_pass(joints.t, joints.position[:, joint_columns(joints, remaining, recording.name)])
         spline = scipy.interpolate.CubicSpline(joints.t, values, axis=0)
         sampled = spline(np.clip(grid.times, joints.t[0], joints.t[-1]))
         course.update({name: sampled[:, i] for i, name in enumerate(remaining)})
     return np.stack([course[name] for name in system.prescribed], axis=1)
 
 
-def _clamp_course(recording: Recording, clamp: ClampPath, grid: Grid, smoother: LowPass) -> Mapping[str, Array]:
-    origin = point_course(recording, clamp.origin, grid, smoother)
-    direction = point_course(recording, clamp.towards, grid, smoother) - origin
+def _clamp_course(recording: Recording, clamp: ClampPath, grid: Grid, low_pass: LowPass) -> Mapping[str, Array]:
+    origin = point_course(recording, clamp.origin, grid, low_pass)
+    direction = point_course(recording, clamp.towards, grid, low_pass) - origin
     length = np.linalg.norm(direction, axis=1, keepdims=True)
     if np.any(length < 1e-6):
         raise DataError(f"points '{clamp.origin}' and '{clamp.towards}' coincide", where=recording.name)
@@ -187,7 +163,7 @@ def _clamp_course(recording: Recording, clamp: ClampPath, grid: Grid, smoother: 
     return result
 
 
-def point_course(recording: Recording, point: str, grid: Grid, smoother: LowPass) -> Array:
+def point_course(recording: Recording, point: str, grid: Grid, low_pass: LowPass) -> Array:
     """Smoothed position of a recorded point at every node, shape (steps + 1, 3) [m]."""
     for group in recording.points:
         if point in group.names:
@@ -196,7 +172,7 @@ def point_course(recording: Recording, point: str, grid: Grid, smoother: LowPass
             if good.sum() < 4:
                 what = f"point '{point}' is seen {good.sum()} times"
                 raise DataError(what, where=recording.name, allowed="4 or more")
-            values = smoother(group.t[good], seen[good])
+            values = low_pass(group.t[good], seen[good])
             spline = scipy.interpolate.CubicSpline(group.t[good], values, axis=0)
             return np.asarray(spline(np.clip(grid.times, group.t[good][0], group.t[good][-1])))
     raise DataError(

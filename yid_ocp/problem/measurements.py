@@ -2,19 +2,39 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.data.recording import PointGroup, Recording
-from yid_ocp.errors import DataError, nearest
+from yid_ocp.errors import DataError
 from yid_ocp.problem.grid import Grid
-from yid_ocp.sensors import Sensor
+from yid_ocp.sensors import Sensor, SensorData
 
 Array = NDArray[np.float64]
 Weighting = Literal["whitened", "paper"]
+
+
+@dataclass(frozen=True)
+class Rows:
+    """A part of a residual.
+
+    Attributes
+    ----------
+    cost : float
+        Loss: half the sum of squares, or Huber's.
+    residual : ndarray, shape (nr,)
+    jacobian : ndarray, shape (nr, d), or None
+    weight : ndarray, shape (nr,)
+        Factor from a change of the prediction to that of the residual.
+    """
+
+    cost: float
+    residual: Array
+    jacobian: Array | None
+    weight: Array
 
 
 @dataclass(frozen=True)
@@ -33,7 +53,7 @@ class Measurements:
     weight : ndarray, shape (M, k)
         Factor that turns a difference into a residual, zero where there is no measurement.
     std : ndarray, shape (M, k)
-        Noise deviation, in the sensor's unit; NaN where it is not known.
+        Standard deviation of the noise, in the sensor's unit; NaN where it is not known.
     span : (int, int)
         First and last node at which the sensor can be predicted.
     """
@@ -60,6 +80,40 @@ class Measurements:
             return np.arange(max(low - 1, self.span[0]), min(high + 2, self.span[1] + 1))
         after = self.node[self.fraction > 0] + 1
         return np.unique(np.concatenate([self.node, after]))
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """Where there is a measurement that counts, shape (M, k)."""
+        return self.weight > 0
+
+    @property
+    def count(self) -> int:
+        """How many rows of a residual they make."""
+        return int(np.count_nonzero(self.weight > 0))
+
+    def whitened(self, predicted: Array) -> Array:
+        """Prediction less measurement in units of the noise, zero where there is none, shape (M, k)."""
+        return np.asarray(self.weight * np.where(self.weight > 0, predicted - self.value, 0.0))
+
+    def rows(self, predicted: Array, slopes: Array | None = None, threshold: float = math.inf) -> Rows:
+        """Their part of a residual.
+
+        Parameters
+        ----------
+        predicted : ndarray, shape (M, k)
+        slopes : ndarray, optional, shape (M, k, d)
+            Derivative of the prediction by d directions.
+        threshold : float
+            Of Huber's loss [standard deviations].
+        """
+        raw = self.whitened(predicted)
+        cost, factor = huber(raw, threshold)
+        keep = self.seen.ravel()
+        weight = factor * self.weight
+        jacobian = None
+        if slopes is not None:
+            jacobian = (weight[:, :, None] * slopes).reshape(-1, slopes.shape[2])[keep]
+        return Rows(cost, (factor * raw).ravel()[keep], jacobian, weight.ravel()[keep])
 
     def late(self, steps: Array) -> Measurements:
         """The same samples, each output that of so many steps before, within the span.
@@ -122,65 +176,20 @@ class Measurements:
         return result
 
 
-def point_samples(
-    recording: Recording, group: PointGroup, sensor: Sensor, points: tuple[str, ...], grid: Grid, std: float | None
-) -> Measurements:
-    """Measurements of a group of points.
-
-    Parameters
-    ----------
-    recording : Recording
-    group : PointGroup
-    sensor : Sensor
-    points : tuple of str
-        Points of the group, in the sensor's order.
-    grid : Grid
-    std : float, optional
-        Noise deviation to use instead of the recorded one [m].
-
-    Raises
-    ------
-    DataError
-        A point that is not in the group, or no noise level.
-    """
-    for point in points:
-        if point not in group.names:
-            raise DataError(
-                f"point '{point}' is not in group '{group.name}'",
-                where=recording.name,
-                hint=nearest(point, group.names),
-            )
-    columns = [group.names.index(point) for point in points]
-    inside = (group.t >= grid.start - 1e-9) & (group.t <= grid.times[-1] + 1e-9)
-    value = group.position[inside][:, columns].reshape(int(inside.sum()), 3 * len(columns))
-    if std is not None:
-        deviation = np.full(value.shape, float(std))
-    elif group.std is not None:
-        deviation = group.std[inside][:, columns].reshape(value.shape)
-    else:
-        raise DataError(
-            f"the noise level of group '{group.name}' is neither recorded nor given",
-            where=recording.name,
-            hint=f"set sensors.{group.name}.std [m]",
-        )
-    return make_samples(sensor, group.t[inside], value, deviation, grid, f"{recording.name}: {group.name}")
-
-
-def make_samples(
-    sensor: Sensor, t: Array, value: Array, std: Array, grid: Grid, where: str, span: tuple[int, int] | None = None
-) -> Measurements:
-    """Whitened samples; `DataError` where a noise level is not positive."""
-    seen = np.isfinite(value)
-    if np.any(seen & ~(std > 0)):
+def placed(data: SensorData, grid: Grid, where: str) -> Measurements:
+    """What a sensor measured, on the nodes of a rollout; `DataError` where a noise level is not positive."""
+    seen = np.isfinite(data.value)
+    if np.any(seen & ~(data.std > 0)):
         raise DataError(
             "a noise level is zero or missing",
-            where=where,
-            allowed="a positive deviation",
+            where=f"{where}: {data.sensor.group}",
+            allowed="a positive standard deviation",
             hint="set it under `sensors`",
         )
-    weight = np.where(seen, 1.0 / np.where(std > 0, std, 1.0), 0.0)
-    node, fraction = grid.locate(t)
-    return Measurements(sensor, node, fraction, value, weight, np.where(seen, std, np.nan), span or (0, grid.steps))
+    weight = np.where(seen, 1.0 / np.where(data.std > 0, data.std, 1.0), 0.0)
+    node, fraction = grid.locate(data.t)
+    std = np.where(seen, data.std, np.nan)
+    return Measurements(data.sensor, node, fraction, data.value, weight, std, data.span or (0, grid.steps))
 
 
 def paper_weighting(samples: Measurements, grid: Grid) -> Measurements:

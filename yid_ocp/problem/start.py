@@ -14,10 +14,12 @@ from yid_ocp.errors import DataError
 from yid_ocp.integrator.rollout import momentum_of
 from yid_ocp.integrator.statics import relaxed
 from yid_ocp.integrator.step import Step
+from yid_ocp.least_squares import levenberg_marquardt
 from yid_ocp.model import forward_kinematics
 from yid_ocp.model.cable import PRESET, START_SPEED
+from yid_ocp.parallel import Once
 from yid_ocp.problem.measurements import Measurements
-from yid_ocp.sensors import PointSensor, Sensor, sensor_function
+from yid_ocp.sensors import Sensor, sensor_function
 
 Array = NDArray[np.float64]
 
@@ -54,6 +56,18 @@ class FittedStart:
     values: Mapping[str, float] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class _Task:
+    """One fit: measured rows, theta, configuration and weights of the prior, number of parameters sought, softness."""
+
+    measured: list[tuple[Measurements, int]]
+    theta: Array
+    rest: Array
+    prior: Array
+    wanted: int
+    softness: float
+
+
 class StartFit:
     """Fits start configurations of a step's system.
 
@@ -80,7 +94,7 @@ class StartFit:
         # what follows its load at once has no start of its own
         idle = {system.mechanism.joint_index(joint) for joint in system.compliant}
         self._free = [i for i in range(system.size) if i not in set(self._known) | idle]
-        self._sensors: dict[Sensor, ca.Function] = {}
+        self._sensor: Once[Sensor, ca.Function] = Once(lambda sensor: sensor_function(step.system, sensor, self.local))
         chosen = ca.vertcat(*(system.parameters[name].symbol for name in self.local)) if self.local else ca.SX(0, 1)
         kinematics = forward_kinematics(system.mechanism, e.q1)
         aligned = ca.vertcat(ca.SX(0, 1), *(grasp.alignment(kinematics) for grasp in system.grasps))
@@ -130,7 +144,7 @@ class StartFit:
         last = max(round(window / step.time_step), 1)
         frames: dict[int, list[tuple[Measurements, int]]] = {}
         for group in samples:
-            if isinstance(group.sensor, PointSensor):
+            if group.sensor.points:
                 for row, (node, fraction) in enumerate(zip(group.node, group.fraction, strict=True)):
                     near = int(node + round(float(fraction)))
                     if near <= last and np.any(group.weight[row] > 0):
@@ -138,7 +152,7 @@ class StartFit:
         if not frames:
             raise DataError(
                 f"no point is seen in the first {window:g} s, so the start state cannot be fitted",
-                hint="widen solver.start_window, or start from equilibrium",
+                hint="widen problem.start_window, or start from equilibrium",
             )
         nodes = sorted(frames)
         first, then = nodes[0], nodes[-1]
@@ -153,7 +167,8 @@ class StartFit:
         for stage, softness in enumerate(SOFTNESS):
             if stage == SELECTION:
                 found = [min(found, key=lambda entry: entry[2])]
-            found = [self._fit(q, v, frames[first], theta, rest, weight, len(index), softness) for q, v, _ in found]
+            task = _Task(frames[first], theta, rest, weight, len(index), softness)
+            found = [self._fit(q, v, task) for q, v, _ in found]
         q, values, _ = found[0]
         theta = theta.copy()
         theta[index] = values
@@ -163,7 +178,8 @@ class StartFit:
             guess[list(system.prescribed_indices)] = path[then]
             span = (then - first) * step.time_step
             slow = np.full(system.size, 1 / (RATE_STD * span))
-            velocity = (self._fit(guess, values, frames[then], theta, guess, slow, 0, 1.0)[0] - q) / span
+            task = _Task(frames[then], theta, guess, slow, 0, 1.0)
+            velocity = (self._fit(guess, values, task)[0] - q) / span
         q0 = q - velocity * first * step.time_step
         q0[list(system.prescribed_indices)] = path[0]
         momentum = momentum_of(step, q0, velocity, theta)
@@ -202,78 +218,56 @@ class StartFit:
         grids = [low + (high - low) * shares for low, high in zip(lower, upper, strict=True)]
         return [values, *(np.array(entry) for entry in itertools.product(*grids))]
 
-    def _fit(
-        self,
-        guess: Array,
-        values: Array,
-        measured: list[tuple[Measurements, int]],
-        theta: Array,
-        rest: Array,
-        prior: Array,
-        wanted: int,
-        softness: float,
-    ) -> tuple[Array, Array, float]:
-        """Configuration, values of the first `wanted` local parameters, and the sum of squares there."""
-        step, system, free = self.step, self.step.system, self._free
-        nz, m = step.sizes["nz"], step.sizes["m"]
-        index = [system.parameters.index(name) for name in self.local]
-        lower, upper = system.parameters.bounds(self.local)
-        q, theta = guess.copy(), theta.copy()
+    def _fit(self, guess: Array, values: Array, task: _Task) -> tuple[Array, Array, float]:
+        """Configuration, values of the parameters sought, and the sum of squares there."""
+        free = self._free
+        index = [self.step.system.parameters.index(name) for name in self.local]
+        lower, upper = self.step.system.parameters.bounds(self.local)
+        q, theta = guess.copy(), task.theta.copy()
         theta[index] = values
+        wanted = index[: task.wanted]
+        span = (upper - lower)[: task.wanted]
+        # an angle goes round, anything else stops at its bound
+        turns = np.abs(span - 2 * np.pi) < 1e-9
 
-        def rows(q: Array, theta: Array) -> tuple[Array, Array]:
-            residuals, jacobians = [], []
-            for group, row in measured:
-                y, by_q, _, _, by_theta = self._sensor(group.sensor)(q, np.zeros(nz), np.zeros(system.size), theta)
-                weight = group.weight[row] / softness
-                value = np.where(weight > 0, group.value[row], 0.0)
-                wide = np.hstack([np.array(ca.densify(by_q))[:, free], np.array(ca.densify(by_theta))[:, :wanted]])
-                residuals.append(weight * (np.array(y).ravel() - value))
-                jacobians.append(weight[:, None] * wide)
-            if m:
-                gap, by_q, by_theta = self._phi(q, np.zeros(nz), np.zeros(m), theta, step.time_step)
-                wide = np.hstack([np.array(ca.densify(by_q))[:, free], np.array(ca.densify(by_theta))[:, :wanted]])
-                residuals.append(np.array(gap).ravel() / (CONSTRAINT_STD * softness))
-                jacobians.append(wide / (CONSTRAINT_STD * softness))
-            residuals.append(((q - rest) * prior)[free])
-            jacobians.append(np.hstack([np.diag(prior[free]), np.zeros((len(free), wanted))]))
-            return np.concatenate(residuals), np.vstack(jacobians)
+        def spread(x: Array) -> tuple[Array, Array]:
+            whole, moved = q.copy(), theta.copy()
+            whole[free], moved[wanted] = x[: len(free)], x[len(free) :]
+            return whole, moved
 
-        residual, jacobian = rows(q, theta)
-        cost, damping = float(residual @ residual), 1e-3
-        for _ in range(200):
-            scale = np.sqrt(damping) * np.maximum(np.linalg.norm(jacobian, axis=0), 1e-9)
-            stacked = np.vstack([jacobian, np.diag(scale)])
-            change = -np.linalg.lstsq(stacked, np.concatenate([residual, np.zeros(len(scale))]), rcond=None)[0]
-            size = float(np.max(np.abs(change), initial=0.0))
-            change *= min(1.0, 0.5 / max(size, 1e-12))
-            trial_q, trial_theta = q.copy(), theta.copy()
-            trial_q[free] += change[: len(free)]
-            for k in range(wanted):
-                span = upper[k] - lower[k]
-                value = theta[index[k]] + change[len(free) + k]
-                # an angle goes round, anything else stops at its bound
-                round_again = lower[k] + (value - lower[k]) % span
-                turn = abs(span - 2 * np.pi) < 1e-9
-                trial_theta[index[k]] = round_again if turn else np.clip(value, lower[k], upper[k])
-            new_residual, new_jacobian = rows(trial_q, trial_theta)
-            new_cost = float(new_residual @ new_residual)
-            if new_cost < cost:
-                done = size < 1e-9 or cost - new_cost < 1e-10 * cost
-                q, theta, residual, jacobian, cost = trial_q, trial_theta, new_residual, new_jacobian, new_cost
-                damping = max(damping / 10, 1e-12)
-                if done:
-                    break
-            else:
-                damping *= 10
-                if size < 1e-9 or damping > 1e8:
-                    break
-        return q, theta[index], cost
+        def allowed(x: Array) -> Array:
+            own = x[len(free) :]
+            low, high = lower[: task.wanted], upper[: task.wanted]
+            own = np.where(turns, low + (own - low) % np.where(turns, span, 1.0), np.clip(own, low, high))
+            return np.concatenate([x[: len(free)], own])
 
-    def _sensor(self, sensor: Sensor) -> ca.Function:
-        if sensor not in self._sensors:
-            self._sensors[sensor] = sensor_function(self.step.system, sensor, self.local)
-        return self._sensors[sensor]
+        def rows(x: Array) -> tuple[Array, Array]:
+            return self._rows(*spread(x), task)
+
+        found = levenberg_marquardt(rows, np.concatenate([q[free], theta[wanted]]), project=allowed)
+        q, theta = spread(found.x)
+        return q, theta[index], found.cost
+
+    def _rows(self, q: Array, theta: Array, task: _Task) -> tuple[Array, Array]:
+        """Residual of a fit and its derivative by the free coordinates and the parameters sought."""
+        step, free, wanted = self.step, self._free, task.wanted
+        nz, m = step.sizes["nz"], step.sizes["m"]
+        residuals, jacobians = [], []
+        for group, row in task.measured:
+            y, by_q, _, _, by_theta = self._sensor(group.sensor)(q, np.zeros(nz), np.zeros(step.system.size), theta)
+            weight = group.weight[row] / task.softness
+            value = np.where(weight > 0, group.value[row], 0.0)
+            wide = np.hstack([np.array(ca.densify(by_q))[:, free], np.array(ca.densify(by_theta))[:, :wanted]])
+            residuals.append(weight * (np.array(y).ravel() - value))
+            jacobians.append(weight[:, None] * wide)
+        if m:
+            gap, by_q, by_theta = self._phi(q, np.zeros(nz), np.zeros(m), theta, step.time_step)
+            wide = np.hstack([np.array(ca.densify(by_q))[:, free], np.array(ca.densify(by_theta))[:, :wanted]])
+            residuals.append(np.array(gap).ravel() / (CONSTRAINT_STD * task.softness))
+            jacobians.append(wide / (CONSTRAINT_STD * task.softness))
+        residuals.append(((q - task.rest) * task.prior)[free])
+        jacobians.append(np.hstack([np.diag(task.prior[free]), np.zeros((len(free), wanted))]))
+        return np.concatenate(residuals), np.vstack(jacobians)
 
 
 def _speed(before: Sequence[tuple[Measurements, int]], after: Sequence[tuple[Measurements, int]], span: float) -> float:

@@ -1,16 +1,18 @@
-"""Predictions without a model, to be beaten: nothing moves, all moves with the clamps, the clamps' motion carried."""
+"""Errors of predictions, and predictions without a model, to be beaten: nothing moves, or all with the clamps."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.errors import DataError, nearest
+from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.prediction import EpisodeResult
 from yid_ocp.problem.problem import EstimationProblem
-from yid_ocp.sensors import PointSensor
 
 Array = NDArray[np.float64]
 
@@ -172,6 +174,27 @@ def _carried(recording: Recording, points: Sequence[str], known: Sequence[str], 
     return result
 
 
+def channel_errors(results: Sequence[EpisodeResult], episodes: Sequence[Episode]) -> dict[str, dict[str, Any]]:
+    """Root mean square error of every channel: {channel: {rmse, unit, n}}.
+
+    For points the error of a sample is the Euclidean distance.
+    """
+    squares: dict[str, list[float]] = {}
+    units: dict[str, str] = {}
+    for result, episode in zip(results, episodes, strict=True):
+        for predicted, samples in zip(result.predicted, episode.samples, strict=True):
+            shape = (len(predicted), len(samples.sensor.channels), samples.sensor.width)
+            square = np.sum((predicted - samples.value).reshape(shape) ** 2, axis=2)
+            for c, channel in enumerate(samples.sensor.channels):
+                squares.setdefault(channel, []).extend(square[np.isfinite(square[:, c]), c].tolist())
+                units[channel] = samples.sensor.unit
+    return {
+        channel: {"rmse": float(np.sqrt(np.mean(values))), "unit": units[channel], "n": len(values)}
+        for channel, values in squares.items()
+        if values
+    }
+
+
 def point_errors(problem: EstimationProblem, x: ArrayLike, points: Sequence[str]) -> dict[str, float]:
     """Prediction error of every recording of a problem, the held-out ones too, over some points [m].
 
@@ -179,15 +202,15 @@ def point_errors(problem: EstimationProblem, x: ArrayLike, points: Sequence[str]
     """
     x = np.asarray(x, float)
     errors = {}
-    episodes = [(episode, problem.split(x, i)) for i, episode in enumerate(problem.episodes)]
-    episodes += [(episode, problem.split(x, 0)) for episode in problem.held_out]
-    for episode, (theta, deviation) in episodes:
-        result = problem.run(episode, theta, deviation, derivatives=False)
+    found: list[tuple[Episode, EpisodeResult | str]] = list(problem.validate(x))
+    for i, episode in enumerate(problem.episodes):
+        found.append((episode, problem.predictor.run(episode, *problem.split(x, i), False)))
+    for episode, result in found:
         if isinstance(result, str):
             errors[episode.name] = float("nan")
             continue
         for samples, predicted in zip(episode.samples, result.predicted, strict=True):
-            if isinstance(samples.sensor, PointSensor) and samples.sensor.points == tuple(points):
+            if samples.sensor.points == tuple(points):
                 shape = (len(predicted), len(points), 3)
                 errors[episode.name] = prediction_error(predicted.reshape(shape), samples.value.reshape(shape))
     return errors

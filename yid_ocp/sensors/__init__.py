@@ -1,7 +1,18 @@
-"""What is measured: each sensor turns a node of the trajectory into readings; add one file for a new kind."""
+"""What is measured: each sensor turns a node of the trajectory into readings; a new kind is one file that registers."""
 
+from importlib import import_module
+from pkgutil import iter_modules
+
+from yid_ocp.sensors.base import SENSORS as SENSORS
 from yid_ocp.sensors.base import Sensor as Sensor
+from yid_ocp.sensors.base import SensorData as SensorData
+from yid_ocp.sensors.base import Surroundings as Surroundings
+from yid_ocp.sensors.base import joint_columns as joint_columns
 from yid_ocp.sensors.base import sensor_function as sensor_function
-from yid_ocp.sensors.joints import AngleSensor as AngleSensor
 from yid_ocp.sensors.joints import EffortSensor as EffortSensor
 from yid_ocp.sensors.points import PointSensor as PointSensor
+from yid_ocp.sensors.points import camera_pose as camera_pose
+
+# every file of this folder registers its sensors when it is imported
+for _module in iter_modules(__path__):
+    import_module(f"{__name__}.{_module.name}")

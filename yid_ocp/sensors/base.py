@@ -1,20 +1,27 @@
-"""What every sensor has in common: a name, outputs with units, and the expression of what it reads."""
+"""What every sensor has in common: its channels, the expression of what it reads, what it takes from a recording."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Protocol, runtime_checkable
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, Protocol, runtime_checkable
 
 import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
 
+from yid_ocp.errors import DataError, nearest
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import NodeState, System
+from yid_ocp.registry import Registry
+
+Array = NDArray[np.float64]
 
 
 @runtime_checkable
 class Sensor(Protocol):
-    """A group of measured channels that share a clock.
+    """A group of measured channels that share a clock; hashable.
 
     Channels are named `group.point` (three outputs each) or `joints.quantity.JOINT` (one output each).
     """
@@ -45,9 +52,26 @@ class Sensor(Protocol):
         ...
 
     @property
+    def points(self) -> tuple[str, ...]:
+        """Recorded name of the point that each channel marks; none for joints."""
+        ...
+
+    @property
+    def efforts(self) -> tuple[str, ...]:
+        """Joints whose effort it reads, smoothed like the motion it follows from; none for other sensors."""
+        ...
+
+    @property
     def camera(self) -> Placement | None:
         """Pose in the world of the camera that looks; None for any other sensor."""
         ...
+
+    @property
+    def baseline(self) -> Literal["zero", "stays"]:
+        """What a prediction without a model says: nothing is needed, or everything stays where it was first seen."""
+        ...
+
+    def __hash__(self) -> int: ...
 
     def output(self, state: NodeState) -> ca.SX:
         """What the sensor reads at a node, shape (width * len(channels), 1)."""
@@ -87,3 +111,146 @@ def sensor_function(system: System, sensor: Sensor, names: tuple[str, ...]) -> c
     chosen = ca.vertcat(*(system.parameters[name].symbol for name in names)) if names else ca.SX(0, 1)
     outputs = [output, *(ca.jacobian(output, x) for x in (q, z, effort, chosen))]
     return ca.Function("sensor", [q, z, effort, system.parameters.symbols], ca.cse(outputs))
+
+
+# -- from a recording -------------------------------------------------------------------------------------------------
+
+
+class PointData(Protocol):
+    """A recorded group of points; see `data.recording.PointGroup`."""
+
+    @property
+    def name(self) -> str: ...  # noqa: D102
+    @property
+    def names(self) -> tuple[str, ...]: ...  # noqa: D102
+    @property
+    def sensor(self) -> str: ...  # noqa: D102
+    @property
+    def t(self) -> Array: ...  # noqa: D102
+    @property
+    def position(self) -> Array: ...  # noqa: D102
+    @property
+    def std(self) -> Array | None: ...  # noqa: D102
+    @property
+    def pose(self) -> Array | None: ...  # noqa: D102
+
+
+class JointData(Protocol):
+    """Recorded joints; see `data.recording.JointGroup`."""
+
+    @property
+    def names(self) -> tuple[str, ...]: ...  # noqa: D102
+    @property
+    def t(self) -> Array: ...  # noqa: D102
+    @property
+    def effort(self) -> Array | None: ...  # noqa: D102
+    @property
+    def effort_std(self) -> float | Array | None: ...  # noqa: D102
+    @property
+    def position_std(self) -> float | Array | None: ...  # noqa: D102
+
+
+class RecordingData(Protocol):
+    """What sensors need of a recording; see `data.recording.Recording`."""
+
+    @property
+    def name(self) -> str: ...  # noqa: D102
+    @property
+    def joints(self) -> JointData | None: ...  # noqa: D102
+    @property
+    def points(self) -> Sequence[PointData]: ...  # noqa: D102
+
+
+class Choice(Protocol):
+    """How one group of a recording is used; see `problem.options.SensorOptions`."""
+
+    @property
+    def use(self) -> bool: ...  # noqa: D102
+    @property
+    def std(self) -> float | Mapping[str, float] | None: ...  # noqa: D102
+    @property
+    def frames(self) -> Mapping[str, str]: ...  # noqa: D102
+    @property
+    def points(self) -> tuple[str, ...] | None: ...  # noqa: D102
+    @property
+    def position_std(self) -> float | Mapping[str, float] | None: ...  # noqa: D102
+
+
+class Smoothing(Protocol):
+    """A zero-phase low-pass filter; see `problem.low_pass.LowPass`."""
+
+    @property
+    def cutoff(self) -> float: ...  # noqa: D102
+    @property
+    def settling(self) -> float: ...  # noqa: D102
+
+    def __call__(self, t: Array, values: Array) -> Array: ...  # noqa: D102
+    def stride(self, step: float) -> int: ...  # noqa: D102
+    def gains(self, step: float) -> tuple[float, float, float]: ...  # noqa: D102
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What a sensor's part of a recording is read with.
+
+    Attributes
+    ----------
+    system : System
+    recording : RecordingData
+    choice : callable
+        From a group's name to how it is used.
+    times : ndarray, shape (N + 1,)
+        Of the rollout's nodes [s].
+    time_step : float
+        Between them [s].
+    low_pass : Smoothing
+        That of prescribed paths and efforts.
+    inertia : callable
+        From joint names to the diagonal of the mass matrix [kg m^2 or kg].
+    """
+
+    system: System
+    recording: RecordingData
+    choice: Callable[[str], Choice]
+    times: Array
+    time_step: float
+    low_pass: Smoothing
+    inertia: Callable[[tuple[str, ...]], Array]
+
+
+@dataclass(frozen=True)
+class SensorData:
+    """What one sensor measured in one recording.
+
+    Attributes
+    ----------
+    sensor : Sensor
+    t : ndarray, shape (M,)
+        [s]
+    value, std : ndarray, shape (M, k)
+        Outputs, NaN where there is none, and the standard deviations of their noise, in the sensor's unit.
+    span : (int, int), optional
+        First and last node at which the sensor can be predicted; all of them when absent.
+    """
+
+    sensor: Sensor
+    t: Array
+    value: Array
+    std: Array
+    span: tuple[int, int] | None = None
+
+
+SENSORS: Registry[Callable[[Surroundings], list[SensorData]]] = Registry("kind of sensor")
+"""What looks through a recording for the measurements of one kind of sensor."""
+
+
+def joint_columns(joints: JointData, names: tuple[str, ...], where: str) -> list[int]:
+    """Columns of the named joints; `DataError` with the nearest recorded name where one is missing."""
+    for name in names:
+        if name not in joints.names:
+            raise DataError(
+                f"joint '{name}' of the model is not recorded",
+                where=f"{where}: joints",
+                hint=nearest(name, joints.names),
+            )
+    return [joints.names.index(name) for name in names]

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import casadi as ca
+import numpy as np
 
+from yid_ocp.errors import ConfigError, DataError, nearest
 from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import NodeState
+from yid_ocp.sensors.base import SENSORS, Choice, PointData, SensorData, Surroundings
 
 
 @dataclass(frozen=True)
@@ -47,10 +52,85 @@ class PointSensor:
         return 3
 
     @property
+    def efforts(self) -> tuple[str, ...]:
+        """No joints."""
+        return ()
+
+    @property
     def camera(self) -> Placement | None:
         """Pose of the camera."""
         return None if self.pose is None else Placement.of(self.pose)
 
+    @property
+    def baseline(self) -> Literal["zero", "stays"]:
+        """A point stays where it was first seen."""
+        return "stays"
+
     def output(self, state: NodeState) -> ca.SX:
         """Positions one below the other, shape (3 np, 1) [m]."""
         return ca.vertcat(*(state.kinematics.position(frame) for frame in self.frames))
+
+
+@SENSORS.register("points")
+def measured_points(around: Surroundings) -> list[SensorData]:
+    """Every group of points that is used and marks a frame of the model.
+
+    Raises
+    ------
+    DataError
+        A group none of whose points is a frame, a chosen point that is not in it, or no noise level.
+    """
+    return [
+        _points(around, group, around.choice(group.name))
+        for group in around.recording.points
+        if around.choice(group.name).use
+    ]
+
+
+def _points(around: Surroundings, group: PointData, choice: Choice) -> SensorData:
+    where = around.recording.name
+    wanted = choice.points if choice.points is not None else group.names
+    frames = {p: choice.frames.get(p, p) for p in wanted}
+    known = tuple(p for p in wanted if frames[p] in around.system.mechanism.frames)
+    if not known:
+        raise DataError(
+            f"none of the points of group '{group.name}' is a frame of the model",
+            where=where,
+            allowed=", ".join(around.system.points),
+            hint=f"name them under sensors.{group.name}.frames, or switch the group off",
+        )
+    for point in known:
+        if point not in group.names:
+            raise DataError(
+                f"point '{point}' is not in group '{group.name}'", where=where, hint=nearest(point, group.names)
+            )
+    columns = [group.names.index(point) for point in known]
+    inside = (group.t >= around.times[0] - 1e-9) & (group.t <= around.times[-1] + 1e-9)
+    value = group.position[inside][:, columns].reshape(int(inside.sum()), 3 * len(columns))
+    if isinstance(choice.std, Mapping):
+        raise ConfigError("a group of points takes one std", where=f"sensors.{group.name}.std")
+    if choice.std is not None:
+        std = np.full(value.shape, float(choice.std))
+    elif group.std is not None:
+        std = group.std[inside][:, columns].reshape(value.shape)
+    else:
+        raise DataError(
+            f"the noise level of group '{group.name}' is neither recorded nor given",
+            where=where,
+            hint=f"set sensors.{group.name}.std [m]",
+        )
+    sensor = PointSensor(group.name, known, tuple(frames[p] for p in known), camera_pose(group))
+    return SensorData(sensor, group.t[inside], value, std)
+
+
+def camera_pose(group: PointData) -> tuple[tuple[float, ...], ...] | None:
+    """Pose of the camera that saw a group of points, None where it was none.
+
+    A group is a camera's when it has a pose, or when its name or its sensor says `camera`; without a pose the camera
+    then counts as standing in the world's origin.
+    """
+    if group.pose is not None:
+        return tuple(tuple(float(x) for x in row) for row in group.pose)
+    if "camera" in group.name.lower() or "camera" in group.sensor.lower():
+        return tuple(tuple(row) for row in np.eye(4).tolist())
+    return None

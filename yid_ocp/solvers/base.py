@@ -15,7 +15,7 @@ import threadpoolctl
 from numpy.typing import NDArray
 
 from yid_ocp.errors import SolverError
-from yid_ocp.problem.problem import EstimationProblem, Evaluation
+from yid_ocp.problem.problem import EstimationProblem, Evaluation, WarmStart
 from yid_ocp.registry import Registry
 
 log = logging.getLogger(__name__)
@@ -142,13 +142,17 @@ Callback = Callable[[Iterate], None]
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a method's own loop returns: the best point, why it stopped, and how it got there."""
+    """What a method's own loop returns: the best point, why it stopped, and how it got there.
+
+    `warm` is where the equilibria of the best point are looked for, as far as the method knows.
+    """
 
     status: Status
     message: str
     x: Array
     history: tuple[Iterate, ...]
     evaluations: int
+    warm: WarmStart | None = None
 
 
 @runtime_checkable
@@ -234,14 +238,12 @@ def _solved(
             break
         x = np.where(problem.positive, np.clip(first * factor, lower, upper), first)
         log.info("starting again from %g times the initial values", factor)
-        problem.forget_starts()
         again, more, steps = _attempt(problem, solver, x, callback)
         tried, evaluations = tried + 1, evaluations + more
         history += [replace(entry, note=f"start x {factor:g}") for entry in steps]
         if again[1].cost < best[1].cost:
             best = again
     outcome, finish = best
-    problem.forget_starts()
     covariance, chi2 = uncertainty(problem, finish)
     status, message = outcome.status, outcome.message
     if not finish.ok:
@@ -285,7 +287,7 @@ def _attempt(
                 break
     outcome = solver.run(problem, x, callback)
     history += outcome.history
-    return (outcome, problem.evaluate(outcome.x)), evaluations + outcome.evaluations, history
+    return (outcome, problem.evaluate(outcome.x, warm=outcome.warm)), evaluations + outcome.evaluations, history
 
 
 def _good_fit(problem: EstimationProblem, finish: Evaluation) -> bool:
@@ -303,21 +305,17 @@ def uncertainty(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Arr
     count = len(problem.start)
     if evaluation.jacobian is None or not evaluation.ok:
         return np.full((count, count), np.nan), math.nan
-    total = len(evaluation.residual) - problem.weak_prior_rows
-    data_rows = total - problem.stated_prior_rows
     scale = problem.scales
-    noise = problem.paper_noise if problem.options.weighting == "paper" else 1.0
-    informing = evaluation.jacobian[:data_rows] / noise
-    jacobian = np.vstack([informing, evaluation.jacobian[data_rows:total]]) * scale
+    residual, jacobian = problem.informing(evaluation)
+    jacobian = jacobian * scale
     _, singular, vectors = np.linalg.svd(jacobian, full_matrices=False)
     inverse = np.zeros(count)
     inverse[: len(singular)] = singular
     inverse = 1.0 / np.maximum(inverse, 1e-8)
     basis = np.eye(count) if len(vectors) == 0 else _completed(vectors, count)
     covariance = (basis.T * inverse**2) @ basis * np.outer(scale, scale)
-    residual = evaluation.residual[:data_rows] / noise
-    degrees = max(total - count, 1)
-    chi2 = float(residual @ residual) / degrees
+    data = residual[problem.rows.data]
+    chi2 = float(data @ data) / max(len(residual) - count, 1)
     return covariance * max(1.0, chi2), chi2
 
 

@@ -9,7 +9,7 @@ import scipy.linalg
 import scipy.optimize
 from numpy.typing import NDArray
 
-from yid_ocp.problem.problem import EstimationProblem
+from yid_ocp.problem.problem import EstimationProblem, Evaluation
 from yid_ocp.solvers.base import SOLVERS, Callback, Outcome, Recorder, Status, projected_gradient
 
 Array = NDArray[np.float64]
@@ -67,12 +67,12 @@ class GaussNewton:
                 message = (
                     f"no convergence in {self.iterations} iterations; raise solver.iterations or free fewer parameters"
                 )
-                return self._end(Status.ITERATION_LIMIT, message, x, recorder)
+                return self._end(Status.ITERATION_LIMIT, message, x, recorder, now)
             step = bounded_step(jacobian * size, residual, mu, (lower - x) / size, (upper - x) / size) * size
             promised = -float(gradient @ step) - 0.5 * float(np.sum((jacobian @ step) ** 2))
             if promised <= self.cost_tolerance * max(now.cost, 1e-300):
-                return self._end(Status.CONVERGED, "the cost cannot be lowered any further", x, recorder)
-            trial = problem.evaluate(np.clip(x + step, lower, upper))
+                return self._end(Status.CONVERGED, "the cost cannot be lowered any further", x, recorder, now)
+            trial = problem.evaluate(np.clip(x + step, lower, upper), warm=now.warm)
             recorder.evaluations += 1
             gain = (now.cost - trial.cost) / promised if trial.ok else -1.0
             if gain > 1e-3:
@@ -82,7 +82,7 @@ class GaussNewton:
                 if moved < self.step_tolerance and now.jacobian is not None:
                     slope = projected_gradient(x, now.jacobian.T @ now.residual, lower, upper, size)
                     recorder.accept(now.cost, x, slope)
-                    return self._end(Status.CONVERGED, "the step is below its tolerance", x, recorder)
+                    return self._end(Status.CONVERGED, "the step is below its tolerance", x, recorder, now)
                 continue
             rejected += 1
             mu = max(mu * 8.0, 1e-6)
@@ -97,10 +97,10 @@ class GaussNewton:
                         "start nearer, shorten the recording, or use multiple_shooting"
                     )
                 )
-                return self._end(status, message, x, recorder)
+                return self._end(status, message, x, recorder, now)
 
-    def _end(self, status: Status, message: str, x: Array, recorder: Recorder) -> Outcome:
-        return Outcome(status, message, x, tuple(recorder.history), recorder.evaluations)
+    def _end(self, status: Status, message: str, x: Array, recorder: Recorder, now: Evaluation) -> Outcome:
+        return Outcome(status, message, x, tuple(recorder.history), recorder.evaluations, now.warm)
 
 
 def bounded_step(jacobian: Array, residual: Array, mu: float, lower: Array, upper: Array) -> Array:

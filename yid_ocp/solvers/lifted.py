@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.integrator.step import Directions
-from yid_ocp.problem.measurements import huber
+from yid_ocp.problem.prediction import Start
 from yid_ocp.problem.problem import EstimationProblem
 from yid_ocp.solvers.base import SOLVERS, Callback, Outcome, Recorder, Status, projected_gradient
 from yid_ocp.solvers.gauss_newton import bounded_step
@@ -127,7 +127,7 @@ class Lifted:
             moved = float(np.max(np.abs(step) / size, initial=0.0))
             if moved < self.step_tolerance or (mu < TRUSTED and promised <= self.cost_tolerance * now.cost):
                 if now.defect < self.defect_tolerance:
-                    return self._end(Status.CONVERGED, f"closed to {now.defect:.1e}", x, recorder)
+                    return self._end(Status.CONVERGED, f"closed to {now.defect:.1e}", x, recorder, transcription)
                 # a change along what the data do not inform would only open the defects again
                 step = np.zeros_like(step)
             slope = float(now.residual @ (now.by_defect + now.jacobian @ step))
@@ -144,7 +144,9 @@ class Lifted:
             if factor < SHORTEST:
                 if mu > 1e2:
                     message = trial if isinstance(trial, str) else "no step lowers the cost or closes the defects"
-                    return self._end(Status.STALLED, f"{message}; try more nodes, or gauss_newton", x, recorder)
+                    return self._end(
+                        Status.STALLED, f"{message}; try more nodes, or gauss_newton", x, recorder, transcription
+                    )
                 mu = max(mu * 30.0, 1e-4)
                 continue
             mu = mu * 0.2 if factor == 1.0 else mu * 5.0
@@ -152,17 +154,17 @@ class Lifted:
             nodes = self._moved(transcription, nodes, now, step, factor)
             x, now = trial_x, trial
         message = f"no convergence in {self.iterations} iterations; largest defect {now.defect:.1e}"
-        return self._end(Status.ITERATION_LIMIT, message, x, recorder)
+        return self._end(Status.ITERATION_LIMIT, message, x, recorder, transcription)
 
-    def _end(self, status: Status, message: str, x: Array, recorder: Recorder) -> Outcome:
-        return Outcome(status, message, x, tuple(recorder.history), recorder.evaluations)
+    def _end(self, status: Status, message: str, x: Array, recorder: Recorder, transcription: Transcription) -> Outcome:
+        return Outcome(status, message, x, tuple(recorder.history), recorder.evaluations, transcription.warm)
 
     def _moved(
         self, transcription: Transcription, nodes: list[Array], now: _Linearised, step: Array, factor: float
     ) -> list[Array]:
         moved = []
         for i, (state, (by_x, by_defect, _)) in enumerate(zip(nodes, now.states, strict=True)):
-            local = transcription.local_columns(i)
+            local = transcription.problem.unknowns.columns(i)
             moved.append(state + factor * (by_x @ step[local] + by_defect))
         return moved
 
@@ -170,31 +172,25 @@ class Lifted:
         problem = transcription.problem
         cost, defect, residuals, jacobians, changes, states = 0.0, 0.0, [], [], [], []
         for i, episode in enumerate(problem.episodes):
-            theta, deviation = problem.split(x, i)
-            theta = problem.own_theta(episode, theta)
-            start, by_start, message = problem.start_state(episode, theta, deviation)
-            if message:
-                return message
-            swept = self._condensed(transcription, i, theta, start, by_start, nodes[i])
+            theta, offset = problem.split(x, i)
+            theta = problem.predictor.own_theta(episode, theta)
+            start = problem.start_state(episode, theta, offset, transcription.warm[i])
+            if start.message:
+                return start.message
+            swept = self._condensed(transcription, i, theta, start, nodes[i])
             if isinstance(swept, str):
                 return swept
             trajectory, slopes, by_x, by_defect, gaps = swept
             defect = max(defect, float(np.max(np.abs(gaps), initial=0.0)))
             states.append((by_x, by_defect, gaps))
-            local = transcription.local_columns(i)
             for samples in episode.samples:
-                predicted, sensitivity = problem.predict_along(samples, trajectory, slopes, theta)
-                seen = samples.weight > 0
-                raw = samples.weight * np.where(seen, predicted - samples.value, 0.0)
-                loss, robust = huber(raw, problem.options.huber_threshold)
-                cost += loss
-                keep = seen.ravel()
-                scaled = ((robust * samples.weight)[:, :, None] * sensitivity).reshape(raw.size, -1)[keep]
-                residuals.append((robust * raw).ravel()[keep])
-                wide = np.zeros((len(scaled), len(x)))
-                wide[:, local] = scaled[:, :-1]
-                jacobians.append(wide)
-                changes.append(scaled[:, -1])
+                predicted, sensitivity = problem.predictor.along(samples, trajectory, slopes, theta)
+                part = samples.rows(predicted, sensitivity, problem.options.huber_threshold)
+                assert part.jacobian is not None
+                cost += part.cost
+                residuals.append(part.residual)
+                jacobians.append(problem.unknowns.placed(part.jacobian[:, :-1], i))
+                changes.append(part.jacobian[:, -1])
         prior, by_x_prior = problem.prior(x)
         cost += 0.5 * float(prior @ prior)
         return _Linearised(
@@ -207,21 +203,22 @@ class Lifted:
         )
 
     def _condensed(
-        self, transcription: Transcription, i: int, theta: Array, start: Array, by_start: Array, nodes: Array
+        self, transcription: Transcription, i: int, theta: Array, start: Start, nodes: Array
     ) -> tuple[Array, Array, Array, Array, Array] | str:
         """Trajectory through the nodes with derivatives by (free parameters and start, closing of the defects)."""
         problem, layout = transcription.problem, transcription.layouts[i]
+        by_start = start.by_unknowns
         nx, width = transcription.nx, by_start.shape[1]
         steps = problem.episodes[i].grid.steps
         trajectory, slopes = np.zeros((steps + 1, nx)), np.zeros((steps + 1, nx, width + 1))
         by_x, by_defect = np.zeros((len(nodes), nx, width)), np.zeros((len(nodes), nx))
         gaps = np.zeros((len(nodes), nx))
-        gaps[0] = start - nodes[0]
+        gaps[0] = start.state - nodes[0]
         by_x[0], by_defect[0] = by_start, gaps[0]
         for j in range(len(nodes) - 1):
             first, last = int(layout.nodes[j]), int(layout.nodes[j + 1])
             column = np.concatenate([by_x[j], by_defect[j][:, None]], axis=1)
-            wanted = (*problem.shared, *problem.local)
+            wanted = problem.unknowns.parameters
             rollout = transcription.interval_sweep(i, j, nodes[j], theta, Directions(wanted, column))
             if not rollout.status.ok or rollout.by_state is None:
                 return f"{problem.episodes[i].name}: interval {j}: {rollout.status.message}"

@@ -134,9 +134,8 @@ class MultipleShooting:
                 f"IPOPT: {stats['return_status']}, largest defect {defect:.1e}; "
                 "start nearer, use more nodes, or use gauss_newton"
             )
-        return Outcome(
-            status, message, transcription.unknowns(best), tuple(nlp.recorder.history), nlp.recorder.evaluations
-        )
+        history, evaluations = tuple(nlp.recorder.history), nlp.recorder.evaluations
+        return Outcome(status, message, transcription.unknowns(best), history, evaluations, transcription.warm)
 
 
 class _Function(ca.Callback):
@@ -219,8 +218,7 @@ class _Nlp:
         curvature = curvature + scipy.sparse.identity(t.size, format="csc")
         self._h = _Pattern(scipy.sparse.triu(curvature, format="csc"))
         residual, _, cost = t.residual(w0, False)
-        noise = t.problem.paper_noise if t.problem.options.weighting == "paper" else 1.0
-        self._unit = max(cost, 0.5 * len(residual) * noise**2)
+        self._unit = max(cost, 0.5 * len(residual) * t.problem.noise**2)
         self.best = w0
         self.recorder.evaluations += 1
         self.recorder.accept(cost, w0[: len(t.problem.shared)], np.nan, "start")

@@ -44,6 +44,7 @@ class SingleShooting:
         if not first[2].ok:
             return Outcome(Status.FAILED, first[2].message, start, (), recorder.evaluations)
         unit = max(first[0], 1e-300)
+        warm = first[2].warm
         seen: dict[bytes, tuple[float, Array]] = {start.tobytes(): (first[0], first[1])}
         worst = 1e3
 
@@ -51,7 +52,7 @@ class SingleShooting:
             x = scaled * scale
             key = x.tobytes()
             if key not in seen:
-                cost, gradient, evaluation = problem.gradient(x)
+                cost, gradient, evaluation = problem.gradient(x, warm=warm)
                 recorder.evaluations += 1
                 # a failed rollout is a wall: the line search steps back from it
                 seen[key] = (cost, gradient) if evaluation.ok else (worst * unit, np.zeros_like(x))
@@ -79,4 +80,4 @@ class SingleShooting:
             if result.status == 0
             else (Status.ITERATION_LIMIT if result.status == 1 else Status.STALLED)
         )
-        return Outcome(status, str(result.message).lower(), best.x, tuple(recorder.history), recorder.evaluations)
+        return Outcome(status, str(result.message).lower(), best.x, tuple(recorder.history), recorder.evaluations, warm)

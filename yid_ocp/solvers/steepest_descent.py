@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.errors import SolverError
-from yid_ocp.problem.problem import EstimationProblem
+from yid_ocp.problem.problem import EstimationProblem, Evaluation
 from yid_ocp.solvers.base import SOLVERS, Callback, Outcome, Recorder, Status, projected_gradient
 
 Array = NDArray[np.float64]
@@ -72,20 +72,20 @@ class SteepestDescent:
             recorder.accept(cost, x, slope)
             reference = max(entry.cost for entry in recorder.history[-self.memory :])
             if slope <= self.gradient_tolerance * max(cost, 1e-300):
-                return self._end(Status.CONVERGED, "the projected gradient vanishes", recorder)
+                return self._end(Status.CONVERGED, "the projected gradient vanishes", recorder, evaluation)
             while True:
                 trial = np.clip(x - length * gradient, lower, upper)
-                attempt = problem.evaluate(trial, derivatives=False)
+                attempt = problem.evaluate(trial, False, evaluation.warm)
                 recorder.evaluations += 1
                 needed = self.sufficient_decrease * float(gradient @ (x - trial))
                 if attempt.ok and attempt.cost <= reference - needed:
                     break
                 length *= self.shrink
                 if np.max(np.abs(length * gradient) / size) < 1e-12:
-                    return self._end(Status.STALLED, "no step along the gradient lowers the cost", recorder)
+                    return self._end(Status.STALLED, "no step along the gradient lowers the cost", recorder, evaluation)
             before, slope_before = x, gradient
             x = trial
-            cost, gradient, _ = problem.gradient(x, attempt)
+            cost, gradient, evaluation = problem.gradient(x, attempt)
             length /= self.shrink
             moved, turned = x - before, gradient - slope_before
             if self.trial == "spectral" and float(moved @ turned) > 0:
@@ -93,8 +93,8 @@ class SteepestDescent:
         size = np.maximum(np.abs(x), problem.scales)
         recorder.accept(cost, x, projected_gradient(x, gradient, lower, upper, size))
         message = f"no convergence in {self.iterations} iterations, as is usual for this method; try gauss_newton"
-        return self._end(Status.ITERATION_LIMIT, message, recorder)
+        return self._end(Status.ITERATION_LIMIT, message, recorder, evaluation)
 
-    def _end(self, status: Status, message: str, recorder: Recorder) -> Outcome:
+    def _end(self, status: Status, message: str, recorder: Recorder, last: Evaluation) -> Outcome:
         best = min(recorder.history, key=lambda entry: entry.cost)
-        return Outcome(status, message, best.x, tuple(recorder.history), recorder.evaluations)
+        return Outcome(status, message, best.x, tuple(recorder.history), recorder.evaluations, last.warm)

@@ -23,9 +23,10 @@ from yid_ocp.errors import SolverError
 from yid_ocp.integrator.lqr import lqr_filter
 from yid_ocp.integrator.rollout import momentum_of, simulate
 from yid_ocp.integrator.step import Directions, Feedback, Rollout
+from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.low_pass import LowPass
-from yid_ocp.problem.measurements import Measurements, huber
-from yid_ocp.problem.problem import Episode, EstimationProblem
+from yid_ocp.problem.measurements import Measurements
+from yid_ocp.problem.problem import EstimationProblem
 
 Array = NDArray[np.float64]
 Sparse: TypeAlias = Any
@@ -105,7 +106,7 @@ class Transcription:
                     where=episode.name,
                     allowed=f"solver.node_interval from 1 to {steps}",
                 )
-            if any(s.sensor.group == "joints.effort" for s in episode.samples):
+            if any(s.sensor.efforts for s in episode.samples):
                 raise SolverError(
                     "effort channels depend on whole steps, which node states do not carry",
                     where=episode.name,
@@ -125,6 +126,9 @@ class Transcription:
             )
         self.layouts = tuple(layouts)
         self.size = at
+        # equilibria are looked for near those of the problem's start, whatever the point
+        starts = (problem.start_state(e, problem.split(problem.start, i)[0]) for i, e in enumerate(problem.episodes))
+        self.warm = tuple(None if s.rest is None or s.message else s.rest.state[: self.n] for s in starts)
 
     # -- initial guess ------------------------------------------------------------------------------------------------
 
@@ -139,8 +143,9 @@ class Transcription:
         w[:count] = x[:count]
         for i, (episode, layout) in enumerate(zip(self.problem.episodes, self.layouts, strict=True)):
             theta = self._theta(w, i)
-            start, _, message = self.problem.start_state(episode, theta)
-            rollout = None if message else self._tracked(episode, theta, start)
+            begin = self.problem.start_state(episode, theta, guess=self.warm[i])
+            start = begin.state
+            rollout = None if begin.message else self._tracked(episode, theta, start)
             candidates = []
             if rollout is not None and rollout.status.ok:
                 candidates.append((rollout.state[layout.nodes], rollout.multipliers))
@@ -175,7 +180,7 @@ class Transcription:
         )
 
     def _tracking(self, episode: Episode, theta: Array) -> Feedback | None:
-        feedback = self.problem.feedback(episode)
+        feedback = episode.feedback
         if feedback is None and self.problem.system.driven:
             smooth = LowPass(self.problem.options.path_cutoff)(episode.grid.times, episode.measured_arm)
             return lqr_filter(self.step, smooth, episode.torque, theta)
@@ -184,7 +189,7 @@ class Transcription:
     def _resting(self, episode: Episode, layout: Layout, theta: Array, start: Array) -> tuple[Array, Array]:
         """Node states at rest at the measured postures, with the momentum of moving from one to the next."""
         problem, n = self.problem, self.n
-        statics, h = problem.statics(), self.step.time_step
+        statics, h = problem.functions.statics, self.step.time_step
         state = np.tile(start, (len(layout.nodes), 1))
         pull = np.zeros((len(layout.nodes), self.m))
         shape: Array | None = None
@@ -214,16 +219,10 @@ class Transcription:
         return state, force[:-1] * h
 
     def _unknowns(self, theta_free: Array) -> Array:
-        """The problem's unknown vector with the starts' deviations at zero."""
+        """The problem's unknown vector with the starts' offsets at zero."""
         x = self.problem.start.copy()
         x[: len(theta_free)] = theta_free
         return x
-
-    def local_columns(self, i: int) -> NDArray[np.int64]:
-        """Places of one recording's (shared, local, start) unknowns in the problem's vector."""
-        shared = len(self.problem.shared)
-        own = len(self.problem.local) + len(self.problem.start_rows)
-        return np.concatenate([np.arange(shared), shared + i * own + np.arange(own)])
 
     # -- bounds -------------------------------------------------------------------------------------------------------
 
@@ -257,15 +256,15 @@ class Transcription:
 
     def _theta(self, w: Array, episode: int) -> Array:
         theta = self.problem.split(self._unknowns(w[: len(self.problem.shared)]), episode)[0]
-        return self.problem.own_theta(self.problem.episodes[episode], theta)
+        return self.problem.predictor.own_theta(self.problem.episodes[episode], theta)
 
     def _start_rows(self, w: Array, i: int, derivatives: bool) -> tuple[Array, Sparse | None]:
         episode, layout = self.problem.episodes[i], self.layouts[i]
         loose = self.problem.start_rows if self.free_start else ()
         keep = np.setdiff1d(np.arange(self.nx), [*self.problem.system.prescribed_indices, *loose])
         theta = self._theta(w, i)
-        start, by_theta, _ = self.problem.start_state(episode, theta)
-        value = (w[layout.state[0]] - start)[keep]
+        start = self.problem.start_state(episode, theta, guess=self.warm[i])
+        value = (w[layout.state[0]] - start.state)[keep]
         if not derivatives:
             return value, None
         rows = np.arange(len(keep))
@@ -273,21 +272,21 @@ class Transcription:
         matrix[rows, layout.state[0][keep]] = 1.0
         count = len(self.problem.shared)
         if count:
-            matrix[:, :count] = -by_theta[keep][:, :count]
+            matrix[:, :count] = -start.by_unknowns[keep][:, :count]
         return value, matrix.tocsc()
 
     def _start_prior(self, w: Array, i: int, derivatives: bool) -> tuple[Array, Sparse | None]:
-        """Deviation of an estimated start from rest, over its prior's deviation."""
+        """Offset of an estimated start from rest, over its prior's standard deviation."""
         layout, rows = self.layouts[i], np.array(self.problem.start_rows)
-        start, by_theta, _ = self.problem.start_state(self.problem.episodes[i], self._theta(w, i))
-        weight = 1.0 / self.problem.start_deviations
-        value = weight * (w[layout.state[0]] - start)[rows]
+        start = self.problem.start_state(self.problem.episodes[i], self._theta(w, i), guess=self.warm[i])
+        weight = 1.0 / self.problem.start_std
+        value = weight * (w[layout.state[0]] - start.state)[rows]
         if not derivatives:
             return value, None
         matrix = scipy.sparse.lil_matrix((len(rows), self.size))
         matrix[np.arange(len(rows)), layout.state[0][rows]] = weight
         count = len(self.problem.shared)
-        matrix[:, :count] = -(weight[:, None] * by_theta[rows][:, :count])
+        matrix[:, :count] = -(weight[:, None] * start.by_unknowns[rows][:, :count])
         return value, matrix.tocsc()
 
     def unknowns(self, w: Array) -> Array:
@@ -296,7 +295,7 @@ class Transcription:
         if self.free_start:
             at, size = len(self.problem.shared), len(self.problem.start_rows)
             for i, (episode, layout) in enumerate(zip(self.problem.episodes, self.layouts, strict=True)):
-                start, _, _ = self.problem.start_state(episode, self._theta(w, i))
+                start = self.problem.start_state(episode, self._theta(w, i), guess=self.warm[i]).state
                 x[at : at + size] = (w[layout.state[0]] - start)[list(self.problem.start_rows)]
                 at += size
         return x
@@ -329,7 +328,7 @@ class Transcription:
         problem, episode = self.problem, self.problem.episodes[i]
         n, nz, m, nx, h = self.n, self.nz, self.m, self.nx, self.step.time_step
         steps = len(before)
-        feedback = problem.feedback(episode)
+        feedback = episode.feedback
         torque = episode.torque
         if feedback is not None:
             deviation = before[:, feedback.index] - feedback.reference
@@ -451,7 +450,7 @@ class Transcription:
         """Rollout over one interval of a recording, with the problem's own feedback."""
         episode, nodes = self.problem.episodes[i], self.layouts[i].nodes
         first, last = int(nodes[j]), int(nodes[j + 1])
-        feedback = self.problem.feedback(episode)
+        feedback = episode.feedback
         if feedback is not None:
             feedback = replace(feedback, gain=feedback.gain[first:last], reference=feedback.reference[first:last])
         return simulate(
@@ -513,20 +512,17 @@ class Transcription:
             if np.all(layout.nodes[np.minimum(position, len(layout.nodes) - 1)] == nodes):
                 state = w[layout.state[position]]
                 effort = np.zeros((len(nodes), self.n))
-                outputs = problem.sensor(samples.sensor, problem.shared)(
+                outputs = problem.functions.sensor(samples.sensor, problem.shared)(
                     state[:, : self.n], state[:, 2 * self.n :], effort, theta
                 )
                 predicted, jacobian = self._at_nodes(samples, outputs, layout.state[position], derivatives)
             else:
                 predicted, jacobian = self._between_nodes(w, i, samples, theta, derivatives)
-            seen = samples.weight > 0
-            raw = samples.weight * np.where(seen, predicted - samples.value, 0.0)
-            loss, factor = huber(raw, problem.options.huber_threshold)
-            keep = seen.ravel()
+            part = samples.rows(predicted, threshold=problem.options.huber_threshold)
             placed: Sparse | None = None
             if jacobian is not None:
-                placed = (scipy.sparse.diags((factor * samples.weight).ravel()) @ jacobian).tocsr()[keep]
-            result.append(((factor * raw).ravel()[keep], placed, loss))
+                placed = scipy.sparse.diags(part.weight) @ jacobian.tocsr()[samples.seen.ravel()]
+            result.append((part.residual, placed, part.cost))
         return result
 
     def _at_nodes(
@@ -575,7 +571,7 @@ class Transcription:
             if rollout.by_state is not None:
                 slope[here] = rollout.by_state[offset]
         effort = np.zeros((len(nodes), n))
-        y, by_q, by_z, _, by_theta = problem.sensor(samples.sensor, problem.shared)(
+        y, by_q, by_z, _, by_theta = problem.functions.sensor(samples.sensor, problem.shared)(
             state[:, :n], state[:, 2 * n :], effort, theta
         )
         predicted = samples.interpolate(y[:, :, 0])

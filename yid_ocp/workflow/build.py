@@ -28,7 +28,7 @@ from yid_ocp.model.system import Spring, placement_matrix
 from yid_ocp.model.urdf import read_urdf, robot_description_file
 from yid_ocp.model.y_object import Y_FOOT, y_segments
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.problem import Episode
+from yid_ocp.problem.episodes import Episode
 
 GIVEN_FRAMES = 2  # of a cable's free points, from which every prediction starts
 LARGEST_GAP = 0.01  # what encoder noise and a slightly wrong length of the object can make of a grasp [m]

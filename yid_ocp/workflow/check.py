@@ -12,7 +12,7 @@ from yid_ocp.analysis.convergence import Frequencies, natural_frequencies
 from yid_ocp.config.settings import Run, dump_config
 from yid_ocp.data.recording import Recording
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.problem import Episode
+from yid_ocp.problem.episodes import Episode
 from yid_ocp.workflow.build import build_problem, build_step, build_system, first_gaps
 from yid_ocp.workflow.folder import Monitor, Silent, input_hashes, new_run_folder, versions
 
@@ -106,7 +106,9 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
             warnings.append(f"{episode.name}: joints come at {recorded:.4g} Hz, the model steps at {rate:.4g} Hz")
     if problem.options.initial_state != "fitted_to_points" and (system.driven or system.prescribed or system.elastic):
         torque = episode.torque[0] if system.driven else None
-        rest = problem.statics().solve(episode.posture, problem.own_theta(episode, problem.theta), torque)
+        rest = problem.functions.statics.solve(
+            episode.posture, problem.predictor.own_theta(episode, problem.theta), torque
+        )
         entry["equilibrium"] = {"found": rest.converged, "imbalance": rest.error, "message": rest.message}
         if not rest.converged:
             warnings.append(f"{episode.name}: {rest.message} with the initial parameters")
@@ -140,9 +142,9 @@ def refine(run: Run, problem: EstimationProblem | None, warnings: list[str]) -> 
         return {"links": [], "time_step": [], "message": "no posture is known: the run names no recording"}
     theta, split, guess = system.parameters.vector(), run.solver.force_split, None
     if problem is not None:
-        theta = problem.own_theta(problem.episodes[0], theta)
-        if problem.options.initial_state == "fitted_to_points":
-            guess = problem.fitted_start(problem.episodes[0], theta).state[: system.size]
+        first = problem.episodes[0]
+        theta = problem.predictor.own_theta(first, theta)
+        guess = None if first.start is None else first.start.state[: system.size]
     own = natural_frequencies(system, posture, theta, h, split, guess)
     if own.message:
         return {"links": [], "time_step": [], "message": own.message}

@@ -18,7 +18,8 @@ from yid_ocp.diagnosis import Finding, Thresholds, diagnose
 from yid_ocp.diagnosis.localise import units
 from yid_ocp.errors import OutputError
 from yid_ocp.problem import EstimationProblem, SensorOptions
-from yid_ocp.problem.problem import Episode, EpisodeResult
+from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.prediction import EpisodeResult
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import Findings
 from yid_ocp.solvers import Solution, solve
@@ -191,7 +192,7 @@ def _encoder(
 
 def predictions(finding: Finding) -> list[Prediction]:
     """Held-out recordings that can be predicted both before and after."""
-    before, after = (fit.problem.validate(fit.problem.unknowns(fit.values)) for fit in (finding.nominal, finding.last))
+    before, after = (fit.problem.validate(fit.problem.vector(fit.values)) for fit in (finding.nominal, finding.last))
     return [
         (episode, first, last)
         for (episode, first), (_, last) in zip(before, after, strict=True)

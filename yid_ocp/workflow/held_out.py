@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from yid_ocp.model.cable import Cable
 from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.measurements import Measurements
-from yid_ocp.problem.problem import Episode, EpisodeResult
+from yid_ocp.problem.prediction import EpisodeResult
 from yid_ocp.problem.validation import linear_carry, move_with_clamps, stay
-from yid_ocp.sensors import EffortSensor, PointSensor
 
 Array = NDArray[np.float64]
 
@@ -66,7 +66,7 @@ def _errors(samples: Measurements, predicted: Array, fixed: float) -> dict[str, 
         seen = square[np.isfinite(square[:, c]), c]
         if len(seen):
             result[channel] = float(np.sqrt(np.mean(seen)))
-    if isinstance(sensor, PointSensor) and len(sensor.channels) > 1:
+    if len(sensor.points) > 1:
         later = square[samples.node + samples.fraction > fixed + 1e-6]
         if np.any(np.isfinite(later)):
             result[sensor.group] = float(np.sqrt(np.nanmean(later)))
@@ -75,11 +75,9 @@ def _errors(samples: Measurements, predicted: Array, fixed: float) -> dict[str, 
 
 def _baselines(episode: Episode, samples: Measurements, cable: Cable | None) -> dict[str, Array]:
     sensor = samples.sensor
-    if isinstance(sensor, EffortSensor):
+    if sensor.baseline == "zero":
         return {"zero": np.zeros_like(samples.value)}
-    if not isinstance(sensor, PointSensor):
-        return {}
-    if cable is not None and set(sensor.points) <= set(cable.vertices):
+    if cable is not None and sensor.points and set(sensor.points) <= set(cable.vertices):
         recording, held, points = episode.recording, cable.held, sensor.points
         group = next(group for group in recording.points if group.name == sensor.group)
         inside = (group.t >= episode.grid.start - 1e-9) & (group.t <= episode.grid.times[-1] + 1e-9)

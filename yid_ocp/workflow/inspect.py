@@ -116,7 +116,7 @@ def _linearised(step: Step, problem: EstimationProblem | None) -> tuple[str, Lin
         episode = problem.episodes[0]
         known, at = episode.posture, f"rest at the first posture of {episode.name}"
         torque = episode.torque[0] if system.driven else None
-        theta = problem.own_theta(episode, theta)
+        theta = problem.predictor.own_theta(episode, theta)
     rest = Statics(step).solve(known, theta, torque)
     state, holding = rest.state, rest.torque
     if not rest.converged:

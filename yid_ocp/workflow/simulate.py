@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from yid_ocp.config.settings import Run, dump_config
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate, write_recording
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.problem import Episode, EpisodeResult
-from yid_ocp.sensors import PointSensor
+from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.prediction import EpisodeResult
 from yid_ocp.workflow.build import build_step, build_system, problem_options, read_recordings
 from yid_ocp.workflow.folder import Monitor, Silent, input_hashes, new_run_folder, versions
 
@@ -112,7 +112,7 @@ def _predicted(run: Run, watcher: Monitor, seed: int | None) -> Recording | str:
     problem = EstimationProblem(step, recordings, (), options)
     episode = problem.episodes[0]
     watcher.stage(f"rolling out {episode.grid.steps} steps")
-    outcome = problem.run(episode, problem.theta, np.zeros(len(problem.start)), derivatives=False)
+    outcome = problem.predictor.run(episode, problem.theta, np.zeros(len(problem.start)), False)
     if isinstance(outcome, str):
         return outcome
     return validate(as_recording(run, problem, episode, outcome, seed))
@@ -136,7 +136,7 @@ def as_recording(
     system, source = problem.system, episode.recording
     groups = []
     for samples, predicted in zip(episode.samples, outcome.predicted, strict=True):
-        if isinstance(samples.sensor, PointSensor):
+        if samples.sensor.points:
             t = episode.grid.start + problem.step.time_step * (samples.node + samples.fraction)
             shape = (len(t), len(samples.sensor.points), 3)
             std = np.where(np.isfinite(samples.std), samples.std, np.nanmedian(samples.std)).reshape(shape)
@@ -148,7 +148,7 @@ def as_recording(
                     original.sensor, original.frame, original.pose,
                 )
             )  # fmt: skip
-    theta = problem.own_theta(episode, problem.theta)
+    theta = problem.predictor.own_theta(episode, problem.theta)
     truth = dict(zip(system.parameters.names, map(float, theta), strict=True))
     text = f"{run.description} Simulated with the inputs of {episode.name}.".strip()
     joints = _joints(problem, episode, outcome, rng)

@@ -14,7 +14,9 @@ from yid_ocp.config.settings import Run, dump_config
 from yid_ocp.errors import OutputError
 from yid_ocp.model.cable import Cable
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.problem import Episode, EpisodeResult
+from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.prediction import EpisodeResult
+from yid_ocp.problem.validation import channel_errors
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import Findings
 from yid_ocp.solvers import Solution, Status, solve
@@ -110,7 +112,7 @@ def solve_result(
     """`yid-solve/1` without inputs and versions; a cable has baselines of its own."""
     residuals: Mapping[str, Any] = {}
     if solution.evaluation is not None:
-        residuals = problem.channel_errors(solution.evaluation.episodes, problem.episodes)
+        residuals = channel_errors(solution.evaluation.episodes, problem.episodes)
     return {
         "format": FORMAT,
         "status": solution.status.value,

@@ -10,7 +10,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.problem import Episode, EpisodeResult
+from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.prediction import EpisodeResult
 from yid_ocp.registry import Registry
 from yid_ocp.solvers import Solution
 

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from yid_ocp.diagnosis import Finding, residual_series
 from yid_ocp.diagnosis.localise import informed_map, units
 from yid_ocp.diagnosis.smoother import Smoothed
-from yid_ocp.problem.problem import Episode, EpisodeResult
+from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.prediction import EpisodeResult
 from yid_ocp.report import figures
 from yid_ocp.report.figures import Change, Curve, Ranked, Row
 from yid_ocp.report.sections import Findings, section

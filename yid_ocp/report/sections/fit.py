@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from yid_ocp.problem.problem import Episode, EpisodeResult
+from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.prediction import EpisodeResult
 from yid_ocp.report import figures
 from yid_ocp.report.sections import Findings, section
 from yid_ocp.report.tables import held_out_rows, medians
@@ -82,7 +83,8 @@ def _course(findings: Findings, role: str, episode: Episode, outcome: EpisodeRes
     theta, _ = problem.split(solution.x, problem.episodes.index(episode) if role == "estimate" else 0)
     n, state = problem.system.size, outcome.rollout.state
     efforts = np.zeros((len(state), n))
-    seen = problem.sensor(sensor, ())(state[:, :n], state[:, 2 * n :], efforts, problem.own_theta(episode, theta))
+    own = problem.predictor.own_theta(episode, theta)
+    seen = problem.functions.sensor(sensor, ())(state[:, :n], state[:, 2 * n :], efforts, own)
     return np.asarray(seen[0][:, :, 0])
 
 

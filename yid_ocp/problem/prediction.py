@@ -1,0 +1,383 @@
+"""What the model says about one episode: its start, its rollout, its readings, and their derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.integrator.rollout import adjoint_gradient, simulate
+from yid_ocp.integrator.statics import Rest
+from yid_ocp.integrator.step import Directions, Rollout, Step
+from yid_ocp.model.system import System
+from yid_ocp.problem.corrections import Inputs
+from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.functions import ModelFunctions
+from yid_ocp.problem.inputs import held_torque, held_torque_slope
+from yid_ocp.problem.measurements import Measurements
+from yid_ocp.problem.options import ProblemOptions
+from yid_ocp.problem.unknowns import Unknowns
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class EpisodeResult:
+    """Rollout of one episode and its prediction of every sample.
+
+    Attributes
+    ----------
+    rollout : Rollout
+    rest : Rest or None
+        The equilibrium at which it started.
+    predicted : tuple of ndarray, shape (M, k) each
+        Prediction of every sample, in the sensor's unit.
+    sensitivities : tuple of ndarray, shape (M, k, d) each, or None
+    warm : ndarray, shape (n,), or None
+        Configuration at `rest`, from which that of similar parameters is found quickly.
+    """
+
+    rollout: Rollout
+    rest: Rest | None
+    predicted: tuple[Array, ...]
+    sensitivities: tuple[Array, ...] | None
+    warm: Array | None = None
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where a rollout begins.
+
+    Attributes
+    ----------
+    state : ndarray, shape (nx,)
+        (q, p, z)
+    by_unknowns : ndarray, shape (nx, d)
+        Derivative by (wanted parameters, offset of the start).
+    rest : Rest or None
+        The equilibrium, where it is one.
+    message : str
+        What went wrong; empty where all is well.
+    """
+
+    state: Array
+    by_unknowns: Array
+    rest: Rest | None
+    message: str
+
+
+@dataclass(frozen=True)
+class Predictor:
+    """Predicts episodes; a function of what it is given and nothing else.
+
+    Attributes
+    ----------
+    functions : ModelFunctions
+    options : ProblemOptions
+    unknowns : Unknowns
+    """
+
+    functions: ModelFunctions
+    options: ProblemOptions
+    unknowns: Unknowns
+
+    @property
+    def step(self) -> Step:
+        """The compiled step."""
+        return self.functions.step
+
+    @property
+    def system(self) -> System:
+        """The step's system."""
+        return self.functions.step.system
+
+    # -- the start ----------------------------------------------------------------------------------------------------
+
+    @property
+    def start_rows(self) -> tuple[int, ...]:
+        """Rows of the initial state that are estimated, in the order of `Unknowns.start`."""
+        joints, n = self.system.mechanism.joint_index, self.system.size
+        split = (name.split(".", 1) for name in self.unknowns.start)
+        return tuple(joints(joint) + (n if kind == "p" else 0) for kind, joint in split)
+
+    def fitted(self, episode: Episode, theta: Array) -> Episode:
+        """The episode with its start fitted to the first measured points at given parameters, where it is fitted."""
+        if episode.start is not None or self.options.initial_state != "fitted_to_points":
+            return episode
+        samples = episode.samples
+        if self.options.start_std is not None:
+            weight = 1.0 / self.options.start_std
+            samples = tuple(replace(s, weight=np.where(s.seen, weight, 0.0)) for s in samples)
+        own = self._with(theta, episode.values)
+        window = self.options.start_window
+        return replace(
+            episode, start=self.functions.start_fit.solve(episode.posture, samples, own, window, episode.path)
+        )
+
+    def own_theta(self, episode: Episode, theta: Array) -> Array:
+        """theta with the values that belong to one recording: known ones, and those fitted along with its start."""
+        fitted: Mapping[str, float] = {} if episode.start is None else episode.start.values
+        return self._with(theta, {**episode.values, **fitted})
+
+    def _with(self, theta: Array, values: Mapping[str, float]) -> Array:
+        own = theta.copy()
+        for name, value in values.items():
+            own[self.system.parameters.index(name)] = value
+        return own
+
+    def start(
+        self, episode: Episode, theta: Array, offset: Array, wanted: tuple[str, ...], guess: Array | None = None
+    ) -> Start:
+        """Where an episode's rollout begins at its own parameters.
+
+        Parameters
+        ----------
+        episode : Episode
+        theta : ndarray, shape (ntheta,)
+            From `own_theta`.
+        offset : ndarray, shape (number of estimated rows,)
+            Of an estimated start.
+        wanted : tuple of str
+            Parameters by which to differentiate.
+        guess : ndarray, optional, shape (n,)
+            Configuration near the equilibrium; without one several are tried and that of least energy is taken.
+        """
+        nx, rows = self.step.sizes["nx"], list(self.start_rows)
+        by_offset = np.zeros((nx, len(rows)))
+        by_offset[rows, np.arange(len(rows))] = 1.0
+        rest: Rest | None = None
+        if episode.start is not None:
+            state, by_theta = episode.start.state.copy(), np.zeros((nx, len(wanted)))
+        else:
+            inputs = self.inputs(episode, theta, wanted)
+            first = inputs.first_torque if self.system.driven else None
+            rest = self.functions.rest(inputs.posture, theta, first, guess, wanted)
+            if not rest.converged:
+                none = np.zeros((nx, len(wanted) + len(rows)))
+                return Start(rest.state, none, rest, f"{episode.name}: {rest.message}")
+            state = rest.state.copy()
+            by_theta = rest.by_theta + rest.by_posture @ inputs.by_posture(len(wanted))
+            if inputs.by_first_torque is not None:
+                by_theta += rest.by_torque @ inputs.by_first_torque
+        state[rows] += offset
+        return Start(state, np.hstack([by_theta, by_offset]), rest, "")
+
+    # -- what drives the rollout --------------------------------------------------------------------------------------
+
+    def inputs(self, episode: Episode, theta: Array, wanted: tuple[str, ...]) -> Inputs:
+        """What drives an episode's rollout: the recording, as far as no effect says that it reads something else.
+
+        Parameters
+        ----------
+        episode : Episode
+        theta : ndarray, shape (ntheta,)
+        wanted : tuple of str
+            Parameters by which to differentiate.
+        """
+        inputs = self._corrected(episode, theta, wanted)
+        if not self.system.driven or self.options.feedback != "lqr":
+            return inputs
+        shift = self.functions.momentum_shift
+        if not shift.active(theta, wanted):
+            return inputs
+        momentum, slope = shift.along(episode.smooth_arm, episode.torque, theta, wanted)
+        return replace(inputs, momentum=momentum, by_momentum=slope if np.any(slope) else None)
+
+    def _corrected(self, episode: Episode, theta: Array, wanted: tuple[str, ...]) -> Inputs:
+        """The recording's torques, angles and paths as the effects say they truly were."""
+        corrections = self.functions.corrections
+        torque, arm, path = episode.torque, episode.measured_arm, episode.path
+        nu, nc = torque.shape[1], path.shape[1]
+        first = torque[0] if nu else np.zeros(0)
+        by_torque = by_first = by_arm = by_path = None
+        if nu and (corrections.delays_torque or corrections.corrects_efforts):
+            joints = episode.recording.joints
+            assert joints is not None
+            where = (joints, self.system.driven, episode.grid, episode.name)
+            delay, by_delay = corrections.torque_delay(theta, wanted)
+            if corrections.delays_torque:
+                torque = held_torque(*where, delay)
+            readings = np.pad(np.vstack([torque, first]), ((0, 0), (0, nc)))
+            _, true, _, by_theta, by_reading = corrections.true(np.zeros_like(readings), readings, theta, wanted)
+            by_theta = by_theta[:, :nu].copy()
+            if corrections.delays_torque and wanted:
+                slope = by_reading[:-1, :nu] * held_torque_slope(*where, delay)
+                by_theta[:-1] += slope[:, :, None] * by_delay
+            torque, first, by_torque, by_first = true[:-1, :nu], true[-1, :nu], by_theta[:-1], by_theta[-1]
+        if corrections.corrects_angles:
+            true, _, by_angle, _, _ = corrections.true(np.hstack([arm, path]), episode.load, theta, wanted)
+            arm, path, by_arm, by_path = true[:, :nu], true[:, nu:], by_angle[:, :nu], by_angle[:, nu:]
+        return Inputs(torque, first, path, arm, by_torque, by_first, by_path, by_arm)
+
+    # -- the rollout and its readings ---------------------------------------------------------------------------------
+
+    def run(
+        self, episode: Episode, theta: Array, offset: Array, derivatives: bool, guess: Array | None = None
+    ) -> EpisodeResult | str:
+        """Roll one episode out and predict its samples; a text says why where that is impossible."""
+        wanted = self.unknowns.parameters if derivatives else ()
+        theta = self.own_theta(episode, theta)
+        start = self.start(episode, theta, offset, wanted, guess)
+        if start.message:
+            return start.message
+        inputs, by_start = self.inputs(episode, theta, wanted), start.by_unknowns
+        feedback, driven = episode.feedback, self.system.driven_indices
+        directions = None
+        if derivatives and by_start.shape[1]:
+            extra = ((0, 0), (0, 0), (0, by_start.shape[1] - len(wanted)))
+            moved = (inputs.torque_directions(feedback, driven), inputs.by_path)
+            by_torque, by_path = (None if by is None else np.pad(by, extra) for by in moved)
+            directions = Directions(wanted, by_start, by_torque, by_path)
+        feedback = inputs.guided(feedback, driven, episode.measured_arm)
+        rollout = simulate(
+            self.step, theta, start.state, episode.grid.steps, inputs.torque, inputs.path, feedback, directions
+        )
+        if not rollout.status.ok:
+            return f"{episode.name}: {rollout.status.message}"
+        predicted, sensitivities = [], []
+        for samples in episode.samples:
+            values, by_all = self._predict(samples, rollout, theta, wanted, derivatives)
+            predicted.append(values)
+            sensitivities.append(by_all)
+        # states by all directions are the largest arrays of all, and what samples need of them has been taken
+        rollout = replace(rollout, by_state=None, by_multipliers=None, by_effort=None)
+        warm = None if start.rest is None else start.rest.state[: self.system.size]
+        return EpisodeResult(rollout, start.rest, tuple(predicted), tuple(sensitivities) if derivatives else None, warm)
+
+    def along(self, samples: Measurements, state: Array, by_state: Array, theta: Array) -> tuple[Array, Array]:
+        """Readings along a given trajectory and their derivatives.
+
+        Parameters
+        ----------
+        samples : Measurements
+        state : ndarray, shape (N + 1, nx)
+        by_state : ndarray, shape (N + 1, nx, d)
+            The first of the d directions are the free parameters.
+        theta : ndarray, shape (ntheta,)
+
+        Returns
+        -------
+        predicted : ndarray, shape (M, k)
+        sensitivities : ndarray, shape (M, k, d)
+        """
+        effort = np.zeros((len(samples.nodes), self.system.size))
+        read = _Trajectory(state, by_state, effort, None)
+        y, total = self._read(samples, read, theta, self.unknowns.parameters)
+        return samples.interpolate(y), samples.interpolate(total)
+
+    def efforts(self, rollout: Rollout) -> Array:
+        """Effort of prescribed joints and torque of driven ones along a rollout, zero elsewhere, shape (N + 1, n)."""
+        steps = len(rollout.multipliers)
+        effort = np.zeros((steps + 1, self.system.size))
+        effort[:-1, list(self.system.prescribed_indices)] = rollout.effort
+        effort[:-1, list(self.system.driven_indices)] = rollout.torque
+        effort[-1] = effort[-2]
+        return effort
+
+    def lateness(self, samples: Measurements, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array] | None:
+        """By how many steps each output is late, shape (k,), and its derivative, (k, d); None where none ever is."""
+        found = self.functions.corrections.sensor_delay(samples.sensor, theta, wanted)
+        return None if found is None else (found[0] / self.step.time_step, found[1] / self.step.time_step)
+
+    def _predict(
+        self, samples: Measurements, rollout: Rollout, theta: Array, wanted: tuple[str, ...], derivatives: bool
+    ) -> tuple[Array, Array]:
+        unmoved, late = samples, self.lateness(samples, theta, wanted)
+        if late is not None:
+            samples = samples.late(late[0])
+        by_state = rollout.by_state if derivatives else None
+        effort = self.efforts(rollout)[samples.nodes]
+        y, total = self._read(samples, _Trajectory(rollout.state, by_state, effort, rollout.by_effort), theta, wanted)
+        predicted, slopes = samples.interpolate(y), samples.interpolate(total)
+        if late is not None and by_state is not None:
+            slopes[:, :, : len(wanted)] -= samples.slope(y, unmoved, late[0])[:, :, None] * late[1]
+        return predicted, slopes
+
+    def _read(
+        self, samples: Measurements, along: _Trajectory, theta: Array, wanted: tuple[str, ...]
+    ) -> tuple[Array, Array]:
+        """Readings at the samples' nodes, (nodes, k), and their derivatives by d directions, (nodes, k, d)."""
+        n, nodes = self.system.size, samples.nodes
+        q, z = along.state[nodes, :n], along.state[nodes, 2 * n :]
+        y, by_q, by_z, by_load, by_theta = self.functions.sensor(samples.sensor, wanted)(q, z, along.effort, theta)
+        if along.by_state is None:
+            return y[:, :, 0], np.zeros((*y.shape[:2], 0))
+        total = by_q @ along.by_state[nodes, :n]
+        if z.shape[1]:
+            total += by_z @ along.by_state[nodes, 2 * n :]
+        fixed = list(self.system.prescribed_indices)
+        if fixed and along.by_effort is not None and np.any(by_load):
+            total += by_load[:, :, fixed] @ along.by_effort[np.minimum(nodes, len(along.by_effort) - 1)]
+        total[:, :, : len(wanted)] += by_theta
+        return y[:, :, 0], total
+
+    # -- the adjoint --------------------------------------------------------------------------------------------------
+
+    def pulled(self, episode: Episode, result: EpisodeResult, theta: Array, offset: Array, pulls: list[Array]) -> Array:
+        """Gradient of a cost of one episode's predictions by its (shared, local, start) unknowns, by the adjoint sweep.
+
+        Parameters
+        ----------
+        episode : Episode
+        result : EpisodeResult
+            At the same unknowns.
+        theta : ndarray, shape (ntheta,)
+        offset : ndarray
+            Of an estimated start.
+        pulls : list of ndarray, shape (M, k) each
+            Derivative of the cost by every prediction.
+        """
+        wanted, rollout = self.unknowns.parameters, result.rollout
+        theta = self.own_theta(episode, theta)
+        by_state = np.zeros((episode.grid.steps + 1, self.step.sizes["nx"]))
+        by_effort = np.zeros_like(rollout.effort)
+        total = np.zeros(len(wanted))
+        for samples, pull in zip(episode.samples, pulls, strict=True):
+            total += self._pull(samples, pull, rollout, theta, by_state, by_effort)
+        feedback = episode.feedback
+        swept = adjoint_gradient(self.step, theta, rollout, wanted, by_state, None, by_effort, feedback)
+        inputs = self.inputs(episode, theta, wanted)
+        by_torque = inputs.torque_directions(feedback, self.system.driven_indices)
+        if by_torque is not None:
+            total += np.einsum("ku,kuw->w", swept.by_torque, by_torque)
+        if inputs.by_path is not None:
+            # node 0 is part of the start state
+            total += np.einsum("kc,kcw->w", swept.by_path[1:], inputs.by_path[1:])
+        by_start = self.start(episode, theta, offset, wanted, result.warm).by_unknowns
+        own = np.concatenate([total + swept.by_theta, np.zeros(len(self.unknowns.start))])
+        return np.asarray(own + swept.by_start @ by_start)
+
+    def _pull(
+        self, samples: Measurements, pull: Array, rollout: Rollout, theta: Array, by_state: Array, by_effort: Array
+    ) -> Array:
+        """Spread the pull at one group's samples over states and efforts; the direct part by the parameters."""
+        n, wanted = self.system.size, self.unknowns.parameters
+        unmoved, late = samples, self.lateness(samples, theta, wanted)
+        if late is not None:
+            samples = samples.late(late[0])
+        at_nodes, nodes = samples.distribute(pull), samples.nodes
+        q, z = rollout.state[nodes, :n], rollout.state[nodes, 2 * n :]
+        effort = self.efforts(rollout)[nodes]
+        y, by_q, by_z, by_load, by_theta = self.functions.sensor(samples.sensor, wanted)(q, z, effort, theta)
+        direct = np.einsum("mk,mkq->q", at_nodes, by_theta)
+        if late is not None:
+            direct -= np.sum(pull * samples.slope(y[:, :, 0], unmoved, late[0]), axis=0) @ late[1]
+        by_state[nodes, :n] += np.einsum("mk,mkq->mq", at_nodes, by_q)
+        by_state[nodes, 2 * n :] += np.einsum("mk,mkq->mq", at_nodes, by_z)
+        fixed = list(self.system.prescribed_indices)
+        if fixed:
+            last = np.minimum(nodes, len(rollout.effort) - 1)
+            np.add.at(by_effort, last, np.einsum("mk,mkq->mq", at_nodes, by_load[:, :, fixed]))
+        return np.asarray(direct)
+
+
+@dataclass(frozen=True)
+class _Trajectory:
+    """States at all nodes, efforts at the nodes that are read, and their derivatives."""
+
+    state: Array
+    by_state: Array | None
+    effort: Array
+    by_effort: Array | None

@@ -1,0 +1,75 @@
+"""The unknown vector of an estimation problem: what stands where, recording by recording."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from yid_ocp.model.system import System
+
+Array = NDArray[np.float64]
+START = "start."
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """(shared parameters | recording 1: local parameters, offset of its start | recording 2: ...).
+
+    Attributes
+    ----------
+    shared, local : tuple of str
+        Free parameters with one value for all recordings, and with a value in each.
+    start : tuple of str
+        Rows of an estimated initial state, `q.JOINT` and `p.JOINT`.
+    recordings : tuple of str
+    """
+
+    shared: tuple[str, ...]
+    local: tuple[str, ...]
+    start: tuple[str, ...]
+    recordings: tuple[str, ...]
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of all unknowns; local ones and initial states carry their recording's name."""
+        own = [*self.local, *(f"{START}{name}" for name in self.start)]
+        return (*self.shared, *(f"{name}[{recording}]" for recording in self.recordings for name in own))
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Free parameters in the order of one recording's directions."""
+        return (*self.shared, *self.local)
+
+    def columns(self, recording: int) -> NDArray[np.int64]:
+        """Places of one recording's (shared, local, start) unknowns in the vector."""
+        shared, own = len(self.shared), len(self.local) + len(self.start)
+        return np.concatenate([np.arange(shared), shared + recording * own + np.arange(own)])
+
+    def placed(self, block: Array, recording: int) -> Array:
+        """Columns by one recording's directions, (r, d), moved to their places in the unknown vector, (r, nx)."""
+        wide = np.zeros((len(block), len(self.names)))
+        wide[:, self.columns(recording)] = block
+        return wide
+
+    def split(self, x: ArrayLike, recording: int, theta: Array, system: System) -> tuple[Array, Array]:
+        """theta with one recording's values in place of the nominal ones, and the offset of its start."""
+        own = np.asarray(x, float)[self.columns(recording)]
+        result = theta.copy()
+        for name, value in zip(self.parameters, own, strict=False):
+            result[system.parameters.index(name)] = value
+        return result, own[len(self.parameters) :]
+
+    def spread(self, shared: ArrayLike, local: ArrayLike, start: ArrayLike) -> Array:
+        """An unknown vector from values for the shared parameters, each recording's local ones and its start."""
+        parts = [np.asarray(shared, float)]
+        parts += [np.asarray(local, float), np.asarray(start, float)] * len(self.recordings)
+        return np.concatenate(parts)
+
+
+def replaced(x: Array, names: Sequence[str], values: Mapping[str, float]) -> Array:
+    """An unknown vector with named entries replaced."""
+    return np.array([values.get(name, value) for name, value in zip(names, x, strict=True)], float)
