@@ -14,6 +14,7 @@ from yid_ocp.diagnosis.refit import Loss
 from yid_ocp.diagnosis.screening import robust, shape_grid
 from yid_ocp.diagnosis.select import gain, out_of_shape, oversized, within_reach
 from yid_ocp.effects import make_effect
+from yid_ocp.problem import EstimationProblem
 
 
 def white(rows, colour=None):
@@ -30,6 +31,27 @@ def screened(bench):
     composed = CandidateProblem.of(problem, effects, recordings[1:])
     nominal = refit(composed, (), {})
     return composed, nominal, linearise(composed, (), nominal.values)
+
+
+def test_all_candidates_together_are_the_nominal_model_until_they_are_freed(bench, screened):
+    composed, _, _ = screened
+    recordings = [episode.recording for episode in composed.problem.episodes]
+    x = composed.problem.start * 1.1
+    plain = bench.problem(recordings).evaluate(x)
+    together = composed.freeing(()).evaluate(x)
+    assert together.residual == pytest.approx(plain.residual, rel=1e-9, abs=1e-9)
+    assert together.jacobian == pytest.approx(plain.jacobian, rel=1e-8, abs=1e-8)
+
+
+def test_part_of_the_parameters_is_freed_by_columns_of_the_whole(screened):
+    composed, nominal, _ = screened
+    chosen = [effect for effect in composed.effects if effect.kind in ("joint_stribeck", "link_mass")]
+    some = composed.freeing(chosen)
+    alone = EstimationProblem(composed.problem.step, [e.recording for e in some.episodes], some.free, some.options)
+    x = some.vector(nominal.values) + 0.01
+    assert some.names == alone.names
+    assert some.evaluate(x).jacobian == pytest.approx(alone.evaluate(x).jacobian, rel=1e-9, abs=1e-9)
+    assert composed.problem.free == composed.nominal == ("shoulder.damping", "elbow.damping")
 
 
 def test_p_values_of_matching_noise_are_uniform():

@@ -143,9 +143,9 @@ def _composed(
     if problem.options.weighting != "whitened":
         raise SolverError(
             "a diagnosis needs residuals in units of their noise",
-            where="solver.weighting",
+            where="problem.weighting",
             allowed="whitened",
-            hint="set solver.weighting: whitened and the noise levels under `sensors`",
+            hint="set problem.weighting: whitened and the noise levels under `sensors`",
         )
     effects = chosen_effects(problem.system, [episode.recording for episode in problem.episodes], candidates)
     progress(f"composing {len(effects)} candidates into one step")

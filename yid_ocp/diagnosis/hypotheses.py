@@ -158,17 +158,9 @@ class CandidateProblem:
         """Parameters that the nominal problem frees."""
         return self.problem.free
 
-    def freeing(self, effects: Sequence[EffectBase], names: Sequence[str] | None = None) -> EstimationProblem:
-        """The problem with the parameters of some effects free beside the nominal ones.
-
-        Parameters
-        ----------
-        effects : sequence of EffectBase
-        names : sequence of str, optional
-            Those of their parameters to free; all where absent.
-        """
-        extra = tuple(name for effect in effects for name in effect.parameters.names) if names is None else tuple(names)
-        return self.problem.freeing((*self.nominal, *extra))
+    def freeing(self, effects: Sequence[EffectBase]) -> EstimationProblem:
+        """The problem with the parameters of some effects free beside the nominal ones."""
+        return self.problem.freeing((*self.nominal, *(name for effect in effects for name in effect.parameters.names)))
 
 
 def _check_apart(estimate: Sequence[Recording], held: Sequence[Recording]) -> None:

@@ -196,8 +196,7 @@ def refit(
     if best is None:
         return None
     outcome, finish = best
-    deviation = deviations(own, finish)
-    std = dict(zip(own.names, map(float, deviation), strict=True))
+    std = own.named(deviations(own, finish))
     loss = held_out_loss(own, outcome.x)
     values = own.named(outcome.x)
     if store is not None:

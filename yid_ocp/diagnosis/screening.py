@@ -159,7 +159,7 @@ def linearise(
         chosen = [effect for effect in others if k < len(grids[effect.label])]
         shape = {name: value for effect in chosen for name, value in grids[effect.label][k].items()}
         swept = [name for effect in chosen for name in effect.amplitudes]
-        trial = problem.freeing((), [*own, *swept]).at(shape)
+        trial = problem.problem.freeing((*problem.nominal, *own, *swept)).at(shape)
         evaluation = trial.evaluate(trial.vector(values), warm=warm)
         if not evaluation.ok or evaluation.jacobian is None:
             raise SolverError(f"the model cannot be linearised: {evaluation.message}", where="diagnosis")
