@@ -11,7 +11,7 @@ import scipy.stats
 from yid_ocp.diagnosis import closure, confusability, linearise, null_test, refit, residual_series, scores, visibility
 from yid_ocp.diagnosis.hypotheses import CandidateProblem, Series, chosen_effects, smoothed_colour
 from yid_ocp.diagnosis.refit import Loss
-from yid_ocp.diagnosis.screening import robust, shape_grid
+from yid_ocp.diagnosis.screening import Linearisation, Signature, robust, shape_grid
 from yid_ocp.diagnosis.select import gain, out_of_shape, oversized, within_reach
 from yid_ocp.effects import make_effect
 from yid_ocp.problem import EstimationProblem
@@ -147,6 +147,21 @@ def test_shapes_are_tried_over_their_range(bench):
     values = [entry["joint_stribeck@elbow.v_stribeck"] for entry in grid]
     assert (values[0], values[-1]) == pytest.approx(effect.prior_range["joint_stribeck@elbow.v_stribeck"])
     assert shape_grid(make_effect("joint_coulomb", "elbow", bench.system)) == [{}]
+
+
+@pytest.mark.parametrize(("lean", "chosen"), [(0.0, 0), (1e-10, 0), (0.01, 1)])
+def test_of_shape_values_that_make_no_difference_the_first_counts(bench, lean, chosen):
+    effect = make_effect("joint_stribeck", "elbow", bench.system)
+    rng = np.random.default_rng(4)
+    column = rng.standard_normal((200, 1))
+    residual = rng.standard_normal((200, 1)) - 0.3 * column
+    # the more it leans towards the residual, the more of it the second one explains
+    columns = (column, column - lean * residual)
+    grid = [{"joint_stribeck@elbow.v_stribeck": value} for value in (0.02, 0.05)]
+    signatures = tuple(Signature(effect, values, x, x.T @ x) for values, x in zip(grid, columns, strict=True))
+    point = Linearisation(residual[:, 0], signatures, {})
+    best = scores(point, [white(np.arange(200))], visibility(point))[0]
+    assert best.step["joint_stribeck@elbow.v_stribeck"] == grid[chosen]["joint_stribeck@elbow.v_stribeck"]
 
 
 def loss(squares, counts):

@@ -31,6 +31,9 @@ from yid_ocp.errors import SolverError
 
 Array = NDArray[np.float64]
 
+EQUAL = 1e-6
+"""Relative difference of promised decreases that rounding can make."""
+
 
 @dataclass(frozen=True)
 class Signature:
@@ -255,7 +258,8 @@ def scores(point: Linearisation, series: Sequence[Series], visible: Sequence[Vis
             continue
         tries[label] = tries.get(label, 0) + 1
         score = _score(signature, point.residual, series)
-        if label not in best or score.decrease > best[label].decrease:
+        # shape values that make no difference are told apart by nothing but rounding: the first one stays
+        if label not in best or score.decrease > best[label].decrease * (1 + EQUAL):
             best[label] = score
     final = [
         Score(s.effect, s.step, s.decrease, s.statistic, min(1.0, s.p_value * tries[label]))
