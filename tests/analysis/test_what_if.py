@@ -11,7 +11,7 @@ import pytest
 from yid_ocp.analysis import layouts
 from yid_ocp.analysis.identifiability import identifiability
 from yid_ocp.analysis.layouts import LayoutBuilder, Setting, sights
-from yid_ocp.analysis.what_if import Change, compatible, what_if
+from yid_ocp.analysis.what_if import Change, WhatIfOptions, compatible, what_if
 from yid_ocp.data.recording import PointGroup
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.step import compile_step
@@ -80,7 +80,7 @@ def test_torsional_springs_need_a_marker_off_the_axis(springs):
 
 
 def test_series_springs_need_the_joint(springs):
-    ranking = what_if(springs("series_ends"), largest=1)
+    ranking = what_if(springs("series_ends"), options=WhatIfOptions(largest=1))
     assert [entry.changes for entry in ranking.smallest] == [("camera:joint",)]
 
 
@@ -130,7 +130,7 @@ def test_what_cannot_be_worked_out_is_said_and_ranked_last(short_run, monkeypatc
         raise DataError("MuJoCo is not installed")
 
     monkeypatch.setattr(layouts, "simulate_in_mujoco", missing)
-    ranking = what_if(short_run, only=["travel", "rate:30"], largest=1, start="known")
+    ranking = what_if(short_run, options=WhatIfOptions(only=("travel", "rate:30"), largest=1), start="known")
     assert [entry.changes for entry in ranking.singles] == [("rate:30",), ("travel",)]
     assert ranking.singles[1].message == "MuJoCo is not installed"
     assert ranking.singles[1].verdicts == {}

@@ -10,9 +10,11 @@ import scipy.stats
 
 from yid_ocp.diagnosis import closure, confusability, linearise, null_test, refit, residual_series, scores, visibility
 from yid_ocp.diagnosis.hypotheses import CandidateProblem, Series, chosen_effects, smoothed_colour
-from yid_ocp.diagnosis.screening import robust, shape_grid
-from yid_ocp.diagnosis.select import Loss, gain, out_of_shape, oversized, within_reach
+from yid_ocp.diagnosis.refit import Loss
+from yid_ocp.diagnosis.screening import Linearisation, Signature, robust, shape_grid
+from yid_ocp.diagnosis.select import gain, out_of_shape, oversized, within_reach
 from yid_ocp.effects import make_effect
+from yid_ocp.problem import EstimationProblem
 
 
 def white(rows, colour=None):
@@ -29,6 +31,27 @@ def screened(bench):
     composed = CandidateProblem.of(problem, effects, recordings[1:])
     nominal = refit(composed, (), {})
     return composed, nominal, linearise(composed, (), nominal.values)
+
+
+def test_all_candidates_together_are_the_nominal_model_until_they_are_freed(bench, screened):
+    composed, _, _ = screened
+    recordings = [episode.recording for episode in composed.problem.episodes]
+    x = composed.problem.start * 1.1
+    plain = bench.problem(recordings).evaluate(x)
+    together = composed.freeing(()).evaluate(x)
+    assert together.residual == pytest.approx(plain.residual, rel=1e-9, abs=1e-9)
+    assert together.jacobian == pytest.approx(plain.jacobian, rel=1e-8, abs=1e-8)
+
+
+def test_part_of_the_parameters_is_freed_by_columns_of_the_whole(screened):
+    composed, nominal, _ = screened
+    chosen = [effect for effect in composed.effects if effect.kind in ("joint_stribeck", "link_mass")]
+    some = composed.freeing(chosen)
+    alone = EstimationProblem(composed.problem.step, [e.recording for e in some.episodes], some.free, some.options)
+    x = some.vector(nominal.values) + 0.01
+    assert some.names == alone.names
+    assert some.evaluate(x).jacobian == pytest.approx(alone.evaluate(x).jacobian, rel=1e-9, abs=1e-9)
+    assert composed.problem.free == composed.nominal == ("shoulder.damping", "elbow.damping")
 
 
 def test_p_values_of_matching_noise_are_uniform():
@@ -124,6 +147,21 @@ def test_shapes_are_tried_over_their_range(bench):
     values = [entry["joint_stribeck@elbow.v_stribeck"] for entry in grid]
     assert (values[0], values[-1]) == pytest.approx(effect.prior_range["joint_stribeck@elbow.v_stribeck"])
     assert shape_grid(make_effect("joint_coulomb", "elbow", bench.system)) == [{}]
+
+
+@pytest.mark.parametrize(("lean", "chosen"), [(0.0, 0), (1e-10, 0), (0.01, 1)])
+def test_of_shape_values_that_make_no_difference_the_first_counts(bench, lean, chosen):
+    effect = make_effect("joint_stribeck", "elbow", bench.system)
+    rng = np.random.default_rng(4)
+    column = rng.standard_normal((200, 1))
+    residual = rng.standard_normal((200, 1)) - 0.3 * column
+    # the more it leans towards the residual, the more of it the second one explains
+    columns = (column, column - lean * residual)
+    grid = [{"joint_stribeck@elbow.v_stribeck": value} for value in (0.02, 0.05)]
+    signatures = tuple(Signature(effect, values, x, x.T @ x) for values, x in zip(grid, columns, strict=True))
+    point = Linearisation(residual[:, 0], signatures, {})
+    best = scores(point, [white(np.arange(200))], visibility(point))[0]
+    assert best.step["joint_stribeck@elbow.v_stribeck"] == grid[chosen]["joint_stribeck@elbow.v_stribeck"]
 
 
 def loss(squares, counts):

@@ -211,7 +211,7 @@ def test_the_papers_weighting_cannot_be_diagnosed(bench):
 def test_a_barely_significant_excess_without_shape_is_chance(bench):
     finding = diagnose(bench.problem([bench.recording({}, 1)]), FRICTION, [bench.recording({}, 2)])
     nominal = finding.nominal
-    smoothed = smooth(nominal.problem, nominal.problem.unknowns(nominal.values), nominal.evaluation)
+    smoothed = smooth(nominal.problem, nominal.problem.vector(nominal.values), nominal.evaluation)
     limits = Thresholds()
 
     def tested(p):

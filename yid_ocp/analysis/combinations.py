@@ -69,8 +69,8 @@ def combination_words(parts: Sequence[Component], moved: Callable[[Mapping[str, 
     parts : sequence of Component
         Of the direction that is not seen.
     moved : callable, optional
-        From new values of parameters to how far the data move [deviations]; tells combinations apart that look alike
-        for small changes. Without it the trade is described and not named.
+        From new values of parameters to how far the data move [standard deviations]; tells combinations apart that look
+        alike for small changes. Without it the trade is described and not named.
     """
     if len(parts) == 1:
         return f"{parts[0].name} is not seen"

@@ -1,4 +1,4 @@
-"""Several methods on one problem: what each found, how sure, at what price, and whether they agree."""
+"""Several methods on one problem: what each found, how sure, at what cost, and whether they agree."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ PUBLISHED: dict[str, dict[str, float]] = {
 """The source paper's answers for its four experiments [N m/rad]; its data are not public."""
 
 SAMPLING_PERIOD = 0.02
-# Two estimates agree when they differ by less than this many of the larger deviation, or by this fraction of the value:
-# below that the methods' own stopping rules show.
+# Two estimates agree when they differ by less than this many of the larger standard deviation, or by this fraction of
+# the value: below that the methods' own stopping rules show.
 DEVIATIONS, FRACTION = 2.0, 0.005
 
 
@@ -117,13 +117,13 @@ def compare(
         if solver.name == "steepest_descent" and problem.options.weighting != "paper":
             own = problem.with_options(replace(problem.options, weighting="paper"))
 
-        def iterate(entry: Iterate, name: str = solver.name) -> None:
+        def progress(entry: Iterate, name: str = solver.name) -> None:
             if callback is not None:
                 callback(name, entry)
 
         wall, cpu = time.perf_counter(), time.process_time()
         with _Memory() as memory:
-            solution = solve(own, solver, callback=iterate)
+            solution = solve(own, solver, callback=progress)
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         cost = problem.evaluate(solution.x, derivatives=False).cost
         runs.append(MethodRun(solver.name, solution, cost, own.validate(solution.x), wall, cpu, memory.peak))

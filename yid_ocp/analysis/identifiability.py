@@ -44,10 +44,10 @@ class ParameterInformation:
     std_relative : float
         The same over the value, over its typical size where the value is zero.
     std_alone : float
-        Relative deviation if everything else were known.
+        Relative standard deviation if everything else were known.
     verdict : str
-        identifiable (relative deviation up to 10 %), weak (up to 400 %) or not_identifiable; a parameter whose interval
-        was asked for and is open on one side is at best weak, open on both sides not_identifiable.
+        identifiable (relative standard deviation up to 10 %), weak (up to 400 %) or not_identifiable; a parameter whose
+        interval was asked for and is open on one side is at best weak, open on both sides not_identifiable.
     interval : (float or None, float or None), or None
         95 % interval by profile likelihood about the best fit of all unknowns, None for an open end; None as a whole
         where it was not asked for.
@@ -69,9 +69,10 @@ class Direction:
     Attributes
     ----------
     singular_value : float
-        Of the whitened sensitivity to relative changes, nuisances eliminated: deviations of the data per unit change.
+        Of the whitened sensitivity to relative changes, nuisances eliminated: standard deviations of the data per
+        unit change.
     std_relative : float
-        Its reciprocal, the deviation along the direction.
+        Its reciprocal, the standard deviation along the direction.
     components : mapping of parameter to float
         The direction, of unit length.
     verdict : str
@@ -104,7 +105,7 @@ class Identifiability:
     nuisances : tuple of str
         Unknowns that were estimated along.
     chi2_per_dof : float
-        At the point; deviations are scaled by its square root where it exceeds one and the point is a fit.
+        At the point; standard deviations are scaled by its square root where it exceeds one and the point is a fit.
     profiles : mapping of str to Profile
     """
 
@@ -139,7 +140,7 @@ def identifiability(
     """Which free parameters the problem's recordings determine, and what they leave open.
 
     The Fisher information of independent Gaussian noise is I = J' J, J = d r/d x the whitened sensitivities; the
-    deviation of one unknown is the root of the diagonal of its inverse, with all nuisances in it.
+    standard deviation of one unknown is the root of the diagonal of its inverse, with all nuisances in it.
 
     Parameters
     ----------
@@ -147,10 +148,10 @@ def identifiability(
     solution : Solution or array_like, optional
         Point at which to judge (a solution of this problem, or its unknown vector); the initial values when absent.
     start : "unknown" or "known"
-        Whether every recording's initial state is estimated along, with the problem's prior about what it presumes.
+        Whether every recording's initial state is estimated along, with the problem's prior about what it assumes.
     grasp_std : float, optional
-        Prior deviation of the fixed `grasp_offset@...` parameters of a system that has any (see `with_grasp_offsets`),
-        which are estimated along [m]; None for grasps that are known.
+        Prior standard deviation of the fixed `grasp_offset@...` parameters of a system that has any (see
+        `with_grasp_offsets`), which are estimated along [m]; None for grasps that are known.
     intervals : iterable of str, or "all"
         Parameters whose interval by profile likelihood is wanted.
 
@@ -172,16 +173,21 @@ def identifiability(
     """
     # the matrices are small: threads of the linear algebra library cost more than they give
     with threadpoolctl.threadpool_limits(1):
-        return _judged(problem, solution, start, grasp_std, intervals)
+        return _information(problem, solution, start, grasp_std, intervals)
 
 
-def _judged(
+def _information(
     problem: EstimationProblem,
     solution: Solution | ArrayLike | None,
     start: StartKnowledge,
     grasp_std: float | None,
     intervals: Iterable[str] | Literal["all"],
 ) -> Identifiability:
+    names = tuple(name for name in problem.names if not name.startswith("start."))
+    wanted = names if intervals == "all" else tuple(intervals)
+    for name in wanted:
+        if name not in names:
+            raise ConfigError(f"'{name}' is not a free parameter", hint=nearest(name, names), where="intervals")
     given = unknown_vector(problem, solution)
     wide = with_nuisances(problem, given, start, grasp_std)
     x = carried(given, problem.names, wide)
@@ -191,55 +197,67 @@ def _judged(
             f"the model cannot be rolled out where its information is asked for: {evaluation.message}",
             hint="solve first, or choose other initial values",
         )
-    names = tuple(name for name in problem.names if not name.startswith("start."))
-    wanted = names if intervals == "all" else tuple(intervals)
-    for name in wanted:
-        if name not in names:
-            raise ConfigError(f"'{name}' is not a free parameter", hint=nearest(name, names), where="intervals")
-    chosen = [wide.names.index(name) for name in names]
     covariance, chi2 = uncertainty(wide, evaluation)
     inflation = math.sqrt(max(1.0, chi2))
     if solution is None:
         # far from the data chi2 says nothing of the noise
         covariance, inflation = covariance / inflation**2, 1.0
-    split = split_rows(wide, evaluation, chosen)
+    chosen = np.array([wide.names.index(name) for name in names], int)
     scale = np.where(x[chosen] != 0, np.abs(x[chosen]), wide.scales[chosen])
-    sensitivity = split.sensitivity * scale / inflation
-    information = sensitivity.T @ sensitivity
+    view = _Sensitivities(wide, x, evaluation, names, chosen, split_rows(wide, evaluation, chosen), scale, inflation)
+    std = np.sqrt(np.diag(covariance)[chosen])
+    std = np.where(std < 1e6 * np.maximum(scale, np.abs(wide.start[chosen])), std, np.inf)
+    profiles = _profiles(view, std, wanted)
+    return Identifiability(
+        _parameters(view, std, profiles),
+        names,
+        _correlations(covariance[np.ix_(chosen, chosen)], std),
+        view.relative.T @ view.relative,
+        _directions(view),
+        tuple(name for name in wide.names if name not in names),
+        chi2,
+        profiles,
+    )
 
-    deviation = np.sqrt(np.diag(covariance)[chosen])
-    deviation = np.where(deviation < 1e6 * np.maximum(scale, np.abs(wide.start[chosen])), deviation, np.inf)
-    profiles = {}
-    if wanted:
-        best, there = best_fit(wide, x)
-        for name in wanted:
-            std = float(deviation[names.index(name)])
-            profiles[name] = profile_likelihood(wide, best, wide.names.index(name), std, there)
-    alone = np.linalg.norm(split.alone * scale / inflation, axis=0)
-    parameters = {}
-    for i, name in enumerate(names):
-        entry = problem.system.parameters[name.split("[")[0]]
+
+def _profiles(view: _Sensitivities, std: Array, wanted: Sequence[str]) -> dict[str, Profile]:
+    """Profile likelihoods of the wanted parameters, about the best fit of all unknowns."""
+    if not wanted:
+        return {}
+    best, there = best_fit(view.problem, view.x)
+    return {
+        name: profile_likelihood(
+            view.problem, best, view.problem.names.index(name), float(std[view.names.index(name)]), there
+        )
+        for name in wanted
+    }
+
+
+def _parameters(view: _Sensitivities, std: Array, profiles: Mapping[str, Profile]) -> dict[str, ParameterInformation]:
+    """What is known of each parameter, from standard deviations with all others free and from its interval."""
+    found = {}
+    for i, name in enumerate(view.names):
         profile = profiles.get(name)
         interval = None if profile is None else (profile.lower, profile.upper)
-        value, std = float(x[chosen[i]]), float(deviation[i])
-        parameters[name] = ParameterInformation(
-            value,
-            entry.unit,
-            std,
-            std / float(scale[i]),
-            1.0 / float(alone[i]) if alone[i] > 0 else math.inf,
-            lowered(verdict(float(scale[i]), std), interval),
+        scale, alone = float(view.scale[i]), float(view.alone[i])
+        found[name] = ParameterInformation(
+            float(view.x[view.chosen[i]]),
+            view.unit(name),
+            float(std[i]),
+            float(std[i]) / scale,
+            1.0 / alone if alone > 0 else math.inf,
+            lowered(verdict(scale, float(std[i])), interval),
             interval,
         )
-    known = np.isfinite(deviation)
-    correlations = np.full((len(names), len(names)), np.nan)
-    block = covariance[np.ix_(chosen, chosen)] / np.outer(deviation, deviation)
-    correlations[np.ix_(known, known)] = block[np.ix_(known, known)]
-    sensor_rows = _SensorRows(wide, x, evaluation, names, chosen, split, scale, inflation)
-    nuisances = tuple(name for name in wide.names if name not in names)
-    return Identifiability(
-        parameters, names, correlations, information, sensor_rows.directions(), nuisances, chi2, profiles
-    )
+    return found
+
+
+def _correlations(covariance: Array, std: Array) -> Array:
+    """Correlations of the parameters, NaN where nothing informs one."""
+    known = np.isfinite(std)
+    found = np.full(covariance.shape, np.nan)
+    found[np.ix_(known, known)] = (covariance / np.outer(std, std))[np.ix_(known, known)]
+    return found
 
 
 def lowered(said: str, interval: tuple[float | None, float | None] | None) -> str:
@@ -355,7 +373,7 @@ class SplitRows:
     nuisance: Array
 
 
-def split_rows(problem: EstimationProblem, evaluation: Evaluation, chosen: Sequence[int]) -> SplitRows:
+def split_rows(problem: EstimationProblem, evaluation: Evaluation, chosen: NDArray[np.int64]) -> SplitRows:
     """Sensitivities of chosen unknowns, those of all others eliminated together with their priors."""
     _, jacobian = problem.informing(evaluation)
     jacobian = jacobian.copy()
@@ -375,100 +393,140 @@ def without(columns: Array, explained: Array) -> Array:
     return np.asarray(columns - basis @ (basis.T @ columns))
 
 
+# -- directions with words --------------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
-class _SensorRows:
-    """Turns sensitivities into directions with words."""
+class _Sensitivities:
+    """What the sensors see of the parameters at one point.
+
+    Attributes
+    ----------
+    problem : EstimationProblem
+        With nuisances among its unknowns.
+    x : ndarray, shape (nx,)
+    evaluation : Evaluation
+        At `x`.
+    names : tuple of str, length p
+        Parameters of interest.
+    chosen : ndarray of int, shape (p,)
+        Their places among the unknowns.
+    split : SplitRows
+    scale : ndarray, shape (p,)
+        By which changes are relative.
+    inflation : float
+        Factor by which the noise is larger than stated.
+    """
 
     problem: EstimationProblem
     x: Array
     evaluation: Evaluation
     names: tuple[str, ...]
-    chosen: Sequence[int]
+    chosen: NDArray[np.int64]
     split: SplitRows
     scale: Array
     inflation: float
 
-    def directions(self) -> tuple[Direction, ...]:
-        relative = self.split.sensitivity * self.scale / self.inflation
-        alone = np.linalg.norm(self.split.alone * self.scale / self.inflation, axis=0)
-        count = len(self.names)
-        found: list[Direction] = []
-        hidden = [i for i in range(count) if alone[i] * WEAK < 1.0]
-        for i in hidden:
-            size = float(np.linalg.norm(relative[:, i]))
-            found.append(self._direction(size, np.eye(count)[i], f"{self.names[i]} is not seen by any sensor"))
-        rest = [i for i in range(count) if i not in hidden]
-        if rest:
-            _, singular, vectors = np.linalg.svd(relative[:, rest], full_matrices=False)
-            wide = np.zeros((len(rest), count))
-            wide[: len(vectors), rest] = vectors
-            sizes = np.zeros(len(rest))
-            sizes[: len(singular)] = singular
-            blind = sizes * WEAK < 1.0
-            if np.any(blind):
-                for vector in sparse_basis(_completed(wide, rest, blind)):
-                    found.append(self._direction(float(np.linalg.norm(relative @ vector)), vector, self._why(vector)))
-            found += [
-                self._direction(float(size), vector, self._strength(float(size), vector))
-                for size, vector in zip(sizes[~blind], wide[~blind], strict=True)
-            ]
-        return tuple(sorted(found, key=lambda entry: entry.singular_value))
+    @property
+    def relative(self) -> Array:
+        """Sensitivity to relative changes, nuisances eliminated, shape (nr, p)."""
+        return self.split.sensitivity * self.scale / self.inflation
 
-    def _direction(self, size: float, vector: Array, words: str) -> Direction:
-        vector = vector * np.sign(vector[np.argmax(np.abs(vector))])
-        std = 1.0 / size if size > 0 else math.inf
-        components = {name: float(part) for name, part in zip(self.names, vector, strict=True)}
-        return Direction(size, std, components, verdict(1.0, std), words)
+    @property
+    def alone(self) -> Array:
+        """Size of the sensitivity to relative changes with everything else known, shape (p,)."""
+        return np.linalg.norm(self.split.alone * self.scale / self.inflation, axis=0)
 
-    def _components(self, vector: Array) -> list[Component]:
-        return [
-            Component(name, float(part), float(self.x[index]), self.problem.system.parameters[name.split("[")[0]].unit)
-            for name, part, index in zip(self.names, vector, self.chosen, strict=True)
-            if abs(part) > 0.05 * np.max(np.abs(vector))
+    def unit(self, name: str) -> str:
+        """Unit of a parameter, which may carry its recording's name."""
+        return self.problem.system.parameters[name.split("[")[0]].unit
+
+
+def _directions(view: _Sensitivities) -> tuple[Direction, ...]:
+    """Unseen parameters, plain unseen combinations, and what is seen; least seen first."""
+    relative, alone, count = view.relative, view.alone, len(view.names)
+    found: list[Direction] = []
+    hidden = [i for i in range(count) if alone[i] * WEAK < 1.0]
+    for i in hidden:
+        size = float(np.linalg.norm(relative[:, i]))
+        found.append(_direction(view, size, np.eye(count)[i], f"{view.names[i]} is not seen by any sensor"))
+    rest = [i for i in range(count) if i not in hidden]
+    if rest:
+        _, singular, vectors = np.linalg.svd(relative[:, rest], full_matrices=False)
+        wide = np.zeros((len(rest), count))
+        wide[: len(vectors), rest] = vectors
+        sizes = np.zeros(len(rest))
+        sizes[: len(singular)] = singular
+        blind = sizes * WEAK < 1.0
+        if np.any(blind):
+            for vector in sparse_basis(_completed(wide, rest, blind)):
+                size = float(np.linalg.norm(relative @ vector))
+                found.append(_direction(view, size, vector, _unseen_words(view, vector)))
+        found += [
+            _direction(view, float(size), vector, _seen_words(view, float(size), vector))
+            for size, vector in zip(sizes[~blind], wide[~blind], strict=True)
         ]
+    return tuple(sorted(found, key=lambda entry: entry.singular_value))
 
-    def _why(self, vector: Array) -> str:
-        parts = self._components(vector)
-        seen_alone = float(np.linalg.norm(self.split.alone @ (self.scale * vector)))
-        if seen_alone / self.inflation * WEAK >= 1.0:
-            what = parts[0].name if len(parts) == 1 else "this: " + combination_words(parts, None)
-            return f"{what} cannot be told apart from {self._culprit(vector)}"
-        return combination_words(parts, self._moved)
 
-    def _culprit(self, vector: Array) -> str:
-        """Which nuisances hide a direction."""
-        others = [name for i, name in enumerate(self.problem.names) if i not in set(self.chosen)]
-        column = (self.split.alone @ (self.scale * vector))[:, None] / self.inflation
-        groups = {"the unknown start": "start.", "where the grasp sits": GRASP_NUISANCE}
-        for words, prefix in groups.items():
-            at = [i for i, name in enumerate(others) if name.startswith(prefix)]
-            if at and np.linalg.norm(without(column, self.split.nuisance[:, at])) * WEAK < 1.0:
-                return words
-        return "the unknown start and where the grasp sits"
+def _direction(view: _Sensitivities, size: float, vector: Array, words: str) -> Direction:
+    vector = vector * np.sign(vector[np.argmax(np.abs(vector))])
+    std = 1.0 / size if size > 0 else math.inf
+    components = {name: float(part) for name, part in zip(view.names, vector, strict=True)}
+    return Direction(size, std, components, verdict(1.0, std), words)
 
-    def _moved(self, changes: Mapping[str, float]) -> float:
-        """How far the data move when parameters take other values, beyond what nuisances explain [deviations]."""
-        x = self.x.copy()
-        for name, value in changes.items():
-            x[self.problem.names.index(name)] = value
-        evaluation = self.problem.evaluate(x, False, self.evaluation.warm)
-        if not evaluation.ok:
-            return math.inf
-        rows = self.problem.rows.data
-        change = np.zeros((len(self.split.alone), 1))
-        change[rows, 0] = (evaluation.residual[rows] - self.evaluation.residual[rows]) / self.problem.noise
-        return float(np.linalg.norm(without(change, self.split.nuisance))) / self.inflation
 
-    def _strength(self, size: float, vector: Array) -> str:
-        parts = self._components(vector)
-        how = "is seen" if size * IDENTIFIABLE >= 1.0 else "is seen only weakly"
-        what = (
-            parts[0].name
-            if len(parts) == 1
-            else "a joint change of "
-            + listed_names([part.name for part in sorted(parts, key=lambda part: -abs(part.part))])
-        )
-        return f"{what} {how} (± {100 / size:.2g} %)"
+def _components(view: _Sensitivities, vector: Array) -> list[Component]:
+    """The parameters that make up a direction."""
+    return [
+        Component(name, float(part), float(view.x[index]), view.unit(name))
+        for name, part, index in zip(view.names, vector, view.chosen, strict=True)
+        if abs(part) > 0.05 * np.max(np.abs(vector))
+    ]
+
+
+def _unseen_words(view: _Sensitivities, vector: Array) -> str:
+    """Why a direction is not seen."""
+    parts = _components(view, vector)
+    seen_alone = float(np.linalg.norm(view.split.alone @ (view.scale * vector)))
+    if seen_alone / view.inflation * WEAK >= 1.0:
+        what = parts[0].name if len(parts) == 1 else "this: " + combination_words(parts, None)
+        return f"{what} cannot be told apart from {_hiding_nuisances(view, vector)}"
+    return combination_words(parts, lambda changes: _moved(view, changes))
+
+
+def _hiding_nuisances(view: _Sensitivities, vector: Array) -> str:
+    """Which nuisances hide a direction."""
+    others = [name for i, name in enumerate(view.problem.names) if i not in set(view.chosen)]
+    column = (view.split.alone @ (view.scale * vector))[:, None] / view.inflation
+    groups = {"the unknown start": "start.", "where the grasp sits": GRASP_NUISANCE}
+    for words, prefix in groups.items():
+        at = [i for i, name in enumerate(others) if name.startswith(prefix)]
+        if at and np.linalg.norm(without(column, view.split.nuisance[:, at])) * WEAK < 1.0:
+            return words
+    return "the unknown start and where the grasp sits"
+
+
+def _moved(view: _Sensitivities, changes: Mapping[str, float]) -> float:
+    """How far the data move when parameters take other values, beyond what nuisances explain [standard deviations]."""
+    problem, x = view.problem, view.x.copy()
+    for name, value in changes.items():
+        x[problem.names.index(name)] = value
+    evaluation = problem.evaluate(x, False, view.evaluation.warm)
+    if not evaluation.ok:
+        return math.inf
+    rows = problem.rows.data
+    change = np.zeros((len(view.split.alone), 1))
+    change[rows, 0] = (evaluation.residual[rows] - view.evaluation.residual[rows]) / problem.noise
+    return float(np.linalg.norm(without(change, view.split.nuisance))) / view.inflation
+
+
+def _seen_words(view: _Sensitivities, size: float, vector: Array) -> str:
+    """How well a direction is seen."""
+    parts = sorted(_components(view, vector), key=lambda part: -abs(part.part))
+    how = "is seen" if size * IDENTIFIABLE >= 1.0 else "is seen only weakly"
+    joint = "a joint change of " if len(parts) > 1 else ""
+    return f"{joint}{listed_names([part.name for part in parts])} {how} (± {100 / size:.2g} %)"
 
 
 def _completed(wide: Array, rest: Sequence[int], blind: NDArray[np.bool_]) -> Array:

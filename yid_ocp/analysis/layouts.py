@@ -89,7 +89,7 @@ class Setting:
         return dict(zip(self.problem.system.parameters.names, map(float, theta), strict=True))
 
     def camera(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
-        """The camera's group, the times of its frames since the start and its typical deviation [m]."""
+        """The camera's group, the times of its frames since the start and its typical standard deviation [m]."""
         for group in used_groups(self.problem, episode):
             if camera_pose(group) is not None:
                 std = self._std(group)
@@ -292,7 +292,7 @@ class LayoutBuilder:
             found.append("second_arm")
         if system.driven:
             found += ["motion", "travel"]
-        measured = any("joints.effort" in s.sensor.group for e in setting.problem.episodes for s in e.samples)
+        measured = any(s.sensor.efforts for e in setting.problem.episodes for s in e.samples)
         if (system.driven or system.prescribed) and not measured and setting.problem.episodes[0].recording.joints:
             found.append("torque")
         return found
@@ -343,7 +343,7 @@ class LayoutBuilder:
                     fixed += block.T @ block
         names = tuple(name for name in problem.names if name.split("[")[0] in base.free)
         stated = evaluation.jacobian[problem.rows.stated_priors].copy()
-        # what is presumed of the parameters themselves stays out: what is asked is what sensors say
+        # what is assumed of the parameters themselves stays out: what is asked is what sensors say
         stated[:, [problem.names.index(name) for name in names]] = 0.0
         return Layout(problem, x, names, slopes, fixed + stated.T @ stated, tuple(notes))
 
@@ -429,7 +429,7 @@ class LayoutBuilder:
         return Recording(joints, source="what if", name=episode.name), notes
 
     def _dense(self, recording: Recording, index: int, seen: Sequence[Sight], torque: bool) -> Recording:
-        """The recording with every sight in view at every node, at unit deviation, and efforts to be predicted."""
+        """The recording with every sight in view at every node, of unit standard deviation, and efforts to predict."""
         setting = self.setting
         base = setting.problem
         episode = base.episodes[index % len(base.episodes)]

@@ -19,7 +19,7 @@ LEVEL = 3.841458820694124
 """Quantile 0.95 of chi2 with one degree of freedom."""
 
 REACH = math.log(1e3)  # how far a positive unknown is followed, up and down, before its interval counts as open
-ANCHOR = math.log(1e3)  # other positive unknowns stay put that nothing informs: one deviation for a factor of 1000
+ANCHOR = math.log(1e3)  # standard deviation that keeps other positive unknowns in place that nothing informs
 REFIT_TOLERANCE = 1e-3  # chi2 that a refit may leave on the table
 ROOT_TOLERANCE = 0.01  # of the root of delta chi2 against its level's
 REFITS, ATTEMPTS = 30, 12

@@ -32,7 +32,7 @@ from yid_ocp.solvers.base import WEAK, Solution, verdict
 Array = NDArray[np.float64]
 
 FASTER = (10.0, 30.0)  # rates of the camera to try [Hz]
-FLOOR = 1e-16  # of eigenvalues of the information on relative changes: deviations up to 1e8
+FLOOR = 1e-16  # of eigenvalues of the information on relative changes: standard deviations up to 1e8
 LARGEST_SET = 3
 
 
@@ -122,6 +122,28 @@ class WhatIf:
     searched: int
 
 
+@dataclass(frozen=True)
+class WhatIfOptions:
+    """How changes are searched.
+
+    Attributes
+    ----------
+    torque_std : float
+        Noise of joint torques as a measurement, where the recordings state none [N m].
+    seed : int
+        Of another motion.
+    largest : int
+        Largest set of changes to search for one that makes all parameters identifiable.
+    only : tuple of str, optional
+        Names of changes to consider, all when absent.
+    """
+
+    torque_std: float = TORQUE_STD
+    seed: int = 11
+    largest: int = LARGEST_SET
+    only: tuple[str, ...] | None = None
+
+
 def what_if(
     problem: EstimationProblem,
     solution: Solution | ArrayLike | None = None,
@@ -129,10 +151,7 @@ def what_if(
     start: StartKnowledge = "unknown",
     grasp_std: float | None = GRASP_STD,
     second_arm: System | None = None,
-    torque_std: float = TORQUE_STD,
-    seed: int = 11,
-    largest: int = LARGEST_SET,
-    only: Iterable[str] | None = None,
+    options: WhatIfOptions | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> WhatIf:
     """Rank changes of an experiment by how many parameters they would make identifiable.
@@ -150,14 +169,7 @@ def what_if(
         Nuisances, as in `identifiability`.
     second_arm : System, optional
         The system with one more arm and its grasp; without it that change is not tried.
-    torque_std : float
-        Noise of joint torques as a measurement, where the recordings state none [N m].
-    seed : int
-        Of another motion.
-    largest : int
-        Largest set of changes to search for one that makes all parameters identifiable.
-    only : iterable of str, optional
-        Names of changes to consider, all when absent.
+    options : WhatIfOptions, optional
     progress : callable, optional
         Told what takes time.
 
@@ -172,31 +184,31 @@ def what_if(
     ConfigError, DataError
         As `identifiability`.
     """
+    options = options or WhatIfOptions()
     x = unknown_vector(problem, solution)
     fit = None if solution is None else identifiability(problem, x, start=start, grasp_std=grasp_std)
     inflation = 1.0 if fit is None else max(1.0, fit.chi2_per_dof)
-    setting = Setting(problem, x, start, grasp_std, second_arm, torque_std, seed)
-    judge = _Judge(setting, LayoutBuilder(setting, progress), inflation)
-    base = judge(())
+    setting = Setting(problem, x, start, grasp_std, second_arm, options.torque_std, options.seed)
+    outcomes = _Outcomes(setting, LayoutBuilder(setting, progress), inflation)
+    base = outcomes.of(())
     if not base.verdicts:
         raise SolverError(base.message)
-    wanted = None if only is None else set(only)
-    known = possible_changes(setting, judge.builder)
-    changes = [change for change in known if wanted is None or change.name in wanted]
-    singles = ranked([judge((change,)) for change in changes])
-    greedy = _greedy(judge, changes, base, largest)
-    smallest: list[Outcome] = []
+    known = possible_changes(setting, outcomes.builder)
+    changes = [change for change in known if options.only is None or change.name in options.only]
+    singles = ranked([outcomes.of((change,)) for change in changes])
+    greedy = _greedy(outcomes, changes, base, options.largest)
+    smallest = _smallest(outcomes, changes, base, options.largest)
+    return WhatIf(base, tuple(singles), tuple(ranked(smallest)), tuple(greedy), outcomes.count)
+
+
+def _smallest(outcomes: _Outcomes, changes: Sequence[Change], base: Outcome, largest: int) -> list[Outcome]:
+    """All sets of as few changes as will do with which every parameter is identifiable."""
     for size in range(0 if base.complete else 1, largest + 1):
-        smallest = [
-            outcome
-            for chosen in itertools.combinations(changes, size)
-            if compatible(chosen)
-            for outcome in [judge(chosen)]
-            if outcome.complete
-        ]
-        if smallest or not changes:
-            break
-    return WhatIf(base, tuple(singles), tuple(ranked(smallest)), tuple(greedy), judge.count)
+        found = [outcomes.of(chosen) for chosen in itertools.combinations(changes, size) if compatible(chosen)]
+        complete = [outcome for outcome in found if outcome.complete]
+        if complete or not changes:
+            return complete
+    return []
 
 
 def possible_changes(setting: Setting, builder: LayoutBuilder) -> list[Change]:
@@ -231,33 +243,41 @@ def ranked(outcomes: Iterable[Outcome]) -> list[Outcome]:
     return sorted(outcomes, key=lambda entry: (not entry.verdicts, -entry.identifiable, -entry.gain))
 
 
-@dataclass
-class _Judge:
-    """Judges sets of changes, each once."""
+class _Outcomes:
+    """What sets of changes would tell, each worked out once.
 
-    setting: Setting
-    builder: LayoutBuilder
-    inflation: float
-    count: int = 0
+    Attributes
+    ----------
+    setting : Setting
+    builder : LayoutBuilder
+    inflation : float
+        Factor by which variances are larger than stated.
+    """
 
-    def __post_init__(self) -> None:
+    def __init__(self, setting: Setting, builder: LayoutBuilder, inflation: float) -> None:
+        self.setting, self.builder, self.inflation = setting, builder, inflation
         self._known: dict[frozenset[str], Outcome] = {}
 
-    def __call__(self, changes: Sequence[Change]) -> Outcome:
+    @property
+    def count(self) -> int:
+        """Sets worked out so far."""
+        return len(self._known)
+
+    def of(self, changes: Sequence[Change]) -> Outcome:
+        """The outcome of some changes together."""
         key = frozenset(change.name for change in changes)
         if key not in self._known:
-            self._known[key] = self._judged(changes)
-            self.count += 1
+            self._known[key] = self._outcome(changes)
         return self._known[key]
 
-    def _judged(self, changes: Sequence[Change]) -> Outcome:
+    def _outcome(self, changes: Sequence[Change]) -> Outcome:
         names = tuple(change.name for change in changes)
         words = "; ".join(change.words for change in changes) if changes else "as it is"
         layout = self.builder.layout(frozenset(change.mechanics for change in changes if change.mechanics))
         if isinstance(layout, str):
             return Outcome(names, words, {}, {}, 0, -math.inf, layout)
         views = [self._views(episode, changes, layout) for episode in self.setting.problem.episodes]
-        std, gain = judged(layout, layout.information(views) / self.inflation)
+        std, gain = precision(layout, layout.information(views) / self.inflation)
         verdicts = {name: verdict(1.0, value) for name, value in std.items()}
         count = sum(said == "identifiable" for said in verdicts.values())
         return Outcome(names, words, std, verdicts, count, gain, "; ".join(layout.notes))
@@ -288,8 +308,8 @@ class _Judge:
         return views
 
 
-def judged(layout: Layout, information: Array) -> tuple[dict[str, float], float]:
-    """Relative deviation of every free parameter, and the gain, from a Fisher information of all unknowns.
+def precision(layout: Layout, information: Array) -> tuple[dict[str, float], float]:
+    """Relative standard deviation of every free parameter, and the gain, from a Fisher information of all unknowns.
 
     Parameters
     ----------
@@ -307,12 +327,13 @@ def judged(layout: Layout, information: Array) -> tuple[dict[str, float], float]
         own = own - cross @ np.linalg.lstsq(scaled[np.ix_(others, others)], cross.T, rcond=None)[0]
     values, vectors = np.linalg.eigh(0.5 * (own + own.T))
     values = np.maximum(values, FLOOR)
-    deviation = np.sqrt(np.sum(vectors**2 / values, axis=1))
+    std = np.sqrt(np.sum(vectors**2 / values, axis=1))
     gain = 0.5 * float(np.sum(np.log1p(WEAK**2 * values)))
-    return dict(zip(layout.names, map(float, deviation), strict=True)), gain
+    return dict(zip(layout.names, map(float, std), strict=True)), gain
 
 
-def _greedy(judge: _Judge, changes: Sequence[Change], base: Outcome, largest: int) -> list[Outcome]:
+def _greedy(outcomes: _Outcomes, changes: Sequence[Change], base: Outcome, largest: int) -> list[Outcome]:
+    """Best single change added one after the other."""
     chosen: tuple[Change, ...] = ()
     steps: list[Outcome] = []
     best = base
@@ -320,10 +341,10 @@ def _greedy(judge: _Judge, changes: Sequence[Change], base: Outcome, largest: in
         trials = [(*chosen, change) for change in changes if change not in chosen and compatible((*chosen, change))]
         if not trials:
             break
-        outcomes = [judge(trial) for trial in trials]
-        top = ranked(outcomes)[0]
+        found = [outcomes.of(trial) for trial in trials]
+        top = ranked(found)[0]
         if (top.identifiable, top.gain) <= (best.identifiable, best.gain):
             break
-        chosen, best = trials[outcomes.index(top)], top
+        chosen, best = trials[found.index(top)], top
         steps.append(top)
     return steps

@@ -2,29 +2,23 @@
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from yid_ocp.data.recording import Recording
 from yid_ocp.effects import EFFECTS, EffectBase, candidates, make_effect
 from yid_ocp.errors import ConfigError, DataError
-from yid_ocp.integrator.codegen import Mapped
-from yid_ocp.integrator.statics import Rest, Statics
-from yid_ocp.integrator.step import Step, compile_step
+from yid_ocp.integrator.step import compile_step
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.corrections import InputCorrections
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.inputs import sensors_present
 from yid_ocp.problem.low_pass import LowPass
 from yid_ocp.problem.measurements import Measurements
-from yid_ocp.problem.start import FittedStart
-from yid_ocp.sensors import EffortSensor, Sensor
 
 Array = NDArray[np.float64]
 Choice = Literal["all"] | Sequence[str]
@@ -112,82 +106,26 @@ def chosen_effects(system: System, recordings: Sequence[Recording], choice: Choi
     return [make_effect(kind, place, system) for kind, place in pairs]
 
 
-class _SlicedMap(Mapped):
-    """A sensor's compiled function with the derivatives by some of its parameters only."""
-
-    def __init__(self, full: Mapped, columns: Sequence[int]) -> None:
-        self._full, self._chosen = full, list(columns)
-
-    def __call__(self, *inputs: Array) -> list[Array]:
-        *rest, by_theta = self._full(*inputs)
-        return [*rest, by_theta[:, :, self._chosen]]
-
-
-class _SlicedStatics(Statics):
-    def __init__(self, step: Step, names: tuple[str, ...]) -> None:
-        super().__init__(step)
-        self._names = names
-
-    def solve(
-        self,
-        posture: ArrayLike,
-        theta: ArrayLike,
-        torque: ArrayLike | None = None,
-        guess: ArrayLike | None = None,
-        names: Sequence[str] = (),
-        tolerance: float = 1e-10,
-    ) -> Rest:
-        if not names:
-            return super().solve(posture, theta, torque, guess, (), tolerance)
-        rest = super().solve(posture, theta, torque, guess, self._names, tolerance)
-        return replace(rest, by_theta=rest.by_theta[:, [self._names.index(name) for name in names]])
-
-
-class _SlicedReadings(InputCorrections):
-    def __init__(self, system: System, use_compiler: bool, names: tuple[str, ...]) -> None:
-        super().__init__(system, use_compiler)
-        self._names = names
-
-    def true(
-        self, angle: Array, effort: Array, theta: Array, names: tuple[str, ...]
-    ) -> tuple[Array, Array, Array, Array, Array]:
-        if not names:
-            return super().true(angle, effort, theta, names)
-        at = [self._names.index(name) for name in names]
-        a, e, a_theta, e_theta, e_reading = super().true(angle, effort, theta, self._names)
-        return a, e, a_theta[:, :, at], e_theta[:, :, at], e_reading
-
-    def _chosen_columns(self, found: tuple[Array, Array], names: tuple[str, ...]) -> tuple[Array, Array]:
-        return found[0], found[1][:, [self._names.index(name) for name in names]]
-
-    def torque_delay(self, theta: Array, names: tuple[str, ...]) -> tuple[Array, Array]:
-        return self._chosen_columns(super().torque_delay(theta, self._names), names)
-
-    def sensor_delay(self, sensor: Sensor, theta: Array, names: tuple[str, ...]) -> tuple[Array, Array] | None:
-        found = super().sensor_delay(sensor, theta, self._names)
-        return None if found is None else self._chosen_columns(found, names)
-
-
-class CandidateProblem(EstimationProblem):
+@dataclass(frozen=True)
+class CandidateProblem:
     """The estimation problem of a system with all candidates, of which any part can be freed at no cost.
 
-    Sensors, statics and readings are differentiated by everything once and sliced, recordings are placed on the nodes
-    once, and the tracking filter is that of the nominal start, the same for every hypothesis.
+    Sensors, statics and corrections are differentiated by everything once, recordings are placed on the nodes once, and
+    the tracking filter is that of the nominal start, the same for every hypothesis.
 
     Attributes
     ----------
+    problem : EstimationProblem
+        Of the system with all candidates at their neutral values; frees the nominal parameters.
     effects : tuple of EffectBase
-        All candidates, neutral.
-    nominal : tuple of str
-        Parameters that the nominal problem frees.
+        All candidates.
     blocks : bool
         Whether a single recording is both estimated on and held out, in alternate blocks.
     """
 
+    problem: EstimationProblem
     effects: tuple[EffectBase, ...]
-    nominal: tuple[str, ...]
     blocks: bool
-    _everything: tuple[str, ...]
 
     @staticmethod
     def of(
@@ -201,79 +139,28 @@ class CandidateProblem(EstimationProblem):
             A recording is both estimated on and held out.
         """
         step = problem.step
-        system = step.system.with_effects(effects)
-        joint = compile_step(system, step.time_step, step.force_split, use_compiler=step.compiled)
+        joint = compile_step(
+            step.system.with_effects(effects), step.time_step, step.force_split, use_compiler=step.compiled
+        )
         estimate = [episode.recording for episode in problem.episodes]
         held = [*held_out] if held_out else [episode.recording for episode in problem.held_out]
         _check_apart(estimate, held)
         values = dict(zip(problem.system.parameters.names, map(float, problem.theta), strict=True))
-        made = CandidateProblem(joint, estimate, problem.free, problem.options, values, held)
-        made.effects, made.nominal, made.blocks = tuple(effects), tuple(problem.free), not held
-        everything = (*problem.free, *(name for effect in effects for name in effect.parameters.names))
-        made._everything = everything
-        made.readings = _SlicedReadings(system, joint.compiled, everything)
-        made._statics = _SlicedStatics(joint, everything)
-        if joint.system.driven and problem.options.feedback == "lqr":
-            _ = made._momentum_shift  # built once, before copies are made
+        extra = [name for effect in effects for name in effect.parameters.names]
+        made = EstimationProblem(joint, estimate, problem.free, problem.options, values, held, extra)
         if not held:
-            made.held_out = tuple(_masked(episode, 1) for episode in made.episodes)
-            made.episodes = tuple(_masked(episode, 0) for episode in made.episodes)
-        return made
+            others = [replace(_masked(e, 1), shares_start_of=i) for i, e in enumerate(made.episodes)]
+            made = made.on([_masked(episode, 0) for episode in made.episodes], others)
+        return CandidateProblem(made, tuple(effects), not held)
 
-    def held_out_start(self, i: int, theta: Array, x: Array) -> Array:
-        """See `EstimationProblem.held_out_start`; where one recording is split in blocks, both have one start."""
-        return self.split(x, i)[1] if self.blocks else super().held_out_start(i, theta, x)
+    @property
+    def nominal(self) -> tuple[str, ...]:
+        """Parameters that the nominal problem frees."""
+        return self.problem.free
 
-    def fitted_start(self, episode: Episode, theta: Array) -> FittedStart:
-        """See `EstimationProblem.fitted_start`."""
-        twins = {id(held): own for held, own in zip(self.held_out, self.episodes, strict=True)} if self.blocks else {}
-        return super().fitted_start(twins.get(id(episode), episode), theta)
-
-    def sensor(self, sensor: Sensor, wanted: tuple[str, ...]) -> Mapped:
-        """See `EstimationProblem.sensor`."""
-        if not wanted:
-            return super().sensor(sensor, wanted)
-        full = super().sensor(sensor, self._everything)
-        return _SlicedMap(full, [self._everything.index(name) for name in wanted])
-
-    def freeing(self, effects: Sequence[EffectBase], names: Sequence[str] | None = None) -> CandidateProblem:
-        """The problem with the parameters of some effects free beside the nominal ones.
-
-        Parameters
-        ----------
-        effects : sequence of EffectBase
-        names : sequence of str, optional
-            Those of their parameters to free; all where absent.
-        """
-        extra = tuple(name for effect in effects for name in effect.parameters.names) if names is None else tuple(names)
-        made = copy.copy(self)
-        made.free = (*self.nominal, *extra)
-        made.shared = tuple(name for name in made.free if name not in self.options.local)
-        made._columns = (*made.shared, *made.local)
-        made._starts = {}
-        for cached in ("_prior_deviations", "_tied"):
-            made.__dict__.pop(cached, None)
-        return made
-
-    def at(self, values: Mapping[str, float]) -> CandidateProblem:
-        """The problem with other values of parameters that are not free."""
-        made = copy.copy(self)
-        made.theta = self.theta.copy()
-        made._starts = {}
-        for name, value in values.items():
-            made.theta[self.system.parameters.index(name)] = value
-        return made
-
-    def unknowns(self, values: Mapping[str, float]) -> Array:
-        """Unknown vector with named entries replaced, clipped to the bounds."""
-        x = self.start
-        for i, name in enumerate(self.names):
-            x[i] = values.get(name, x[i])
-        return np.clip(x, *self.bounds)
-
-    def named(self, x: Array) -> dict[str, float]:
-        """An unknown vector as a mapping."""
-        return dict(zip(self.names, map(float, x), strict=True))
+    def freeing(self, effects: Sequence[EffectBase]) -> EstimationProblem:
+        """The problem with the parameters of some effects free beside the nominal ones."""
+        return self.problem.freeing((*self.nominal, *(name for effect in effects for name in effect.parameters.names)))
 
 
 def _check_apart(estimate: Sequence[Recording], held: Sequence[Recording]) -> None:
@@ -318,17 +205,14 @@ def sample_times(episode: Episode, samples: Measurements) -> Array:
 def residual_series(problem: EstimationProblem) -> tuple[Series, ...]:
     """How the residual of a problem is made up, output by output."""
     series: list[Series] = []
-    at = 0
-    for episode in problem.episodes:
-        for samples in episode.samples:
+    for episode, groups in zip(problem.episodes, problem.rows.measurements, strict=True):
+        for samples, rows in zip(episode.samples, groups, strict=True):
             t = sample_times(episode, samples)
-            keep = samples.weight > 0
-            place = np.full(keep.shape, -1)
-            place[keep] = at + np.arange(int(keep.sum()))
-            at += int(keep.sum())
+            place = np.full(samples.seen.shape, -1)
+            place[samples.seen] = np.arange(rows.start, rows.stop)
             colour = noise_colour(problem, episode, samples)
             for column, channel in enumerate(samples.channel_of_column):
-                seen = keep[:, column]
+                seen = samples.seen[:, column]
                 if seen.any():
                     text = (episode.name, channel, samples.sensor.group, samples.sensor.unit)
                     series.append(Series(*text, t[seen], place[seen, column], colour))
@@ -337,7 +221,7 @@ def residual_series(problem: EstimationProblem) -> tuple[Series, ...]:
 
 def noise_colour(problem: EstimationProblem, episode: Episode, samples: Measurements) -> Array:
     """Autocorrelation of a sensor's noise at lags 0, 1, ... samples: white, but for efforts, which are smoothed."""
-    if not isinstance(samples.sensor, EffortSensor):
+    if not samples.sensor.efforts:
         return np.ones(1)
     stride = LowPass(problem.options.path_cutoff).stride(episode.grid.time_step)
     return smoothed_colour(problem.options.path_cutoff, episode.grid.time_step)[::stride]

@@ -196,7 +196,7 @@ def _encoder(
 
 def predictions(finding: Finding) -> list[Prediction]:
     """Held-out recordings that can be predicted both before and after."""
-    before, after = (fit.problem.validate(fit.problem.unknowns(fit.values)) for fit in (finding.nominal, finding.last))
+    before, after = (fit.problem.validate(fit.problem.vector(fit.values)) for fit in (finding.nominal, finding.last))
     return [
         (episode, first, last)
         for (episode, first), (_, last) in zip(before, after, strict=True)
