@@ -15,7 +15,7 @@ from pathlib import Path
 from make_recordings import TRAVEL, TRUTH, compress
 
 import yid_ocp
-from yid_ocp.data.recording import write_recording
+from yid_ocp.data.hdf5 import write_recording
 from yid_ocp.model import Grasp, System, flexible_object
 from yid_ocp.model.system import placement_matrix
 from yid_ocp.model.urdf import read_urdf

@@ -13,7 +13,8 @@ from pathlib import Path
 import h5py
 
 import yid_ocp
-from yid_ocp.data.recording import new_file, write_recording
+from yid_ocp.data.hdf5 import write_recording
+from yid_ocp.data.recording import new_file
 from yid_ocp.virtual.experiment import Motion, initial_posture, paper_system, virtual_experiment
 
 TRUTH = {

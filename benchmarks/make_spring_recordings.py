@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.data.recording import JointGroup, PointGroup, Recording, write_recording
+from yid_ocp.data.hdf5 import write_recording
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 
 Array = NDArray[np.float64]
 GRAVITY = 9.81

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import yid_ocp
-from yid_ocp.data.recording import read_recording
+from yid_ocp.data.hdf5 import read_recording
 from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.model.flexible import Segment, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body

@@ -10,7 +10,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from yid_ocp.data.recording import JointGroup, Recording, read_recording
+from yid_ocp.data.hdf5 import read_recording
+from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.errors import DataError
 from yid_ocp.vision import DepthCamera, FrameTiming, TrackOptions, look_at, read_frames, track, virtual_frames
 from yid_ocp.vision.fit import ShapeFit

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from yid_ocp.data.recording import JointGroup, Recording, write_recording
+from yid_ocp.data.hdf5 import write_recording
+from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.virtual.experiment import Motion, initial_posture, paper_system, simulate_in_mujoco
 from yid_ocp.vision import FilterOptions, FrameSequence, FrameTiming, look_at, virtual_frames, write_frames
 from yid_ocp.vision.filters import ObjectRegion, voxel_grid, without_outliers, without_robot

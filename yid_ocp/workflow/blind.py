@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from yid_ocp.config.settings import Run, dump_config
-from yid_ocp.data.recording import new_file, read_recording, write_recording
+from yid_ocp.data.hdf5 import read_recording, write_recording
+from yid_ocp.data.recording import new_file
 from yid_ocp.diagnosis import Thresholds
 from yid_ocp.diagnosis.blind import Case, Ensemble, Label, answer, best_closure, mark, opened, score, seal
 from yid_ocp.errors import OutputError, YidError

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.config.settings import Run, dump_config
-from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate, write_recording
+from yid_ocp.data.hdf5 import write_recording
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.problem import Episode, EpisodeResult
 from yid_ocp.sensors import PointSensor

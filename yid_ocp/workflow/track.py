@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.config.settings import Run, VirtualFramesSettings, dump_config
-from yid_ocp.data.recording import Recording, file_sha256, read_recording, write_recording
+from yid_ocp.data.hdf5 import read_recording, write_recording
+from yid_ocp.data.recording import Recording, file_sha256
 from yid_ocp.errors import ConfigError
 from yid_ocp.model.system import System
 from yid_ocp.vision.camera import DepthCamera, FrameTiming, VirtualFrames, virtual_frames
