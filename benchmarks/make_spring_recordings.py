@@ -28,7 +28,7 @@ ARM_MASS, ARM_LEVER, POINTER, MARKER = 0.3, 0.2, 0.3, 0.05  # [kg], [m]
 
 
 def course(t: Array) -> Array:
-    """Slow rollout of the motor from -1 to 1 rad that starts and ends at rest."""
+    """Slow turn of the motor from -1 to 1 rad that starts and ends at rest."""
     return np.asarray(-np.cos(np.pi * t / DURATION))
 
 

@@ -96,12 +96,16 @@ def run_simulate(
 
 
 def _virtual(run: Run, watcher: Monitor, seed: int) -> Recording:
-    from yid_ocp.virtual.experiment import virtual_experiment
+    from yid_ocp.virtual.engine import Simulation
+    from yid_ocp.virtual.experiment import VirtualExperiment, virtual_experiment
 
     system = build_system(run)
     watcher.stage("simulating a virtual experiment in MuJoCo")
     duration = run.solver.duration or DURATION
-    return virtual_experiment(system, None, duration=duration, seed=seed, name=run.name, description=run.description)
+    experiment = VirtualExperiment(
+        simulation=Simulation(duration), seed=seed, name=run.name, description=run.description
+    )
+    return virtual_experiment(system, None, experiment)
 
 
 def _predicted(run: Run, watcher: Monitor, seed: int | None) -> Recording | str:
