@@ -26,7 +26,8 @@ from rich.table import Table
 
 import yid_ocp as yid
 from yid_ocp.data.edges import edge_lengths
-from yid_ocp.data.recording import Recording, read_recording
+from yid_ocp.data.hdf5 import read_recording
+from yid_ocp.data.recording import Recording
 from yid_ocp.model.cable import (
     BranchOptions,
     Cable,

@@ -31,8 +31,10 @@ from yid_ocp.diagnosis.hypotheses import CandidateProblem, chosen_effects
 from yid_ocp.diagnosis.refit import refit
 from yid_ocp.parallel import Task, process_pool, run_tasks
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.virtual.experiment import Motion, initial_posture
+from yid_ocp.virtual.experiment import VirtualExperiment
 from yid_ocp.virtual.injected import InjectedEffect, injected_experiment
+from yid_ocp.virtual.motion import Excitation, multisine
+from yid_ocp.virtual.posture import initial_posture
 from yid_ocp.workflow.build import build_problem, build_system
 
 NOISE_SEEDS = (401, 402)
@@ -100,10 +102,9 @@ def record(case: Case, motion_seed: int, noise_seed: int) -> Recording:
     system = nominal if case.links == 1 else build_system(run, links)
     values = TRUTH if case.links == 1 else finer_values(nominal, system, TRUTH)
     posture = initial_posture(nominal, TRUTH)
-    motion = Motion.multisine(nominal, TRUTH, seed=motion_seed, posture=posture, travel=TRAVEL[1])
-    return injected_experiment(
-        system, values, case.withheld, motion=motion, seed=noise_seed, posture=posture, name=f"motion_{motion_seed}"
-    )
+    motion = multisine(nominal, TRUTH, seed=motion_seed, posture=posture, excitation=Excitation(travel=TRAVEL[1]))
+    experiment = VirtualExperiment(motion=motion, posture=posture, seed=noise_seed, name=f"motion_{motion_seed}")
+    return injected_experiment(system, values, case.withheld, experiment)
 
 
 def found(name: str, seeds: Sequence[int]) -> tuple[Finding, float, float]:

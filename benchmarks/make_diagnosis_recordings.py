@@ -15,12 +15,15 @@ from pathlib import Path
 from make_recordings import TRAVEL, TRUTH, compress
 
 import yid_ocp
-from yid_ocp.data.recording import write_recording
+from yid_ocp.data.hdf5 import write_recording
 from yid_ocp.model import Grasp, System, flexible_object
 from yid_ocp.model.system import placement_matrix
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.model.y_object import y_segments
-from yid_ocp.virtual.experiment import BAXTER_JOINTS, Motion, initial_posture, virtual_experiment
+from yid_ocp.virtual.engine import Simulation
+from yid_ocp.virtual.experiment import VirtualExperiment, virtual_experiment
+from yid_ocp.virtual.motion import Excitation, multisine
+from yid_ocp.virtual.posture import BAXTER_JOINTS, initial_posture
 
 TAU = 0.05
 NOMINAL_DAMPING = 0.05
@@ -57,19 +60,18 @@ def make(folder: Path) -> None:
     values = damped(SEGMENT, TAU)
     posture = initial_posture(system, TRUTH)
     for purpose, seed in MOTION_SEEDS.items():
-        motion = Motion.multisine(system, TRUTH, seed=seed, posture=posture, travel=TRAVEL[1])
+        excitation = Excitation(travel=TRAVEL[1])
+        motion = multisine(system, TRUTH, seed=seed, posture=posture, excitation=excitation)
         name = f"diagnosis_{purpose}"
-        recording = virtual_experiment(
-            system,
-            values,
+        described = VirtualExperiment(
             motion=motion,
-            seed=NOISE_SEEDS[purpose],
-            vision=True,
-            time_step=INNER_STEP,
             posture=posture,
+            simulation=Simulation(time_step=INNER_STEP),
+            seed=NOISE_SEEDS[purpose],
             name=name,
             description=f"Baxter moves a foam Y whose trunk damps more than the model says (motion seed {seed}).",
         )
+        recording = virtual_experiment(system, values, described)
         path = folder / f"{name}.h5"
         write_recording(recording, path)
         compress(path)

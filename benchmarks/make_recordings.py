@@ -13,9 +13,12 @@ from pathlib import Path
 import h5py
 
 import yid_ocp
-from yid_ocp.data.recording import write_recording
+from yid_ocp.data.hdf5 import write_recording
 from yid_ocp.files import new_file
-from yid_ocp.virtual.experiment import Motion, initial_posture, paper_system, virtual_experiment
+from yid_ocp.virtual.engine import Simulation
+from yid_ocp.virtual.experiment import PointCamera, VirtualExperiment, paper_system, virtual_experiment
+from yid_ocp.virtual.motion import Excitation, multisine
+from yid_ocp.virtual.posture import initial_posture
 
 TRUTH = {
     "T1.bend": 22.0,
@@ -58,20 +61,20 @@ def make(folder: Path) -> None:
         posture = initial_posture(system, TRUTH, offsets=OFFSETS[arms])
         for purpose in ("estimate", "held_out"):
             seed = MOTION_SEEDS[arms, purpose]
-            motion = Motion.multisine(system, TRUTH, seed=seed, posture=posture, travel=TRAVEL[arms])
+            excitation = Excitation(travel=TRAVEL[arms])
+            motion = multisine(system, TRUTH, seed=seed, posture=posture, excitation=excitation)
             for vision in (False, True):
                 name = f"{word}_arm_{'vision' if vision else 'no_vision'}_{purpose}"
-                recording = virtual_experiment(
-                    system,
-                    TRUTH,
+                experiment = VirtualExperiment(
                     motion=motion,
-                    seed=NOISE_SEEDS[arms, purpose],
-                    vision=vision,
-                    time_step=INNER_STEP,
                     posture=posture,
+                    simulation=Simulation(time_step=INNER_STEP),
+                    camera=PointCamera() if vision else None,
+                    seed=NOISE_SEEDS[arms, purpose],
                     name=name,
                     description=f"Baxter moves the foam Y with {hands} (motion seed {seed}).",
                 )
+                recording = virtual_experiment(system, TRUTH, experiment)
                 path = folder / f"{name}.h5"
                 write_recording(recording, path)
                 compress(path)

@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.data.recording import JointGroup, PointGroup, Recording, write_recording
+from yid_ocp.data.hdf5 import write_recording
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 
 Array = NDArray[np.float64]
 GRAVITY = 9.81
@@ -27,7 +28,7 @@ ARM_MASS, ARM_LEVER, POINTER, MARKER = 0.3, 0.2, 0.3, 0.05  # [kg], [m]
 
 
 def course(t: Array) -> Array:
-    """Slow rollout of the motor from -1 to 1 rad that starts and ends at rest."""
+    """Slow turn of the motor from -1 to 1 rad that starts and ends at rest."""
     return np.asarray(-np.cos(np.pi * t / DURATION))
 
 

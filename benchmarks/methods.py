@@ -16,7 +16,7 @@ from workloads import STIFFNESSES, TIME_STEP
 
 import yid_ocp
 from yid_ocp.analysis.compare import compare
-from yid_ocp.data.recording import read_recording
+from yid_ocp.data.hdf5 import read_recording
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import GaussNewton, Lifted, MultipleShooting, SingleShooting, SteepestDescent

@@ -18,7 +18,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 import yid_ocp
-from yid_ocp.data.recording import Recording, read_recording
+from yid_ocp.data.hdf5 import read_recording
+from yid_ocp.data.recording import Recording
 from yid_ocp.integrator.discrete import ForceSplit
 from yid_ocp.integrator.lqr import lqr_filter
 from yid_ocp.integrator.statics import Statics

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Rows = Callable[[Array], tuple[Array, Array]]
+Project = Callable[[Array], Array]
+
+_FIRST_DAMPING, _MOST_DAMPING = 1e-3, 1e8
 
 
 @dataclass(frozen=True)
@@ -33,11 +37,43 @@ class SmallFit:
     converged: bool
 
 
+@dataclass(frozen=True)
+class Quadratic:
+    """A cost about a point, for costs that are no plain sum of squares or come with many rows.
+
+    Attributes
+    ----------
+    cost : float
+    gradient : ndarray, shape (n,)
+    hessian : ndarray, shape (n, n)
+        Positive definite, that of Gauss and Newton for example.
+    """
+
+    cost: float
+    gradient: Array
+    hessian: Array
+
+    def change(self, damping: float) -> Array:
+        """The damped step, shape (n,)."""
+        damped = self.hessian + damping * np.diag(np.diag(self.hessian))
+        return np.asarray(-np.linalg.solve(damped, self.gradient))
+
+
+@dataclass(frozen=True)
+class QuadraticFit:
+    """Where a fit of quadratic models ended: `x` (n,), the model there, iterations, whether it converged."""
+
+    x: Array
+    model: Quadratic
+    iterations: int
+    converged: bool
+
+
 def levenberg_marquardt(
     rows: Rows,
     start: Array,
     *,
-    project: Callable[[Array], Array] | None = None,
+    project: Project | None = None,
     largest_step: float = 0.5,
     iterations: int = 200,
     step_tolerance: float = 1e-9,
@@ -62,26 +98,93 @@ def levenberg_marquardt(
     ----------
     Nocedal and Wright (2006), Numerical Optimization, section 10.3, doi:10.1007/978-0-387-40065-5.
     """
+    limits = _Limits(largest_step, iterations, step_tolerance, cost_tolerance, 1e-12)
+    x, model, used, converged = _descend(lambda x: _SumOfSquares(*rows(x)), start, project, limits)
+    return SmallFit(x, model.cost, model.jacobian, used, converged)
+
+
+def damped_newton(
+    quadratic: Callable[[Array], Quadratic],
+    start: Array,
+    *,
+    largest_step: float = 0.5,
+    iterations: int = 200,
+    step_tolerance: float = 1e-9,
+    cost_tolerance: float = 1e-10,
+    least_damping: float = 1e-9,
+) -> QuadraticFit:
+    """Minimise a cost by the same loop as `levenberg_marquardt`, from quadratic models in place of rows.
+
+    Parameters
+    ----------
+    quadratic : callable
+        From x to the cost about it.
+    start : ndarray, shape (n,)
+    largest_step, iterations, step_tolerance, cost_tolerance
+        As for `levenberg_marquardt`.
+    least_damping : float
+        Of every step; some damping keeps a search on a robust cost from leaping out of its valley.
+    """
+    limits = _Limits(largest_step, iterations, step_tolerance, cost_tolerance, least_damping)
+    return QuadraticFit(*_descend(quadratic, start, None, limits))
+
+
+@dataclass(frozen=True)
+class _Limits:
+    largest_step: float
+    iterations: int
+    step_tolerance: float
+    cost_tolerance: float
+    least_damping: float
+
+
+class _Model(Protocol):
+    """What is known of a cost about a point."""
+
+    @property
+    def cost(self) -> float: ...
+
+    def change(self, damping: float) -> Array: ...
+
+
+_M = TypeVar("_M", bound=_Model)
+
+
+class _SumOfSquares:
+    """|r|^2 about a point, from residual (m,) and Jacobian (m, n)."""
+
+    def __init__(self, residual: Array, jacobian: Array) -> None:
+        self.residual, self.jacobian = residual, jacobian
+        self.cost = float(residual @ residual)
+
+    def change(self, damping: float) -> Array:
+        scale = np.sqrt(damping) * np.maximum(np.linalg.norm(self.jacobian, axis=0), 1e-9)
+        stacked = np.vstack([self.jacobian, np.diag(scale)])
+        return np.asarray(
+            -np.linalg.lstsq(stacked, np.concatenate([self.residual, np.zeros(len(scale))]), rcond=None)[0]
+        )
+
+
+def _descend(
+    model_at: Callable[[Array], _M], start: Array, project: Project | None, limits: _Limits
+) -> tuple[Array, _M, int, bool]:
+    """The point, its model, iterations used, whether it converged."""
     x = np.array(start, float)
-    residual, jacobian = rows(x)
-    cost, damping = float(residual @ residual), 1e-3
-    for iteration in range(1, iterations + 1):
-        scale = np.sqrt(damping) * np.maximum(np.linalg.norm(jacobian, axis=0), 1e-9)
-        stacked = np.vstack([jacobian, np.diag(scale)])
-        change = -np.linalg.lstsq(stacked, np.concatenate([residual, np.zeros(len(scale))]), rcond=None)[0]
+    model, damping = model_at(x), _FIRST_DAMPING
+    for iteration in range(1, limits.iterations + 1):
+        change = model.change(damping)
         size = float(np.max(np.abs(change), initial=0.0))
-        change *= min(1.0, largest_step / max(size, 1e-12))
+        change = change * min(1.0, limits.largest_step / max(size, 1e-12))
         trial = x + change if project is None else project(x + change)
-        new_residual, new_jacobian = rows(trial)
-        new_cost = float(new_residual @ new_residual)
-        if new_cost < cost:
-            done = size < step_tolerance or cost - new_cost < cost_tolerance * cost
-            x, residual, jacobian, cost = trial, new_residual, new_jacobian, new_cost
-            damping = max(damping / 10, 1e-12)
+        new = model_at(trial)
+        if new.cost < model.cost:
+            done = size < limits.step_tolerance or model.cost - new.cost < limits.cost_tolerance * model.cost
+            x, model = trial, new
+            damping = max(damping / 10, limits.least_damping)
             if done:
-                return SmallFit(x, cost, jacobian, iteration, True)
+                return x, model, iteration, True
         else:
             damping *= 10
-            if size < step_tolerance or damping > 1e8:
-                return SmallFit(x, cost, jacobian, iteration, size < step_tolerance)
-    return SmallFit(x, cost, jacobian, iterations, False)
+            if size < limits.step_tolerance or damping > _MOST_DAMPING:
+                return x, model, iteration, size < limits.step_tolerance
+    return x, model, limits.iterations, False

@@ -17,7 +17,9 @@ from yid_ocp.errors import DataError
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import GaussNewton, solve
-from yid_ocp.virtual.experiment import Motion, paper_system, virtual_experiment
+from yid_ocp.virtual.engine import Simulation
+from yid_ocp.virtual.experiment import VirtualExperiment, paper_system, virtual_experiment
+from yid_ocp.virtual.motion import Excitation, multisine
 from yid_ocp.workflow.build import load_problem
 
 TRUTH = {"T1.bend": 22.0, "T1.twist": 13.6, "T2.bend": 10.7, "T2.twist": 8.2, "T3.bend": 11.5, "T3.twist": 9.7}
@@ -170,10 +172,10 @@ def test_the_smallest_set_finds_all_six_in_another_engine(repository):
     assert not isinstance(layout, str), layout
     system = layout.problem.system
     posture = dict(zip(system.driven, map(float, made.episodes[0].measured_arm[0]), strict=True))
-    motion = Motion.multisine(system, TRUTH, seed=7, posture=posture, travel=0.13)
-    recording = virtual_experiment(
-        system, TRUTH, motion=motion, seed=5, vision=False, posture=posture, time_step=5e-5, name="welded"
-    )
+    motion = multisine(system, TRUTH, seed=7, posture=posture, excitation=Excitation(travel=0.13))
+    simulation = Simulation(time_step=5e-5)
+    experiment = VirtualExperiment(motion, posture, simulation, camera=None, seed=5, name="welded")
+    recording = virtual_experiment(system, TRUTH, experiment)
     assert [group.name for group in recording.points] == ["points_arm"]
     step = compile_step(system, 0.01, "left_damping")
     problem = EstimationProblem(step, [recording], made.free, made.options, dict.fromkeys(TRUTH, 3.0))

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from yid_ocp.data.edges import edge_lengths, measured
-from yid_ocp.data.recording import PointGroup, Recording, read_recording
+from yid_ocp.data.hdf5 import read_recording
+from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.errors import DataError, ModelError
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.statics import Statics

@@ -13,18 +13,21 @@ from yid_ocp.effects import EFFECTS, make_effect
 from yid_ocp.errors import ConfigError
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import MidpointState
-from yid_ocp.virtual.experiment import Motion, mujoco_xml, paper_system
+from yid_ocp.virtual.engine import Simulation
+from yid_ocp.virtual.experiment import VirtualExperiment, paper_system
 from yid_ocp.virtual.injected import (
     FORCED,
     KINDS,
     MODELLED,
     OUTSIDE,
-    READ,
+    SENSOR_ERRORS,
     InjectedEffect,
     InjectedTerms,
     injected_experiment,
-    misread,
+    with_sensor_error,
 )
+from yid_ocp.virtual.mjcf import mujoco_xml
+from yid_ocp.virtual.motion import multisine
 
 mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
 
@@ -148,10 +151,10 @@ def reading(duration=1.0) -> Recording:
         ),
     ],
 )
-def test_joints_are_misread_as_the_table_says(label, values, channel, expected):
+def test_errors_of_joint_sensors_are_those_of_the_table(label, values, channel, expected):
     kind, _, place = label.partition("@")
     recording = reading()
-    wrong = misread(recording, SYSTEM, InjectedEffect(kind, place, values))
+    wrong = with_sensor_error(recording, SYSTEM, InjectedEffect(kind, place, values))
     assert getattr(wrong.joints, channel)[:, 1] == pytest.approx(expected(recording))
     other = getattr(wrong.joints, channel)[:, 2]
     assert other == pytest.approx(getattr(recording.joints, channel)[:, 2])
@@ -159,16 +162,16 @@ def test_joints_are_misread_as_the_table_says(label, values, channel, expected):
 
 def test_what_is_recorded_late_acts_later():
     recording = reading()
-    wrong = misread(recording, SYSTEM, InjectedEffect("effort_delay", "left", {"delay": 0.05}))
+    wrong = with_sensor_error(recording, SYSTEM, InjectedEffect("effort_delay", "left", {"delay": 0.05}))
     assert wrong.joints.effort[:-6] == pytest.approx(recording.joints.effort[5:-1], abs=1e-9)
 
 
-def test_cameras_misplace_points_as_the_table_says():
+def test_errors_of_cameras_are_those_of_the_table():
     recording = reading()
     true = recording.points[0].position
 
     def seen(kind, **values):
-        return misread(recording, SYSTEM, InjectedEffect(kind, "camera", values)).points[0]
+        return with_sensor_error(recording, SYSTEM, InjectedEffect(kind, "camera", values)).points[0]
 
     assert seen("camera_translation", x=0.01, y=0.0, z=-0.01).position == pytest.approx(
         true + np.array([0.01, 0.0, -0.01])
@@ -183,13 +186,12 @@ def test_cameras_misplace_points_as_the_table_says():
 
 
 def test_an_effect_acts_on_a_whole_recording_and_leaves_no_trace_of_itself():
-    motion = Motion.multisine(SYSTEM, TRUTH, seed=1)
-    settings = {"motion": motion, "seed": 2, "duration": 0.3, "time_step": 2e-4}
-    clean = injected_experiment(SYSTEM, TRUTH, (), **settings)
-    pushed = injected_experiment(
-        SYSTEM, TRUTH, [InjectedEffect("hysteresis", "T1", {"stiffness": 9.0, "yield_angle": 0.1})], **settings
-    )
-    again = injected_experiment(SYSTEM, TRUTH, (), **settings)
+    motion = multisine(SYSTEM, TRUTH, seed=1)
+    experiment = VirtualExperiment(motion, simulation=Simulation(0.3, time_step=2e-4), seed=2)
+    hysteresis = InjectedEffect("hysteresis", "T1", {"stiffness": 9.0, "yield_angle": 0.1})
+    clean = injected_experiment(SYSTEM, TRUTH, (), experiment)
+    pushed = injected_experiment(SYSTEM, TRUTH, [hysteresis], experiment)
+    again = injected_experiment(SYSTEM, TRUTH, (), experiment)
     assert np.abs(pushed.joints.effort - clean.joints.effort).max() > 1e-3
     assert again.joints.effort == pytest.approx(clean.joints.effort, abs=0)
 
@@ -202,7 +204,7 @@ def test_every_kind_is_done_once_and_what_is_outside_is_not_in_the_library():
         *MODELLED,
         *FORCED,
     }
-    assert set(READ) <= set(KINDS)
+    assert set(SENSOR_ERRORS) <= set(KINDS)
 
 
 def test_a_kind_that_cannot_be_done_is_refused():

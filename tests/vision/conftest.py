@@ -10,7 +10,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from yid_ocp.data.recording import JointGroup, Recording, read_recording
+from yid_ocp.data.hdf5 import read_recording
+from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.errors import DataError
 from yid_ocp.vision import DepthCamera, FrameTiming, TrackOptions, look_at, read_frames, track, virtual_frames
 from yid_ocp.vision.fit import ShapeFit
@@ -56,11 +57,13 @@ def shape(system):
 def run(system):
     """Three seconds in MuJoCo."""
     pytest.importorskip("mujoco", reason="virtual films need MuJoCo")
-    from yid_ocp.virtual.experiment import Motion, initial_posture, simulate_in_mujoco
+    from yid_ocp.virtual.engine import Simulation, simulate_in_mujoco
+    from yid_ocp.virtual.motion import Excitation, multisine
+    from yid_ocp.virtual.posture import initial_posture
 
     posture = initial_posture(system, TRUTH)
-    motion = Motion.multisine(system, TRUTH, seed=1, posture=posture, travel=0.15)
-    return simulate_in_mujoco(system, TRUTH, motion, posture=posture, duration=3.0, time_step=2.5e-4)
+    motion = multisine(system, TRUTH, seed=1, posture=posture, excitation=Excitation(travel=0.15))
+    return simulate_in_mujoco(system, TRUTH, motion, Simulation(3.0, time_step=2.5e-4), posture=posture)
 
 
 @pytest.fixture(scope="session")

@@ -10,8 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from yid_ocp.data.recording import JointGroup, Recording, write_recording
-from yid_ocp.virtual.experiment import Motion, initial_posture, paper_system, simulate_in_mujoco
+from yid_ocp.data.hdf5 import write_recording
+from yid_ocp.data.recording import JointGroup, Recording
+from yid_ocp.virtual.engine import Simulation, simulate_in_mujoco
+from yid_ocp.virtual.experiment import paper_system
+from yid_ocp.virtual.motion import Excitation, multisine
+from yid_ocp.virtual.posture import initial_posture
 from yid_ocp.vision import FilterOptions, FrameSequence, FrameTiming, look_at, virtual_frames, write_frames
 from yid_ocp.vision.filters import ObjectRegion, voxel_grid, without_outliers, without_robot
 from yid_ocp.vision.fit import ShapeFit
@@ -24,8 +28,8 @@ VOXEL = 0.011
 def main() -> None:
     system = paper_system(1)
     posture = initial_posture(system)
-    motion = Motion.multisine(system, seed=1, posture=posture, travel=0.15)
-    run = simulate_in_mujoco(system, None, motion, posture=posture, duration=1.5, time_step=2.5e-4)
+    motion = multisine(system, seed=1, posture=posture, excitation=Excitation(travel=0.15))
+    run = simulate_in_mujoco(system, None, motion, Simulation(1.5, time_step=2.5e-4), posture=posture)
     made = virtual_frames(
         system, run.t, run.q, look_at([2.6, 0.0, 0.45], [0.85, 0.0, -0.1]), timing=FrameTiming(rate=2.7), seed=5
     )

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.cli import main
-from yid_ocp.data.recording import read_recording
+from yid_ocp.data.hdf5 import read_recording
 from yid_ocp.vision.pictures import STAGES
 
 CONFIG = """\

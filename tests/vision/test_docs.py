@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from yid_ocp.data.recording import read_recording
+from yid_ocp.data.hdf5 import read_recording
 from yid_ocp.vision import TrackOptions
 
 

@@ -164,15 +164,15 @@ def test_derivatives_agree_with_differences(system, shape, run):
     sight = seen(shape, q, 20, noise=0.005)
     task = _Task(sight.points, sight.weight / 0.006**2, 1.0, 0.03, CAMERA, (q + 0.01, 0.2))
     q[list(shape.free)] += 0.01 * np.random.default_rng(0).standard_normal(len(shape.free))
-    _, gradient, hessian = shape._system(q, task)
+    model = shape._quadratic(q, task)
     step, differences = 1e-6, []
     for index in shape.free:
         ahead, behind = q.copy(), q.copy()
         ahead[index] += step
         behind[index] -= step
-        differences.append((shape._system(ahead, task)[0] - shape._system(behind, task)[0]) / (2 * step))
-    assert np.allclose(gradient, differences, rtol=1e-4, atol=1e-4 * np.abs(gradient).max())
-    assert np.linalg.eigvalsh(hessian).min() > 0
+        differences.append((shape._quadratic(ahead, task).cost - shape._quadratic(behind, task).cost) / (2 * step))
+    assert np.allclose(model.gradient, differences, rtol=1e-4, atol=1e-4 * np.abs(model.gradient).max())
+    assert np.linalg.eigvalsh(model.hessian).min() > 0
 
 
 def test_what_cannot_be_fitted_is_said(alone, urdf_folder):

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from yid_ocp.data.recording import JointGroup, PointGroup, Recording, read_recording, write_recording
+from yid_ocp.data.hdf5 import read_recording, write_recording
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.vision import ClockOptions, FilterOptions, FrameSequence, TrackOptions, track
 from yid_ocp.vision.pictures import STAGES, draw_stages, draw_track

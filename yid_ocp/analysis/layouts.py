@@ -22,7 +22,9 @@ from yid_ocp.problem import EstimationProblem, SensorOptions
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.grid import Grid
 from yid_ocp.sensors import camera_pose
-from yid_ocp.virtual.experiment import Motion, initial_posture, simulate_in_mujoco
+from yid_ocp.virtual.engine import Simulation, simulate_in_mujoco
+from yid_ocp.virtual.motion import Excitation, multisine
+from yid_ocp.virtual.posture import initial_posture
 
 Array = NDArray[np.float64]
 
@@ -411,10 +413,9 @@ class LayoutBuilder:
         duration = episode.grid.steps * episode.grid.time_step
         travel = _travel(base.system, setting.values, episode) * (2.0 if twice else 1.0)
         speed = 2.8 if twice else 1.4
-        motion = Motion.multisine(
-            system, values, seed=seed, posture=posture, travel=travel, speed=speed, duration=duration
-        )
-        run = simulate_in_mujoco(system, values, motion, duration=duration, posture=posture)
+        excitation = Excitation(travel=travel, speed=speed, duration=duration)
+        motion = multisine(system, values, seed=seed, posture=posture, excitation=excitation)
+        run = simulate_in_mujoco(system, values, motion, Simulation(duration), posture=posture)
         driven = list(system.driven_indices)
         joints = JointGroup(system.driven, run.t, run.q[:, driven], effort=run.effort, position_std=0.0, effort_std=0.0)
         beyond: dict[str, list[str]] = {"range": [], "torque": []}

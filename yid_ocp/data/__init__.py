@@ -1,14 +1,14 @@
-"""Recordings in memory and on disk; a new file format is a reader in `readers.py` and touches nothing else."""
+"""Recordings in memory and on disk; a new file format is one file in `readers/` and touches nothing else."""
 
+from yid_ocp.data.hdf5 import read_recording as read_recording
+from yid_ocp.data.hdf5 import write_recording as write_recording
 from yid_ocp.data.readers import READERS as READERS
 from yid_ocp.data.readers import read_any as read_any
-from yid_ocp.data.readers import read_bag as read_bag
-from yid_ocp.data.readers import read_csv as read_csv
+from yid_ocp.data.readers.bags import read_bag as read_bag
+from yid_ocp.data.readers.csv import read_csv as read_csv
 from yid_ocp.data.recording import JOINT_CHANNELS as JOINT_CHANNELS
 from yid_ocp.data.recording import JointGroup as JointGroup
 from yid_ocp.data.recording import PointGroup as PointGroup
 from yid_ocp.data.recording import Recording as Recording
 from yid_ocp.data.recording import check_names as check_names
-from yid_ocp.data.recording import read_recording as read_recording
 from yid_ocp.data.recording import validate as validate
-from yid_ocp.data.recording import write_recording as write_recording

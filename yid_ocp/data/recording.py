@@ -1,27 +1,21 @@
-"""The one in-memory form of a recording, its checks and its HDF5 file (`yid-recording/1`)."""
+"""The one in-memory form of a recording, and its checks."""
 
 from __future__ import annotations
 
-import json
 import numbers
-import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, Literal, get_args
 
-import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import DataError, nearest
-from yid_ocp.files import file_sha256, new_file, reason
 
 Array = NDArray[np.float64]
 Clock = Literal["recorded", "nominal"]
 
-FORMAT = "yid-recording/1"
 JOINT_CHANNELS: Mapping[str, str] = {
     "position": "rad",
     "velocity": "rad/s",
@@ -32,12 +26,11 @@ JOINT_CHANNELS: Mapping[str, str] = {
 }
 """Channels of a joint group and their units."""
 
-_JOINT_STD = ("position_std", "velocity_std", "effort_std")
-_JOINT_UNITS = {"t": "s", **JOINT_CHANNELS}
-_POINT_UNITS = {"t": "s", "position": "m", "std": "m"}
-_JOINT_ATTRIBUTES = ("names", "clock", *_JOINT_STD)
-_POINT_ATTRIBUTES = ("names", "sensor", "frame", "pose", "clock", "std")
-_POINT_GROUP_NAME = re.compile(r"points(_[^/]+)?")
+JOINT_STD = ("position_std", "velocity_std", "effort_std")
+"""Standard deviations that a joint group may have, in the units of their channels."""
+POINT_GROUP_NAME = re.compile(r"points(_[^/]+)?")
+"""What a group of points may be called."""
+
 _LARGEST_ANGLE = 50.0  # eight turns: no robot joint does that, whereas a posture in degrees nearly always does
 _LARGEST_DISTANCE = 50.0  # beyond any motion capture volume, whereas an object in millimetres is always larger
 _TIME_TOLERANCE = 1e-9  # a nominal clock is a sum of rounded periods, so its end is seldom exactly the number asked for
@@ -86,10 +79,10 @@ class JointGroup:
         object.__setattr__(self, "names", tuple(self.names))
         for name in ("t", *JOINT_CHANNELS):
             if getattr(self, name) is not None:
-                object.__setattr__(self, name, _frozen(getattr(self, name), f"joints/{name}"))
-        for name in _JOINT_STD:
+                object.__setattr__(self, name, read_only(getattr(self, name), f"joints/{name}"))
+        for name in JOINT_STD:
             if getattr(self, name) is not None:
-                std = _frozen(getattr(self, name), f"joints, attribute {name}")
+                std = read_only(getattr(self, name), f"joints, attribute {name}")
                 object.__setattr__(self, name, float(std) if std.ndim == 0 else std)
 
     @property
@@ -144,9 +137,11 @@ class PointGroup:
         object.__setattr__(self, "names", tuple(self.names))
         for name in ("t", "position", "std", "pose"):
             if getattr(self, name) is not None:
-                object.__setattr__(self, name, _frozen(getattr(self, name), f"{self.name}/{name}"))
+                object.__setattr__(self, name, read_only(getattr(self, name), f"{self.name}/{name}"))
         if self.std is not None and self.std.ndim == 0:
-            object.__setattr__(self, "std", _frozen(np.full(self.position.shape, float(self.std)), f"{self.name}/std"))
+            object.__setattr__(
+                self, "std", read_only(np.full(self.position.shape, float(self.std)), f"{self.name}/std")
+            )
 
     def _rows(self, rows: NDArray[np.bool_]) -> PointGroup:
         std = None if self.std is None else self.std[rows]
@@ -178,6 +173,8 @@ class Recording:
         Hash of the file read; kept by `slice` and `select_points`.
     truth : mapping of str to float
         The parameter values of a virtual experiment, in the parameters' own units; empty for a real one.
+    straight : ndarray, shape (np, 3), or None
+        Positions of the points of the first group while the object was held straight, in that group's frame [m].
     """
 
     joints: JointGroup | None = None
@@ -187,10 +184,13 @@ class Recording:
     name: str = "recording"
     sha256: str | None = None
     truth: Mapping[str, float] = field(default_factory=dict)
+    straight: Array | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "points", tuple(self.points))
         object.__setattr__(self, "truth", dict(self.truth))
+        if self.straight is not None:
+            object.__setattr__(self, "straight", read_only(self.straight, "straight"))
 
     @property
     def groups(self) -> tuple[JointGroup | PointGroup, ...]:
@@ -236,9 +236,11 @@ class Recording:
         kept = [group._rows(mask) for group, mask in zip(self.groups, masks, strict=True) if mask.any()]
         first, last = min(g.t[0] for g in self.groups), max(g.t[-1] for g in self.groups)
         what, allowed = f"nothing was recorded from {start:g} s to {stop:g} s", f"within {first:g} s to {last:g} s"
-        _check(start < stop and bool(kept), what, f"recording '{self.name}'", f"start < stop, {allowed}")
+        require(start < stop and bool(kept), what, f"recording '{self.name}'", f"start < stop, {allowed}")
         joints = next((group for group in kept if isinstance(group, JointGroup)), None)
-        return replace(self, joints=joints, points=tuple(g for g in kept if isinstance(g, PointGroup)))
+        points = tuple(group for group in kept if isinstance(group, PointGroup))
+        first_kept = bool(points) and points[0].name == self.points[0].name
+        return replace(self, joints=joints, points=points, straight=self.straight if first_kept else None)
 
     def select_points(self, names: Iterable[str]) -> Recording:
         """Keep only the named points, in the order given, in every group that has them.
@@ -263,11 +265,14 @@ class Recording:
         present = [(group, [name for name in wanted if name in group.names]) for group in self.points]
         points = tuple(group._select(kept) for group, kept in present if kept)
         what = "no point was selected and the recording has no joints"
-        _check(bool(points) or self.joints is not None, what, f"recording '{self.name}'", ", ".join(self.point_names))
-        return replace(self, points=points)
+        require(bool(points) or self.joints is not None, what, f"recording '{self.name}'", ", ".join(self.point_names))
+        straight = None
+        if self.straight is not None and points and points[0].name == self.points[0].name:
+            straight = self.straight[[self.points[0].names.index(name) for name in points[0].names]]
+        return replace(self, points=points, straight=straight)
 
 
-def validate(recording: Recording, *, allow_nan_effort: bool = False) -> Recording:
+def validate(recording: Recording, *, allow_nan_effort: bool = False, where: str = "") -> Recording:
     """Check shapes, clocks, names, values and units of a recording.
 
     Parameters
@@ -276,6 +281,8 @@ def validate(recording: Recording, *, allow_nan_effort: bool = False) -> Recordi
         What to check.
     allow_nan_effort : bool
         Whether `effort` and `external_effort` may hold NaN.
+    where : str
+        What errors call the recording, its file for example; its name where empty.
 
     Returns
     -------
@@ -288,9 +295,24 @@ def validate(recording: Recording, *, allow_nan_effort: bool = False) -> Recordi
         If there is no group, or one is empty; names are repeated or do not match the arrays; a clock is not finite and
         strictly increasing; a joint channel has a value that is not finite; a point is infinite or seen in part; a
         standard deviation is negative; a pose is not a rigid transform; joint positions exceed 50 rad or points 50 m,
-        which are degrees or millimetres.
+        which are degrees or millimetres; `straight` does not match the first group of points.
     """
-    _validate(recording, f"recording '{recording.name}'", allow_nan_effort)
+    origin = where or f"recording '{recording.name}'"
+    require(bool(recording.groups), "the recording has no group", origin, "joints, points, points_<name>")
+    _check_text(origin, recording.description, recording.source)
+    for key, value in recording.truth.items():
+        good = isinstance(value, numbers.Real) and not isinstance(value, bool) and bool(np.isfinite(value))
+        require(good, f"the true value of '{key}' is {value!r}", f"{origin}: truth", "finite numbers")
+    if recording.joints is not None:
+        _validate_joints(recording.joints, f"{origin}: joints", allow_nan_effort)
+    names = [group.name for group in recording.points]
+    for group in recording.points:
+        legal = POINT_GROUP_NAME.fullmatch(group.name) is not None
+        require(legal, f"a group of points is called '{group.name}'", origin, "points, points_<name>")
+        require(names.count(group.name) == 1, f"two groups of points are called '{group.name}'", origin)
+        _validate_points(group, f"{origin}: {group.name}")
+    if recording.straight is not None:
+        _validate_straight(recording.straight, recording.points, f"{origin}: straight")
     return recording
 
 
@@ -321,98 +343,20 @@ def check_names(recording: Recording, joints: Iterable[str], points: Iterable[st
             )
 
 
-def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = False) -> Recording:
-    """Read and check a `yid-recording/1` file.
-
-    Parameters
-    ----------
-    path : path-like
-        The HDF5 file.
-    allow_nan_effort : bool
-        Whether `effort` and `external_effort` may hold NaN.
-
-    Returns
-    -------
-    Recording
-        Its contents, with the file's stem as name and its hash.
-
-    Raises
-    ------
-    DataError
-        If the file is missing, not HDF5 or damaged, of another format, has a group, dataset, attribute or unit that
-        the format does not know, lacks one that it needs, or fails `validate`.
-    """
-    path = Path(path)
-    digest = file_sha256(path)
-    hint = "read other formats (CSV, rosbag, MCAP) with `yid-ocp import` or yid_ocp.data.read_any"
-    _check(h5py.is_hdf5(path), "the file is not an HDF5 file", str(path), f"HDF5 in the format {FORMAT}", hint)
-    try:
-        with h5py.File(path, "r") as file:
-            recording = _from_file(file, path, digest)
-    except (OSError, RuntimeError, KeyError, TypeError) as error:  # all of them come from h5py on damaged files
-        what = f"the HDF5 file is truncated or damaged ({reason(error)})"
-        raise DataError(what, where=str(path), hint="copy or record it again") from error
-    _validate(recording, str(path), allow_nan_effort)
-    return recording
-
-
-def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
-    """Check a recording and write it as `yid-recording/1`, whole or not at all.
-
-    Parameters
-    ----------
-    recording : Recording
-        What to write; effort may hold NaN. Its `name` and `sha256` are properties of the file and not written.
-    path : path-like
-        The HDF5 file to make or replace.
-
-    Raises
-    ------
-    DataError
-        As `validate`.
-    OutputError
-        If the file cannot be written; one that was there before is left as it was.
-    """
-    validate(recording, allow_nan_effort=True)
-    with new_file(Path(path)) as temporary, h5py.File(temporary, "x") as file:
-        file.attrs.update(format=FORMAT, description=recording.description, source=recording.source)
-        if recording.truth:
-            file.attrs["truth"] = json.dumps({key: float(value) for key, value in recording.truth.items()})
-        if recording.joints is not None:
-            _write_group(file.create_group("joints"), recording.joints, _JOINT_UNITS, _JOINT_ATTRIBUTES)
-        for group in recording.points:
-            attributes = [name for name in _POINT_ATTRIBUTES if name != "std"]
-            _write_group(file.create_group(group.name), group, _POINT_UNITS, attributes)
-
-
-def _check(ok: bool, what: str, where: str, allowed: str = "", hint: str = "") -> None:
+def require(ok: bool, what: str, where: str, allowed: str = "", hint: str = "") -> None:
+    """Raise a `DataError` unless a condition holds."""
     if not ok:
         raise DataError(what, where=where, allowed=allowed, hint=hint)
 
 
-def _frozen(value: ArrayLike, where: str) -> Array:
+def read_only(value: ArrayLike, where: str) -> Array:
+    """A read-only copy as float64; `DataError` where that is not possible."""
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise DataError("not an array of real numbers", where=where, allowed="numbers in a regular array") from error
     array.setflags(write=False)
     return array
-
-
-def _validate(recording: Recording, origin: str, allow_nan_effort: bool) -> None:
-    _check(bool(recording.groups), "the recording has no group", origin, "joints, points, points_<name>")
-    _check_text(origin, recording.description, recording.source)
-    for key, value in recording.truth.items():
-        good = isinstance(value, numbers.Real) and not isinstance(value, bool) and bool(np.isfinite(value))
-        _check(good, f"the true value of '{key}' is {value!r}", f"{origin}: truth", "finite numbers")
-    if recording.joints is not None:
-        _validate_joints(recording.joints, f"{origin}: joints", allow_nan_effort)
-    names = [group.name for group in recording.points]
-    for group in recording.points:
-        legal = _POINT_GROUP_NAME.fullmatch(group.name) is not None
-        _check(legal, f"a group of points is called '{group.name}'", origin, "points, points_<name>")
-        _check(names.count(group.name) == 1, f"two groups of points are called '{group.name}'", origin)
-        _validate_points(group, f"{origin}: {group.name}")
 
 
 def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> None:
@@ -433,20 +377,20 @@ def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> 
                 + (", or read with allow_nan_effort=True" if is_effort else ""),
             )
         largest = float(np.nanmax(np.abs(value))) if JOINT_CHANNELS[channel] == "rad" else 0.0
-        _check(
+        require(
             largest <= _LARGEST_ANGLE,
             f"channel '{channel}' reaches {largest:g} rad",
             place,
             f"at most {_LARGEST_ANGLE:g} rad",
             f"these look like degrees: convert them to radians, or read a CSV with units={{'{channel}': 'deg'}}",
         )
-    for name in _JOINT_STD:
+    for name in JOINT_STD:
         std, place = getattr(joints, name), f"{where}, attribute {name}"
         if std is not None:
             if np.ndim(std) > 0:
                 _check_shape(std, (len(joints.names),), place, "one number or (nj,)")
             good = bool(np.all(np.isfinite(std) & (np.asarray(std) >= 0)))
-            _check(good, f"{name} is {std}", place, "finite and not negative")
+            require(good, f"{name} is {std}", place, "finite and not negative")
 
 
 def _validate_points(group: PointGroup, where: str) -> None:
@@ -463,7 +407,7 @@ def _validate_points(group: PointGroup, where: str) -> None:
             allowed="three finite coordinates, or three NaN where the point was not seen",
         )
     largest = float(np.abs(group.position[~unseen]).max(initial=0.0))
-    _check(
+    require(
         largest <= _LARGEST_DISTANCE,
         f"a coordinate reaches {largest:g} m",
         f"{where}/position",
@@ -475,18 +419,31 @@ def _validate_points(group: PointGroup, where: str) -> None:
         seen = group.std[~unseen]
         wrong = seen[~(np.isfinite(seen) & (seen >= 0))]
         what = f"the standard deviation of a point that was seen is {wrong[:1]}"
-        _check(wrong.size == 0, what, f"{where}/std", "finite and not negative")
+        require(wrong.size == 0, what, f"{where}/std", "finite and not negative")
     if group.pose is not None:
         _check_pose(group.pose, f"{where}, attribute pose")
+
+
+def _validate_straight(straight: Array, groups: Sequence[PointGroup], where: str) -> None:
+    require(bool(groups), "the positions of a straight object belong to no points", where, "a group of points")
+    _check_shape(straight, (len(groups[0].names), 3), where, "(np, 3), for the first group of points")
+    require(bool(np.isfinite(straight).all()), "a position is not finite", where, "finite coordinates of every point")
+    largest = float(np.abs(straight).max())
+    what, allowed = f"a coordinate reaches {largest:g} m", f"at most {_LARGEST_DISTANCE:g} m"
+    require(largest <= _LARGEST_DISTANCE, what, where, allowed, "these look like millimetres: convert them to metres")
+    # a file lists its groups by name, so only that order survives it
+    first = min(groups, key=lambda group: group.name.encode())
+    what = f"the positions belong to '{groups[0].name}', but a file would list '{first.name}' first"
+    require(first is groups[0], what, where, "groups of points sorted by name")
 
 
 def _check_pose(pose: Array, where: str) -> None:
     _check_shape(pose, (4, 4), where, "(4, 4)")
     rotation, allowed = pose[:3, :3], "a rotation, a translation [m] and the last row 0 0 0 1"
-    _check(bool(np.isfinite(pose).all()), "the pose has a value that is not finite", where, allowed)
-    _check(_close(pose[3], np.eye(4)[3]), f"the last row of the pose is {pose[3]}", where, allowed)
-    _check(_close(rotation.T @ rotation, np.eye(3)), "the axes of the pose are not orthonormal", where, allowed)
-    _check(bool(np.linalg.det(rotation) > 0), "the pose is a reflection", where, allowed)
+    require(bool(np.isfinite(pose).all()), "the pose has a value that is not finite", where, allowed)
+    require(_close(pose[3], np.eye(4)[3]), f"the last row of the pose is {pose[3]}", where, allowed)
+    require(_close(rotation.T @ rotation, np.eye(3)), "the axes of the pose are not orthonormal", where, allowed)
+    require(bool(np.linalg.det(rotation) > 0), "the pose is a reflection", where, allowed)
 
 
 def _close(array: Array, expected: Array) -> bool:
@@ -494,18 +451,18 @@ def _close(array: Array, expected: Array) -> bool:
 
 
 def _check_names_and_clock(group: JointGroup | PointGroup, where: str) -> None:
-    _check(bool(group.names), "the group has no names", where)
-    _check(group.t.size > 0, "the group has no samples", where)
+    require(bool(group.names), "the group has no names", where)
+    require(group.t.size > 0, "the group has no samples", where)
     for name in group.names:
         place = f"{where}, names"
-        _check(isinstance(name, str) and bool(name), f"the name {name!r} cannot be used", place, "text, not empty")
+        require(isinstance(name, str) and bool(name), f"the name {name!r} cannot be used", place, "text, not empty")
         _check_text(place, name)
-        _check(group.names.count(name) == 1, f"the name '{name}' occurs {group.names.count(name)} times", place)
+        require(group.names.count(name) == 1, f"the name '{name}' occurs {group.names.count(name)} times", place)
     clocks = get_args(Clock)
-    _check(group.clock in clocks, f"the clock is '{group.clock}'", f"{where}, attribute clock", ", ".join(clocks))
+    require(group.clock in clocks, f"the clock is '{group.clock}'", f"{where}, attribute clock", ", ".join(clocks))
     _check_shape(group.t, (group.t.size,), f"{where}/t", "one-dimensional")
     bad = np.flatnonzero(~np.isfinite(group.t))
-    _check(bad.size == 0, f"the time at index {bad[:1]} is not finite", f"{where}/t", "finite seconds")
+    require(bad.size == 0, f"the time at index {bad[:1]} is not finite", f"{where}/t", "finite seconds")
     backward = np.flatnonzero(np.diff(group.t) <= 0)
     if backward.size:
         index = int(backward[0])
@@ -519,106 +476,11 @@ def _check_names_and_clock(group: JointGroup | PointGroup, where: str) -> None:
 
 
 def _check_shape(array: Array, shape: tuple[int, ...], where: str, letters: str) -> None:
-    _check(array.shape == shape, f"the array has shape {array.shape}", where, f"{shape}, that is {letters}")
+    require(array.shape == shape, f"the array has shape {array.shape}", where, f"{shape}, that is {letters}")
 
 
 def _check_text(where: str, *texts: str) -> None:
     for text in texts:
         # HDF5 ends text at the first null character and stores it as UTF-8
         storable = "\0" not in text and not any("\ud800" <= letter <= "\udfff" for letter in text)
-        _check(storable, f"the text {text!r} cannot be stored", where, "Unicode text without null characters")
-
-
-def _write_group(
-    target: h5py.Group, group: JointGroup | PointGroup, units: Mapping[str, str], attributes: Iterable[str]
-) -> None:
-    for name, unit in units.items():
-        if getattr(group, name) is not None:
-            target.create_dataset(name, data=getattr(group, name)).attrs["unit"] = unit
-    for name in attributes:
-        if getattr(group, name) is not None:
-            value = getattr(group, name)
-            target.attrs[name] = np.array(value, dtype=h5py.string_dtype()) if name == "names" else value
-
-
-def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
-    origin = str(path)
-    texts = {
-        key: _text(file.attrs[key], f"{origin}, attribute {key}") if key in file.attrs else ""
-        for key in ("format", "description", "source", "truth")
-    }
-    what = f"the format of the file is '{texts['format']}'" if texts["format"] else "the file does not say its format"
-    _check(texts["format"] == FORMAT, what, f"{origin}, attribute format", FORMAT)
-    joints, points = None, []
-    for name in map(str, file):
-        where, legal = f"{origin}: {name}", name == "joints" or _POINT_GROUP_NAME.fullmatch(name) is not None
-        hint = "" if legal else nearest(name, ("joints", "points"))
-        _check(legal, f"the format has no group '{name}'", origin, "joints, points, points_<name>", hint)
-        _check(isinstance(file[name], h5py.Group), f"'{name}' is not a group", where, "a group of datasets")
-        if name == "joints":
-            joints = JointGroup(**_read_group(file[name], where, _JOINT_UNITS, _JOINT_ATTRIBUTES, ("names",)))
-        else:
-            required = ("names", "sensor", "frame")
-            values = _read_group(file[name], where, _POINT_UNITS, _POINT_ATTRIBUTES, required)
-            points.append(PointGroup(name=name, **values))
-    truth = _truth(texts["truth"], f"{origin}, attribute truth") if texts["truth"] else {}
-    return Recording(joints, tuple(points), texts["description"], texts["source"], path.stem, digest, truth)
-
-
-def _read_group(
-    group: h5py.Group, where: str, units: Mapping[str, str], attributes: Sequence[str], required: Iterable[str]
-) -> dict[str, Any]:
-    for noun, found, known, needed in (
-        ("dataset", set(map(str, group)), tuple(units), {"t", "position"}),
-        ("attribute", set(map(str, group.attrs)), attributes, set(required)),
-    ):
-        for name in sorted(found - set(known)):
-            what = f"the format has no {noun} '{name}' here"
-            raise DataError(what, where=where, allowed=", ".join(known), hint=nearest(name, known))
-        for name in sorted(needed - found):
-            raise DataError(f"the {noun} '{name}' is missing", where=where, allowed=", ".join(known))
-    both = "std" in group and "std" in group.attrs
-    _check(not both, "`std` is both a dataset and an attribute", where, "one of the two")
-    values: dict[str, Any] = {name: _read_dataset(group[name], f"{where}/{name}", units[name]) for name in group}
-    for name, value in group.attrs.items():
-        place = f"{where}, attribute {name}"
-        if name == "names":
-            values[name] = tuple(_text(entry, place) for entry in np.atleast_1d(np.asarray(value, dtype=object)))
-        elif name in ("clock", "sensor", "frame"):
-            values[name] = _text(value, place)
-        else:
-            values[name] = _frozen(value, place)
-    return values
-
-
-def _read_dataset(dataset: Any, where: str, unit: str) -> Array:
-    numeric = isinstance(dataset, h5py.Dataset) and dataset.dtype.kind in "fiu" and dataset.shape is not None
-    _check(numeric, "not a dataset of real numbers", where, "floating point or integer numbers")
-    found = _text(dataset.attrs["unit"], f"{where}, attribute unit") if "unit" in dataset.attrs else unit
-    hint = f"convert the values to {unit}: recordings are never converted silently"
-    _check(found == unit, f"the unit is '{found}'", where, unit, hint)
-    return np.asarray(dataset[()], dtype=np.float64)
-
-
-def _text(value: object, where: str) -> str:
-    if isinstance(value, h5py.Empty):
-        return ""
-    if isinstance(value, np.ndarray) and value.size == 1:
-        value = value.reshape(()).item()
-    if isinstance(value, bytes):
-        try:
-            return value.decode("utf-8")
-        except UnicodeDecodeError as error:
-            raise DataError("the text is not UTF-8", where=where) from error
-    _check(isinstance(value, str), f"found {value!r}", where, "text")
-    return str(value)
-
-
-def _truth(text: str, where: str) -> dict[str, float]:
-    try:
-        truth = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise DataError(f"the text is not JSON ({error})", where=where) from error
-    if not isinstance(truth, dict):
-        raise DataError("the JSON text is not an object", where=where, allowed='{"name": number, ...}')
-    return truth
+        require(storable, f"the text {text!r} cannot be stored", where, "Unicode text without null characters")

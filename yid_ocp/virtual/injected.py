@@ -1,9 +1,9 @@
-"""Effects done to a virtual experiment in the other engine's own terms, for a diagnosis that is not told of them.
+"""Effects put into a virtual experiment in the other engine's own terms, for a diagnosis that does not know of them.
 
 Whatever MuJoCo has a term of its own for (joint damping, armature, inertias, sites) is set in its model; other forces
-are worked out here in NumPy at every inner step; errors of sensors and clocks are done to the finished recording. None
-of the equations of `yid_ocp.effects` take part, but for effects that only change the description of the system (masses,
-lengths, rest angles, gravity, where a grasp sits).
+are worked out here in NumPy at every inner step; errors of sensors and clocks are put into the finished recording. None
+of the equations of `yid_ocp.effects` take part, except for effects that only change the description of the system
+(masses, lengths, rest angles, gravity, where a grasp sits).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from yid_ocp.effects import make_effect
 from yid_ocp.effects.base import arms, object_joints
 from yid_ocp.errors import ConfigError, nearest
 from yid_ocp.model.system import System
-from yid_ocp.virtual.experiment import virtual_experiment
+from yid_ocp.virtual.experiment import VirtualExperiment, virtual_experiment
 from yid_ocp.virtual.mjcf import Evaluator, mujoco_module
 
 Array = NDArray[np.float64]
@@ -33,6 +33,7 @@ AIR_DENSITY = 1.2
 SMOOTHING = 0.02
 """v_s of dry friction [rad/s]."""
 
+# a change of the system's description
 DESCRIBED: tuple[str, ...] = (
     "density",
     "point_mass",
@@ -43,7 +44,9 @@ DESCRIBED: tuple[str, ...] = (
     "gravity_tilt",
     "grasp_offset",
 )
+# a term that MuJoCo's own model has
 MODELLED: tuple[str, ...] = ("kelvin_voigt", "joint_viscous", "rotor_inertia")
+# a force that is worked out here
 FORCED: tuple[str, ...] = (
     "cubic_stiffness",
     "standard_linear_solid",
@@ -54,7 +57,8 @@ FORCED: tuple[str, ...] = (
     "joint_coulomb",
     "joint_stribeck",
 )
-READ: tuple[str, ...] = (
+# an error of a sensor or clock
+SENSOR_ERRORS: tuple[str, ...] = (
     "effort_gain",
     "effort_offset",
     "effort_delay",
@@ -67,7 +71,7 @@ READ: tuple[str, ...] = (
     "camera_latency",
     "surface_offset",
 )
-KINDS = (*DESCRIBED, *MODELLED, *FORCED, *READ)
+KINDS = (*DESCRIBED, *MODELLED, *FORCED, *SENSOR_ERRORS)
 """Kinds of the vocabulary that can be done in the other engine."""
 OUTSIDE = ("torque_ripple", "cross_stiffness", "quadratic_stiffness", "gusts")
 """Effects that are in no library: torque that ripples with the joint's angle, a spring that couples the two bends, one
@@ -98,7 +102,10 @@ class InjectedEffect:
 
 
 def injected_experiment(
-    system: System, values: Mapping[str, float], withheld: Sequence[InjectedEffect], **settings: Any
+    system: System,
+    values: Mapping[str, float],
+    effects: Sequence[InjectedEffect],
+    experiment: VirtualExperiment | None = None,
 ) -> Recording:
     """A virtual experiment with effects that are not in the system's description.
 
@@ -108,9 +115,9 @@ def injected_experiment(
         Nominal, with driven joints.
     values : mapping of str to float
         True parameter values.
-    withheld : sequence of InjectedEffect
-    settings
-        Of `virtual_experiment`.
+    effects : sequence of InjectedEffect
+    experiment : VirtualExperiment, optional
+        Its own `injected` is replaced.
 
     Returns
     -------
@@ -125,7 +132,7 @@ def injected_experiment(
         As `virtual_experiment`.
     """
     known = (*KINDS, *OUTSIDE)
-    for effect in withheld:
+    for effect in effects:
         if effect.kind not in known:
             raise ConfigError(
                 f"{effect.kind} cannot be done in MuJoCo here",
@@ -133,14 +140,14 @@ def injected_experiment(
                 allowed=", ".join(known),
                 hint=nearest(effect.kind, known),
             )
-    described = [make_effect(e.kind, e.location, system, e.values) for e in withheld if e.kind in DESCRIBED]
+    described = [make_effect(e.kind, e.location, system, e.values) for e in effects if e.kind in DESCRIBED]
     changed = system.with_effects(described) if described else system
-    inner = [e for e in withheld if e.kind not in DESCRIBED and e.kind not in READ]
+    inner = [e for e in effects if e.kind not in DESCRIBED and e.kind not in SENSOR_ERRORS]
     injected = InjectedTerms(changed, values, inner) if inner else None
-    made = virtual_experiment(changed, values, injected=injected, **settings)
-    for effect in withheld:
-        if effect.kind in READ:
-            made = misread(made, system, effect)
+    made = virtual_experiment(changed, values, replace(experiment or VirtualExperiment(), injected=injected))
+    for effect in effects:
+        if effect.kind in SENSOR_ERRORS:
+            made = with_sensor_error(made, system, effect)
     return made
 
 
@@ -167,7 +174,7 @@ class InjectedTerms:
         self._running = False
 
     def prepare(self, model: Any) -> None:
-        """Edit a compiled `mujoco.MjModel` and get ready to push."""
+        """Edit a compiled `mujoco.MjModel` and work out the forces."""
         for effect in self._effects:
             size, place = effect.values, effect.location
             if effect.kind == "kelvin_voigt":
@@ -181,7 +188,7 @@ class InjectedTerms:
                 self._forces.append(getattr(self, f"_{effect.kind}")(model, place, size))
 
     def begin(self, data: Any) -> None:
-        """The motion begins; what has a memory has none of what was before."""
+        """The motion begins: effects with a memory start to remember."""
         self._running = True
 
     def force(self, model: Any, data: Any) -> None:
@@ -359,7 +366,7 @@ class InjectedTerms:
 # -- sensors and clocks -----------------------------------------------------------------------------------------------
 
 
-def misread(recording: Recording, system: System, effect: InjectedEffect) -> Recording:
+def with_sensor_error(recording: Recording, system: System, effect: InjectedEffect) -> Recording:
     """The recording as sensors with an error would have made it.
 
     Parameters
@@ -367,20 +374,20 @@ def misread(recording: Recording, system: System, effect: InjectedEffect) -> Rec
     recording : Recording
     system : System
     effect : InjectedEffect
-        Of `READ`.
+        Of `SENSOR_ERRORS`.
     """
     if effect.kind.startswith("camera") or effect.kind == "surface_offset":
         points = tuple(
-            g if g.pose is None else _misseen(g, system, effect, recording.duration) for g in recording.points
+            g if g.pose is None else _camera_error(g, system, effect, recording.duration) for g in recording.points
         )
         return replace(recording, points=points)
     joints = recording.joints
     assert joints is not None
     assert joints.effort is not None
-    return replace(recording, joints=_misfelt(joints, system, effect))
+    return replace(recording, joints=_joint_error(joints, system, effect))
 
 
-def _misfelt(joints: JointGroup, system: System, effect: InjectedEffect) -> JointGroup:
+def _joint_error(joints: JointGroup, system: System, effect: InjectedEffect) -> JointGroup:
     assert joints.effort is not None
     position, effort = joints.position.copy(), joints.effort.copy()
     size = effect.values
@@ -404,7 +411,7 @@ def _misfelt(joints: JointGroup, system: System, effect: InjectedEffect) -> Join
     return replace(joints, position=position, effort=effort)
 
 
-def _misseen(group: PointGroup, system: System, effect: InjectedEffect, duration: float) -> PointGroup:
+def _camera_error(group: PointGroup, system: System, effect: InjectedEffect, duration: float) -> PointGroup:
     assert group.pose is not None
     size, position = effect.values, group.position
     centre = np.asarray(group.pose)[:3, 3]

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.model.kinematics import forward_kinematics
-from yid_ocp.model.mechanism import Frame, Inertia, Mechanism, Placement, merged
+from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement, merged
 from yid_ocp.model.system import Effect, MidpointState, System
 
 Array = NDArray[np.float64]
@@ -58,8 +58,7 @@ def mujoco_xml(
     ------
     ModelError
         What MuJoCo cannot express: a moving body without mass, more than six massless joints at one place, a frame on
-        one of them, a compliant grasp or
-        coordinate, an effect that adds forces.
+        one of them, a compliant grasp or coordinate, an effect that adds forces.
     ConfigError
         Unknown parameter, or `time_step` not positive.
     """
@@ -81,33 +80,41 @@ def mujoco_xml(
         tolerance="1e-14",
     )
     ElementTree.SubElement(option, "flag", contact="disable")
-    world = ElementTree.SubElement(root, "worldbody")
+    sites = _sites(system, tree, value)
+    elements = _bodies(system, tree, value, sites, ElementTree.SubElement(root, "worldbody"))
+    for name, frame in sites:
+        ElementTree.SubElement(elements[frame.joint], "site", {"name": name, **_pose(frame.placement)})
+    _add_grasps(system, ElementTree.SubElement(root, "equality"), time_step)
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode") + "\n"
 
+
+def _bodies(
+    system: System,
+    tree: Mechanism,
+    value: Evaluator,
+    sites: list[tuple[str, Frame]],
+    world: ElementTree.Element,
+) -> dict[int, ElementTree.Element]:
+    """Add bodies with their joints and masses; the body of every joint by its index, -1 for the world."""
     springs: dict[str, list[tuple[float, float]]] = {}
     damping = {joint: float(value(coefficient)[0]) for joint, coefficient in system.damping.items()}
     for entry in system.elastic:
         springs.setdefault(entry.joint, []).append((float(value(entry.stiffness)[0]), float(value(entry.rest)[0])))
         damping[entry.joint] = damping.get(entry.joint, 0.0) + float(value(entry.damping)[0])
-
-    sites = _sites(system, tree, value)
-    carried = {frame.joint for _, frame in sites}
+    carried = {frame.joint: name for name, frame in reversed(sites)}
     elements: dict[int, ElementTree.Element] = {-1: world}
     for j, joint in enumerate(tree.joints):
         if _shares_body(tree, j):
             elements[j] = elements[joint.parent]
             if joint.parent in carried:
-                name = next(name for name, frame in sites if frame.joint == joint.parent)
-                raise ModelError(f"frame '{name}' sits on a joint that carries no mass", where=f"joint {joint.name}")
+                what = f"frame '{carried[joint.parent]}' sits on a joint that carries no mass"
+                raise ModelError(what, where=f"joint {joint.name}")
         else:
             elements[j] = ElementTree.SubElement(
                 elements[joint.parent], "body", {"name": f"{joint.name}_body", **_pose(joint.placement)}
             )
-        attributes = {"name": joint.name, "axis": _text(joint.axis), "damping": _text([damping.get(joint.name, 0.0)])}
-        attributes["type"] = "hinge" if joint.kind == "revolute" else "slide"
-        stiffness = sum(k for k, _ in springs.get(joint.name, ()))
-        if stiffness > 0:
-            attributes["stiffness"] = _text([stiffness])
-            attributes["springref"] = _text([sum(k * rest for k, rest in springs[joint.name]) / stiffness])
+        attributes = _joint_attributes(joint, damping.get(joint.name, 0.0), springs.get(joint.name, []))
         ElementTree.SubElement(elements[j], "joint", attributes)
         if len(elements[j].findall("joint")) > _JOINTS_PER_BODY:
             raise ModelError(
@@ -124,18 +131,26 @@ def mujoco_xml(
                 where=f"joint {joint.name}",
                 allowed="a body with mass on every joint, or several joints at one place with a body on the last",
             )
-    for name, frame in sites:
-        ElementTree.SubElement(elements[frame.joint], "site", {"name": name, **_pose(frame.placement)})
+    return elements
 
-    equality = ElementTree.SubElement(root, "equality")
+
+def _joint_attributes(joint: Joint, damping: float, springs: list[tuple[float, float]]) -> dict[str, str]:
+    attributes = {"name": joint.name, "axis": _text(joint.axis), "damping": _text([damping])}
+    attributes["type"] = "hinge" if joint.kind == "revolute" else "slide"
+    stiffness = sum(k for k, _ in springs)
+    if stiffness > 0:
+        attributes["stiffness"] = _text([stiffness])
+        attributes["springref"] = _text([sum(k * rest for k, rest in springs) / stiffness])
+    return attributes
+
+
+def _add_grasps(system: System, equality: ElementTree.Element, time_step: float) -> None:
     firm = {"solref": _text([2 * time_step, 1.0]), "solimp": "0.9999 0.9999 0.001 0.5 2"}
     for grasp in system.grasps:
         kind = "weld" if grasp.kind == "weld" else "connect"
         for end in ("", "_ahead") if grasp.kind == "axis" else ("",):
             ends = {"site1": f"grasp_{grasp.name}_holder{end}", "site2": f"grasp_{grasp.name}_held{end}"}
             ElementTree.SubElement(equality, kind, {"name": f"grasp_{grasp.name}{end}", **ends, **firm})
-    ElementTree.indent(root)
-    return ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
 class Evaluator:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import casadi as ca
@@ -23,6 +23,7 @@ from annotated_types import Ge, Gt, Le
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import ConfigError, DataError
+from yid_ocp.least_squares import Quadratic, damped_newton
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.options import About, check
@@ -39,6 +40,7 @@ _STATIONS = 6  # per link, where it is asked whether points are near
 _OWN_SHARE = 0.3
 _TOUCHING = 1e-3  # [m]
 _LEAST_STIFFNESS = 1e-2  # of the mean; softer bends are still held this much
+_TOLERANCE = 1e-4  # of a bend [rad] and, relative, of the cost, at which a pass ends
 
 
 @dataclass(frozen=True)
@@ -100,7 +102,7 @@ class Fit:
     points : ndarray, shape (np, 3)
         The system's points there [m].
     std : ndarray, shape (np, 3)
-        Deviation of each coordinate by the curvature of the cost [m].
+        Standard deviation of each coordinate by the curvature of the cost [m].
     distance : float
         Mean of |e_i| over the points of the cloud, each counted for 0.1 m at most: the value of equation (3) [m].
         Parts of the cloud that are not connected with the largest one and lie off the shape are left out.
@@ -249,79 +251,85 @@ class ShapeFit:
         DataError
             There is no point.
         """
-        options, free = self.options, list(self.free)
         if not len(sight.points) or not len(sight.nodes):
             raise DataError("there is no point to fit to", where="fit")
+        free = list(self.free)
         q = self.rest.copy()
         known = [self.system.mechanism.joint_index(name) for name in self.known]
         q[known] = q_known[known]
-        weight = np.minimum(sight.weight, options.weight_cap)
-        # nodes weigh together as much as the points, which share their errors
-        node_weight = np.full(len(sight.nodes), weight.sum() / len(sight.nodes))
-        factor = 1.0 / (options.noise_correlation * options.noise**2)
-        passes = [(sight.nodes, node_weight, NODE_FACTOR, scale) for scale in options.scales]
-        passes += [(sight.points, weight, 1.0, scale) for scale in options.surface_scales]
-        tasks = [_Task(p, w * factor, share, scale, sight.camera, previous) for p, w, share, scale in passes]
-        found, iterations = [], 0
+        weight = np.minimum(sight.weight, self.options.weight_cap)
+        on_nodes, on_points = self._tasks(sight, weight, previous)
+        tried = []
         for start in (*starts, self.rest):
             trial = q.copy()
             trial[free] = start[free]
-            cost, hessian = math.inf, np.eye(len(free))
-            for task in tasks[: len(options.scales)]:
-                trial, hessian, cost, used = self._minimise(trial, task)
-                iterations += used
-            found.append((cost, trial, hessian))
-        _, q, hessian = min(found, key=lambda entry: entry[0])
-        for task in tasks[len(options.scales) :]:
-            q, hessian, _, used = self._minimise(q, task)
-            iterations += used
-        near = (options.surface_scales or options.scales)[-1] * 3
+            tried.append(self._minimise(_Minimum(trial, np.eye(len(free)), math.inf, 0), on_nodes))
+        best = min(tried, key=lambda minimum: minimum.cost)
+        last = self._minimise(best, on_points)
+        iterations = sum(minimum.iterations for minimum in tried) + last.iterations - best.iterations
+        return self._judged(replace(last, iterations=iterations), sight, weight)
+
+    def _tasks(
+        self, sight: Sight, weight: Array, previous: tuple[Array, float] | None
+    ) -> tuple[list[_Task], list[_Task]]:
+        """The passes on the nodes and those on the points."""
+        options = self.options
+        factor = 1.0 / (options.noise_correlation * options.noise**2)
+        # nodes weigh together as much as the points, which share their errors
+        node_weight = np.full(len(sight.nodes), weight.sum() / len(sight.nodes)) * factor
+        camera = sight.camera
+        return (
+            [_Task(sight.nodes, node_weight, NODE_FACTOR, scale, camera, previous) for scale in options.scales],
+            [_Task(sight.points, weight * factor, 1.0, scale, camera, previous) for scale in options.surface_scales],
+        )
+
+    def _minimise(self, start: _Minimum, tasks: Sequence[_Task]) -> _Minimum:
+        """One pass after the other, each from where the one before ended."""
+        free, end = list(self.free), start
+        for task in tasks:
+            q = end.q.copy()
+
+            def about(bends: Array, task: _Task = task, q: Array = q) -> Quadratic:
+                trial = q.copy()
+                trial[free] = bends
+                return self._quadratic(trial, task)
+
+            found = damped_newton(
+                about,
+                q[free],
+                iterations=self.options.iterations,
+                step_tolerance=_TOLERANCE,
+                cost_tolerance=_TOLERANCE,
+            )
+            q[free] = found.x
+            end = _Minimum(q, found.model.hessian, found.model.cost, end.iterations + found.iterations)
+        return end
+
+    def _judged(self, minimum: _Minimum, sight: Sight, weight: Array) -> Fit:
+        """The shape with its standard deviations, and how much of the cloud lies on it."""
+        q = minimum.q
+        near = (self.options.surface_scales or self.options.scales)[-1] * 3
         error, link, along = self._errors(q, sight.points, 1.0, sight.camera)
         size = np.abs(error)
-        share_in = size < near
-        own = _own_parts(sight.part, share_in, weight)
+        on_shape = size < near
+        own = _own_parts(sight.part, on_shape, weight)
         points, jacobian = self._seen(q)
-        spread = np.array(jacobian) @ np.linalg.solve(hessian, np.array(jacobian).T)
+        spread = np.array(jacobian) @ np.linalg.solve(minimum.hessian, np.array(jacobian).T)
         corners = np.array(self._corners(q)[0]).reshape(-1, 2, 3)
-        coverage = self._coverage(link[share_in], along[share_in])
+        coverage = self._coverage(link[on_shape], along[on_shape])
         places = np.array(points).reshape(-1, 3)
         return Fit(
             q,
             places,
             np.sqrt(np.maximum(np.diag(spread), 0.0)).reshape(-1, 3),
             float(np.average(np.minimum(size, 0.1)[own], weights=weight[own])),
-            float(np.average(share_in[own], weights=weight[own])),
+            float(np.average(on_shape[own], weights=weight[own])),
             coverage,
             self._seen_points(corners, places, coverage),
             np.array(self._gap(q)).reshape(-1, 3),
-            iterations,
+            minimum.iterations,
             corners,
         )
-
-    def _minimise(self, q: Array, task: _Task) -> tuple[Array, Array, float, int]:
-        """Levenberg and Marquardt's method: the configuration, the Hessian and the cost there, the iterations."""
-        free = list(self.free)
-        cost, gradient, hessian = self._system(q, task)
-        damping = 1e-3
-        used = 0
-        while used < self.options.iterations:
-            used += 1
-            step = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), gradient)
-            size = float(np.abs(step).max())
-            trial = q.copy()
-            trial[free] += step * min(1.0, 0.5 / max(size, 1e-12))
-            new_cost, new_gradient, new_hessian = self._system(trial, task)
-            if new_cost < cost:
-                done = size < 1e-4 or cost - new_cost < 1e-4 * cost
-                q, cost, gradient, hessian = trial, new_cost, new_gradient, new_hessian
-                damping = max(damping / 10, 1e-9)
-                if done:
-                    break
-            else:
-                damping *= 10
-                if size < 1e-5 or damping > 1e6:
-                    break
-        return q, hessian, cost, used
 
     def _errors(self, q: Array, points: Array, share: float, camera: Array) -> tuple[Array, Integers, Array]:
         """e_i, the link that each point belongs to, and where along it (0 to 1)."""
@@ -345,7 +353,7 @@ class ShapeFit:
         distance = np.sqrt(apart[rows, link])
         return link, along, normal / np.maximum(distance, 1e-9)[:, None], distance
 
-    def _system(self, q: Array, task: _Task) -> tuple[float, Array, Array]:
+    def _quadratic(self, q: Array, task: _Task) -> Quadratic:
         """Cost, gradient and Gauss-Newton Hessian by the free bends."""
         out, jacobian = self._corners(q)
         corners, by_q = np.array(out).reshape(-1, 2, 3), np.array(jacobian)
@@ -382,7 +390,7 @@ class ShapeFit:
             cost += 0.5 * float(change @ change)
             gradient += change * slow
             hessian += slow**2 * np.eye(len(change))
-        return cost, gradient, hessian
+        return Quadratic(cost, gradient, hessian)
 
     def _coverage(self, link: Integers, along: Array) -> Array:
         stations = link * _STATIONS + np.minimum((along * _STATIONS).astype(np.int64), _STATIONS - 1)
@@ -407,6 +415,16 @@ def _own_parts(part: Integers, near: NDArray[np.bool_], weight: Array) -> NDArra
     share = np.bincount(part, weight * near) / np.maximum(total, 1e-12)
     share[0] = 1.0
     return np.asarray(share[part] >= _OWN_SHARE)
+
+
+@dataclass(frozen=True, eq=False)
+class _Minimum:
+    """Where passes ended: configuration, Hessian by the free bends and cost there, iterations so far."""
+
+    q: Array
+    hessian: Array
+    cost: float
+    iterations: int
 
 
 @dataclass(frozen=True, eq=False)

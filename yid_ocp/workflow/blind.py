@@ -14,7 +14,7 @@ from typing import Any
 
 from yid_ocp.config.reader import DIAGNOSIS_DEFAULT, load_config
 from yid_ocp.config.settings import Run, dump_config
-from yid_ocp.data.recording import read_recording, write_recording
+from yid_ocp.data.hdf5 import read_recording, write_recording
 from yid_ocp.diagnosis.blind import Case, Ensemble, Label, answer, best_closure, mark, opened, score, seal
 from yid_ocp.errors import OutputError, YidError
 from yid_ocp.files import jsonable, write_json, write_text

@@ -16,7 +16,8 @@ from yid_ocp.analysis.convergence import grasp_gaps
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import CableObject, MountSettings, ParameterSettings, Run, SegmentedObject, YObject
 from yid_ocp.data.edges import edge_lengths
-from yid_ocp.data.recording import Recording, read_recording
+from yid_ocp.data.hdf5 import read_recording
+from yid_ocp.data.recording import Recording
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import DataError, ModelError, YidError, nearest
 from yid_ocp.integrator.step import Step, compile_step

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import Run
-from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate, write_recording
+from yid_ocp.data.hdf5 import write_recording
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.prediction import EpisodeResult
@@ -108,12 +109,16 @@ def run_simulate(
 
 
 def _virtual(run: Run, progress: Progress, seed: int) -> Recording:
-    from yid_ocp.virtual.experiment import virtual_experiment
+    from yid_ocp.virtual.engine import Simulation
+    from yid_ocp.virtual.experiment import VirtualExperiment, virtual_experiment
 
     system = build_system(run)
     progress.stage("simulating a virtual experiment in MuJoCo")
     duration = run.problem.duration or DURATION
-    return virtual_experiment(system, None, duration=duration, seed=seed, name=run.name, description=run.description)
+    experiment = VirtualExperiment(
+        simulation=Simulation(duration), seed=seed, name=run.name, description=run.description
+    )
+    return virtual_experiment(system, None, experiment)
 
 
 def _predicted(run: Run, progress: Progress, seed: int | None) -> Recording | str:

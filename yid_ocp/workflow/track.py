@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import Run, VirtualFramesSettings
-from yid_ocp.data.recording import Recording, read_recording, write_recording
+from yid_ocp.data.hdf5 import read_recording, write_recording
+from yid_ocp.data.recording import Recording
 from yid_ocp.errors import ConfigError
 from yid_ocp.files import file_sha256
 from yid_ocp.model.system import System
@@ -178,7 +179,10 @@ def virtual_film(run: Run, system: System, settings: VirtualFramesSettings) -> t
     ------
     ConfigError, DataError, ModelError
     """
-    from yid_ocp.virtual.experiment import INNER_STEP, Motion, initial_posture, simulate_in_mujoco, virtual_experiment
+    from yid_ocp.virtual.engine import Simulation, simulate_in_mujoco
+    from yid_ocp.virtual.experiment import VirtualExperiment, virtual_experiment
+    from yid_ocp.virtual.motion import Excitation, multisine
+    from yid_ocp.virtual.posture import initial_posture
 
     for name in settings.offsets:
         if name not in [grasp.name for grasp in system.grasps]:
@@ -186,22 +190,21 @@ def virtual_film(run: Run, system: System, settings: VirtualFramesSettings) -> t
             raise run.refuse(f"there is no grasp '{name}'", "track", "virtual", "offsets", name, allowed=known)
     with located(run, "track", "virtual"):
         posture = initial_posture(system, offsets=settings.offsets)
-        duration = settings.duration
-        motion = Motion.multisine(
-            system, seed=settings.seed, posture=posture, travel=settings.travel, duration=duration
-        )
-        recording = virtual_experiment(
-            system,
+        simulation = Simulation(settings.duration)
+        excitation = Excitation(travel=settings.travel, duration=settings.duration)
+        motion = multisine(system, seed=settings.seed, posture=posture, excitation=excitation)
+        experiment = VirtualExperiment(
             motion=motion,
-            duration=duration,
-            seed=settings.seed,
-            vision=False,
             posture=posture,
+            simulation=simulation,
+            camera=None,
+            seed=settings.seed,
             name=run.name,
             description=run.description,
         )
+        recording = virtual_experiment(system, None, experiment)
         # the same once more, for the shape that a recording does not hold
-        truth = simulate_in_mujoco(system, None, motion, duration=duration, posture=posture, time_step=INNER_STEP)
+        truth = simulate_in_mujoco(system, None, motion, simulation, posture=posture)
         made = virtual_frames(
             system,
             truth.t,

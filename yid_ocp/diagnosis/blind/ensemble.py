@@ -24,8 +24,9 @@ from yid_ocp.effects.base import Quantity, segment_springs
 from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.virtual.experiment import Motion
+from yid_ocp.virtual.experiment import PointCamera, VirtualExperiment
 from yid_ocp.virtual.injected import KINDS, OUTSIDE, InjectedEffect, injected_experiment
+from yid_ocp.virtual.motion import Excitation, multisine
 
 SIZES = (1.0, 3.0, 10.0)
 """Multiples of the detectable size."""
@@ -181,17 +182,24 @@ class Ensemble:
         if links > 1:
             assert self._finer is not None
             system = self._finer(links)
-        motion = Motion.multisine(
-            self.problem.system, truth, seed=int(rng.integers(2**31)), posture=self.posture, travel=TRAVEL
+        motion = multisine(
+            self.problem.system,
+            truth,
+            seed=int(rng.integers(2**31)),
+            posture=self.posture,
+            excitation=Excitation(travel=TRAVEL),
+        )
+        experiment = VirtualExperiment(
+            motion=motion,
+            posture=self.posture,
+            camera=PointCamera() if self.vision else None,
+            seed=int(rng.integers(2**31)),
         )
         made = injected_experiment(
             system,
             truth if links == 1 else finer_values(self.problem.system, system, truth),
             injected,
-            motion=motion,
-            seed=int(rng.integers(2**31)),
-            posture=self.posture,
-            vision=self.vision,
+            experiment,
         )
         return replace(made, name=name, description="", source="", truth={})
 

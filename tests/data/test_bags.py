@@ -1,0 +1,236 @@
+from __future__ import annotations
+
+import contextlib
+import math
+import sqlite3
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from recording_examples import joints_of
+
+from yid_ocp.data.hdf5 import write_recording
+from yid_ocp.data.readers import read_any
+from yid_ocp.data.readers.bags import read_bag
+from yid_ocp.errors import DataError
+
+SECOND = 10**9
+
+
+NO_ROSBAGS = "bags need rosbags: pip install 'yid-ocp[bags]'"
+JOINT_STATE, POINT = "sensor_msgs/msg/JointState", "geometry_msgs/msg/PointStamped"
+START = 1_700_000_000 * SECOND
+FORMATS = ("bag", "mcap", "mcap folder", "db3", "db3 folder")
+
+
+def joint_state(names: Sequence[str], stamp: int, **channels: Sequence[float]) -> tuple[str, dict[str, Any]]:
+    return JOINT_STATE, {"name": list(names), "stamp": stamp, "frame_id": "", **channels}
+
+
+def point(stamp: int, xyz: Sequence[float], frame: str = "camera_link") -> tuple[str, dict[str, Any]]:
+    return POINT, {"stamp": stamp, "frame_id": frame, "xyz": xyz}
+
+
+Messages = Sequence[tuple[str, int, tuple[str, dict[str, Any]]]]
+
+
+def write_bag(folder: Path, kind: str, messages: Messages) -> Path:
+    """Write (topic, time of recording, message) triples as one of `FORMATS`."""
+    pytest.importorskip("rosbags", reason=NO_ROSBAGS)
+    from rosbags.rosbag1 import Writer as Writer1
+    from rosbags.rosbag2 import StoragePlugin
+    from rosbags.rosbag2 import Writer as Writer2
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC if kind == "bag" else Stores.ROS2_HUMBLE)
+    types: Any = store.types
+    path = folder / ("run.bag" if kind == "bag" else "run")
+    writer: Any
+    if kind == "bag":
+        writer = Writer1(path)
+    else:
+        plugin = StoragePlugin.MCAP if kind.startswith("mcap") else StoragePlugin.SQLITE3
+        writer = Writer2(path, version=9, storage_plugin=plugin)
+    with writer:
+        connections: dict[tuple[str, str], Any] = {}
+        for topic, logged, (msgtype, values) in messages:
+            if (topic, msgtype) not in connections:
+                connections[topic, msgtype] = writer.add_connection(topic, msgtype, typestore=store)
+            stamp = types["builtin_interfaces/msg/Time"](*divmod(values["stamp"], SECOND))
+            sequence = (0,) if kind == "bag" else ()
+            header = types["std_msgs/msg/Header"](*sequence, stamp=stamp, frame_id=values["frame_id"])
+            if msgtype == JOINT_STATE:
+                arrays = [np.array(values.get(c, []), dtype=float) for c in ("position", "velocity", "effort")]
+                message = types[JOINT_STATE](header, values["name"], *arrays)
+            elif msgtype == POINT:
+                message = types[POINT](header, types["geometry_msgs/msg/Point"](*map(float, values["xyz"])))
+            else:
+                message = types[msgtype](values["data"])
+            serialize = store.serialize_ros1 if kind == "bag" else store.serialize_cdr
+            writer.write(connections[topic, msgtype], logged, serialize(message, msgtype))
+    return path / f"run.{kind}" if kind in ("mcap", "db3") else path
+
+
+def arm_and_camera() -> Messages:
+    messages: list[tuple[str, int, tuple[str, dict[str, Any]]]] = []
+    for k in range(5):
+        stamp = START + k * SECOND // 100
+        values = {"position": [0.1 * k, 0.2 * k], "velocity": [1.0, 2.0], "effort": [math.nan, math.nan]}
+        messages.append(("/joint_states", stamp + 1000, joint_state(("a", "b"), stamp, **values)))
+    for k, topic in enumerate(("/seen/w_T1", "/seen/w_T2", "/seen/w_T1")):
+        stamp = START + (k // 2) * SECOND // 50 + SECOND // 200
+        messages.append((topic, stamp + 1000, point(stamp, (0.1 * k, 0.0, 1.0))))
+    messages.append(("/note", START, ("std_msgs/msg/String", {"stamp": 0, "frame_id": "", "data": "hello"})))
+    return messages
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_bag_round_trip(kind: str, tmp_path: Path) -> None:
+    path = write_bag(tmp_path, kind, arm_and_camera())
+    recording = read_any(path, sensor="camera")
+    joints = joints_of(recording)
+    assert joints.names == ("a", "b")
+    assert np.allclose(joints.t, 0.01 * np.arange(5), rtol=0, atol=1e-12)
+    assert np.allclose(joints.position, np.outer(np.arange(5), [0.1, 0.2]))
+    assert list(joints.channels) == ["position", "velocity"]
+    (points,) = recording.points
+    assert (points.name, points.names) == ("points", ("w_T1", "w_T2"))
+    assert (points.frame, points.sensor, points.clock) == ("camera_link", "camera", "recorded")
+    assert np.allclose(points.t, [0.005, 0.025])
+    assert np.allclose(points.position[0], [[0.0, 0, 1], [0.1, 0, 1]])
+    assert np.allclose(points.position[1, 0], [0.2, 0, 1])
+    assert np.isnan(points.position[1, 1]).all()
+    assert recording.name == "run"
+    assert recording.sha256 is not None
+    write_recording(recording, tmp_path / "run.h5")
+    assert read_any(tmp_path / "run.h5").point_names == ("w_T1", "w_T2")
+
+
+def test_bag_order_of_joints_may_change(tmp_path: Path) -> None:
+    first = joint_state(("a", "b"), START, position=[1.0, 2.0])
+    second = joint_state(("b", "a"), START + SECOND, position=[4.0, 3.0])
+    path = write_bag(tmp_path, "bag", [("/joint_states", START, first), ("/joint_states", START + SECOND, second)])
+    assert np.array_equal(joints_of(read_bag(path, joints=["a", "b"])).position, [[1, 2], [3, 4]])
+    assert np.array_equal(np.sort(joints_of(read_bag(path)).position), [[1, 2], [3, 4]])
+
+
+def test_bag_with_different_sets_of_joints(tmp_path: Path) -> None:
+    """Baxter's grippers come on the topic of its arms, in messages of their own."""
+    arm = joint_state(("a", "b"), START, position=[1.0, 2.0])
+    gripper = joint_state(("finger",), START, position=[0.5])
+    path = write_bag(tmp_path, "bag", [("/joint_states", START, arm), ("/joint_states", START, gripper)])
+    with pytest.raises(DataError, match="2 different sets of joints") as caught:
+        read_bag(path)
+    assert "joints=[...]" in caught.value.hint
+    assert read_bag(path, joints=["b"]).joint_names == ("b",)
+    with pytest.raises(DataError, match="no joint 'fingr'") as caught:
+        read_bag(path, joints=["a", "fingr"])
+    assert caught.value.hint == "did you mean 'finger'?"
+    with pytest.raises(DataError, match="never come in one message"):
+        read_bag(path, joints=["a", "finger"])
+
+
+def test_bag_with_several_joint_topics(tmp_path: Path) -> None:
+    one, two = (joint_state((name,), START, position=[1.0]) for name in "ab")
+    path = write_bag(tmp_path, "bag", [("/left", START, one), ("/right", START, two)])
+    with pytest.raises(DataError, match="several topics"):
+        read_bag(path)
+    assert read_bag(path, joint_topic="/right").joint_names == ("b",)
+    with pytest.raises(DataError, match="on the topic '/rigth'") as caught:
+        read_bag(path, joint_topic="/rigth")
+    assert caught.value.hint == "did you mean '/right'?"
+
+
+@pytest.mark.parametrize("stamps", [(0, 0), (START - SECOND // 2, 0)])
+def test_bag_without_stamps_uses_the_time_of_recording(stamps: tuple[int, int], tmp_path: Path) -> None:
+    messages = [
+        ("/joint_states", START + k * SECOND, joint_state(("a",), stamp, position=[1.0]))
+        for k, stamp in enumerate(stamps)
+    ]
+    path = write_bag(tmp_path, "mcap", messages)
+    assert np.array_equal(joints_of(read_bag(path)).t, [0.0, 1.0])
+
+
+def test_bag_without_definitions_of_its_messages(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, "db3", arm_and_camera())
+    with contextlib.closing(sqlite3.connect(path)) as database, database:
+        database.execute("DELETE FROM message_definitions")
+    recording = read_bag(path)
+    assert recording.joint_names == ("a", "b")
+    assert recording.point_names == ("w_T1", "w_T2")
+
+
+def test_bag_points_of_two_frames(tmp_path: Path) -> None:
+    messages = [
+        ("/a/tip", START, point(START, (0, 0, 0), "base/link")),
+        ("/b/tip", START, point(START + SECOND, (1, 1, 1), "camera")),
+    ]
+    path = write_bag(tmp_path, "bag", messages)
+    with pytest.raises(DataError, match="points of the same name"):
+        read_bag(path)
+    recording = read_bag(path, point_topics={"/a/tip": "tip", "/b/tip": "seen_tip"})
+    assert recording.joints is None
+    assert [(g.name, g.frame, g.names) for g in recording.points] == [
+        ("points_base_link", "base/link", ("tip",)),
+        ("points_camera", "camera", ("seen_tip",)),
+    ]
+    assert recording.duration == 1.0
+    with pytest.raises(DataError, match="no points on the topic '/c'"):
+        read_bag(path, point_topics={"/c": "tip"})
+
+
+@pytest.mark.parametrize(
+    ("messages", "expected"),
+    [
+        (
+            [("/note", START, ("std_msgs/msg/String", {"stamp": 0, "frame_id": "", "data": "x"}))],
+            "no joint states and no",
+        ),
+        ([("/j", START, joint_state(("a",), START, velocity=[1.0]))], "no positions"),
+        ([("/j", START, joint_state(("a", "b"), START, position=[1.0]))], "1 values of 'position' for 2 joints"),
+        (
+            [
+                ("/j", START, joint_state(("a",), START, position=[1.0], effort=[1.0])),
+                ("/j", START, joint_state(("a",), START + 1000, position=[1.0])),
+            ],
+            "1 of 2 messages lack 'effort'",
+        ),
+        ([("/j", START + k, joint_state(("a",), START, position=[1.0])) for k in range(2)], "from index 0 to 1"),
+        ([("/p", START + k, point(START, (1, 1, 1))) for k in range(2)], "point 'p' comes twice"),
+    ],
+    ids=["nothing", "no positions", "length", "sometimes", "repeated joints", "repeated point"],
+)
+def test_bag_errors(messages: Messages, expected: str, tmp_path: Path) -> None:
+    path = write_bag(tmp_path, "bag", messages)
+    with pytest.raises(DataError, match=expected):
+        read_bag(path)
+
+
+@pytest.mark.parametrize("kind", ["bag", "mcap", "db3"])
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.9])
+def test_truncated_bags(kind: str, share: float, tmp_path: Path) -> None:
+    path = write_bag(tmp_path, kind, arm_and_camera())
+    contents = path.read_bytes()
+    path.write_bytes(contents[: int(share * len(contents))])
+    with pytest.raises(DataError, match="the bag cannot be read") as caught:
+        read_bag(path)
+    assert caught.value.where == str(path)
+
+
+def test_bags_that_are_none(tmp_path: Path) -> None:
+    pytest.importorskip("rosbags", reason=NO_ROSBAGS)
+    with pytest.raises(DataError, match="the bag cannot be read"):
+        read_any(tmp_path)
+    with pytest.raises(DataError, match="no such file"):
+        read_bag(tmp_path / "absent.bag")
+
+
+def test_bags_without_rosbags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_bag(tmp_path, "bag", arm_and_camera())
+    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
+    with pytest.raises(DataError, match="needs the package rosbags") as caught:
+        read_any(path)
+    assert caught.value.hint == "pip install 'yid-ocp[bags]'"

@@ -1,0 +1,139 @@
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from recording_examples import joints_of, table
+
+from yid_ocp.data.readers.csv import read_csv
+from yid_ocp.errors import DataError
+
+
+def test_csv_conventional_columns(tmp_path: Path) -> None:
+    path = table(
+        tmp_path,
+        "\ufefft, q_a, position_b, effort_a, effort_b, position_command_a, position_command_b, tip_x, tip_y, tip_z\n"
+        "0.0, 0.1, 0.2, 1, 2, 0, 0, 0.5, 0.6, 0.7\n"
+        "\n"
+        "0.5, 0.3, 0.4, 3, 4, 0, 1, , , \n",
+    )
+    recording = read_csv(path, clock="nominal", sensor="camera", frame="base", description="two joints")
+    joints = joints_of(recording)
+    assert joints.names == ("a", "b")
+    assert joints.clock == "nominal"
+    assert np.array_equal(joints.position, [[0.1, 0.2], [0.3, 0.4]])
+    assert np.array_equal(joints.channels["effort"], [[1, 2], [3, 4]])
+    assert np.array_equal(joints.channels["position_command"], [[0, 0], [0, 1]])
+    (points,) = recording.points
+    assert (points.names, points.sensor, points.frame, points.clock) == (("tip",), "camera", "base", "nominal")
+    assert np.array_equal(points.position, [[[0.5, 0.6, 0.7]]])
+    assert np.array_equal(points.t, [0.0])
+    assert (recording.name, recording.source, recording.description) == ("run", "run.csv", "two joints")
+    assert recording.sha256 is not None
+
+
+def test_csv_units_are_converted(tmp_path: Path) -> None:
+    path = table(tmp_path, "time,q_a,velocity_a,effort_a,p_x,p_y,p_z\n0,180,60,1000,1,2,3\n500,90,0,0,0,0,0\n")
+    units = {"t": "ms", "position": "deg", "velocity": "rpm", "effort": "N mm", "points": "mm"}
+    recording = read_csv(path, units=units)
+    joints = joints_of(recording)
+    assert np.allclose(joints.t, [0.0, 0.5])
+    assert np.allclose(joints.position[:, 0], [math.pi, math.pi / 2])
+    assert joints.channels["velocity"][0, 0] == pytest.approx(2 * math.pi)
+    assert joints.channels["effort"][0, 0] == pytest.approx(1.0)
+    assert np.allclose(recording.points[0].position[0, 0], [0.001, 0.002, 0.003])
+    with pytest.raises(DataError, match="reaches 180 rad"):
+        read_csv(path, units={"t": "ms"})
+
+
+def test_csv_columns_given(tmp_path: Path) -> None:
+    path = table(tmp_path, "stamp;angle;label;X;Y;Z\n0;0.1;start;1;2;3\n1;0.2;;4;5;6\n")
+    columns: Mapping[str, Any] = {
+        "stamp": "t",
+        "angle": ("position", "elbow"),
+        "label": None,
+        "X": ["x", "tip"],
+        "Y": ["y", "tip"],
+        "Z": ["z", "tip"],
+    }
+    recording = read_csv(path, columns=columns, delimiter=";")
+    assert recording.joint_names == ("elbow",)
+    assert np.array_equal(recording.points[0].position[:, 0], [[1, 2, 3], [4, 5, 6]])
+
+
+def test_csv_two_clocks_in_one_table(tmp_path: Path) -> None:
+    recording = read_csv(table(tmp_path, "t,q_a,p_x,p_y,p_z\n0,1,,,\n1,2,1,1,1\n2,,2,2,2\n3,3,,,\n"))
+    assert np.array_equal(joints_of(recording).t, [0, 1, 3])
+    assert np.array_equal(recording.points[0].t, [1, 2])
+
+
+def test_csv_of_points_keeps_frames_without_any(tmp_path: Path) -> None:
+    recording = read_csv(table(tmp_path, "t,p_x,p_y,p_z\n0,1,1,1\n1,,,\n"))
+    assert np.array_equal(recording.points[0].t, [0, 1])
+    assert np.isnan(recording.points[0].position[1]).all()
+
+
+def test_joints_named_after_axes_are_not_points(tmp_path: Path) -> None:
+    recording = read_csv(table(tmp_path, "t,q_T1_x,q_T1_y,q_T1_z\n0,1,2,3\n"))
+    assert recording.joint_names == ("T1_x", "T1_y", "T1_z")
+    assert not recording.points
+
+
+GOOD = "t,q_a\n0,1\n"
+CSV_ERRORS: dict[str, tuple[str, dict[str, Any], str, str]] = {
+    "empty": ("", {}, "the table is empty", ""),
+    "no header": ("0,1\n1,2\n", {}, "no header row", ""),
+    "no rows": ("t,q_a\n", {}, "no rows", ""),
+    "other delimiter": ("t;q_a\n0;1\n", {}, "one column, 't;q_a'", "delimiter=';'"),
+    "one column": ("t\n0\n", {}, "one column, 't'", ""),
+    "long delimiter": (GOOD, {"delimiter": "::"}, "the delimiter is '::'", ""),
+    "repeated column": ("t,q_a,q_a\n0,1,1\n", {}, "two columns are called 'q_a'", ""),
+    "same meaning": ("t,q_a,position_a\n0,1,1\n", {}, "'q_a' and 'position_a' mean the same, position a", ""),
+    "unknown column": ("t,q_a,label\n0,1,2\n", {}, "meaning of column 'label'", "columns={'label'"),
+    "bare prefix": ("t,q_\n0,1\n", {}, "meaning of column 'q_'", ""),
+    "no time": ("q_a,q_b\n0,1\n", {}, "no column of times", ""),
+    "only time": ("t,label\n0,1\n", {"columns": {"label": None}}, "the recording has no group", ""),
+    "column not there": (GOOD, {"columns": {"q_b": None}}, "there is no column 'q_b'", "did you mean 'q_a'"),
+    "meaning of a column": (GOOD, {"columns": {"q_a": ("angle", "a")}}, "given the meaning", "known: "),
+    "meaning without joint": (GOOD, {"columns": {"q_a": "position"}}, "given the meaning 'position'", ""),
+    "short row": ("t,q_a\n0,1\n1\n", {}, "the row has 1 cells", ""),
+    "text": ("t,q_a\n0,1\n1,fast\n", {}, "column 'q_a' holds 'fast'", ""),
+    "joint missing in a channel": ("t,q_a,q_b,effort_a\n0,1,1,1\n", {}, "no column for effort of 'b'", ""),
+    "no position": ("t,effort_a\n0,1\n", {}, "no column for position of 'a'", ""),
+    "axis missing": ("t,p_x,p_y\n0,1,1\n", {}, "no column for z of 'p'", ""),
+    "empty cell of a joint": ("t,q_a\n0,1\n1,\n", {}, "'position' of joint 'a' is not finite at t = 1 s", ""),
+    "clock": ("t,q_a\n1,1\n0,1\n", {}, "from index 0 to 1", ""),
+    "unit of what": (GOOD, {"units": {"angle": "deg"}}, "unit is given for 'angle'", ""),
+    "unit": (GOOD, {"units": {"velocity": "deg"}}, "'deg' is not a unit of 'velocity'", "did you mean 'deg/s'"),
+}
+
+
+@pytest.mark.parametrize("case", CSV_ERRORS)
+def test_csv_errors(case: str, tmp_path: Path) -> None:
+    text, options, message, hint = CSV_ERRORS[case]
+    path = table(tmp_path, text)
+    with pytest.raises(DataError, match=message.replace("(", r"\(")) as caught:
+        read_csv(path, **options)
+    assert "run" in caught.value.where
+    assert hint in caught.value.hint
+
+
+def test_csv_errors_say_the_line(tmp_path: Path) -> None:
+    with pytest.raises(DataError) as caught:
+        read_csv(table(tmp_path, "t,q_a\n0,1\n\n1,fast\n"))
+    assert caught.value.where.endswith("line 4")
+
+
+def test_csv_that_is_no_text(tmp_path: Path) -> None:
+    path = tmp_path / "run.csv"
+    path.write_bytes(b"t,q_a\n\xff\xfe\x00,1\n")
+    with pytest.raises(DataError, match="not a table of text"):
+        read_csv(path)
+    with pytest.raises(DataError, match="not a table of text"):
+        read_csv(tmp_path)
+    with pytest.raises(DataError, match="no such file"):
+        read_csv(tmp_path / "absent.csv")

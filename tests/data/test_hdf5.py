@@ -1,0 +1,303 @@
+from __future__ import annotations
+
+import dataclasses
+import os
+import re
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from recording_examples import assert_same, changed, example, finite, turned, with_joints
+
+from yid_ocp.data.hdf5 import read_recording, write_recording
+from yid_ocp.data.recording import JOINT_CHANNELS, JointGroup, PointGroup, Recording, validate
+from yid_ocp.errors import DataError, OutputError
+
+ROOT = Path(__file__).parents[2]
+REAL_FOLDER = ROOT.parent / "shared" / "recordings"
+REAL_FILES = sorted(REAL_FOLDER.glob("*/*.h5"))
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "run.h5"
+    write_recording(example(), path)
+    return path
+
+
+# -------------------------------------------------------------------------------------------------------- the file
+
+
+def test_round_trip(file: Path) -> None:
+    recording = read_recording(file)
+    assert_same(recording, example())
+    assert recording.name == "run"
+    assert recording.sha256 is not None
+    assert re.fullmatch("[0-9a-f]{64}", recording.sha256)
+
+
+def test_positions_of_the_straight_object_survive_the_file(tmp_path: Path) -> None:
+    recording = dataclasses.replace(example(), straight=np.array([[0.1, 0.2, 0.3]]))
+    write_recording(recording, tmp_path / "run.h5")
+    assert_same(read_recording(tmp_path / "run.h5"), recording)
+    with h5py.File(tmp_path / "run.h5") as handle:
+        assert handle["straight"].attrs["unit"] == "m"
+
+
+def test_writing_is_reproducible(file: Path, tmp_path: Path) -> None:
+    write_recording(read_recording(file), tmp_path / "again.h5")
+    assert read_recording(tmp_path / "again.h5").sha256 == read_recording(file).sha256
+
+
+TEXT = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]))
+NAME = TEXT.filter(bool)
+
+
+@st.composite
+def recordings(draw: st.DrawFn) -> Recording:
+    def clock() -> np.ndarray:
+        return np.array(sorted(draw(st.lists(finite(1e9), min_size=1, max_size=6, unique=True))))
+
+    def names() -> tuple[str, ...]:
+        return tuple(draw(st.lists(NAME, min_size=1, max_size=3, unique=True)))
+
+    joints = None
+    if draw(st.booleans()):
+        t, joint_names = clock(), names()
+        shape = (len(t), len(joint_names))
+        channels: dict[str, Any] = {"position": draw(hnp.arrays(float, shape, elements=finite(50.0)))}
+        for channel in draw(st.sets(st.sampled_from(sorted(set(JOINT_CHANNELS) - {"position"})))):
+            bound = 50.0 if channel == "position_command" else 1e300
+            channels[channel] = draw(hnp.arrays(float, shape, elements=finite(bound)))
+        std = draw(st.none() | st.floats(0, 1e9) | hnp.arrays(float, shape[1], elements=st.floats(0, 1e9)))
+        joints = JointGroup(
+            joint_names, t, **channels, effort_std=std, clock=draw(st.sampled_from(["recorded", "nominal"]))
+        )
+    suffixes = draw(st.sets(st.sampled_from(["", "_camera", "_arm", "_\u00e9 2"]), min_size=0 if joints else 1))
+    points = []
+    for suffix in sorted(suffixes):
+        t, point_names = clock(), names()
+        position = draw(hnp.arrays(float, (len(t), len(point_names), 3), elements=finite(50.0)))
+        position[draw(hnp.arrays(bool, position.shape[:2]))] = np.nan
+        std = draw(st.none() | hnp.arrays(float, position.shape, elements=st.floats(0, 1e9)))
+        pose = draw(st.none() | finite(10.0).map(turned))
+        points.append(PointGroup(f"points{suffix}", point_names, t, position, std, draw(TEXT), draw(TEXT), pose))
+    truth = draw(st.dictionaries(st.text(), finite(1e300), max_size=3))
+    return Recording(joints, tuple(points), draw(TEXT), draw(TEXT), truth=truth)
+
+
+@given(recordings())
+def test_any_valid_recording_survives_the_file(recording: Recording) -> None:
+    validate(recording)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "run.h5"
+        write_recording(recording, path)
+        again = read_recording(path)
+    by_name = sorted(recording.points, key=lambda group: group.name.encode())
+    assert_same(again, dataclasses.replace(recording, points=tuple(by_name)))
+
+
+def test_nan_effort_is_written_and_read_on_request(tmp_path: Path) -> None:
+    joints = example().joints
+    assert joints is not None
+    recording = with_joints(effort=changed(joints.position, (2, 0), np.nan))
+    write_recording(recording, tmp_path / "run.h5")
+    with pytest.raises(DataError, match="'effort'") as caught:
+        read_recording(tmp_path / "run.h5")
+    assert "allow_nan_effort" in caught.value.hint
+    assert_same(read_recording(tmp_path / "run.h5", allow_nan_effort=True), recording)
+
+
+def test_missing_file_and_folder(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no such file"):
+        read_recording(tmp_path / "absent.h5")
+    with pytest.raises(DataError, match="not an HDF5 file"):
+        read_recording(tmp_path)
+
+
+def test_other_contents(tmp_path: Path) -> None:
+    for contents in (b"", b"t,q_a\n0,1\n"):
+        (tmp_path / "run.h5").write_bytes(contents)
+        with pytest.raises(DataError, match="not an HDF5 file"):
+            read_recording(tmp_path / "run.h5")
+
+
+@pytest.mark.parametrize("share", [0.05, 0.3, 0.6, 0.9, 0.999])
+def test_truncated_file(file: Path, share: float) -> None:
+    contents = file.read_bytes()
+    file.write_bytes(contents[: int(share * len(contents))])
+    with pytest.raises(DataError, match="truncated or damaged") as caught:
+        read_recording(file)
+    assert caught.value.where == str(file)
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="the superuser may read everything")
+def test_unreadable_file(file: Path) -> None:
+    file.chmod(0)
+    with pytest.raises(DataError, match="cannot be read"):
+        read_recording(file)
+
+
+def rename(file: h5py.File, old: str, new: str) -> None:
+    file.move(old, new)
+
+
+def set_names(file: h5py.File, names: Any) -> None:
+    file["joints"].attrs["names"] = names
+
+
+def straight(file: h5py.File, rows: int = 1, unit: str = "m") -> h5py.File:
+    """Add positions of a straight object, of as many points as `points_arm` has when there is one row."""
+    file.create_dataset("straight", data=np.zeros((rows, 3))).attrs["unit"] = unit
+    return file
+
+
+MALFORMED: dict[str, tuple[Callable[[h5py.File], object], str, str]] = {
+    "no format": (lambda f: f.attrs.pop("format"), "does not say its format", ""),
+    "other format": (lambda f: f.attrs.modify("format", "yid-recording/2"), "'yid-recording/2'", ""),
+    "format no text": (lambda f: f.attrs.create("format", 1), "found", ""),
+    "format not UTF-8": (lambda f: f.attrs.create("format", np.bytes_(b"\xff\xfe")), "not UTF-8", ""),
+    "group": (lambda f: rename(f, "joints", "joint"), "no group 'joint'", "did you mean 'joints'"),
+    "dataset at the top": (lambda f: f.create_dataset("points", data=[1.0]), "'points' is not a group", ""),
+    "dataset": (lambda f: rename(f, "joints/effort", "joints/efort"), "no dataset 'efort'", "did you mean 'effort'"),
+    "dataset of points": (lambda f: rename(f, "points_arm/position", "points_arm/xyz"), "no dataset 'xyz'", "known:"),
+    "attribute": (lambda f: f["joints"].attrs.create("effrt_std", 1.0), "no attribute 'effrt_std'", "'effort_std'"),
+    "no t": (lambda f: f["joints"].__delitem__("t"), "dataset 't' is missing", ""),
+    "no position": (lambda f: f["points_arm"].__delitem__("position"), "dataset 'position' is missing", ""),
+    "no names": (lambda f: f["joints"].attrs.pop("names"), "attribute 'names' is missing", ""),
+    "no sensor": (lambda f: f["points_arm"].attrs.pop("sensor"), "attribute 'sensor' is missing", ""),
+    "no frame": (lambda f: f["points_arm"].attrs.pop("frame"), "attribute 'frame' is missing", ""),
+    "names no text": (lambda f: set_names(f, [1, 2]), "found 1", ""),
+    "names empty": (lambda f: set_names(f, h5py.Empty("S1")), "cannot be used", ""),
+    "clock": (lambda f: f["joints"].attrs.modify("clock", "wall"), "the clock is 'wall'", ""),
+    "unit of position": (lambda f: f["joints/position"].attrs.modify("unit", "deg"), "'deg'", "never converted"),
+    "unit of points": (
+        lambda f: f["points_arm/position"].attrs.modify("unit", "mm"),
+        "'mm'",
+        "convert the values to m:",
+    ),
+    "unit of t": (lambda f: f["joints/t"].attrs.modify("unit", "ms"), "'ms'", "convert the values to s:"),
+    "group for dataset": (lambda f: [f["joints"].pop("effort"), f.create_group("joints/effort")], "not a dataset", ""),
+    "text for numbers": (
+        lambda f: [f["joints"].pop("effort"), f["joints"].create_dataset("effort", data=b"many")],
+        "not a dataset of real numbers",
+        "",
+    ),
+    "std twice": (lambda f: f["points_camera"].attrs.create("std", 1.0), "both a dataset and an attribute", ""),
+    "std no number": (lambda f: f["joints"].attrs.create("position_std", "small"), "not an array of real", ""),
+    "truth no JSON": (lambda f: f.attrs.modify("truth", "T1.bend = 3"), "not JSON", ""),
+    "truth no object": (lambda f: f.attrs.modify("truth", "[3]"), "not an object", ""),
+    "truth no number": (lambda f: f.attrs.modify("truth", '{"a": true}'), "'a' is True", ""),
+    "straight in millimetres": (lambda f: straight(f, unit="mm"), "'mm'", "convert the values to m:"),
+    "straight a group": (lambda f: f.create_group("straight"), "not a dataset of real numbers", ""),
+    "straight of too few": (lambda f: straight(f, rows=2), r"shape \(2, 3\)", ""),
+    "another entry at the top": (lambda f: rename(straight(f), "straight", "straigt"), "'straigt'", "mean 'straight'"),
+    "contents": (lambda f: f["joints/t"].__setitem__(3, 0.0), "from index 2 to 3", "sort by time"),
+}
+
+
+@pytest.mark.parametrize("case", MALFORMED)
+def test_malformed_files_are_refused(case: str, file: Path) -> None:
+    damage, message, hint = MALFORMED[case]
+    with h5py.File(file, "r+") as handle:
+        damage(handle)
+    with pytest.raises(DataError, match=message) as caught:
+        read_recording(file)
+    assert str(file) in caught.value.where
+    assert hint in caught.value.hint
+
+
+def test_files_of_other_tools(file: Path) -> None:
+    """MATLAB and C write byte strings, scalars and integers where h5py writes text, arrays and floats."""
+    with h5py.File(file, "r+") as handle:
+        handle.attrs["format"] = np.bytes_("yid-recording/1")
+        handle.attrs["description"] = h5py.Empty("S1")
+        handle.attrs["operator"] = "free notes on the file are nobody's business"
+        set_names(handle, np.array([b"a", b"b"]))
+        del handle["joints/effort"], handle["points_camera/std"]
+        handle["joints"].create_dataset("effort", data=np.ones((50, 2), dtype=np.int32))
+        handle["points_camera"].create_dataset("std", data=0.02)
+        handle["points_arm"].attrs["names"] = "w_T2"
+        handle["points_arm"].attrs["std"] = 0.03
+        handle["points_arm"].attrs["clock"] = np.array(["nominal"], dtype=h5py.string_dtype())
+        del handle["joints"].attrs["clock"], handle["joints/t"].attrs["unit"]
+    recording = read_recording(file)
+    assert recording.joint_names == ("a", "b")
+    assert recording.description == ""
+    assert recording.joints is not None
+    assert recording.joints.clock == "recorded"
+    assert recording.joints.effort is not None
+    assert recording.joints.effort.dtype == np.float64
+    arm, camera = recording.points
+    assert arm.names == ("w_T2",)
+    assert arm.clock == "nominal"
+    assert arm.std is not None
+    assert camera.std is not None
+    assert (arm.std[0, 0, 0], camera.std.shape) == (0.03, (4, 3, 3))
+
+
+# -------------------------------------------------------------------------------------------------------- writing
+
+
+def test_unwritable_places(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for path in (tmp_path / "absent" / "run.h5", tmp_path / "file" / "run.h5"):
+        with pytest.raises(OutputError, match="folder to write to does not exist"):
+            write_recording(example(), path)
+    with pytest.raises(OutputError, match="that of a folder"):
+        write_recording(example(), tmp_path)
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="the superuser may write everywhere")
+def test_a_folder_without_permission(tmp_path: Path) -> None:
+    tmp_path.chmod(0o500)
+    with pytest.raises(OutputError, match="Permission denied"):
+        write_recording(example(), tmp_path / "run.h5")
+
+
+def test_a_failure_leaves_the_old_file_alone(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = file.read_bytes()
+
+    def refuse(source: object, target: object) -> None:
+        raise PermissionError(13, "no")
+
+    monkeypatch.setattr(os, "replace", refuse)
+    with pytest.raises(OutputError, match="Permission denied"):
+        write_recording(example().slice(0.0, 0.1), file)
+    assert [entry.name for entry in file.parent.iterdir()] == ["run.h5"]
+    assert file.read_bytes() == before
+
+
+@pytest.mark.skipif(
+    not REAL_FILES, reason="the real recordings are not here (folder shared/recordings beside the project)"
+)
+def test_the_real_recordings_are_all_there() -> None:
+    assert {path.parent.name for path in REAL_FILES} == set(REAL_SIZES)
+
+
+@pytest.mark.parametrize(
+    "path",
+    REAL_FILES
+    or [
+        pytest.param(
+            Path(),
+            marks=pytest.mark.skip(reason="the real recordings are not here (shared/recordings beside the project)"),
+        )
+    ],
+    ids=lambda path: path.stem,
+)
+def test_real_recordings_read(path: Path, tmp_path: Path) -> None:
+    recording = read_recording(path)
+    assert (len(recording.joint_names), len(recording.point_names)) == REAL_SIZES[path.parent.name]
+    assert (recording.straight is not None) == (path.parent.name == "soft_beam")
+    assert 4.0 < recording.duration < 60.0
+    assert recording.source
+    write_recording(recording, tmp_path / "copy.h5")
+    assert_same(read_recording(tmp_path / "copy.h5"), recording)

@@ -1,0 +1,100 @@
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from virtual_examples import SYSTEMS, TRUTH, Runs
+
+from yid_ocp.errors import ConfigError, DataError, ModelError
+from yid_ocp.model.kinematics import forward_kinematics, rigid_body
+from yid_ocp.model.system import Grasp
+from yid_ocp.virtual.engine import Simulation, simulate_in_mujoco
+from yid_ocp.virtual.motion import multisine
+from yid_ocp.virtual.posture import initial_posture
+
+mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
+
+
+@pytest.mark.parametrize("arms", [1, 2])
+def test_grasps_hold(runs: Runs, arms: int) -> None:
+    run, system = runs(arms, 1e-4), SYSTEMS[arms]
+    assert run.grasp_error.max() < 1e-4
+    q = ca.SX.sym("q", system.size)
+    phi = ca.Function("phi", [q], [system.constraints(forward_kinematics(system.mechanism.numeric(), q))])
+    gaps = np.array([phi(row) for row in run.q]).reshape(len(run.t), -1, 3)
+    np.testing.assert_allclose(np.linalg.norm(gaps, axis=2), run.grasp_error, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("arms", [1, 2])
+def test_halving_the_inner_step_changes_little(runs: Runs, arms: int) -> None:
+    coarse, fine = runs(arms, 1e-4), runs(arms, 5e-5)
+    assert np.linalg.norm(coarse.points - fine.points, axis=-1).max() < 5e-5
+
+
+@pytest.mark.parametrize("arms", [1, 2])
+def test_the_motion_excites_the_object_at_moderate_speed(runs: Runs, arms: int) -> None:
+    run, system = runs(arms, 5e-5), SYSTEMS[arms]
+    held = [system.points.index(grasp.held) for grasp in system.grasps]
+    extent = np.ptp(run.points[:, held], axis=0).max(-1)
+    assert np.all((extent > 0.1) & (extent < 0.25))
+    assert np.abs(run.v[:, list(system.driven_indices)]).max() < 1.5
+    limits = [system.mechanism.joints[j].effort_limit for j in system.driven_indices]
+    assert np.all(np.abs(run.effort).max(0) < limits)
+
+
+@pytest.mark.parametrize("arms", [1, 2])
+def test_starts_in_static_equilibrium_of_the_symbolic_equations(runs: Runs, arms: int) -> None:
+    run, system = runs(arms, 1e-4), SYSTEMS[arms]
+    q, u = ca.SX.sym("q", system.size), ca.SX.sym("u", len(system.driven))
+    kinematics = forward_kinematics(system.mechanism, q)
+    rigid = rigid_body(kinematics, ca.SX(ca.DM.zeros(system.size)), system.gravity)
+    force = rigid.by_q - ca.gradient(system.elastic_energy(q), q) + system.input_force(u)
+    jacobian = ca.jacobian(system.constraints(kinematics), q)
+    function = ca.Function("statics", [q, u, system.parameters.symbols], [force, jacobian])
+    load, gradient = (
+        np.array(ca.densify(e)) for e in function(run.q[0], run.effort[0], system.parameters.vector(TRUTH))
+    )
+    multiplier = np.linalg.lstsq(gradient.T, load, rcond=None)[0]
+    assert np.abs(load - gradient.T @ multiplier).max() < 1e-5
+    assert np.abs(run.v[0]).max() == 0.0
+    posture = initial_posture(system, TRUTH)
+    start = dict(zip(system.mechanism.joint_names, run.q[0], strict=True))
+    assert all(abs(start[name] - angle) < 1e-5 for name, angle in posture.items())
+
+
+@pytest.mark.parametrize("kind", ["axis", "weld"])
+def test_other_grasps_hold(kind: str) -> None:
+    system = SYSTEMS[1]
+    posture = initial_posture(system)
+    q = ca.SX.sym("q", system.size)
+    kinematics = forward_kinematics(system.mechanism.numeric(), q)
+    rotation = kinematics.pose("left_gripper").rotation.T @ kinematics.pose("w_T2").rotation
+    start = [posture.get(name, 0.0) for name in system.mechanism.joint_names]
+    turned = ca.SX(ca.densify(ca.Function("r", [q], [rotation])(start)))
+    grasp = Grasp("left", "left_gripper", "w_T2", kind, rotation=turned)  # type: ignore[arg-type]
+    system = replace(system, grasps=(grasp,))
+    motion = multisine(system, TRUTH, seed=1, posture=posture)
+    run = simulate_in_mujoco(system, TRUTH, motion, Simulation(0.8, time_step=2e-4), posture=posture)
+    phi = ca.Function("phi", [q], [system.constraints(forward_kinematics(system.mechanism.numeric(), q))])
+    assert np.abs(run.q[-1] - run.q[0]).max() > 0.02
+    residual = np.array([np.array(phi(row)).ravel() for row in run.q])
+    assert residual.shape[1] == grasp.equations
+    assert np.abs(residual).max() < 1e-4
+
+
+def test_simulations_that_do_not_fit_are_refused() -> None:
+    system = SYSTEMS[1]
+    motion = multisine(system, seed=0)
+    with pytest.raises(ConfigError, match="does not divide"):
+        Simulation(time_step=3e-4)
+    with pytest.raises(ModelError, match="driven joints"):
+        simulate_in_mujoco(replace(system, driven=system.driven[:3], prescribed=system.driven[3:]), None, motion)
+
+
+def test_without_mujoco_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(DataError, match=r"yid-ocp\[blind\]"):
+        simulate_in_mujoco(SYSTEMS[1], None, multisine(SYSTEMS[1], seed=0))

@@ -1,0 +1,329 @@
+"""The simulation in MuJoCo: a controller makes the driven joints follow a motion, from static equilibrium.
+
+The simulator shares the description of the system with the estimator and nothing else: its equations, its integrator
+and its treatment of the grasps are MuJoCo's own, so that an estimate is never checked against its own mistakes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from yid_ocp.errors import ConfigError, ModelError
+from yid_ocp.model.system import System
+from yid_ocp.virtual.mjcf import compiled_model, mujoco_module, mujoco_xml
+from yid_ocp.virtual.motion import Motion
+from yid_ocp.virtual.posture import initial_posture
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+INNER_STEP = 1e-4
+"""Step of the simulator where nothing else is said [s]."""
+
+_BANDWIDTH = 25.0  # of the joint controller [rad/s]; a 10 ms hold leaves it well damped
+_HOLD_STIFFNESS = 2e3  # [N m/rad] while settling; stable explicitly on the lightest wrist
+_HOLD_DAMPING = 60.0  # [N m s/rad]
+_SETTLING_FACTOR = 10.0  # on the object's damping: equilibrium does not depend on it, time to get there does
+_SETTLING_LIMIT = 60.0  # [s]
+_POSTURE_TOLERANCE = 1e-6  # [rad]
+_REST = 1e-7  # [rad/s]
+_BAD_ACCELERATION = 6  # mjWARN_BADQACC: MuJoCo then resets its state and goes on
+
+
+class EngineTerms(Protocol):
+    """Terms that the simulator has and the system's description has not."""
+
+    def prepare(self, model: Any) -> None:
+        """Edit the compiled `mujoco.MjModel`."""
+        ...
+
+    def begin(self, data: Any) -> None:
+        """Called when the motion begins, at rest."""
+        ...
+
+    def force(self, model: Any, data: Any) -> None:
+        """Add generalized forces to `data.qfrc_passive`; called at every inner step."""
+        ...
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """How long and how finely is simulated.
+
+    Attributes
+    ----------
+    duration : float
+        [s]
+    rate : float
+        Of controller and samples [Hz].
+    time_step : float
+        Of the simulator [s]; must divide 1 / rate.
+    """
+
+    duration: float = 5.0
+    rate: float = 100.0
+    time_step: float = INNER_STEP
+
+    def __post_init__(self) -> None:
+        inner = self.inner_steps
+        if inner < 1 or abs(inner * self.time_step * self.rate - 1.0) > 1e-9:
+            raise ConfigError(
+                f"time_step = {self.time_step:g} s does not divide the period of {self.rate:g} Hz",
+                allowed="1/(rate k), k whole",
+            )
+
+    @property
+    def inner_steps(self) -> int:
+        """Steps of the simulator from sample to sample."""
+        return round(1.0 / (self.rate * self.time_step))
+
+    @property
+    def samples(self) -> int:
+        """Periods of the controller, N."""
+        return round(self.duration * self.rate)
+
+
+@dataclass(frozen=True)
+class SimulatedRun:
+    """What happened in the simulator, free of noise.
+
+    Attributes
+    ----------
+    t : ndarray, shape (N + 1,)
+        [s]
+    q, v : ndarray, shape (N + 1, n)
+        In configuration order [rad or m].
+    effort : ndarray, shape (N + 1, nu)
+        Torque held from t_k to t_{k+1} [N m]; the last row was computed and not applied.
+    points : ndarray, shape (N + 1, np, 3)
+        Of `system.points` in the world [m].
+    frame_t : ndarray, shape (M,)
+        Times of the camera's frames, rounded to the simulator's step [s].
+    frame_points : ndarray, shape (M, np, 3)
+        [m]
+    grasp_error : ndarray, shape (N + 1, number of grasps)
+        Distance between the two ends of each grasp [m].
+    """
+
+    t: Array
+    q: Array
+    v: Array
+    effort: Array
+    points: Array
+    frame_t: Array
+    frame_points: Array
+    grasp_error: Array
+
+
+def simulate_in_mujoco(
+    system: System,
+    values: Mapping[str, float] | None,
+    motion: Motion,
+    simulation: Simulation | None = None,
+    *,
+    posture: Mapping[str, float] | None = None,
+    frame_times: ArrayLike = (),
+    injected: EngineTerms | None = None,
+) -> SimulatedRun:
+    """Let the controller follow a motion in MuJoCo, from static equilibrium at the initial posture.
+
+    Parameters
+    ----------
+    system : System
+    values : mapping of str to float or None
+        Parameter values; nominal where absent.
+    motion : Motion
+        Of exactly the driven joints.
+    simulation : Simulation, optional
+    posture : mapping of str to float, optional
+        Initial angles [rad or m]; `initial_posture` where absent.
+    frame_times : array_like, shape (M,)
+        When a camera looks [s], increasing, in [0, duration].
+    injected : EngineTerms, optional
+        What is at work beside the system's description. MuJoCo knows one such callback for the whole process: no other
+        simulation may run meanwhile in another thread.
+
+    Raises
+    ------
+    ModelError
+        The system cannot be expressed (`mujoco_xml`), has prescribed or no driven joints, does not come to rest, or
+        diverges.
+    DataError
+        MuJoCo is not installed.
+    """
+    chosen = simulation or Simulation()
+    if tuple(motion.joints) != tuple(system.driven) or not system.driven or system.prescribed:
+        raise ModelError(
+            "the motion is not one of the driven joints",
+            where=f"motion of {', '.join(motion.joints) or 'nothing'}",
+            allowed=f"the driven joints ({', '.join(system.driven) or 'none'}), nothing prescribed",
+        )
+    mujoco = mujoco_module()
+    model = compiled_model(mujoco_xml(system, values, time_step=chosen.time_step))
+    nominal_damping = np.array(model.dof_damping)
+    with _at_work(mujoco, model, injected):
+        scene = _Scene.of(system, mujoco, model)
+        start = initial_posture(system, values) if posture is None else posture
+        scene.data.qpos[:] = model.qpos_spring
+        scene.data.qpos[[model.joint(name).id for name in start]] = list(start.values())
+        balance = _settle(scene, nominal_damping)
+        if injected is not None:
+            injected.begin(scene.data)
+        controller = _Controller(scene, motion, balance)
+        frames = np.round(np.asarray(frame_times, float) / chosen.time_step).astype(int)
+        result = _play(scene, controller, chosen, frames)
+        lost = scene.data.warning[_BAD_ACCELERATION].number > 0
+    if lost or not (np.isfinite(result.q).all() and np.isfinite(result.effort).all()):
+        raise ModelError("the simulation diverged", where="MuJoCo", hint="take a shorter time_step or a calmer motion")
+    return result
+
+
+@dataclass(frozen=True, eq=False)
+class _Scene:
+    """A compiled model with its state; `order` of all joints and `driven` ones, sites of points and of grasps' ends."""
+
+    mujoco: ModuleType
+    model: Any
+    data: Any
+    order: Integers
+    driven: Integers
+    sites: list[int]
+    ends: list[list[int]]
+
+    @staticmethod
+    def of(system: System, mujoco: ModuleType, model: Any) -> _Scene:
+        # Every joint has one coordinate, so positions, velocities and joints share their addresses.
+        order = np.array([model.joint(name).id for name in system.mechanism.joint_names])
+        sites = [model.site(name).id for name in system.points]
+        ends = [[model.site(f"grasp_{g.name}_{end}").id for end in ("holder", "held")] for g in system.grasps]
+        return _Scene(mujoco, model, mujoco.MjData(model), order, order[list(system.driven_indices)], sites, ends)
+
+
+@contextlib.contextmanager
+def _at_work(mujoco: ModuleType, model: Any, injected: EngineTerms | None) -> Iterator[None]:
+    """Let injected terms act inside MuJoCo while the block runs."""
+    if injected is None:
+        yield
+        return
+    injected.prepare(model)
+    mujoco.set_mjcb_passive(injected.force)
+    try:
+        yield
+    finally:
+        mujoco.set_mjcb_passive(None)
+
+
+def _settle(scene: _Scene, damping: Array) -> Array:
+    """Bring the scene to static equilibrium with the driven joints where they are; return their torques [N m].
+
+    On the way there joints damp as `damping` says: of several shapes that an object can rest in, it must not depend on
+    its own damping which is found.
+    """
+    model, data, driven = scene.model, scene.data, scene.driven
+    held = copy.copy(model)
+    target = data.qpos[driven].copy()
+    others = np.setdiff1d(np.arange(model.nv), driven)
+    held.dof_damping[:] = damping
+    held.dof_damping[others] *= _SETTLING_FACTOR
+    held.dof_damping[driven] += _HOLD_DAMPING
+    held.jnt_stiffness[driven] += _HOLD_STIFFNESS
+    held.qpos_spring[driven] = target
+    block = max(1, round(0.1 / model.opt.timestep))
+    for _ in range(math.ceil(_SETTLING_LIMIT / (block * model.opt.timestep))):
+        scene.mujoco.mj_step(held, data, nstep=block)
+        calm, error = float(np.abs(data.qvel).max()), target - data.qpos[driven]
+        if np.abs(error).max() > _POSTURE_TOLERANCE:
+            held.qpos_spring[driven] += error
+        elif calm < _REST:
+            break
+    else:
+        raise ModelError(
+            f"the object does not come to rest in {_SETTLING_LIMIT:g} s (largest velocity {calm:.2g} rad/s)",
+            where="settling before the motion",
+            hint="give every coordinate some damping and enough stiffness to stand",
+        )
+    balance = _HOLD_STIFFNESS * (held.qpos_spring[driven] - data.qpos[driven])
+    data.qvel[:], data.qacc_warmstart[:], data.time = 0.0, 0.0, 0.0
+    return balance
+
+
+class _Controller:
+    """Torques of the driven joints: the arms' inverse dynamics along the motion, the grasps' load at rest, feedback.
+
+    Parameters
+    ----------
+    scene : _Scene
+        At rest, before the motion.
+    motion : Motion
+    balance : ndarray, shape (nu,)
+        Torques that hold the scene at rest [N m].
+    """
+
+    def __init__(self, scene: _Scene, motion: Motion, balance: Array) -> None:
+        self._scene, self._motion = scene, motion
+        self._free = copy.copy(scene.model)
+        self._free.opt.disableflags |= int(scene.mujoco.mjtDisableBit.mjDSBL_EQUALITY)
+        self._shadow = scene.mujoco.MjData(self._free)
+        self._rest = scene.data.qpos.copy()
+        zero = np.zeros(len(scene.driven))
+        self._load = balance - self._arm_torque(self._rest[scene.driven], zero, zero)
+
+    def torque(self, t: float) -> Array:
+        """Torques at time t [s] from the scene's state then, shape (nu,) [N m]."""
+        data, driven = self._scene.data, self._scene.driven
+        offset, velocity, acceleration = self._motion.at(t)
+        reference = self._rest[driven] + offset
+        demand = acceleration + 2 * _BANDWIDTH * (velocity - data.qvel[driven])
+        demand += _BANDWIDTH**2 * (reference - data.qpos[driven])
+        return np.asarray(self._load + self._arm_torque(reference, velocity, demand))
+
+    def _arm_torque(self, q: Array, v: Array, a: Array) -> Array:
+        shadow, driven = self._shadow, self._scene.driven
+        shadow.qpos[:], shadow.qvel[:], shadow.qacc[:] = self._rest, 0.0, 0.0
+        shadow.qpos[driven], shadow.qvel[driven], shadow.qacc[driven] = q, v, a
+        self._scene.mujoco.mj_inverse(self._free, shadow)
+        return np.array(shadow.qfrc_inverse[driven])
+
+
+def _play(scene: _Scene, controller: _Controller, simulation: Simulation, frames: Integers) -> SimulatedRun:
+    """Simulate sample by sample, the torque held in between; `frames` count the simulator's steps."""
+    mujoco, model, data = scene.mujoco, scene.model, scene.data
+    inner, steps = simulation.inner_steps, simulation.samples
+    q, v, effort, points, error, seen = [], [], [], [], [], []
+    for k in range(steps + 1):
+        mujoco.mj_kinematics(model, data)
+        torque = controller.torque(k / simulation.rate)
+        q.append(data.qpos[scene.order])
+        v.append(data.qvel[scene.order])
+        effort.append(torque)
+        points.append(data.site_xpos[scene.sites])
+        error.append([np.linalg.norm(data.site_xpos[a] - data.site_xpos[b]) for a, b in scene.ends])
+        data.qfrc_applied[scene.driven] = torque
+        done = k * inner
+        for frame in frames[(frames >= done) & (frames < done + inner)]:
+            if frame > done:
+                mujoco.mj_step(model, data, nstep=int(frame - done))
+                mujoco.mj_kinematics(model, data)
+            seen.append(data.site_xpos[scene.sites])
+            done = int(frame)
+        if k < steps:
+            mujoco.mj_step(model, data, nstep=(k + 1) * inner - done)
+    return SimulatedRun(
+        np.arange(steps + 1) / simulation.rate,
+        np.array(q),
+        np.array(v),
+        np.array(effort),
+        np.array(points),
+        np.asarray(frames[: len(seen)] * simulation.time_step),
+        np.array(seen).reshape(len(seen), len(scene.sites), 3),
+        np.array(error).reshape(steps + 1, len(scene.ends)),
+    )

@@ -1,0 +1,164 @@
+"""Motions of the driven joints: sums of sines with a smooth start, scaled to how far the grippers shall travel."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.model.kinematics import forward_kinematics
+from yid_ocp.model.system import System
+from yid_ocp.virtual.posture import initial_posture
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A smooth motion of the driven joints about their initial posture, starting at rest.
+
+    offset_j(t) = r(t) sum_i amplitude_ji sin(2 pi frequency_ji t + phase_ji), with the ramp
+    r = 10 s^3 - 15 s^4 + 6 s^5, s = min(t / ramp, 1), twice continuously differentiable.
+
+    Attributes
+    ----------
+    joints : tuple of str, length nj
+    amplitude, frequency, phase : ndarray, shape (nj, nf)
+        [rad or m], [Hz], [rad]
+    ramp : float
+        Duration of the ramp [s].
+    """
+
+    joints: tuple[str, ...]
+    amplitude: Array
+    frequency: Array
+    phase: Array
+    ramp: float = 1.0
+
+    def at(self, t: float) -> tuple[Array, Array, Array]:
+        """Offset, velocity and acceleration at time t [s], three arrays of shape (nj,)."""
+        omega = 2 * math.pi * self.frequency
+        angle = omega * t + self.phase
+        sine, cosine = self.amplitude * np.sin(angle), self.amplitude * np.cos(angle)
+        wave, rate, bend = sine.sum(1), (omega * cosine).sum(1), -(omega**2 * sine).sum(1)
+        s = min(t / self.ramp, 1.0)
+        r = s**3 * (10 - 15 * s + 6 * s**2)
+        dr = 30 * s**2 * (1 - s) ** 2 / self.ramp
+        ddr = 60 * s * (1 - s) * (1 - 2 * s) / self.ramp**2
+        return r * wave, dr * wave + r * rate, ddr * wave + 2 * dr * rate + r * bend
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """How far, how fast and at which frequencies a random motion goes.
+
+    Attributes
+    ----------
+    travel : float
+        Largest distance of a gripper from its start [m]; every arm is scaled to it by itself. Much more than the
+        default, on two arms, lets the foam Y snap from one shape to another.
+    speed : float
+        No joint is asked to be faster [rad/s]; an arm that would be is slowed by travelling less.
+    components : int
+        Sines per joint, one in each of as many equal parts (in log frequency) of `band`.
+    band : (float, float)
+        Lowest and highest frequency [Hz].
+    ramp, duration : float
+        [s]
+    """
+
+    travel: float = 0.11
+    speed: float = 1.4
+    components: int = 3
+    band: tuple[float, float] = (0.2, 2.0)
+    ramp: float = 1.0
+    duration: float = 5.0
+
+
+def multisine(
+    system: System,
+    values: Mapping[str, float] | None = None,
+    *,
+    seed: int,
+    posture: Mapping[str, float] | None = None,
+    excitation: Excitation | None = None,
+) -> Motion:
+    """Draw a motion at random and scale it to the wanted travel of the grippers.
+
+    Parameters
+    ----------
+    system : System
+    values : mapping of str to float, optional
+        Parameter values; nominal where absent.
+    seed : int
+        Of the random draw of frequencies and phases.
+    posture : mapping of str to float, optional
+        Initial angles [rad or m]; `initial_posture` where absent.
+    excitation : Excitation, optional
+
+    Returns
+    -------
+    Motion
+        Amplitudes fall in inverse proportion to the frequency and towards the base.
+    """
+    chosen = excitation or Excitation()
+    motion = _drawn(system, chosen, np.random.default_rng(seed))
+    times = np.linspace(0.0, chosen.duration, 251)
+    start = initial_posture(system, values) if posture is None else posture
+    tree = replace(system.mechanism, parameters=system.parameters).numeric(values)
+    q0 = np.zeros(system.size)
+    q0[[tree.joint_index(name) for name in start]] = list(start.values())
+    holders = [tree.frame(grasp.holder) for grasp in system.grasps]
+    arms = [[i for i, j in enumerate(system.driven_indices) if j in tree.ancestors(f.joint)] for f in holders]
+    for arm in arms:  # the same angle near the base moves the hand further
+        motion = _scaled(motion, arm, np.linspace(0.5, 1.0, len(arm)))
+    q = ca.SX.sym("q", system.size)
+    kinematics = forward_kinematics(tree, q)
+    for frame, arm in zip(holders, arms, strict=True):
+        tip = ca.Function("tip", [q], [kinematics.position(frame)]).map(len(times))
+        waves = np.array([motion.at(t)[:2] for t in times])[:, :, arm]
+        scale = _scale(chosen, tip, q0, [system.driven_indices[i] for i in arm], waves)
+        motion = _scaled(motion, arm, np.full(len(arm), scale))
+    if not holders:
+        fastest = max(float(np.abs(motion.at(t)[1]).max()) for t in times)
+        joints = range(len(motion.joints))
+        motion = _scaled(motion, joints, np.full(len(joints), chosen.speed / fastest))
+    return motion
+
+
+def _scaled(motion: Motion, joints: Sequence[int], factors: Array) -> Motion:
+    amplitude = motion.amplitude.copy()
+    amplitude[list(joints)] *= factors[:, None]
+    return replace(motion, amplitude=amplitude)
+
+
+def _drawn(system: System, excitation: Excitation, rng: np.random.Generator) -> Motion:
+    """Frequencies, phases and relative amplitudes at random."""
+    nj, components = len(system.driven), excitation.components
+    lowest, highest = excitation.band
+    edges = np.linspace(math.log(lowest), math.log(highest), components + 1)
+    frequency = np.exp(rng.uniform(edges[:-1], edges[1:], (nj, components)))
+    phase = rng.uniform(0.0, 2 * math.pi, (nj, components))
+    amplitude = rng.uniform(0.7, 1.3, (nj, components)) / frequency
+    return Motion(system.driven, amplitude, frequency, phase, excitation.ramp)
+
+
+def _scale(excitation: Excitation, tip: ca.Function, q0: Array, columns: Sequence[int], waves: Array) -> float:
+    """Factor with which an arm's waves (N, 2, nj), offset and velocity, take the tip as far as wanted."""
+
+    def distance(scale: float) -> float:
+        path = np.tile(q0, (len(waves), 1))
+        path[:, columns] += scale * waves[:, 0]
+        positions = np.array(tip(path.T))
+        return float(np.linalg.norm(positions - positions[:, :1], axis=0).max())
+
+    low, high = 0.0, excitation.speed / float(np.abs(waves[:, 1]).max())
+    if distance(high) > excitation.travel:
+        for _ in range(40):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if distance(middle) < excitation.travel else (low, middle)
+    return high
