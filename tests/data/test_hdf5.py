@@ -275,6 +275,10 @@ def test_a_failure_leaves_the_old_file_alone(file: Path, monkeypatch: pytest.Mon
     assert file.read_bytes() == before
 
 
+# joints and points of the recordings in each folder
+REAL_SIZES = {"baxter": (7, 0), "deft": (0, 20), "double_pendulum": (2, 0), "panda_beam": (7, 0), "soft_beam": (0, 6)}
+
+
 @pytest.mark.skipif(
     not REAL_FILES, reason="the real recordings are not here (folder shared/recordings beside the project)"
 )
