@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +19,10 @@ from yid_ocp.integrator.step_model import (
     Rollout,
     StepCode,
     StepLinearization,
+    StepModel,
     empty_linearization,
     status_of,
 )
-
-if TYPE_CHECKING:
-    from yid_ocp.integrator.step import Step
 
 Array = NDArray[np.float64]
 
@@ -74,14 +71,14 @@ def _contiguous(array: Array | None) -> Array | None:
 class CompiledKernel:
     """Sweeps in generated C; holds no state between calls, so that threads may share it."""
 
-    def __init__(self, step: Step, library: ctypes.CDLL) -> None:
-        self._step = step
+    def __init__(self, model: StepModel, library: ctypes.CDLL) -> None:
+        self._model = model
         self._library = library
         self._columns: dict[tuple[str, ...], _CompiledColumns] = {}
 
     def _theta_columns(self, names: tuple[str, ...]) -> _CompiledColumns:
         if names not in self._columns:
-            function = codegen.theta_function(self._step.equations, names)
+            function = codegen.theta_function(self._model.equations, names)
             library = compiler.compile_library(codegen.function_source(function), straight_line=True)
             if library is None:
                 raise ModelError("the compiler worked for the step but not for its derivatives", hint="set CC=none")
@@ -124,7 +121,7 @@ class CompiledKernel:
         wanted: Directions | None,
     ) -> Rollout:
         """See `Kernel.rollout`."""
-        sizes = self._step.sizes
+        sizes = self._model.sizes
         steps = len(torque)
         theta, torque, path = (np.ascontiguousarray(a, dtype=float) for a in (theta, torque, path))
         state = np.full((steps + 1, sizes["nx"]), np.nan)
@@ -147,7 +144,7 @@ class CompiledKernel:
         code = self._library.yid_rollout(
             ctypes.c_int(steps),
             _pointer(theta),
-            ctypes.c_double(self._step.time_step),
+            ctypes.c_double(self._model.time_step),
             _pointer(torque),
             _pointer(path),
             ctypes.byref(loop) if loop is not None else None,
@@ -161,7 +158,7 @@ class CompiledKernel:
             _pointer(by_effort),
             _pointer(given_torque),
             _pointer(given_path),
-            ctypes.c_double(self._step.tolerance),
+            ctypes.c_double(self._model.tolerance),
             ctypes.c_int(ITERATION_LIMIT),
             _pointer(info),
         )
@@ -180,7 +177,7 @@ class CompiledKernel:
         by_effort: Array | None,
     ) -> Gradient:
         """See `Kernel.adjoint`."""
-        sizes = self._step.sizes
+        sizes = self._model.sizes
         steps = len(rollout.multipliers)
         gradient, by_start = np.zeros(max(len(names), 1)), np.zeros(sizes["nx"])
         by_torque, by_path = np.zeros((steps, sizes["nu"])), np.zeros((steps + 1, sizes["nc"]))
@@ -194,7 +191,7 @@ class CompiledKernel:
         code = self._library.yid_adjoint(
             ctypes.c_int(steps),
             _pointer(inputs[0]),
-            ctypes.c_double(self._step.time_step),
+            ctypes.c_double(self._model.time_step),
             _pointer(inputs[1]),
             ctypes.byref(loop) if loop is not None else None,
             _pointer(inputs[2]),
@@ -224,13 +221,13 @@ class CompiledKernel:
     ) -> StepLinearization:
         """See `Kernel.linearize`."""
         inputs = [np.ascontiguousarray(a, dtype=float) for a in (theta, state, multipliers, torque)]
-        stages = empty_linearization(self._step.sizes, len(torque), len(names), derivatives)
+        stages = empty_linearization(self._model.sizes, len(torque), len(names), derivatives)
         struct, keep = self._directions(names, len(names))
         matrices = [getattr(stages, field) if derivatives else None for field in LINEARIZATION_MATRICES]
         self._library.yid_linearize(
             ctypes.c_int(len(torque)),
             _pointer(inputs[0]),
-            ctypes.c_double(self._step.time_step),
+            ctypes.c_double(self._model.time_step),
             *(_pointer(a) for a in inputs[1:]),
             ctypes.byref(struct),
             _pointer(stages.rows),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
@@ -21,12 +20,10 @@ from yid_ocp.integrator.step_model import (
     Rollout,
     StepCode,
     StepLinearization,
+    StepModel,
     empty_linearization,
     status_of,
 )
-
-if TYPE_CHECKING:
-    from yid_ocp.integrator.step import Step
 
 Array = NDArray[np.float64]
 
@@ -46,43 +43,43 @@ class _Linearised:
 class InterpretedKernel:
     """The same sweeps by CasADi's interpreter and SciPy's LU, for machines without a C compiler."""
 
-    def __init__(self, step: Step) -> None:
-        self._step = step
-        n = step.system.size
+    def __init__(self, model: StepModel) -> None:
+        self._model = model
+        n = model.system.size
         self._mask = np.zeros((n, n), bool)
-        for j, chain in enumerate(step.structure.ancestors):
+        for j, chain in enumerate(model.structure.ancestors):
             self._mask[j, chain] = True
         self._theta_functions: dict[tuple[str, ...], ca.Function] = {}
-        patterns = step.functions.patterns
+        patterns = model.functions.patterns
         self._triplets = {
             key: tuple(np.array(part, np.intp) for part in s.get_triplet()) for key, s in patterns.items()
         }
-        self._unknown = step.structure.unknown_row
-        self._free = np.array(step.system.free_indices, np.intp)
-        self._fixed = np.array(step.system.prescribed_indices, np.intp)
+        self._unknown = model.structure.unknown_row
+        self._free = np.array(model.system.free_indices, np.intp)
+        self._fixed = np.array(model.system.prescribed_indices, np.intp)
 
     def _scales(self, theta: Array) -> tuple[Array, float]:
-        s = self._step.sizes
+        s = self._model.sizes
         zero = [np.zeros(s["n"])] * 3 + [np.zeros(s["nz"])] * 2 + [np.zeros(s["m"]), np.zeros(s["nu"])]
-        scale, h = self._step.functions.scales(*zero, theta, self._step.time_step)
+        scale, h = self._model.functions.scales(*zero, theta, self._model.time_step)
         return np.array(scale).ravel(), float(h)
 
     def _matrix(self, arguments: list[Array | float]) -> Array:
-        s = self._step.sizes
+        s = self._model.sizes
         phi = np.zeros((s["m"], s["n"]))
-        phi[self._triplets["matrix"]] = np.array(self._step.functions.matrix(*arguments)).ravel()
+        phi[self._triplets["matrix"]] = np.array(self._model.functions.matrix(*arguments)).ravel()
         return phi
 
     def _rows(self, arguments: list[Array | float], phi: Array, scale: Array) -> tuple[Array, Array]:
-        balance, internal, constraint, p1 = (np.array(x).ravel() for x in self._step.functions.residual(*arguments))
+        balance, internal, constraint, p1 = (np.array(x).ravel() for x in self._model.functions.residual(*arguments))
         pull = phi.T @ np.asarray(arguments[5])
         return np.concatenate([balance - scale * pull, internal, constraint]), p1
 
     def _linearise(self, arguments: list[Array | float], phi: Array, scale: Array) -> _Linearised:
-        s = self._step.sizes
+        s = self._model.sizes
         n, nz, m, nu = s["n"], s["nz"], s["m"], s["nu"]
         nt, nqz = n + nz + m, n + nz
-        pairs, rest, rest_p, by_unknown = (np.array(x).ravel() for x in self._step.functions.linear(*arguments))
+        pairs, rest, rest_p, by_unknown = (np.array(x).ravel() for x in self._model.functions.linear(*arguments))
         plus, minus, lower, upper = (pairs[6 * n * i : 6 * n * (i + 1)].reshape(6, n) for i in range(4))
         turn, moment = (pairs[3 * n * i : 3 * n * (i + 1)].reshape(3, n) for i in (8, 9))
         weight = moment.T @ turn
@@ -104,14 +101,14 @@ class InterpretedKernel:
         rows_new[:n, :n] = scale[:, None] * slope
         rows_old[:n, :n] = scale[:, None] * both(here, here)
         p1_new[:, :n], p1_old[:, :n] = scale[:, None] * both(there, there), scale[:, None] * slope.T
-        if self._step.equations.closed is not None:
+        if self._model.equations.closed is not None:
             along, turned = (pairs[6 * n * i : 6 * n * (i + 1)].reshape(6, n) for i in (5, 6))
             screw = (plus + minus) / 2
             by_rate, by_turn, by_posture = (
                 np.where(self._mask, x.T @ y, 0.0) for x, y in ((along, screw), (along, plus - screw), (turned, screw))
             )
             for share, new, old in zip(
-                self._step.equations.closed_shares, (rows_new, p1_new), (rows_old, p1_old), strict=True
+                self._model.equations.closed_shares, (rows_new, p1_new), (rows_old, p1_old), strict=True
             ):
                 new[:n, :n] += share * scale[:, None] * both(by_turn + by_rate, by_posture + by_rate)
                 old[:n, :n] += share * scale[:, None] * both(by_turn - by_rate, by_posture - by_rate)
@@ -129,12 +126,12 @@ class InterpretedKernel:
         rows_new[:n, n + nz :] -= scale[:, None] * phi.T
         if m:
             row, column = self._triplets["pull"]
-            rows_old[row, column] -= scale[row] * np.array(self._step.functions.pull(*arguments)).ravel()
+            rows_old[row, column] -= scale[row] * np.array(self._model.functions.pull(*arguments)).ravel()
         return _Linearised(rows_new, rows_old, rows_input, p1_new, p1_old, p1_input)
 
     def _by_theta(self, names: tuple[str, ...], arguments: list[Array | float]) -> list[Array]:
         if names not in self._theta_functions:
-            self._theta_functions[names] = codegen.theta_function(self._step.equations, names)
+            self._theta_functions[names] = codegen.theta_function(self._model.equations, names)
         return [np.array(ca.densify(out)) for out in self._theta_functions[names].call(arguments)]
 
     def _factorised(self, arguments: list[Array | float], phi: Array, scale: Array) -> list[Array] | None:
@@ -147,13 +144,13 @@ class InterpretedKernel:
         self, arguments: list[Array | float], phi: Array, scale: Array, kept: list[list[Array]]
     ) -> tuple[StepCode, float, Array, int]:
         """Newton with the factors in `kept` for as long as they contract, damped with fresh ones after that."""
-        n, nz = self._step.sizes["n"], self._step.sizes["nz"]
+        n, nz = self._model.sizes["n"], self._model.sizes["nz"]
         count = len(self._free) + nz
         q1, z1, lam = arguments[1], arguments[4], arguments[5]
         assert isinstance(q1, np.ndarray)
         assert isinstance(z1, np.ndarray)
         assert isinstance(lam, np.ndarray)
-        previous, error, tolerance = math.inf, 0.0, self._step.tolerance
+        previous, error, tolerance = math.inf, 0.0, self._model.tolerance
         for iteration in range(1, ITERATION_LIMIT + 1):
             rows, p1 = self._rows(arguments, phi, scale)
             if not np.all(np.isfinite(rows[self._unknown])):
@@ -205,7 +202,7 @@ class InterpretedKernel:
         wanted: Directions | None,
     ) -> Rollout:
         """See `Kernel.rollout`."""
-        s = self._step.sizes
+        s = self._model.sizes
         n, m, nx = s["n"], s["m"], s["nx"]
         steps, d = len(torque), 0 if wanted is None else wanted.count
         scale, h = self._scales(theta)
@@ -237,7 +234,7 @@ class InterpretedKernel:
                 lam,
                 u,
                 theta,
-                self._step.time_step,
+                self._model.time_step,
             ]
             phi = self._matrix(arguments)
             code, error, p1, spent = self._newton(arguments, phi, scale, kept)
@@ -283,7 +280,7 @@ class InterpretedKernel:
         k: int,
         feedback: Feedback | None,
     ) -> tuple[Array, Array, Array]:
-        s = self._step.sizes
+        s = self._model.sizes
         n, nz, nt, d = s["n"], s["nz"], s["n"] + s["nz"] + s["m"], wanted.count
         matrices = self._linearise(arguments, phi, scale)
         old = np.concatenate([before[:n], before[2 * n :]])
@@ -324,7 +321,7 @@ class InterpretedKernel:
         by_effort: Array | None,
     ) -> Gradient:
         """See `Kernel.adjoint`."""
-        s = self._step.sizes
+        s = self._model.sizes
         n, nt = s["n"], s["n"] + s["nz"] + s["m"]
         scale, h = self._scales(theta)
         steps = len(rollout.multipliers)
@@ -341,7 +338,7 @@ class InterpretedKernel:
                 rollout.multipliers[k],
                 rollout.torque[k],
                 theta,
-                self._step.time_step,
+                self._model.time_step,
             ]
             matrices = self._linearise(arguments, self._matrix(arguments), scale)
             weight = costate[n : 2 * n]
@@ -376,7 +373,7 @@ class InterpretedKernel:
         derivatives: bool,
     ) -> StepLinearization:
         """See `Kernel.linearize`."""
-        s = self._step.sizes
+        s = self._model.sizes
         n = s["n"]
         scale, _ = self._scales(theta)
         stages = empty_linearization(s, len(torque), len(names), derivatives)
@@ -391,7 +388,7 @@ class InterpretedKernel:
                 multipliers[k],
                 u,
                 theta,
-                self._step.time_step,
+                self._model.time_step,
             ]
             phi = self._matrix(arguments)
             stages.rows[k], stages.p1[k] = self._rows(arguments, phi, scale)

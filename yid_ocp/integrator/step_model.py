@@ -1,4 +1,4 @@
-"""What the sweeps over a rollout take and return, whichever kernel computes them."""
+"""What every kernel needs: the model of a step, and what rollouts, adjoints and linearizations take and return."""
 
 from __future__ import annotations
 
@@ -9,10 +9,64 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from yid_ocp.integrator import codegen
+from yid_ocp.integrator.discrete import DiscreteEquations, ForceSplit, discrete_equations
+from yid_ocp.model.system import System
+
 Array = NDArray[np.float64]
 
 # Newton iterations of one step before it is given up.
 ITERATION_LIMIT = 60
+
+# Newton stops when a correction of the coordinates is below TOLERANCE [rad or m], with short time steps below
+# RATE_TOLERANCE times the step: what is left undone is momentum lost in every step, mass times correction over step.
+TOLERANCE, RATE_TOLERANCE, ROUNDING = 1e-12, 1e-10, 1e-15
+
+
+@dataclass(frozen=True, eq=False)
+class StepModel:
+    """One step of a system, before any kernel computes it.
+
+    Attributes
+    ----------
+    system : System
+    equations : DiscreteEquations
+    functions : StepFunctions
+    structure : Structure
+    sizes : dict of str to int
+        n, nz, m, nu, nc, nx and ntheta.
+    time_step : float
+        h [s]
+    tolerance : float
+        Newton's, on the coordinates [rad or m].
+    """
+
+    system: System
+    equations: DiscreteEquations
+    functions: codegen.StepFunctions
+    structure: codegen.Structure
+    sizes: dict[str, int]
+    time_step: float
+    tolerance: float
+
+
+def step_model(system: System, time_step: float, force_split: ForceSplit, tolerance: float | None = None) -> StepModel:
+    """Equations, functions and tables of a system's step; see `compile_step`."""
+    e = discrete_equations(system, force_split)
+    functions = codegen.step_functions(e)
+    n, nz = system.size, e.z0.numel()
+    sizes = {
+        "n": n,
+        "nz": nz,
+        "m": e.lam.numel(),
+        "nu": e.u.numel(),
+        "nc": len(system.prescribed),
+        "nx": 2 * n + nz,
+        "ntheta": e.theta.numel(),
+    }
+    if tolerance is None:
+        tolerance = max(ROUNDING, min(TOLERANCE, RATE_TOLERANCE * time_step))
+    return StepModel(system, e, functions, codegen.structure(functions), sizes, float(time_step), tolerance)
 
 
 class StepCode(IntEnum):
@@ -129,7 +183,7 @@ class Rollout:
     multipliers : ndarray, shape (N, m)
         [N s]
     effort : ndarray, shape (N, nc)
-        Effort of prescribed coordinates at nodes 0..N-1 [N m]; at node 0 it presumes that p_0 came from a step before
+        Effort of prescribed coordinates at nodes 0..N-1 [N m]; at node 0 it assumes that p_0 came from a step before
         (`Rest` gives such a p_0); after p_0 = dL/dv it holds only half a step's impulse, half the effort.
     torque : ndarray, shape (N, nu)
         Applied torque [N m].
@@ -150,7 +204,7 @@ class Rollout:
 
 @dataclass(frozen=True)
 class Gradient:
-    """Derivatives of a scalar cost along a rollout, from the adjoint sweep.
+    """Derivatives of a scalar cost along a rollout, from the adjoint.
 
     Attributes
     ----------
@@ -204,7 +258,7 @@ class StepLinearization:
 
 
 class Kernel(Protocol):
-    """What the compiled and the interpreted implementation of the sweeps have in common."""
+    """What the compiled and the interpreted implementation have in common."""
 
     def rollout(
         self,
