@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from yid_ocp.errors import ModelError, nearest
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement
 from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.model.rotations import snapped
+from yid_ocp.model.rotations import snapped, turn
 
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
@@ -276,9 +276,8 @@ def polyline_rotations(vertices: ArrayLike, start: ArrayLike | None = None) -> l
     rotations = []
     for edge in edges:
         local = frame.T @ (edge / np.linalg.norm(edge))
-        turn = _shortest_turn(local)
-        rotations.append(turn)
-        frame = frame @ turn
+        rotations.append(_shortest_turn(local))
+        frame = frame @ rotations[-1]
     return rotations
 
 
@@ -287,9 +286,7 @@ def _shortest_turn(direction: NDArray[np.float64]) -> NDArray[np.float64]:
     sine, cosine = float(np.linalg.norm(axis)), float(direction[2])
     if sine < 1e-12:
         return np.eye(3) if cosine > 0 else np.diag([1.0, -1.0, -1.0])
-    u = axis / sine
-    skew = np.array([[0, -u[2], u[1]], [u[2], 0, -u[0]], [-u[1], u[0], 0]])
-    return np.eye(3) + sine * skew + (1 - cosine) * skew @ skew
+    return turn(axis / sine, sine, cosine)
 
 
 def _rotation(matrix: ArrayLike | None) -> NDArray[np.float64]:

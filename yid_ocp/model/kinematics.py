@@ -11,9 +11,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import casadi as ca
-import numpy as np
 
 from yid_ocp.model.mechanism import Frame, Inertia, Mechanism, Placement
+from yid_ocp.model.rotations import about_axis
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ def forward_kinematics(mechanism: Mechanism, q: ca.SX) -> Kinematics:
             rotation = rotations[joint.parent] @ rotation
         axis = rotation @ ca.SX(ca.DM(joint.axis))
         if joint.kind == "revolute":
-            rotations.append(rotation @ _axis_rotation(joint.axis, q[j]))
+            rotations.append(rotation @ about_axis(joint.axis, q[j]))
             screws.append(ca.vertcat(axis, cross(origin, axis)))
         else:
             origin = origin + axis * q[j]
@@ -265,20 +265,6 @@ def _from_pairs(mechanism: Mechanism, entry: Callable[[int, int], tuple[ca.SX, c
             matrix[j, i] = lower
             matrix[i, j] = upper
     return matrix
-
-
-def _axis_rotation(axis: tuple[float, float, float], angle: ca.SX) -> ca.SX:
-    c, s = ca.cos(angle), ca.sin(angle)
-    for k in range(3):
-        if abs(abs(axis[k]) - 1.0) < 1e-15:
-            s = s * axis[k]
-            a, b = (k + 1) % 3, (k + 2) % 3
-            matrix = ca.SX(ca.DM.eye(3))
-            matrix[a, a], matrix[a, b], matrix[b, a], matrix[b, b] = c, -s, s, c
-            return ca.densify(matrix)
-    u = np.asarray(axis)
-    skew = np.array([[0, -u[2], u[1]], [u[2], 0, -u[0]], [-u[1], u[0], 0]])
-    return ca.SX(ca.DM(np.outer(u, u))) + c * ca.SX(ca.DM(np.eye(3) - np.outer(u, u))) + s * ca.SX(ca.DM(skew))
 
 
 def _rotated_tensor(body: Inertia, rotation: ca.SX) -> ca.SX:

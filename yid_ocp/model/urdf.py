@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from yid_ocp.errors import ModelError, nearest
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement, merged
 from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.model.rotations import Matrix, _angles, snapped, transform
+from yid_ocp.model.rotations import Matrix, angles_of, snapped, transform, turn
 
 # Stands for no limit where URDF asks for a number.
 UNLIMITED = 1e9
@@ -236,8 +236,7 @@ def _locked_motion(joint: Any, locked: Mapping[str, float]) -> Matrix:
     axis = _unit_axis(joint)
     if joint.type == "prismatic":
         return transform(np.eye(3), value * axis)
-    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    return transform(np.eye(3) + math.sin(value) * cross + (1 - math.cos(value)) * cross @ cross, np.zeros(3))
+    return transform(turn(axis, math.sin(value), math.cos(value)), np.zeros(3))
 
 
 def _with_all_below(
@@ -273,7 +272,7 @@ def urdf_text(mechanism: Mechanism, values: Mapping[str, float] | None = None) -
     def origin(element: ElementTree.Element, placement: Placement) -> None:
         rotation = np.array(ca.DM(placement.rotation))
         translation = np.array(ca.DM(placement.translation)).ravel()
-        ElementTree.SubElement(element, "origin", xyz=text(translation), rpy=text(_angles(rotation)))
+        ElementTree.SubElement(element, "origin", xyz=text(translation), rpy=text(angles_of(rotation)))
 
     def link_name(wanted: str, joint: int) -> str:
         frame = mechanism.frames.get(wanted)
