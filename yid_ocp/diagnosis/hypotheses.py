@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from yid_ocp.data.recording import Recording
 from yid_ocp.effects import EFFECTS, EffectBase, candidates, make_effect
 from yid_ocp.errors import ConfigError, DataError
-from yid_ocp.integrator.codegen import Mapped
+from yid_ocp.integrator.mapped import Mapped
 from yid_ocp.integrator.statics import Rest, Statics
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model.system import System

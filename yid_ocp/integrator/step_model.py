@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from yid_ocp.errors import ModelError, ResourceError
 from yid_ocp.integrator import codegen
 from yid_ocp.integrator.discrete import DiscreteEquations, ForceSplit, discrete_equations
 from yid_ocp.model.system import System
@@ -76,6 +79,7 @@ class StepCode(IntEnum):
     NOT_CONVERGED = 1
     SINGULAR = 2
     NOT_FINITE = 3
+    OUT_OF_MEMORY = 4
 
 
 MESSAGES = {
@@ -83,6 +87,7 @@ MESSAGES = {
     StepCode.NOT_CONVERGED: "Newton did not converge; try a smaller time step, more damping, or a fitting start",
     StepCode.SINGULAR: "the step's equations are singular; look for redundant grasps or a coordinate without inertia",
     StepCode.NOT_FINITE: "the state is no longer finite; the motion is unstable open loop: add feedback or damping",
+    StepCode.OUT_OF_MEMORY: "there is not enough memory",
 }
 
 
@@ -146,6 +151,10 @@ class Directions:
     start: Array
     torque: Array | None = None
     path: Array | None = None
+
+    def __post_init__(self) -> None:
+        if self.count < len(self.names):
+            raise ModelError(f"{self.count} directions for {len(self.names)} parameters", allowed="one or more each")
 
     @property
     def count(self) -> int:
@@ -298,35 +307,51 @@ class Kernel(Protocol):
         ...
 
 
-# The order in which `yid_linearize` takes them.
-LINEARIZATION_MATRICES = (
-    "rows_new",
-    "rows_old",
-    "rows_input",
-    "p1_new",
-    "p1_old",
-    "p1_input",
-    "rows_theta",
-    "p1_theta",
-)
+def empty_rollout(sizes: dict[str, int], steps: int, count: int | None) -> Rollout:
+    """NaN in the shapes of a rollout with `count` directions (None: without), not begun yet."""
+    shapes: dict[str, tuple[int, ...]] = {
+        "state": (steps + 1, sizes["nx"]),
+        "multipliers": (steps, sizes["m"]),
+        "effort": (steps, sizes["nc"]),
+        "torque": (steps, sizes["nu"]),
+    }
+    if count is not None:
+        shapes |= {f"by_{name}": (*shapes[name], count) for name in ("state", "multipliers", "effort")}
+    arrays = _arrays(f"a rollout of {steps} steps with {count or 0} derivatives", shapes, math.nan)
+    by_state, by_multipliers, by_effort = (arrays.pop(f"by_{name}", None) for name in list(shapes)[:3])
+    status = StepStatus(StepCode.OK, 0, 0.0, 0, 0)
+    return Rollout(**arrays, by_state=by_state, by_multipliers=by_multipliers, by_effort=by_effort, status=status)
 
 
 def empty_linearization(sizes: dict[str, int], count: int, width: int, derivatives: bool) -> StepLinearization:
     """Zeros in the shapes of `count` steps and `width` parameters, without matrices where no derivatives are wanted."""
     n, nz, m, nu = sizes["n"], sizes["nz"], sizes["m"], sizes["nu"]
     nt, steps = n + nz + m, count if derivatives else 0
-    return StepLinearization(
-        np.zeros((count, nt)),
-        np.zeros((count, n)),
-        *(np.zeros((steps, rows, columns)) for rows in (nt, n) for columns in (nt, n + nz, nu)),
-        *(np.zeros((steps, rows, width)) for rows in (nt, n)),
+    shapes: dict[str, tuple[int, ...]] = {"rows": (count, nt), "p1": (count, n)}
+    for name, columns in {"new": nt, "old": n + nz, "input": nu, "theta": width}.items():
+        shapes |= {f"rows_{name}": (steps, nt, columns), f"p1_{name}": (steps, n, columns)}
+    return StepLinearization(**_arrays(f"the derivatives of {count} steps", shapes, 0.0))
+
+
+def _arrays(what: str, shapes: Mapping[str, tuple[int, ...]], value: float) -> dict[str, Array]:
+    try:
+        return {name: np.full(shape, value) if value else np.zeros(shape) for name, shape in shapes.items()}
+    except MemoryError as error:
+        raise out_of_memory(what, 8 * sum(math.prod(shape) for shape in shapes.values())) from error
+
+
+def out_of_memory(what: str, size: int) -> ResourceError:
+    """The error for something that needs `size` bytes."""
+    return ResourceError(
+        f"{MESSAGES[StepCode.OUT_OF_MEMORY]} for {what}: it takes {size / 1e6:.3g} MB",
+        hint="estimate fewer parameters at once, use a shorter part of the recording, or close other programs",
     )
 
 
-def status_of(code: int, info: Array, effort: Array, state: Array, sizes: dict[str, int]) -> StepStatus:
-    """Status from a kernel's code and its (steps done, last correction, iterations, factorisations)."""
-    done = int(info[0])
-    last = effort[done - 1] if done else np.zeros(sizes["nc"])
-    return StepStatus(
-        StepCode(code), done, float(info[1]), int(info[2]), int(info[3]), last, state[done, 2 * sizes["n"] :]
-    )
+def ended(
+    rollout: Rollout, sizes: dict[str, int], code: int, step: int, error: float, counts: tuple[int, int]
+) -> Rollout:
+    """The rollout with its status: step reached, last correction, iterations and factorisations."""
+    last = rollout.effort[step - 1] if step else np.zeros(sizes["nc"])
+    inner = rollout.state[step, 2 * sizes["n"] :]
+    return replace(rollout, status=StepStatus(StepCode(code), step, error, *counts, last, inner))

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import ConfigError, DataError, nearest
-from yid_ocp.integrator.codegen import Mapped
 from yid_ocp.integrator.lqr import MomentumShift, lqr_filter, proportional_filter
+from yid_ocp.integrator.mapped import Mapped
 from yid_ocp.integrator.rollout import adjoint_gradient, simulate
 from yid_ocp.integrator.statics import Rest, Statics
 from yid_ocp.integrator.step import Directions, Feedback, Rollout, Step, check_shape
