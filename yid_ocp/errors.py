@@ -49,6 +49,10 @@ class OutputError(YidError):
     """A result cannot be written where it was asked for."""
 
 
+class ResourceError(YidError):
+    """The machine has too little memory for what was asked of it."""
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
     """Say which known name the given one resembles most, or list them all.
 

@@ -9,7 +9,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from yid_ocp.integrator.step import Feedback, Step, compile_step
+from yid_ocp.integrator.step import Step, compile_step
+from yid_ocp.integrator.step_model import Feedback
 from yid_ocp.model import (
     Grasp,
     Kinematics,
@@ -220,8 +221,8 @@ class Case:
 
 
 def make_case(system: System, q: np.ndarray, time_step=2e-3, steps=10, split="symmetric", strength=1.0) -> Case:
-    step = compile_step(system, time_step, split)
-    step.tolerance = 1e-14  # finite differences magnify what Newton leaves undone
+    # finite differences magnify what Newton leaves undone
+    step = compile_step(system, time_step, split, tolerance=1e-14)
     sizes = step.sizes
     rng = np.random.default_rng(5)
     theta = system.parameters.vector()

@@ -157,7 +157,7 @@ def test_a_damaged_library_leaves_the_interpreter(cache, monkeypatch, caplog, pe
 
 def test_elimination_fills_no_more_than_the_tree(single_step):
     """Tips before roots and multipliers last: a pivot touches its ancestors, and the multipliers of grasps below it."""
-    tables, system = single_step.structure, single_step.system
+    tables, system = single_step.model.structure, single_step.system
     size = len(tables.order)
     names = [*system.mechanism.joint_names, *[f"lam{i}" for i in range(system.constraint_count)]]
     ordered = [names[i] for i in tables.unknown_row[tables.order]]

@@ -7,7 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from yid_ocp.integrator.step import Directions, compile_step
+from yid_ocp.integrator.step import compile_step
+from yid_ocp.integrator.step_model import Directions
 
 EPSILON = 1e-5
 
@@ -208,7 +209,7 @@ def test_linearized_steps_are_the_equations_along_any_trajectory(case):
     n, h = s["n"], step.time_step
     swept = case.rollout()
     exact = step.kernel.linearize(case.theta, swept.state, swept.multipliers, swept.torque, (), False)
-    assert np.max(np.abs(exact.rows[:, step.structure.unknown_row])) < 1e-9 * scale_of(swept.multipliers)
+    assert np.max(np.abs(exact.rows[:, step.model.structure.unknown_row])) < 1e-9 * scale_of(swept.multipliers)
     np.testing.assert_allclose(exact.p1, swept.state[1:, n : 2 * n], rtol=0, atol=1e-9)
     fixed = list(step.system.prescribed_indices)
     np.testing.assert_allclose(-exact.rows[:, fixed] / h, swept.effort, rtol=0, atol=1e-7 * scale_of(swept.effort))

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from yid_ocp.errors import ConfigError, ModelError
-from yid_ocp.integrator.step import StepCode, compile_step
+from yid_ocp.integrator.step import compile_step
+from yid_ocp.integrator.step_model import StepCode
 from yid_ocp.model import Grasp, Parameters, Segment, System, Terms, flexible_object, forward_kinematics
 from yid_ocp.model.urdf import read_urdf, robot_description_file
 
@@ -322,7 +323,7 @@ def test_a_status_says_what_to_try(single_step, golden, theta_golden):
     *_, status = single_step(trep.q[0], trep.p[0], trep.u[0], theta)
     assert (status.ok, status.message, status.step) == (True, "converged", 1)
     assert status.iterations >= 1
-    assert status.error < single_step.tolerance
+    assert status.error < single_step.model.tolerance
 
 
 # -------------------------------------------------------------------------------------------------------------- inputs

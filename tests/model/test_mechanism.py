@@ -1,162 +1,21 @@
-from __future__ import annotations
+"""Trees of bodies: hung on frames, merged, given more frames."""
 
-import math
-from pathlib import Path
+from __future__ import annotations
 
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from yid_ocp.errors import ModelError
-from yid_ocp.model import Mechanism
-from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, merged
-from yid_ocp.model.rotations import roll_pitch_yaw, transform
-from yid_ocp.model.system import floating_clamp, placement_matrix
-from yid_ocp.model.urdf import read_urdf, urdf_text
+from yid_ocp.model.mechanism import Inertia, merged
+from yid_ocp.model.rotations import transform
+from yid_ocp.model.system import placement_matrix
+from yid_ocp.model.urdf import read_urdf
 from yid_ocp.model.y_object import y_object
-
-LINK = '<link name="{name}"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
-LINK += "</inertial></link>"
-JOINT = '<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/><axis xyz="{axis}"/>'
-JOINT += '<limit lower="-1" upper="2" effort="3" velocity="4"/></joint>'
-ANGLES = st.floats(-math.pi, math.pi)
-
-
-def urdf(tmp_path: Path, *parts: str) -> Path:
-    path = tmp_path / "robot.urdf"
-    path.write_text(f'<robot name="robot">{"".join(parts)}</robot>', encoding="utf-8")
-    return path
-
-
-def link(name):
-    return LINK.format(name=name)
-
-
-def joint(name, parent, child, kind="revolute", axis="0 0 1"):
-    return JOINT.format(name=name, kind=kind, parent=parent, child=child, axis=axis)
 
 
 def numbers(expression) -> np.ndarray:
     return np.array(ca.DM(expression))
-
-
-def assert_equal_mechanisms(one, two, tolerance=1e-12):
-    one, two = one.numeric(), two.numeric()
-    assert one.joint_names == two.joint_names
-    assert set(one.frames) <= set(two.frames)
-    for a, b in zip(one.joints, two.joints, strict=True):
-        assert (a.kind, a.parent) == (b.kind, b.parent)
-        for key in ("lower", "upper", "effort_limit", "velocity_limit"):
-            assert getattr(a, key) == getattr(b, key)
-        np.testing.assert_allclose(a.axis, b.axis, rtol=0, atol=tolerance)
-        pairs = [(a.placement.matrix(), b.placement.matrix())]
-        body, other = merged(a.bodies), merged(b.bodies)
-        assert (body is None) == (other is None)
-        if body is not None and other is not None:
-            pairs += [(body.mass, other.mass), (body.com, other.com), (body.about_com, other.about_com)]
-        for x, y in pairs:
-            np.testing.assert_allclose(numbers(x), numbers(y), rtol=tolerance, atol=tolerance)
-    for name, frame in one.frames.items():
-        assert frame.joint == two.frames[name].joint
-        expected = numbers(two.frames[name].placement.matrix())
-        np.testing.assert_allclose(numbers(frame.placement.matrix()), expected, rtol=0, atol=tolerance)
-
-
-def test_kept_joints_in_the_order_given(urdf_folder):
-    names = ["swing", "nod", "slide", "spin"]
-    robot = read_urdf(urdf_folder / "mixed_joints.urdf", joints=names)
-    # parents come first, the rest as given
-    assert robot.joint_names == ("slide", "swing", "nod", "spin")
-    assert robot.parents == (-1, 0, 1, 0)
-    assert robot.name == "mixed_joints"
-    assert robot.ancestors(robot.joint_index("nod")) == (0, 1, 2)
-    assert robot.ancestors(-1) == ()
-
-
-def test_limits_and_kinds(urdf_folder):
-    robot = read_urdf(urdf_folder / "mixed_joints.urdf")
-    by_name = dict(zip(robot.joint_names, robot.joints, strict=True))
-    slide, spin = by_name["slide"], by_name["spin"]
-    assert (slide.kind, slide.unit, slide.lower, slide.upper) == ("prismatic", "m", -0.4, 0.6)
-    assert (slide.effort_limit, slide.velocity_limit) == (120.0, 0.8)
-    assert (spin.kind, spin.unit, spin.lower, spin.upper) == ("revolute", "rad", -math.inf, math.inf)
-    assert (spin.effort_limit, spin.velocity_limit) == (30.0, 6.0)
-    np.testing.assert_allclose(slide.axis, [1 / 3, 2 / 3, 2 / 3], rtol=1e-15)
-
-
-def test_mass_parameters_scale_what_a_joint_carries(urdf_folder):
-    robot = read_urdf(urdf_folder / "mixed_joints.urdf", joints=["spin", "swing"])
-    assert robot.parameters.names == ("spin.mass", "swing.mass")
-    # rotor, bracket, fork and finger; lever and nose
-    assert robot.parameters["spin.mass"].value == pytest.approx(0.9 + 0.35 + 0.6)
-    assert robot.parameters["swing.mass"].value == pytest.approx(0.8 + 0.25)
-    nominal, heavy = robot.numeric().joints[0], robot.numeric({"spin.mass": 2 * 1.85}).joints[0]
-    np.testing.assert_allclose(numbers(heavy.bodies[0].about_com), 2 * numbers(nominal.bodies[0].about_com))
-    np.testing.assert_allclose(numbers(heavy.bodies[0].com), numbers(nominal.bodies[0].com))
-    plain = read_urdf(urdf_folder / "mixed_joints.urdf", parametric=False)
-    assert len(plain.parameters) == 0
-
-
-def test_a_locked_joint_stands_at_its_value_or_within_its_range(urdf_folder):
-    path = urdf_folder / "mixed_joints.urdf"
-    whole = read_urdf(path)
-    q = np.zeros(len(whole.joints))
-    # nod may not stand at zero: its range starts at 0.2, that of extend at 0.05
-    q[[whole.joint_index(name) for name in ("nod", "extend", "slide")]] = [0.2, 0.05, 0.3]
-    fixed = read_urdf(path, joints=["spin"], locked={"slide": 0.3})
-    assert fixed.joint_names == ("spin",)
-    from yid_ocp.model import forward_kinematics
-
-    long = forward_kinematics(whole.numeric(), ca.SX(ca.DM(q)))
-    short = forward_kinematics(fixed.numeric(), ca.SX(ca.DM([0.0])))
-    for frame in ("nose", "tool", "lever", "ground"):
-        expected = numbers(long.pose(frame).matrix())
-        np.testing.assert_allclose(numbers(short.pose(frame).matrix()), expected, atol=1e-14)
-
-
-@pytest.mark.parametrize("robot", ["package:baxter", "package:panda", "package:ur5", "mixed_joints", "turntable"])
-def test_urdf_round_trip(robot, urdf_folder, tmp_path):
-    source = robot if robot.startswith("package:") else urdf_folder / f"{robot}.urdf"
-    mechanism = read_urdf(source)
-    path = tmp_path / "again.urdf"
-    path.write_text(urdf_text(mechanism), encoding="utf-8")
-    again = read_urdf(path, parametric=False)
-    assert_equal_mechanisms(mechanism, again)
-    assert again.name == mechanism.name
-
-
-def test_round_trip_of_changed_parameters(tmp_path):
-    mechanism = y_object().mechanism
-    values = {"T1.length": 1.0, "T2.mass": 0.1, "T3.radius": 0.03}
-    path = tmp_path / "y.urdf"
-    path.write_text(urdf_text(mechanism, values), encoding="utf-8")
-    assert_equal_mechanisms(mechanism.numeric(values), read_urdf(path, parametric=False))
-
-
-def test_round_trip_with_names_that_clash_and_half_open_ranges(tmp_path):
-    """A frame called like the link that the writer would make, a joint called like its fixed joint."""
-    body = (Inertia.of(1.0, [0, 0, 0.1], np.eye(3)),)
-    shifted = Placement.of(transform(np.eye(3), [0.0, 0.0, 0.5]))
-    joints = (
-        Joint("a", "revolute", -1, shifted, (0.0, 0.0, 1.0), body, lower=-1.0),
-        Joint("b_fixed", "prismatic", 0, shifted, (0.0, 1.0, 0.0), body, effort_limit=5e4),
-    )
-    frames = {"a_link": Frame(1, shifted), "world": Frame(0, shifted), "b": Frame(-1, shifted)}
-    mechanism = Mechanism("clash", joints, frames)
-    path = tmp_path / "clash.urdf"
-    path.write_text(urdf_text(mechanism), encoding="utf-8")
-    assert_equal_mechanisms(mechanism, read_urdf(path, parametric=False))
-
-
-@given(roll=ANGLES, pitch=st.one_of(ANGLES, st.floats(-1e-6, 1e-6).map(lambda x: math.pi / 2 - abs(x))), yaw=ANGLES)
-def test_any_orientation_survives_the_round_trip(tmp_path_factory, roll, pitch, yaw):
-    placement = Placement.of(transform(roll_pitch_yaw(roll, pitch, yaw), [0.1, -0.2, 0.3]))
-    mechanism = Mechanism("one", (Joint("j", "revolute", -1, placement, (0.0, 0.0, 1.0)),), {})
-    path = tmp_path_factory.mktemp("urdf") / "one.urdf"
-    path.write_text(urdf_text(mechanism), encoding="utf-8")
-    assert_equal_mechanisms(mechanism, read_urdf(path, parametric=False))
 
 
 def test_joined_mechanisms_hang_on_a_frame(urdf_folder):
@@ -171,16 +30,6 @@ def test_joined_mechanisms_hang_on_a_frame(urdf_folder):
     expected = numbers(carrier.frames["tip"].placement.matrix()) @ placement
     expected = expected @ numbers(item.numeric().joints[0].placement.matrix())
     np.testing.assert_allclose(numbers(both.numeric().joints[2].placement.matrix()), expected, atol=1e-15)
-
-
-def test_a_clamp_has_six_massless_coordinates():
-    clamp = floating_clamp("hand", frame="palm")
-    assert clamp.joint_names == ("hand_x", "hand_y", "hand_z", "hand_rx", "hand_ry", "hand_rz")
-    assert [j.kind for j in clamp.joints] == ["prismatic"] * 3 + ["revolute"] * 3
-    assert clamp.parents == (-1, 0, 1, 2, 3, 4)
-    assert all(merged(j.bodies) is None for j in clamp.joints)
-    assert clamp.frame("palm").joint == 5
-    assert floating_clamp("hand").frame("hand").joint == 5
 
 
 def test_merged_bodies_weigh_what_they_weigh_together():
@@ -202,86 +51,6 @@ def test_merged_bodies_weigh_what_they_weigh_together():
     np.testing.assert_allclose(about_origin(one), sum(about_origin(b) for b in bodies), atol=1e-12)
     assert merged([]) is None
     assert merged([Inertia.of(0.0, np.zeros(3), np.zeros((3, 3)))]) is None
-
-
-def test_a_point_mass_needs_no_inertia(tmp_path):
-    point = '<link name="b"><inertial><mass value="2"/></inertial></link>'
-    path = urdf(tmp_path, link("a"), point, joint("j", "a", "b"))
-    body = read_urdf(path).numeric().joints[0].bodies[0]
-    assert float(body.mass) == 2.0
-    np.testing.assert_array_equal(numbers(body.about_com), np.zeros((3, 3)))
-
-
-BROKEN = {
-    "floating": ((link("a"), link("b"), joint("j", "a", "b", "floating")), ["'j'", "'floating'", "prismatic"]),
-    "planar": ((link("a"), link("b"), joint("j", "a", "b", "planar")), ["'j'", "'planar'"]),
-    "zero_axis": ((link("a"), link("b"), joint("j", "a", "b", axis="0 0 0")), ["'j'", "zero axis"]),
-    "two_roots": ((link("a"), link("b")), ["2 root links", "exactly one"]),
-    "no_root": ((link("a"), link("b"), joint("j", "a", "b"), joint("k", "b", "a")), ["0 root links"]),
-    "unknown_link": ((link("base"), link("b"), joint("j", "bas", "b")), ["'j'", "'bas'", "'base'"]),
-    "two_parents": (
-        (link("a"), link("b"), link("c"), joint("j", "a", "c"), joint("k", "a", "b"), joint("l", "b", "c")),
-        ["two joints carry the link 'c'"],
-    ),
-    "twice_the_joint": (
-        (link("a"), link("b"), link("c"), joint("j", "a", "b"), joint("j", "b", "c")),
-        ["two joints are called 'j'"],
-    ),
-    "ring_beside": (
-        (link("a"), link("b"), link("c"), joint("j", "c", "b"), joint("k", "b", "c")),
-        ["link 'b' does not hang on 'a'"],
-    ),
-    "truncated": ((link("a"), "<link name="), ["cannot be read"]),
-}
-
-
-@pytest.mark.parametrize("name", list(BROKEN))
-def test_a_broken_urdf_is_refused(name, tmp_path):
-    parts, words = BROKEN[name]
-    path = urdf(tmp_path, *parts)
-    with pytest.raises(ModelError) as caught:
-        read_urdf(path)
-    for word in [*words, str(path)]:
-        assert word in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("action", "words"),
-    [
-        (lambda path: read_urdf("nowhere.urdf"), ["'nowhere.urdf'", "package:NAME"]),
-        (lambda path: read_urdf("package:backster"), ["'backster'", "did you mean 'baxter'?"]),
-        (lambda path: read_urdf(path, joints=["swimg"]), ["'swimg'", "did you mean 'swing'?"]),
-        (lambda path: read_urdf(path, locked={"nods": 1.0}), ["'nods'", "did you mean 'nod'?"]),
-        (lambda path: read_urdf(path, joints=["bolt"]), ["movable joint 'bolt'"]),
-        (lambda path: read_urdf(path).joint_index("slider"), ["'slider'", "'slide'", "mixed_joints"]),
-        (lambda path: read_urdf(path).frame("tol"), ["frame 'tol'", "'tool'"]),
-        (lambda path: read_urdf(path).joined(read_urdf(path)), ["two parts", "'bracket'"]),
-        (lambda path: read_urdf(path).joined(floating_clamp("c"), "rotr"), ["'rotr'", "'rotor'"]),
-    ],
-)
-def test_errors_name_what_is_wrong_and_what_is_near(urdf_folder, action, words):
-    with pytest.raises(ModelError) as caught:
-        action(urdf_folder / "mixed_joints.urdf")
-    for word in words:
-        assert word in str(caught.value)
-
-
-def test_a_tool_that_is_not_mounted_is_left_out(tmp_path):
-    parts = (
-        *(link(name) for name in ("base", "arm", "hand", "finger")),
-        joint("turn", "base", "arm"),
-        joint("wrist", "arm", "hand", "fixed"),
-        joint("grip", "hand", "finger", "prismatic"),
-    )
-    path = urdf(tmp_path, *parts)
-    bare = read_urdf(path, exclude_links=["hand"])
-    assert bare.joint_names == ("turn",)
-    assert set(bare.frames) == {"base", "arm"}
-    assert float(bare.numeric().joints[0].bodies[0].mass) == 1.0
-    with pytest.raises(ModelError, match=r"(?s)no link 'hands' to leave out.*did you mean 'hand'"):
-        read_urdf(path, exclude_links=["hands"])
-    with pytest.raises(ModelError, match="joint 'grip' carries a link that is left out"):
-        read_urdf(path, joints=["turn", "grip"], exclude_links=["hand"])
 
 
 def test_a_frame_that_the_file_does_not_have(urdf_folder):

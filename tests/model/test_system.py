@@ -1,3 +1,5 @@
+"""Systems: sizes, parameters, energies, grasps, effects, clamps, and what is refused."""
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -18,6 +20,7 @@ from yid_ocp.model import (
     flexible_object,
     forward_kinematics,
 )
+from yid_ocp.model.mechanism import merged
 from yid_ocp.model.rotations import roll_pitch_yaw
 from yid_ocp.model.system import floating_clamp
 from yid_ocp.model.urdf import read_urdf
@@ -185,3 +188,13 @@ def test_errors_of_build(robot, name):
 def test_negative_damping_is_refused(robot):
     with pytest.raises(ConfigError, match=r"slide\.damping = -1"):
         System.build(robot, damping=-1.0)
+
+
+def test_a_clamp_has_six_massless_coordinates():
+    clamp = floating_clamp("hand", frame="palm")
+    assert clamp.joint_names == ("hand_x", "hand_y", "hand_z", "hand_rx", "hand_ry", "hand_rz")
+    assert [j.kind for j in clamp.joints] == ["prismatic"] * 3 + ["revolute"] * 3
+    assert clamp.parents == (-1, 0, 1, 2, 3, 4)
+    assert all(merged(j.bodies) is None for j in clamp.joints)
+    assert clamp.frame("palm").joint == 5
+    assert floating_clamp("hand").frame("hand").joint == 5

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -193,9 +192,8 @@ def _displaced(frame: Frame, offset: ArrayLike) -> Frame:
 def seeing(step: Step, frames: Mapping[str, Frame]) -> Step:
     """The same step of a system with more frames; sensors need no new equations of motion."""
     mechanism = step.system.mechanism
-    other = copy.copy(step)
-    other.system = replace(step.system, mechanism=replace(mechanism, frames={**mechanism.frames, **frames}))
-    return other
+    system = replace(step.system, mechanism=replace(mechanism, frames={**mechanism.frames, **frames}))
+    return replace(step, model=replace(step.model, system=system))
 
 
 # -- layouts ----------------------------------------------------------------------------------------------------------

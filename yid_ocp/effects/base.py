@@ -403,20 +403,6 @@ def substituted(system: System, old: Collection[ca.SX], new: Collection[ca.SX]) 
     return system.mapped(lambda expression: ca.substitute(expression, before, after))
 
 
-def small_rotation(rx: ca.SX, ry: ca.SX, rz: ca.SX | None = None) -> ca.SX:
-    """Rotation Rz(rz) Ry(ry) Rx(rx), shape (3, 3)."""
-
-    def about(axis: int, angle: ca.SX) -> ca.SX:
-        c, s = ca.cos(angle), ca.sin(angle)
-        a, b = (axis + 1) % 3, (axis + 2) % 3
-        matrix = ca.SX(ca.DM.eye(3))
-        matrix[a, a], matrix[a, b], matrix[b, a], matrix[b, b] = c, -s, s, c
-        return matrix
-
-    turned = about(1, ry) @ about(0, rx)
-    return ca.densify(turned if rz is None else about(2, rz) @ turned)
-
-
 def inverse(placement: Placement) -> Placement:
     """The placement that undoes another."""
     back = placement.rotation.T

@@ -12,10 +12,10 @@ from yid_ocp.effects.base import (
     Quantity,
     object_joints,
     segment_names,
-    small_rotation,
     with_bodies,
 )
 from yid_ocp.model.kinematics import Kinematics, cross, force_cross, motion_cross
+from yid_ocp.model.rotations import symbolic_roll_pitch_yaw
 from yid_ocp.model.system import ClosedForce, MidpointState, System, Terms
 
 AIR_DENSITY = 1.2
@@ -117,7 +117,7 @@ class GravityTilt(EffectBase):
 
     def modify(self, system: System) -> System:
         """See the class."""
-        return replace(system, gravity=small_rotation(self["rx"], self["ry"]) @ system.gravity)
+        return replace(system, gravity=symbolic_roll_pitch_yaw(self["rx"], self["ry"]) @ system.gravity)
 
 
 def _velocities(kinematics: Kinematics, v: ca.SX) -> list[ca.SX]:

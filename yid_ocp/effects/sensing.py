@@ -11,7 +11,8 @@ from typing import ClassVar
 
 import casadi as ca
 
-from yid_ocp.effects.base import EFFECTS, EffectBase, Quantity, robot_joints, segment_of_frame, small_rotation
+from yid_ocp.effects.base import EFFECTS, EffectBase, Quantity, robot_joints, segment_of_frame
+from yid_ocp.model.rotations import symbolic_roll_pitch_yaw
 from yid_ocp.model.system import NodeState, System
 
 CAMERA = frozenset({"camera"})
@@ -94,7 +95,7 @@ class CameraRotation(EffectBase):
         """See the class."""
         if state.camera is None:
             return output
-        turn = small_rotation(self["rx"], self["ry"], self["rz"])
+        turn = symbolic_roll_pitch_yaw(self["rx"], self["ry"], self["rz"])
         return state.camera.translation + turn @ (output - state.camera.translation)
 
 

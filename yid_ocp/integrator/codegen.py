@@ -1,8 +1,7 @@
-"""From symbolic step equations to functions: structure tables, generated C, the compiler and its private cache."""
+"""From symbolic step equations to CasADi functions, index tables and generated C."""
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -11,7 +10,6 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.integrator.compiler import compile_library
 from yid_ocp.integrator.discrete import DiscreteEquations
 
 Indices = NDArray[np.int32]
@@ -165,16 +163,16 @@ def structure(functions: StepFunctions) -> Structure:
     p1_new, p1_old = np.zeros((n, nt), bool), np.zeros((n, nqz), bool)
     rows_new[:n, :n] = rows_old[:n, :n] = p1_new[:, :n] = p1_old[:, :n] = related
     for key, new, old in (("rest", rows_new, rows_old), ("rest_p", p1_new, p1_old)):
-        row, column = _triplet(functions.patterns[key])
+        row, column = triplet(functions.patterns[key])
         inside = column < nt
         new[row[inside], column[inside]] = True
         inside = (column >= nt) & (column < nt + nqz)
         old[row[inside], column[inside] - nt] = True
-    row, column = _triplet(functions.patterns["constraint"])
+    row, column = triplet(functions.patterns["constraint"])
     rows_new[n + nz + row, column] = True
-    row, column = _triplet(functions.patterns["matrix"])
+    row, column = triplet(functions.patterns["matrix"])
     rows_new[column, n + nz + row] = True
-    row, column = _triplet(functions.patterns["pull"])
+    row, column = triplet(functions.patterns["pull"])
     rows_old[row, column] = True
 
     free = np.array(system.free_indices, np.int32)
@@ -252,26 +250,23 @@ def kernel_source(functions: StepFunctions, tables: Structure) -> str:
     ragged("p1_old", tables.p1_old)
     ragged("p1_new", tables.p1_new)
     for key in ("rest", "rest_p", "constraint", "matrix", "pull"):
-        row, column = _triplet(patterns[key])
+        row, column = triplet(patterns[key])
         table(f"{key}_row", row)
         table(f"{key}_col", column)
     body = resources.files("yid_ocp.integrator").joinpath("kernel.c").read_text(encoding="utf-8")
-    return "\n".join([_generated("step", functions.all), *lines, body])
+    return "\n".join([functions_source("step", functions.all), *lines, body])
 
 
-def function_source(function: ca.Function) -> str:
-    """C source of one CasADi function."""
-    return _generated(function.name(), (function,))
-
-
-def _generated(name: str, functions: Sequence[ca.Function]) -> str:
+def functions_source(name: str, functions: Sequence[ca.Function]) -> str:
+    """C source of CasADi functions, which keep their own names."""
     generator = ca.CodeGenerator(name, {"with_header": False, "indent": 0})
     for function in functions:
         generator.add(function)
     return generator.dump()
 
 
-def _triplet(sparsity: ca.Sparsity) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def triplet(sparsity: ca.Sparsity) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Row and column of every nonzero."""
     row, column = sparsity.get_triplet()
     return np.array(row, np.int64), np.array(column, np.int64)
 
@@ -284,86 +279,3 @@ def _runs(entries: Indices, gap: int) -> list[tuple[int, int]]:
         else:
             result.append((value, value + 1))
     return result
-
-
-class Mapped:
-    """A CasADi function evaluated at many points at once, compiled where possible.
-
-    Parameters
-    ----------
-    function : casadi.Function
-        Dense or sparse outputs of any number; inputs are dense columns.
-    shared : collection of int
-        Positions of the inputs that are the same at every point.
-    use_compiler : bool
-        Whether to try compiled code.
-    """
-
-    def __init__(self, function: ca.Function, shared: Sequence[int] = (), use_compiler: bool = True) -> None:
-        self.function = function
-        self.shared = frozenset(shared)
-        self._inputs = [function.numel_in(i) for i in range(function.n_in())]
-        self._outputs = [function.nnz_out(i) for i in range(function.n_out())]
-        self._library = compile_library(self._source(), straight_line=True) if use_compiler else None
-
-    def _source(self) -> str:
-        name, f = self.function.name(), self.function
-        strides = ", ".join("0" if i in self.shared else str(size) for i, size in enumerate(self._inputs)) or "0"
-        widths = ", ".join(str(size) for size in self._outputs) or "0"
-        return f"""{_generated(name, (f,))}
-#include <stdlib.h>
-int yid_map(int count, const double **in, double **out) {{
-    static const int stride[] = {{{strides}}}, width[] = {{{widths}}};
-    const double *arg[{max(f.sz_arg(), 1)}];
-    double *res[{max(f.sz_res(), 1)}];
-    double *w = malloc(sizeof(double) * {f.sz_w() + 1});
-    long long *iw = malloc(sizeof(long long) * {f.sz_iw() + 1});
-    for (int k = 0; k < count; k++) {{
-        for (int i = 0; i < {len(self._inputs)}; i++) arg[i] = in[i] + (size_t)k * stride[i];
-        for (int o = 0; o < {len(self._outputs)}; o++) res[o] = out[o] + (size_t)k * width[o];
-        {name}(arg, res, iw, w, 0);
-    }}
-    free(w);
-    free(iw);
-    return 0;
-}}
-"""
-
-    def __call__(self, *inputs: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """Evaluate.
-
-        Parameters
-        ----------
-        *inputs : ndarray, shape (count, size) or, where shared, (size,)
-
-        Returns
-        -------
-        list of ndarray, shape (count, rows, columns)
-            Dense, one for each output.
-        """
-        count = next((len(x) for i, x in enumerate(inputs) if i not in self.shared), 1)
-        arrays = [np.ascontiguousarray(x, dtype=float) for x in inputs]
-        for i, array in enumerate(arrays):
-            expected = (self._inputs[i],) if i in self.shared else (count, self._inputs[i])
-            assert array.shape == expected, f"input {i} of {self.function.name()}: {array.shape}, not {expected}"
-        values = [np.zeros((count, size)) for size in self._outputs]
-        if self._library is not None:
-            pointers = (ctypes.c_void_p * max(len(arrays), 1))(*(a.ctypes.data for a in arrays))
-            targets = (ctypes.c_void_p * len(values))(*(v.ctypes.data for v in values))
-            self._library.yid_map(ctypes.c_int(count), pointers, targets)
-        else:
-            for k in range(count):
-                point = [a if i in self.shared else a[k] for i, a in enumerate(arrays)]
-                for target, result in zip(values, self.function.call(point), strict=True):
-                    target[k] = np.array(result.nonzeros())
-        dense = []
-        for o, value in enumerate(values):
-            sparsity = self.function.sparsity_out(o)
-            if sparsity.is_dense():
-                dense.append(value.reshape(count, sparsity.size2(), sparsity.size1()).transpose(0, 2, 1))
-                continue
-            full = np.zeros((count, *sparsity.shape))
-            row, column = _triplet(sparsity)
-            full[:, row, column] = value
-            dense.append(full)
-        return dense

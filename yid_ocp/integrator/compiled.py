@@ -1,46 +1,42 @@
-"""The sweeps in generated C, called through ctypes."""
+"""The kernel in generated C, called through ctypes."""
 
 from __future__ import annotations
 
 import ctypes
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import ModelError
 from yid_ocp.integrator import codegen, compiler
 from yid_ocp.integrator.step_model import (
     ITERATION_LIMIT,
-    LINEARIZATION_MATRICES,
     Directions,
     Feedback,
     Gradient,
     Rollout,
     StepCode,
     StepLinearization,
+    StepModel,
     empty_linearization,
-    status_of,
+    empty_rollout,
+    ended,
+    out_of_memory,
 )
 from yid_ocp.parallel import Once
-
-if TYPE_CHECKING:
-    from yid_ocp.integrator.step import Step
 
 Array = NDArray[np.float64]
 
 
-class _Feedback(ctypes.Structure):
-    _fields_ = (
-        ("count", ctypes.c_int),
-        ("index", ctypes.c_void_p),
-        ("gain", ctypes.c_void_p),
-        ("reference", ctypes.c_void_p),
-    )
+class _Struct(ctypes.Structure):
+    """A struct of `kernel.c`; what its pointers point to stays alive with it."""
+
+    kept: object = None
 
 
-class _Directions(ctypes.Structure):
+class _Directions(_Struct):
     _fields_ = (
         ("count", ctypes.c_int),
         ("theta_count", ctypes.c_int),
@@ -56,62 +52,100 @@ class _Directions(ctypes.Structure):
     )
 
 
-@dataclass(frozen=True)
-class _CompiledColumns:
-    address: int
-    patterns: tuple[NDArray[np.int64], ...]
-    work: int
-    keep: object
+class _Feedback(_Struct):
+    _fields_ = (
+        ("count", ctypes.c_int),
+        ("index", ctypes.c_void_p),
+        ("gain", ctypes.c_void_p),
+        ("reference", ctypes.c_void_p),
+    )
 
 
-def _pointer(array: Array | NDArray[np.int32] | NDArray[np.int64] | None) -> ctypes.c_void_p | None:
-    return None if array is None else ctypes.c_void_p(array.ctypes.data)
+class _Motion(_Struct):
+    _fields_ = (
+        ("steps", ctypes.c_int),
+        ("limit", ctypes.c_int),
+        ("time_step", ctypes.c_double),
+        ("tolerance", ctypes.c_double),
+        ("theta", ctypes.c_void_p),
+        ("torque", ctypes.c_void_p),
+        ("path", ctypes.c_void_p),
+        ("feedback", ctypes.c_void_p),
+        ("directions", ctypes.c_void_p),
+    )
 
 
-def _contiguous(array: Array | None) -> Array | None:
+class _Trajectory(_Struct):
+    _fields_ = tuple((name, ctypes.c_void_p) for name in ("state", "multipliers", "effort", "applied"))
+
+
+class _Sensitivities(_Struct):
+    _fields_ = tuple((name, ctypes.c_void_p) for name in ("state", "multipliers", "effort", "torque", "path"))
+
+
+class _Partials(_Struct):
+    _fields_ = tuple((name, ctypes.c_void_p) for name in ("state", "multipliers", "effort"))
+
+
+class _Gradient(_Struct):
+    _fields_ = tuple((name, ctypes.c_void_p) for name in ("theta", "start", "torque", "path"))
+
+
+# In the order of the struct.
+MATRICES = ("rows_new", "rows_old", "rows_input", "p1_new", "p1_old", "p1_input", "rows_theta", "p1_theta")
+
+
+class _Linearization(_Struct):
+    _fields_ = tuple((name, ctypes.c_void_p) for name in ("rows", "p1", *MATRICES))
+
+
+class _Outcome(_Struct):
+    _fields_ = (
+        ("step", ctypes.c_int),
+        ("error", ctypes.c_double),
+        ("iterations", ctypes.c_longlong),
+        ("factorisations", ctypes.c_longlong),
+        ("memory", ctypes.c_longlong),
+    )
+
+
+Kind = TypeVar("Kind", bound=_Struct)
+
+
+def _filled(kind: type[Kind], *values: object) -> Kind:
+    """A struct from numbers and from the addresses of arrays and other structs; None becomes a null pointer."""
+    entries: list[object] = []
+    for value in values:
+        if isinstance(value, np.ndarray):
+            entries.append(value.ctypes.data)
+        else:
+            entries.append(ctypes.addressof(value) if isinstance(value, _Struct) else value)
+    struct = kind(*entries)
+    struct.kept = values
+    return struct
+
+
+def _doubles(array: ArrayLike | None) -> Array | None:
     return None if array is None else np.ascontiguousarray(array, dtype=float)
 
 
+@dataclass(frozen=True)
+class _ThetaColumns:
+    """The compiled derivatives by some parameters: address, sparsity in CasADi's compressed columns, work size."""
+
+    address: int
+    patterns: tuple[NDArray[np.int64], ...]
+    work: int
+    library: ctypes.CDLL
+
+
 class CompiledKernel:
-    """Sweeps in generated C; holds no state between calls, so that threads may share it."""
+    """The kernel in generated C; threads may share it."""
 
-    def __init__(self, step: Step, library: ctypes.CDLL) -> None:
-        self._step = step
+    def __init__(self, model: StepModel, library: ctypes.CDLL) -> None:
+        self._model = model
         self._library = library
-        self._theta_columns: Once[tuple[str, ...], _CompiledColumns] = Once(self._compiled_columns)
-
-    def _compiled_columns(self, names: tuple[str, ...]) -> _CompiledColumns:
-        function = codegen.theta_function(self._step.equations, names)
-        library = compiler.compile_library(codegen.function_source(function), straight_line=True)
-        if library is None:
-            raise ModelError("the compiler worked for the step but not for its derivatives", hint="set CC=none")
-        address = ctypes.cast(library.by_theta, ctypes.c_void_p).value
-        assert address is not None
-        patterns = []
-        for out in range(3):
-            sparsity = function.sparsity_out(out)
-            patterns.append(
-                np.array([sparsity.size1(), sparsity.size2(), *sparsity.colind(), *sparsity.row()], np.int64)
-            )
-        work = max(function.sz_w(), function.sz_iw(), 1)
-        return _CompiledColumns(address, tuple(patterns), work, library)
-
-    def _directions(self, names: tuple[str, ...], count: int) -> tuple[_Directions, list[object]]:
-        if not names:
-            return _Directions(count=count, theta_count=0), []
-        columns = self._theta_columns(names)
-        values = [np.zeros(max(int(pattern[2 + pattern[1]]), 1)) for pattern in columns.patterns]
-        w, iw = np.zeros(columns.work), np.zeros(columns.work, np.int64)
-        struct = _Directions(
-            count,
-            len(names),
-            columns.address,
-            *(_pointer(pattern) for pattern in columns.patterns),
-            *(_pointer(value) for value in values),
-            _pointer(w),
-            _pointer(iw),
-        )
-        return struct, [values, w, iw]
+        self._theta_columns: Once[tuple[str, ...], _ThetaColumns] = Once(lambda names: _theta_columns(model, names))
 
     def rollout(
         self,
@@ -123,50 +157,25 @@ class CompiledKernel:
         wanted: Directions | None,
     ) -> Rollout:
         """See `Kernel.rollout`."""
-        sizes = self._step.sizes
-        steps = len(torque)
-        theta, torque, path = (np.ascontiguousarray(a, dtype=float) for a in (theta, torque, path))
-        state = np.full((steps + 1, sizes["nx"]), np.nan)
-        state[0] = start
-        multipliers = np.full((steps, sizes["m"]), np.nan)
-        effort = np.full((steps, sizes["nc"]), np.nan)
-        applied = np.full((steps, sizes["nu"]), np.nan)
-        info = np.zeros(4)
-        by_state = by_multipliers = by_effort = given_torque = given_path = None
-        struct = None
-        keep: list[object] = []
-        if wanted is not None:
-            d = wanted.count
-            by_state = np.full((steps + 1, sizes["nx"], d), np.nan)
-            by_state[0] = wanted.start
-            by_multipliers, by_effort = (np.full((steps, sizes[key], d), np.nan) for key in ("m", "nc"))
-            struct, keep = self._directions(wanted.names, d)
-            given_torque, given_path = _contiguous(wanted.torque), _contiguous(wanted.path)
-        loop, held = _feedback_struct(feedback)
+        count = None if wanted is None else wanted.count
+        out = empty_rollout(self._model.sizes, len(torque), count)
+        out.state[0] = start
+        sensitivities, directions = None, None
+        if wanted is not None and out.by_state is not None:
+            out.by_state[0] = wanted.start
+            given = _doubles(wanted.torque), _doubles(wanted.path)
+            sensitivities = _filled(_Sensitivities, out.by_state, out.by_multipliers, out.by_effort, *given)
+            directions = self._directions(wanted.names, wanted.count)
+        outcome = _Outcome()
         code = self._library.yid_rollout(
-            ctypes.c_int(steps),
-            _pointer(theta),
-            ctypes.c_double(self._step.time_step),
-            _pointer(torque),
-            _pointer(path),
-            ctypes.byref(loop) if loop is not None else None,
-            _pointer(state),
-            _pointer(multipliers),
-            _pointer(effort),
-            _pointer(applied),
-            ctypes.byref(struct) if struct is not None else None,
-            _pointer(by_state),
-            _pointer(by_multipliers),
-            _pointer(by_effort),
-            _pointer(given_torque),
-            _pointer(given_path),
-            ctypes.c_double(self._step.tolerance),
-            ctypes.c_int(ITERATION_LIMIT),
-            _pointer(info),
+            ctypes.byref(self._motion(len(torque), theta, torque, path, feedback, directions)),
+            ctypes.byref(_filled(_Trajectory, out.state, out.multipliers, out.effort, out.torque)),
+            None if sensitivities is None else ctypes.byref(sensitivities),
+            ctypes.byref(outcome),
         )
-        del keep, held
-        status = status_of(code, info, effort, state, sizes)
-        return Rollout(state, multipliers, effort, applied, by_state, by_multipliers, by_effort, status)
+        self._check(code, outcome)
+        counts = outcome.iterations, outcome.factorisations
+        return ended(out, self._model.sizes, code, outcome.step, outcome.error, counts)
 
     def adjoint(
         self,
@@ -179,38 +188,25 @@ class CompiledKernel:
         by_effort: Array | None,
     ) -> Gradient:
         """See `Kernel.adjoint`."""
-        sizes = self._step.sizes
-        steps = len(rollout.multipliers)
-        gradient, by_start = np.zeros(max(len(names), 1)), np.zeros(sizes["nx"])
-        by_torque, by_path = np.zeros((steps, sizes["nu"])), np.zeros((steps + 1, sizes["nc"]))
-        info = np.zeros(4)
-        struct, keep = self._directions(names, len(names))
-        loop, held = _feedback_struct(feedback)
-        inputs = [
-            np.ascontiguousarray(a, dtype=float) for a in (theta, rollout.torque, rollout.state, rollout.multipliers)
-        ]
-        partial = [_contiguous(a) for a in (by_state, by_multipliers, by_effort)]
+        sizes, steps = self._model.sizes, len(rollout.multipliers)
+        shapes = (len(names),), (sizes["nx"],), (steps, sizes["nu"]), (steps + 1, sizes["nc"])
+        gradient = Gradient(*(np.zeros(shape) for shape in shapes))
+        along = [_doubles(a) for a in (rollout.state, rollout.multipliers, None, rollout.torque)]
+        partials = [_doubles(a) for a in (by_state, by_multipliers, by_effort)]
+        outcome = _Outcome()
+        directions = self._directions(names, len(names))
         code = self._library.yid_adjoint(
-            ctypes.c_int(steps),
-            _pointer(inputs[0]),
-            ctypes.c_double(self._step.time_step),
-            _pointer(inputs[1]),
-            ctypes.byref(loop) if loop is not None else None,
-            _pointer(inputs[2]),
-            _pointer(inputs[3]),
-            ctypes.byref(struct),
-            *(_pointer(a) for a in partial),
-            _pointer(gradient),
-            _pointer(by_start),
-            _pointer(by_torque),
-            _pointer(by_path),
-            _pointer(info),
+            ctypes.byref(self._motion(steps, theta, None, None, feedback, directions)),
+            ctypes.byref(_filled(_Trajectory, *along)),
+            ctypes.byref(_filled(_Partials, *partials)),
+            ctypes.byref(_filled(_Gradient, *vars(gradient).values())),
+            ctypes.byref(outcome),
         )
-        del keep, held
+        self._check(code, outcome)
         if code != StepCode.OK:
-            for array in (gradient, by_start, by_torque, by_path):
+            for array in vars(gradient).values():
                 array[:] = np.nan
-        return Gradient(gradient[: len(names)], by_start, by_torque, by_path)
+        return gradient
 
     def linearize(
         self,
@@ -222,27 +218,63 @@ class CompiledKernel:
         derivatives: bool,
     ) -> StepLinearization:
         """See `Kernel.linearize`."""
-        inputs = [np.ascontiguousarray(a, dtype=float) for a in (theta, state, multipliers, torque)]
-        stages = empty_linearization(self._step.sizes, len(torque), len(names), derivatives)
-        struct, keep = self._directions(names, len(names))
-        matrices = [getattr(stages, field) if derivatives else None for field in LINEARIZATION_MATRICES]
-        self._library.yid_linearize(
-            ctypes.c_int(len(torque)),
-            _pointer(inputs[0]),
-            ctypes.c_double(self._step.time_step),
-            *(_pointer(a) for a in inputs[1:]),
-            ctypes.byref(struct),
-            _pointer(stages.rows),
-            _pointer(stages.p1),
-            *(_pointer(matrix) for matrix in matrices),
+        out = empty_linearization(self._model.sizes, len(torque), len(names), derivatives)
+        along = [_doubles(a) for a in (state, multipliers, None, torque)]
+        matrices = [getattr(out, name) if derivatives else None for name in MATRICES]
+        outcome = _Outcome()
+        directions = self._directions(names, len(names))
+        code = self._library.yid_linearize(
+            ctypes.byref(self._motion(len(torque), theta, None, None, None, directions)),
+            ctypes.byref(_filled(_Trajectory, *along)),
+            ctypes.byref(_filled(_Linearization, out.rows, out.p1, *matrices)),
+            ctypes.byref(outcome),
         )
-        del keep
-        return stages
+        self._check(code, outcome)
+        return out
+
+    def _motion(
+        self,
+        steps: int,
+        theta: Array,
+        torque: Array | None,
+        path: Array | None,
+        feedback: Feedback | None,
+        directions: _Directions | None,
+    ) -> _Motion:
+        loop = None
+        if feedback is not None:
+            index = np.ascontiguousarray(feedback.index, np.int32)
+            loop = _filled(_Feedback, len(index), index, _doubles(feedback.gain), _doubles(feedback.reference))
+        inputs = (_doubles(theta), _doubles(torque), _doubles(path))
+        numbers = (steps, ITERATION_LIMIT, self._model.time_step, self._model.tolerance)
+        return _filled(_Motion, *numbers, *inputs, loop, directions)
+
+    def _directions(self, names: tuple[str, ...], count: int) -> _Directions:
+        if not names:
+            return _filled(_Directions, count, 0)
+        columns = self._theta_columns(names)
+        values = [np.zeros(int(pattern[2 + pattern[1]])) for pattern in columns.patterns]
+        w, iw = np.zeros(columns.work), np.zeros(columns.work, np.int64)
+        return _filled(_Directions, count, len(names), columns.address, *columns.patterns, *values, w, iw)
+
+    def _check(self, code: int, outcome: _Outcome) -> None:
+        if code == StepCode.OUT_OF_MEMORY:
+            raise out_of_memory("the work on one step", outcome.memory)
 
 
-def _feedback_struct(feedback: Feedback | None) -> tuple[_Feedback | None, list[object]]:
-    if feedback is None:
-        return None, []
-    index = np.ascontiguousarray(feedback.index, np.int32)
-    gain, reference = np.ascontiguousarray(feedback.gain, float), np.ascontiguousarray(feedback.reference, float)
-    return _Feedback(len(index), _pointer(index), _pointer(gain), _pointer(reference)), [index, gain, reference]
+def _theta_columns(model: StepModel, names: tuple[str, ...]) -> _ThetaColumns:
+    """Compile the derivatives by some parameters and make sure that they fit the kernel, which does not look."""
+    function = codegen.theta_function(model.equations, names)
+    sizes = model.sizes
+    rows = (sizes["n"] + sizes["nz"] + sizes["m"], sizes["n"], sizes["nc"])
+    shapes = [function.size_out(i) for i in range(function.n_out())]
+    if shapes != [(count, len(names)) for count in rows]:
+        raise ValueError(f"derivatives by {len(names)} parameters have the shapes {shapes}, not the rows {rows}")
+    library = compiler.compile_library(codegen.functions_source(function.name(), (function,)), straight_line=True)
+    if library is None:
+        raise ModelError("the compiler worked for the step but not for its derivatives", hint="set CC=none")
+    address = ctypes.cast(library.by_theta, ctypes.c_void_p).value
+    assert address is not None
+    patterns = (function.sparsity_out(i) for i in range(function.n_out()))
+    compressed = (np.array([s.size1(), s.size2(), *s.colind(), *s.row()], np.int64) for s in patterns)
+    return _ThetaColumns(address, tuple(compressed), max(function.sz_w(), function.sz_iw(), 1), library)

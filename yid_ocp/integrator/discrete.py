@@ -138,25 +138,6 @@ class DiscreteEquations:
         return ca.vertcat(self.q1[list(self.system.free_indices)], self.z1, self.lam)
 
 
-def discrete_lagrangian(system: System, q0: ca.SX, q1: ca.SX, time_step: ca.SX) -> ca.SX:
-    """Midpoint discrete Lagrangian L_d = h L((q0 + q1)/2, (q1 - q0)/h) without effects [J s].
-
-    Parameters
-    ----------
-    system : System
-    q0, q1 : casadi.SX, shape (n, 1)
-    time_step : casadi.SX or float
-        h [s]
-
-    References
-    ----------
-    Marsden and West (2001), Acta Numerica 10:357, doi:10.1017/S096249290100006X.
-    """
-    q, v = (q0 + q1) / 2, (q1 - q0) / time_step
-    rigid = rigid_body(forward_kinematics(system.mechanism, q), v, system.gravity)
-    return time_step * (rigid.kinetic - rigid.potential - system.elastic_energy(q))
-
-
 def discrete_equations(system: System, force_split: ForceSplit = "symmetric") -> DiscreteEquations:
     """Build the DEL equations of one step.
 
@@ -182,23 +163,120 @@ def discrete_equations(system: System, force_split: ForceSplit = "symmetric") ->
     """
     if force_split not in get_args(ForceSplit):
         raise ModelError(f"force_split = '{force_split}'", allowed=", ".join(get_args(ForceSplit)))
-    n, m = system.size, system.constraint_count
-    names = tuple(system.internal)
-    symbols = ca.vertcat(*system.internal.values()) if names else ca.SX(0, 1)
-    q0, q1, p0 = ca.SX.sym("q0", n), ca.SX.sym("q1", n), ca.SX.sym("p0", n)
-    z0, z1 = ca.SX.sym("z0", len(names)), ca.SX.sym("z1", len(names))
-    lam, u = ca.SX.sym("lam", m), ca.SX.sym("u", len(system.driven))
-    time_step = ca.SX.sym("time_step")
-    h = time_step * system.time_scale
-
-    qm, vm = ca.SX.sym("qm", n), ca.SX.sym("vm", n)
-    zm, z_rate, pull_rate = ca.SX.sym("zm", len(names)), ca.SX.sym("z_rate", len(names)), ca.SX.sym("pull_rate", m)
+    at = _Symbols.of(system)
+    q0, q1, z0, z1, lam, h, qm, vm = at.q0, at.q1, at.z0, at.z1, at.lam, at.h, at.qm, at.vm
     kinematics = forward_kinematics(system.mechanism, qm)
     rigid = rigid_body(kinematics, vm, system.gravity)
+    terms = _summed_terms(system, at, kinematics)
+    extra_q, extra_v = ca.gradient(terms.lagrangian, qm), ca.gradient(terms.lagrangian, vm)
+
+    share = 1.0 if force_split == "left" else 0.5
+    viscous_share = 0.5 if force_split == "symmetric" else 1.0
+    push_left = h * (share * terms.force + viscous_share * terms.viscous)
+    push_right = h * ((1 - share) * terms.force + (1 - viscous_share) * terms.viscous)
+    scale, spring = _row_scale(system, at)
+    matrix, pull_by_q = (
+        ca.substitute(expression, at.internal, z0)
+        for expression in _constraint_derivatives(system, forward_kinematics(system.mechanism, q0), q0, lam)
+    )
+    constraint, gain = _constraint(system, at)
+    balance_rest = scale * (h / 2 * extra_q - extra_v + push_left) - spring
+    p1_rest = scale * (h / 2 * extra_q + extra_v + push_right) - spring
+    balance = at.p0 + scale * (h / 2 * rigid.by_q - rigid.by_v - matrix.T @ lam) + balance_rest
+    p1 = scale * (h / 2 * rigid.by_q + rigid.by_v) + p1_rest
+    if terms.closed is not None:
+        balance += viscous_share * h * scale * terms.closed.force
+        p1 += (1 - viscous_share) * h * scale * terms.closed.force
+    fields = ("by_q", "by_v", "kinetic", "potential", "S", "D", "F", "B", "G")
+    closed = terms.closed
+    if closed is not None:
+        closed = ClosedForce(at.placed(closed.force), at.placed(closed.A), at.placed(closed.T))
+    return DiscreteEquations(
+        system=system,
+        force_split=force_split,
+        q0=q0,
+        q1=q1,
+        z0=z0,
+        z1=z1,
+        p0=at.p0,
+        lam=lam,
+        u=at.u,
+        theta=system.parameters.symbols,
+        time_step=at.time_step,
+        h=h,
+        momentum_balance=at.placed(balance),
+        internal=at.placed(terms.internal),
+        internal_at_rest=at.placed(terms.internal_at_rest),
+        constraint=constraint,
+        constraint_gain=gain,
+        p1=at.placed(p1),
+        rigid=RigidBody(**{name: at.placed(getattr(rigid, name)) for name in fields}),
+        balance_rest=at.placed(balance_rest),
+        p1_rest=at.placed(p1_rest),
+        closed=closed,
+        closed_shares=(viscous_share, 1 - viscous_share),
+        constraint_matrix=matrix,
+        pull_by_q=pull_by_q,
+        row_scale=ca.densify(scale),
+    )
+
+
+@dataclass(frozen=True)
+class _Symbols:
+    """The symbols of a step, and those that stand for its midpoint until `placed` puts the nodes in their place."""
+
+    q0: ca.SX
+    q1: ca.SX
+    p0: ca.SX
+    z0: ca.SX
+    z1: ca.SX
+    lam: ca.SX
+    u: ca.SX
+    time_step: ca.SX
+    h: ca.SX
+    qm: ca.SX
+    vm: ca.SX
+    zm: ca.SX
+    z_rate: ca.SX
+    pull_rate: ca.SX
+    internal: ca.SX
+
+    @staticmethod
+    def of(system: System) -> _Symbols:
+        n, m, internal = system.size, system.constraint_count, system.internal
+        sizes = {"q0": n, "q1": n, "p0": n, "z0": len(internal), "z1": len(internal), "lam": m, "u": len(system.driven)}
+        sizes |= {"time_step": 1, "qm": n, "vm": n, "zm": len(internal), "z_rate": len(internal), "pull_rate": m}
+        symbols = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
+        own = ca.vertcat(*internal.values()) if internal else ca.SX(0, 1)
+        return _Symbols(**symbols, h=symbols["time_step"] * system.time_scale, internal=own)
+
+    def placed(self, expression: ca.SX) -> ca.SX:
+        """An expression of the midpoint as one of the two nodes, dense."""
+        h, z = self.h, (self.z0 + self.z1) / 2
+        midpoint = ca.vertcat(self.qm, self.vm, self.zm, self.z_rate, self.pull_rate, self.internal)
+        q, v = (self.q0 + self.q1) / 2, (self.q1 - self.q0) / h
+        values = ca.vertcat(q, v, z, (self.z1 - self.z0) / h, self.lam / h, z)
+        return ca.densify(ca.substitute(expression, midpoint, values))
+
+
+@dataclass(frozen=True)
+class _SummedTerms:
+    """What springs, dampers, inputs and effects add up to at the midpoint, as in `Terms`; equations as columns."""
+
+    lagrangian: ca.SX
+    force: ca.SX
+    viscous: ca.SX
+    internal: ca.SX
+    internal_at_rest: ca.SX
+    closed: ClosedForce | None
+
+
+def _summed_terms(system: System, at: _Symbols, kinematics: Kinematics) -> _SummedTerms:
+    names = tuple(system.internal)
     rows = {name: i for i, name in enumerate(names)}
-    state = MidpointState(system, kinematics, qm, vm, zm, z_rate, u, pull_rate, rows)
-    energy = -system.elastic_energy(qm)
-    force, viscous = system.input_force(u), system.viscous_force(vm)
+    state = MidpointState(system, kinematics, at.qm, at.vm, at.zm, at.z_rate, at.u, at.pull_rate, rows)
+    energy = -system.elastic_energy(at.qm)
+    force, viscous = system.input_force(at.u), system.viscous_force(at.vm)
     equations: dict[str, ca.SX] = {}
     at_rest: dict[str, ca.SX] = {}
     closed: list[ClosedForce] = []
@@ -213,77 +291,40 @@ def discrete_equations(system: System, force_split: ForceSplit = "symmetric") ->
     missing = [name for name in names if name not in equations]
     if missing:
         raise ModelError(f"internal coordinate '{missing[0]}' has no equation")
-    extra_q, extra_v = ca.gradient(energy, qm), ca.gradient(energy, vm)
-    midpoint = ca.vertcat(qm, vm, zm, z_rate, pull_rate, symbols)
-    midpoint_values = ca.vertcat((q0 + q1) / 2, (q1 - q0) / h, (z0 + z1) / 2, (z1 - z0) / h, lam / h, (z0 + z1) / 2)
-
-    phi_there = ca.substitute(system.constraints(forward_kinematics(system.mechanism, q1)), symbols, z1)
-    matrix, pull_by_q = (
-        ca.substitute(expression, symbols, z0)
-        for expression in _constraint_derivatives(system, forward_kinematics(system.mechanism, q0), q0, lam)
+    parts = ([getattr(c, name) for c in closed] for name in ("force", "A", "T"))
+    return _SummedTerms(
+        energy,
+        force,
+        viscous,
+        ca.vertcat(*(equations[name] for name in names)) if names else ca.SX(0, 1),
+        ca.vertcat(*(at_rest.get(name, equations[name]) for name in names)) if names else ca.SX(0, 1),
+        ClosedForce(*(sum(rest, first) for first, *rest in parts)) if closed else None,
     )
-    pull = matrix.T @ lam
 
-    share = 1.0 if force_split == "left" else 0.5
-    viscous_share = 0.5 if force_split == "symmetric" else 1.0
-    push_left = h * (share * force + viscous_share * viscous)
-    push_right = h * ((1 - share) * force + (1 - viscous_share) * viscous)
-    row_scale, held = [ca.SX(1)] * n, [ca.SX(0)] * n
+
+def _row_scale(system: System, at: _Symbols) -> tuple[ca.SX, ca.SX]:
+    """Factor on every row, and what the spring of a compliant coordinate takes off it, both shape (n, 1)."""
+    scale, held = [ca.SX(1)] * system.size, [ca.SX(0)] * system.size
     for joint, compliance in system.compliant.items():
         index = system.mechanism.joint_index(joint)
-        relaxed = qm[index] + system.relaxing[joint] * vm[index] if joint in system.relaxing else qm[index]
-        row_scale[index], held[index] = compliance, h / 2 * relaxed
-    scale, spring = ca.vertcat(*row_scale), ca.vertcat(*held)
-    balance_rest = scale * (h / 2 * extra_q - extra_v + push_left) - spring
-    p1_rest = scale * (h / 2 * extra_q + extra_v + push_right) - spring
-    balance = p0 + scale * (h / 2 * rigid.by_q - rigid.by_v - pull) + balance_rest
-    p1 = scale * (h / 2 * rigid.by_q + rigid.by_v) + p1_rest
+        q, v = at.qm[index], at.vm[index]
+        relaxed = q + system.relaxing[joint] * v if joint in system.relaxing else q
+        scale[index], held[index] = compliance, at.h / 2 * relaxed
+    return ca.vertcat(*scale), ca.vertcat(*held)
 
-    def placed(expression: ca.SX) -> ca.SX:
-        return ca.densify(ca.substitute(expression, midpoint, midpoint_values))
 
-    total: ClosedForce | None = None
-    if closed:
-        parts = ([getattr(c, name) for c in closed] for name in ("force", "A", "T"))
-        total = ClosedForce(*(placed(sum(rest, first)) for first, *rest in parts))
-        balance += viscous_share * h * scale * sum((c.force for c in closed), ca.SX(n, 1))
-        p1 += (1 - viscous_share) * h * scale * sum((c.force for c in closed), ca.SX(n, 1))
+def _constraint(system: System, at: _Symbols) -> tuple[ca.SX, ca.SX | None]:
+    """`constraint` and `constraint_gain` of `DiscreteEquations`."""
+
+    def phi(q: ca.SX, z: ca.SX) -> ca.SX:
+        return ca.substitute(system.constraints(forward_kinematics(system.mechanism, q)), at.internal, z)
+
+    closure, gain = phi(at.q1, at.z1), None
     relaxation = system.constraint_relaxation()
-    gain = None if relaxation is None else 1 + relaxation / h
-    if gain is not None:
-        phi_here = system.constraints(forward_kinematics(system.mechanism, q0))
-        phi_there = gain * phi_there + (1 - gain) * ca.substitute(phi_here, symbols, z0)
-    fields = ("by_q", "by_v", "kinetic", "potential", "S", "D", "F", "B", "G")
-    return DiscreteEquations(
-        system=system,
-        force_split=force_split,
-        q0=q0,
-        q1=q1,
-        z0=z0,
-        z1=z1,
-        p0=p0,
-        lam=lam,
-        u=u,
-        theta=system.parameters.symbols,
-        time_step=time_step,
-        h=h,
-        momentum_balance=placed(balance),
-        internal=placed(ca.vertcat(*(equations[name] for name in names)) if names else ca.SX(0, 1)),
-        internal_at_rest=placed(
-            ca.vertcat(*(at_rest.get(name, equations[name]) for name in names)) if names else ca.SX(0, 1)
-        ),
-        constraint=ca.densify(phi_there - system.constraint_compliance() * lam / h),
-        constraint_gain=gain,
-        p1=placed(p1),
-        rigid=RigidBody(**{name: placed(getattr(rigid, name)) for name in fields}),
-        balance_rest=placed(balance_rest),
-        p1_rest=placed(p1_rest),
-        closed=total,
-        closed_shares=(viscous_share, 1 - viscous_share),
-        constraint_matrix=matrix,
-        pull_by_q=pull_by_q,
-        row_scale=ca.densify(scale),
-    )
+    if relaxation is not None:
+        gain = 1 + relaxation / at.h
+        closure = gain * closure + (1 - gain) * phi(at.q0, at.z0)
+    return ca.densify(closure - system.constraint_compliance() * at.lam / at.h), gain
 
 
 def _constraint_derivatives(system: System, kinematics: Kinematics, q: ca.SX, lam: ca.SX) -> tuple[ca.SX, ca.SX]:
@@ -321,16 +362,16 @@ def _constraint_derivatives(system: System, kinematics: Kinematics, q: ca.SX, la
         relative = kinematics.angular_jacobian(holder) - kinematics.angular_jacobian(held)
         blocks += [sum((cross(a, b).T @ relative for a, b in pairs), ca.SX(1, n)) for pairs in rows]
         for a, b in [(part[3 + k] * a, b) for k, pairs in enumerate(rows) for a, b in pairs]:
-            swept: list[dict[int, ca.SX]] = []
+            turns: list[dict[int, ca.SX]] = []
             for frame, vector, other in ((holder, a, b), (held, b, a)):
                 chain = _turning(system, frame)
-                swept.append({j: cross(kinematics.screws[j][:3], vector) for j in chain})
+                turns.append({j: cross(kinematics.screws[j][:3], vector) for j in chain})
                 for above, i in enumerate(chain):
                     turned = cross(other, kinematics.screws[i][:3])
                     for j in chain[above:]:
-                        add(i, j, ca.dot(swept[-1][j], turned))
-            for i, by_i in swept[0].items():
-                for j, by_j in swept[1].items():
+                        add(i, j, ca.dot(turns[-1][j], turned))
+            for i, by_i in turns[0].items():
+                for j, by_j in turns[1].items():
                     add(i, j, (2 if i == j else 1) * ca.dot(by_i, by_j))
     return ca.sparsify(ca.vertcat(*blocks)), ca.sparsify(hessian)
 

@@ -1,199 +1,116 @@
-"""The sweeps by CasADi's interpreter and SciPy's LU, for machines without a C compiler."""
+"""The kernel for machines without a C compiler: CasADi differentiates the equations, NumPy solves, Newton is plain.
+
+It shares nothing with `kernel.c` but the `DiscreteEquations`, so that each is a check of the other.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import casadi as ca
 import numpy as np
-import scipy.linalg
+import scipy.linalg.lapack
 from numpy.typing import NDArray
 
-from yid_ocp.integrator import codegen
 from yid_ocp.integrator.step_model import (
     ITERATION_LIMIT,
-    LINEARIZATION_MATRICES,
     Directions,
     Feedback,
     Gradient,
     Rollout,
     StepCode,
     StepLinearization,
+    StepModel,
     empty_linearization,
-    status_of,
+    empty_rollout,
+    ended,
 )
-
-if TYPE_CHECKING:
-    from yid_ocp.integrator.step import Step
+from yid_ocp.parallel import Once
 
 Array = NDArray[np.float64]
-
-
-@dataclass
-class _Linearised:
-    """Dense Jacobians of one converged step, as in `kernel.c`."""
-
-    rows_new: Array
-    rows_old: Array
-    rows_input: Array
-    p1_new: Array
-    p1_old: Array
-    p1_input: Array
+Evaluator = Callable[[Array], Array]
 
 
 class InterpretedKernel:
-    """The same sweeps by CasADi's interpreter and SciPy's LU, for machines without a C compiler."""
+    """The kernel by CasADi's interpreter; threads may share it.
 
-    def __init__(self, step: Step) -> None:
-        self._step = step
-        n = step.system.size
-        self._mask = np.zeros((n, n), bool)
-        for j, chain in enumerate(step.structure.ancestors):
-            self._mask[j, chain] = True
-        self._theta_functions: dict[tuple[str, ...], ca.Function] = {}
-        patterns = step.functions.patterns
-        self._triplets = {
-            key: tuple(np.array(part, np.intp) for part in s.get_triplet()) for key, s in patterns.items()
-        }
-        self._unknown = step.structure.unknown_row
-        self._free = np.array(step.system.free_indices, np.intp)
-        self._fixed = np.array(step.system.prescribed_indices, np.intp)
+    A point is a column of all `DiscreteEquations.arguments`. The outputs are the rows of the balance, internal and
+    constraint equations, then p1, then the effort of prescribed coordinates.
+    """
 
-    def _scales(self, theta: Array) -> tuple[Array, float]:
-        s = self._step.sizes
-        zero = [np.zeros(s["n"])] * 3 + [np.zeros(s["nz"])] * 2 + [np.zeros(s["m"]), np.zeros(s["nu"])]
-        scale, h = self._step.functions.scales(*zero, theta, self._step.time_step)
-        return np.array(scale).ravel(), float(h)
+    def __init__(self, model: StepModel) -> None:
+        self._model = model
+        self._functions: Once[None, list[ca.Function]] = Once(self._made)
+        system, sizes = model.system, model.sizes
+        names = ("q0", "q1", "p0", "z0", "z1", "lam", "u", "theta", "time_step")
+        ends = np.cumsum([0, *(argument.numel() for argument in model.equations.arguments)])
+        self._at = {name: np.arange(*ends[i : i + 2]) for i, name in enumerate(names)}
+        free, fixed = (np.array(index, int) for index in (system.free_indices, system.prescribed_indices))
+        self._fixed, self._coordinates = self._at["q1"][fixed], len(free) + sizes["nz"]
+        self._unknown = np.concatenate([self._at["q1"][free], self._at["z1"], self._at["lam"]])
+        self._rows = sizes["n"] + sizes["nz"] + sizes["m"]
+        self._residual = np.concatenate([free, np.arange(sizes["n"], self._rows)])
+        self._p1, self._effort = slice(self._rows, self._rows + sizes["n"]), slice(self._rows + sizes["n"], None)
 
-    def _matrix(self, arguments: list[Array | float]) -> Array:
-        s = self._step.sizes
-        phi = np.zeros((s["m"], s["n"]))
-        phi[self._triplets["matrix"]] = np.array(self._step.functions.matrix(*arguments)).ravel()
-        return phi
+    def _evaluators(self) -> list[Evaluator]:
+        """Outputs at a point, the slope of the residual by the unknowns, and that of the outputs by the point."""
+        return [_evaluator(function) for function in self._functions(None)]
 
-    def _rows(self, arguments: list[Array | float], phi: Array, scale: Array) -> tuple[Array, Array]:
-        balance, internal, constraint, p1 = (np.array(x).ravel() for x in self._step.functions.residual(*arguments))
-        pull = phi.T @ np.asarray(arguments[5])
-        return np.concatenate([balance - scale * pull, internal, constraint]), p1
+    def _made(self, _: None) -> list[ca.Function]:
+        e, point = self._model.equations, ca.vertcat(*self._model.equations.arguments)
+        effort = -e.momentum_balance[list(self._model.system.prescribed_indices)] / e.h
+        outputs = ca.cse(ca.vertcat(e.momentum_balance, e.internal, e.constraint, e.p1, effort))
+        slope = ca.jacobian(outputs[self._residual.tolist()], e.unknowns)
+        wanted = (outputs, slope, ca.jacobian(outputs, point))
+        return [ca.Function("f", [point], [ca.densify(x)]) for x in wanted]
 
-    def _linearise(self, arguments: list[Array | float], phi: Array, scale: Array) -> _Linearised:
-        s = self._step.sizes
-        n, nz, m, nu = s["n"], s["nz"], s["m"], s["nu"]
-        nt, nqz = n + nz + m, n + nz
-        pairs, rest, rest_p, by_unknown = (np.array(x).ravel() for x in self._step.functions.linear(*arguments))
-        plus, minus, lower, upper = (pairs[6 * n * i : 6 * n * (i + 1)].reshape(6, n) for i in range(4))
-        turn, moment = (pairs[3 * n * i : 3 * n * (i + 1)].reshape(3, n) for i in (8, 9))
-        weight = moment.T @ turn
-        low, up = (
-            np.where(self._mask, lower.T @ plus + weight, 0.0),
-            np.where(self._mask, weight - upper.T @ minus, 0.0),
-        )
-        here = np.where(self._mask, weight - lower.T @ minus, 0.0)
-        there = np.where(self._mask, weight + upper.T @ plus, 0.0)
-        strict = np.tril(np.ones((n, n)), -1)
+    def _point(self, theta: Array, before: Array, after: Array, lam: Array, u: Array) -> Array:
+        n = self._model.sizes["n"]
+        parts = (before[:n], after[:n], before[n : 2 * n], before[2 * n :], after[2 * n :], lam, u, theta)
+        return np.concatenate([*parts, [self._model.time_step]])
 
-        def both(below: Array, above: Array) -> Array:
-            diagonal = np.diag(np.diag(below))
-            return below * strict + (above * strict).T + diagonal
+    def _columns(self, names: Sequence[str]) -> NDArray[np.int64]:
+        """Where parameters stand in a point."""
+        return self._at["theta"][[self._model.system.parameters.index(name) for name in names]]
 
-        slope = both(low, up)
-        rows_new, rows_old, rows_input = np.zeros((nt, nt)), np.zeros((nt, nqz)), np.zeros((nt, nu))
-        p1_new, p1_old, p1_input = np.zeros((n, nt)), np.zeros((n, nqz)), np.zeros((n, nu))
-        rows_new[:n, :n] = scale[:, None] * slope
-        rows_old[:n, :n] = scale[:, None] * both(here, here)
-        p1_new[:, :n], p1_old[:, :n] = scale[:, None] * both(there, there), scale[:, None] * slope.T
-        if self._step.equations.closed is not None:
-            along, turned = (pairs[6 * n * i : 6 * n * (i + 1)].reshape(6, n) for i in (5, 6))
-            screw = (plus + minus) / 2
-            by_rate, by_turn, by_posture = (
-                np.where(self._mask, x.T @ y, 0.0) for x, y in ((along, screw), (along, plus - screw), (turned, screw))
-            )
-            for share, new, old in zip(
-                self._step.equations.closed_shares, (rows_new, p1_new), (rows_old, p1_old), strict=True
-            ):
-                new[:n, :n] += share * scale[:, None] * both(by_turn + by_rate, by_posture + by_rate)
-                old[:n, :n] += share * scale[:, None] * both(by_turn - by_rate, by_posture - by_rate)
-        for key, values, blocks in (
-            ("rest", rest, (rows_new, rows_old, rows_input)),
-            ("rest_p", rest_p, (p1_new, p1_old, p1_input)),
-        ):
-            row, column = self._triplets[key]
-            wide = np.zeros((blocks[0].shape[0], nt + nqz + nu))
-            wide[row, column] = values
-            for block, part in zip(blocks, np.split(wide, [nt, nt + nqz], axis=1), strict=True):
-                block += part
-        row, column = self._triplets["constraint"]
-        rows_new[n + nz + row, column] += by_unknown
-        rows_new[:n, n + nz :] -= scale[:, None] * phi.T
-        if m:
-            row, column = self._triplets["pull"]
-            rows_old[row, column] -= scale[row] * np.array(self._step.functions.pull(*arguments)).ravel()
-        return _Linearised(rows_new, rows_old, rows_input, p1_new, p1_old, p1_input)
+    def _newton(self, value: Evaluator, slope: Evaluator, point: Array) -> tuple[StepCode, float, int]:
+        """Solve for the unknowns in the point, with the natural monotonicity test (Deuflhard 2011, section 3.3)."""
 
-    def _by_theta(self, names: tuple[str, ...], arguments: list[Array | float]) -> list[Array]:
-        if names not in self._theta_functions:
-            self._theta_functions[names] = codegen.theta_function(self._step.equations, names)
-        return [np.array(ca.densify(out)) for out in self._theta_functions[names].call(arguments)]
+        def largest(change: Array) -> float:
+            return float(np.max(np.abs(change[: self._coordinates]), initial=0.0))
 
-    def _factorised(self, arguments: list[Array | float], phi: Array, scale: Array) -> list[Array] | None:
-        """LU factors of the step's Jacobian, None where it is singular."""
-        jacobian = self._linearise(arguments, phi, scale).rows_new[np.ix_(self._unknown, self._unknown)]
-        *factors, singular = scipy.linalg.lapack.dgetrf(jacobian)
-        return None if singular else factors
-
-    def _newton(
-        self, arguments: list[Array | float], phi: Array, scale: Array, kept: list[list[Array]]
-    ) -> tuple[StepCode, float, Array, int]:
-        """Newton with the factors in `kept` for as long as they contract, damped with fresh ones after that."""
-        n, nz = self._step.sizes["n"], self._step.sizes["nz"]
-        count = len(self._free) + nz
-        q1, z1, lam = arguments[1], arguments[4], arguments[5]
-        assert isinstance(q1, np.ndarray)
-        assert isinstance(z1, np.ndarray)
-        assert isinstance(lam, np.ndarray)
-        previous, error, tolerance = math.inf, 0.0, self._step.tolerance
+        tolerance, error, previous = self._model.tolerance, 0.0, math.inf
         for iteration in range(1, ITERATION_LIMIT + 1):
-            rows, p1 = self._rows(arguments, phi, scale)
-            if not np.all(np.isfinite(rows[self._unknown])):
-                return StepCode.NOT_FINITE, error, p1, iteration
-            if len(self._unknown) == 0:
-                return StepCode.OK, 0.0, p1, iteration
-            fresh = not kept
-            if fresh:
-                factors = self._factorised(arguments, phi, scale)
-                if factors is None:
-                    return StepCode.SINGULAR, error, p1, iteration
-                kept[:] = [factors]
-            delta = -scipy.linalg.lu_solve(kept[0], rows[self._unknown], check_finite=False)
-            error = float(np.max(np.abs(delta[:count]), initial=0.0))
+            residual = value(point)[self._residual, 0]
+            if not np.all(np.isfinite(residual)):
+                return StepCode.NOT_FINITE, error, iteration
+            factors = _factorised(slope(point))
+            if factors is None:
+                return StepCode.SINGULAR, error, iteration
+            change = -_solved(factors, residual)
+            error = largest(change)
             if not math.isfinite(error):
-                return StepCode.SINGULAR, error, p1, iteration
+                return StepCode.NOT_FINITE, error, iteration
             if error <= tolerance or (error < 1e3 * tolerance and error > 0.5 * previous):
-                lam += delta[count:]
-                return StepCode.OK, error, p1, iteration
-            if not fresh and (error > 0.1 * previous or error > 0.5):
-                kept.clear()
-                continue
-            previous = error
-            keep = q1.copy(), z1.copy(), lam.copy()
-            factor = 0.5 / error if error > 0.5 else 1.0
+                point[self._at["lam"]] += change[self._coordinates :]
+                return StepCode.OK, error, iteration
+            previous, factor = error, min(1.0, 0.5 / error)
             while True:
-                q1[self._free] += factor * delta[: len(self._free)]
-                z1 += factor * delta[len(self._free) : count]
-                lam += factor * delta[count:]
-                if not fresh:
-                    break
-                after = self._rows(arguments, phi, scale)[0][self._unknown]
-                trial = scipy.linalg.lu_solve(kept[0], after, check_finite=False)
-                if np.max(np.abs(trial[:count]), initial=0.0) <= (1 - 0.25 * factor) * error:
+                trial = point.copy()
+                trial[self._unknown] += factor * change
+                further = _solved(factors, value(trial)[self._residual, 0])
+                if largest(further) <= (1 - 0.25 * factor) * error:
                     break
                 if factor < 1e-4:
-                    return StepCode.NOT_CONVERGED, error, p1, iteration
-                q1[:], z1[:], lam[:] = keep
+                    return StepCode.NOT_CONVERGED, error, iteration
                 factor *= 0.5
-        return StepCode.NOT_CONVERGED, error, np.full(n, np.nan), ITERATION_LIMIT
+            point[:] = trial
+            if factor == 1.0 and largest(further) <= tolerance:
+                point[self._at["lam"]] -= further[self._coordinates :]
+                return StepCode.OK, largest(further), iteration
+        return StepCode.NOT_CONVERGED, error, ITERATION_LIMIT
 
     def rollout(
         self,
@@ -205,113 +122,64 @@ class InterpretedKernel:
         wanted: Directions | None,
     ) -> Rollout:
         """See `Kernel.rollout`."""
-        s = self._step.sizes
-        n, m, nx = s["n"], s["m"], s["nx"]
-        steps, d = len(torque), 0 if wanted is None else wanted.count
-        scale, h = self._scales(theta)
-        state = np.full((steps + 1, nx), np.nan)
+        n, lam = self._model.sizes["n"], np.zeros(self._model.sizes["m"])
+        value, slope, slopes = self._evaluators()
+        out = empty_rollout(self._model.sizes, len(torque), None if wanted is None else wanted.count)
+        state, by = out.state, [vars(out)[f"by_{name}"] for name in ("state", "multipliers", "effort")]
         state[0] = start
-        multipliers, effort = np.full((steps, m), np.nan), np.full((steps, s["nc"]), np.nan)
-        applied = np.full((steps, s["nu"]), np.nan)
-        by_state, by_multipliers = np.full((steps + 1, nx, d), np.nan), np.full((steps, m, d), np.nan)
-        by_effort = np.full((steps, s["nc"], d), np.nan)
         if wanted is not None:
-            by_state[0] = wanted.start
-        kept: list[list[Array]] = []
-        total, code, error, k = 0, StepCode.OK, 0.0, 0
-        lam = np.zeros(m)
-        for k in range(steps):
+            by[0][0] = wanted.start
+        code, error, total, done = StepCode.OK, 0.0, 0, 0
+        for k, u in enumerate(torque):
             x = state[k]
-            u = torque[k].copy()
             if feedback is not None:
-                u -= feedback.gain[k] @ (x[feedback.index] - feedback.reference[k])
-            guess = x if k == 0 else 2 * x - state[k - 1] if k == 1 else 3 * (x - state[k - 1]) + state[k - 2]
-            q1, z1, lam = guess[:n].copy(), guess[2 * n :].copy(), lam.copy()
-            q1[self._fixed] = path[k + 1]
-            arguments: list[Array | float] = [
-                x[:n],
-                q1,
-                x[n : 2 * n],
-                x[2 * n :],
-                z1,
-                lam,
-                u,
-                theta,
-                self._step.time_step,
-            ]
-            phi = self._matrix(arguments)
-            code, error, p1, spent = self._newton(arguments, phi, scale, kept)
-            if code != StepCode.OK:
-                kept.clear()
-                q1[self._free], z1[:], lam[:] = x[self._free], x[2 * n :], 0.0
-                code, error, p1, more = self._newton(arguments, phi, scale, kept)
-                spent += more
-            total += spent
-            state[k + 1] = np.concatenate([q1, p1, z1])
+                u = u - feedback.gain[k] @ (x[feedback.index] - feedback.reference[k])
+            guess = x if k == 0 else 2 * x - state[k - 1]
+            if k > 1:
+                guess[:n] += x[:n] - 2 * state[k - 1, :n] + state[k - 2, :n]
+            for first, pull in ((guess, lam), (x, np.zeros_like(lam))):
+                point = self._point(theta, x, first, pull, u)
+                point[self._fixed] = path[k + 1]
+                code, error, spent = self._newton(value, slope, point)
+                total += spent
+                if code == StepCode.OK:
+                    break
+            outputs, lam = value(point)[:, 0], point[self._at["lam"]]
+            state[k + 1] = np.concatenate([point[self._at["q1"]], outputs[self._p1], point[self._at["z1"]]])
             if code != StepCode.OK:
                 break
-            applied[k], multipliers[k] = u, lam
-            effort[k] = -self._rows(arguments, phi, scale)[0][self._fixed] / h
+            out.torque[k], out.multipliers[k], out.effort[k] = u, lam, outputs[self._effort]
             if wanted is not None:
-                by_state[k + 1], by_multipliers[k], by_effort[k] = self._sensitivity(
-                    arguments, phi, scale, h, wanted, by_state[k], k, feedback
-                )
-        else:
-            k = steps
-        info = np.array([k, error, total, total], dtype=float)
-        status = status_of(int(code), info, effort, state, s)
-        some = wanted is not None
-        return Rollout(
-            state,
-            multipliers,
-            effort,
-            applied,
-            by_state if some else None,
-            by_multipliers if some else None,
-            by_effort if some else None,
-            status,
-        )
+                moved = self._moved(slopes(point), wanted, feedback, by[0][k], k)
+                if moved is None:
+                    code = StepCode.SINGULAR
+                    break
+                by[0][k + 1], by[1][k], by[2][k] = moved
+            done = k + 1
+        return ended(out, self._model.sizes, code, done, error, (total, total))
 
-    def _sensitivity(
-        self,
-        arguments: list[Array | float],
-        phi: Array,
-        scale: Array,
-        h: float,
-        wanted: Directions,
-        before: Array,
-        k: int,
-        feedback: Feedback | None,
-    ) -> tuple[Array, Array, Array]:
-        s = self._step.sizes
-        n, nz, nt, d = s["n"], s["nz"], s["n"] + s["nz"] + s["m"], wanted.count
-        matrices = self._linearise(arguments, phi, scale)
-        old = np.concatenate([before[:n], before[2 * n :]])
-        rows = matrices.rows_old @ old
-        rows[:n] += before[n : 2 * n]
-        change = np.zeros((s["nu"], d)) if wanted.torque is None else wanted.torque[k].copy()
+    def _moved(
+        self, slopes: Array, wanted: Directions, feedback: Feedback | None, before: Array, k: int
+    ) -> tuple[Array, Array, Array] | None:
+        """Derivatives of state, multipliers and effort after step k by the implicit function theorem."""
+        n, at, names = self._model.sizes["n"], self._at, wanted.names
+        moved = np.zeros((slopes.shape[1], wanted.count))
+        moved[at["q0"]], moved[at["p0"]], moved[at["z0"]] = before[:n], before[n : 2 * n], before[2 * n :]
+        moved[self._columns(names), np.arange(len(names))] = 1.0
+        if wanted.torque is not None:
+            moved[at["u"]] = wanted.torque[k]
         if feedback is not None:
-            change -= feedback.gain[k] @ before[feedback.index]
-        rows += matrices.rows_input @ change
-        joined = np.zeros((nt, d))
+            moved[at["u"]] -= feedback.gain[k] @ before[feedback.index]
         if wanted.path is not None:
-            joined[self._fixed] = wanted.path[k + 1]
-            rows += matrices.rows_new[:, self._fixed] @ wanted.path[k + 1]
-        p1 = matrices.p1_input @ change
-        by_effort = -rows[self._fixed] / h
-        if wanted.names:
-            width = len(wanted.names)
-            by_rows, by_p1, partial = self._by_theta(wanted.names, arguments)
-            rows[:, :width] += by_rows
-            p1[:, :width] += by_p1
-            by_effort[:, :width] += partial
-        if len(self._unknown):
-            jacobian = matrices.rows_new[np.ix_(self._unknown, self._unknown)]
-            joined[self._unknown] = -np.linalg.solve(jacobian, rows[self._unknown])
-        p1 += matrices.p1_old @ old + matrices.p1_new @ joined
-        free = np.setdiff1d(np.arange(nt), self._fixed)
-        by_effort -= matrices.rows_new[np.ix_(self._fixed, free)] @ joined[free] / h
-        return np.concatenate([joined[:n], p1, joined[n : n + nz]]), joined[n + nz :], by_effort
+            moved[self._fixed] = wanted.path[k + 1]
+        change = slopes @ moved
+        factors = _factorised(slopes[np.ix_(self._residual, self._unknown)])
+        if factors is None:
+            return None
+        moved[self._unknown] = -_solved(factors, change[self._residual])
+        change += slopes[:, self._unknown] @ moved[self._unknown]
+        after = np.concatenate([moved[at["q1"]], change[self._p1], moved[at["z1"]]])
+        return after, moved[at["lam"]], change[self._effort]
 
     def adjoint(
         self,
@@ -324,47 +192,31 @@ class InterpretedKernel:
         by_effort: Array | None,
     ) -> Gradient:
         """See `Kernel.adjoint`."""
-        s = self._step.sizes
-        n, nt = s["n"], s["n"] + s["nz"] + s["m"]
-        scale, h = self._scales(theta)
-        steps = len(rollout.multipliers)
-        gradient, by_torque, by_path = np.zeros(len(names)), np.zeros((steps, s["nu"])), np.zeros((steps + 1, s["nc"]))
-        costate = by_state[steps].copy()
+        sizes, at, steps = self._model.sizes, self._at, len(rollout.torque)
+        slopes, n = self._evaluators()[-1], sizes["n"]
+        by_theta, by_torque = np.zeros(len(names)), np.zeros((steps, sizes["nu"]))
+        by_path, costate = np.zeros((steps + 1, sizes["nc"])), by_state[steps].copy()
         for k in reversed(range(steps)):
             x, after = rollout.state[k], rollout.state[k + 1]
-            arguments: list[Array | float] = [
-                x[:n],
-                after[:n],
-                x[n : 2 * n],
-                x[2 * n :],
-                after[2 * n :],
-                rollout.multipliers[k],
-                rollout.torque[k],
-                theta,
-                self._step.time_step,
-            ]
-            matrices = self._linearise(arguments, self._matrix(arguments), scale)
-            weight = costate[n : 2 * n]
-            effort = np.zeros(s["nc"]) if by_effort is None else by_effort[k]
-            last = np.zeros(s["m"]) if by_multipliers is None else by_multipliers[k]
-            outer = np.concatenate([costate[:n], costate[2 * n :], last]) + matrices.p1_new.T @ weight
-            outer -= matrices.rows_new[self._fixed].T @ effort / h
-            full = np.zeros(nt)
-            if len(self._unknown):
-                jacobian = matrices.rows_new[np.ix_(self._unknown, self._unknown)]
-                full[self._unknown] = -np.linalg.solve(jacobian.T, outer[self._unknown])
-            if names:
-                by_rows, by_p1, partial = self._by_theta(names, arguments)
-                gradient += full @ by_rows + weight @ by_p1 + effort @ partial
-            by_path[k + 1] = outer[self._fixed] + full @ matrices.rows_new[:, self._fixed]
-            full[self._fixed] = -effort / h
-            old = matrices.rows_old.T @ full + matrices.p1_old.T @ weight
-            by_torque[k] = matrices.rows_input.T @ full + matrices.p1_input.T @ weight
-            costate = np.concatenate([old[:n], full[:n], old[n:]]) + by_state[k]
+            jacobian = slopes(self._point(theta, x, after, rollout.multipliers[k], rollout.torque[k]))
+            weight = np.zeros(len(jacobian))
+            weight[self._p1] = costate[n : 2 * n]
+            weight[self._effort] = 0.0 if by_effort is None else by_effort[k]
+            by_point = jacobian.T @ weight
+            by_point[at["q1"]] += costate[:n]
+            by_point[at["z1"]] += costate[2 * n :]
+            by_point[at["lam"]] += 0.0 if by_multipliers is None else by_multipliers[k]
+            factors = _factorised(jacobian[np.ix_(self._residual, self._unknown)].T)
+            if factors is None:
+                return Gradient(*(np.full_like(a, np.nan) for a in (by_theta, costate, by_torque, by_path)))
+            by_point -= jacobian[self._residual].T @ _solved(factors, by_point[self._unknown])
+            by_theta += by_point[self._columns(names)]
+            by_torque[k], by_path[k + 1] = by_point[at["u"]], by_point[self._fixed]
+            costate = np.concatenate([by_point[at[name]] for name in ("q0", "p0", "z0")]) + by_state[k]
             if feedback is not None:
                 np.subtract.at(costate, feedback.index, feedback.gain[k].T @ by_torque[k])
-        by_path[0] = costate[self._fixed]
-        return Gradient(gradient, costate, by_torque, by_path)
+        by_path[0] = costate[list(self._model.system.prescribed_indices)]
+        return Gradient(by_theta, costate, by_torque, by_path)
 
     def linearize(
         self,
@@ -376,29 +228,47 @@ class InterpretedKernel:
         derivatives: bool,
     ) -> StepLinearization:
         """See `Kernel.linearize`."""
-        s = self._step.sizes
-        n = s["n"]
-        scale, _ = self._scales(theta)
-        stages = empty_linearization(s, len(torque), len(names), derivatives)
+        (value, _, slopes), at = self._evaluators(), self._at
+        out = empty_linearization(self._model.sizes, len(torque), len(names), derivatives)
+        new, old = np.concatenate([at["q1"], at["z1"], at["lam"]]), np.concatenate([at["q0"], at["z0"]])
+        columns = {"new": new, "old": old, "input": at["u"], "theta": self._columns(names)}
         for k, u in enumerate(torque):
-            x, after = state[k], state[k + 1]
-            arguments: list[Array | float] = [
-                x[:n],
-                after[:n],
-                x[n : 2 * n],
-                x[2 * n :],
-                after[2 * n :],
-                multipliers[k],
-                u,
-                theta,
-                self._step.time_step,
-            ]
-            phi = self._matrix(arguments)
-            stages.rows[k], stages.p1[k] = self._rows(arguments, phi, scale)
+            point = self._point(theta, state[k], state[k + 1], multipliers[k], u)
+            outputs = value(point)[:, 0]
+            out.rows[k], out.p1[k] = outputs[: self._rows], outputs[self._p1]
             if derivatives:
-                matrices = self._linearise(arguments, phi, scale)
-                for name in LINEARIZATION_MATRICES[:6]:
-                    getattr(stages, name)[k] = getattr(matrices, name)
-                if names:
-                    stages.rows_theta[k], stages.p1_theta[k], _ = self._by_theta(names, arguments)
-        return stages
+                jacobian = slopes(point)
+                for key, index in columns.items():
+                    vars(out)[f"rows_{key}"][k] = jacobian[: self._rows, index]
+                    vars(out)[f"p1_{key}"][k] = jacobian[self._p1, index]
+        return out
+
+
+def _evaluator(function: Any) -> Evaluator:
+    """A function of one column with a dense output, without CasADi's conversions; for one thread."""
+    buffer, run = function.buffer()
+    point, result = np.zeros(function.numel_in(0)), np.zeros(function.size_out(0)[::-1])
+    buffer.set_arg(0, point.data)
+    buffer.set_res(0, result.data)
+
+    def evaluate(values: Array) -> Array:
+        point[:] = values
+        run()
+        if buffer.ret():  # which also keeps the buffer alive
+            raise RuntimeError(f"CasADi could not evaluate {function}")
+        return result.T.copy()
+
+    return evaluate
+
+
+def _factorised(matrix: Array) -> tuple[Array, NDArray[np.int32]] | None:
+    """LU factors, None where the matrix is singular; LAPACK itself, which prints no warning."""
+    if not len(matrix):
+        return matrix, np.zeros(0, np.int32)
+    factors, pivots, info = scipy.linalg.lapack.dgetrf(matrix)
+    return None if info else (factors, pivots)
+
+
+def _solved(factors: tuple[Array, NDArray[np.int32]], right: Array) -> Array:
+    solution: Array = scipy.linalg.lapack.dgetrs(*factors, right)[0] if len(right) else right
+    return solution

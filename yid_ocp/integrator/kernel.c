@@ -1,9 +1,11 @@
-/* Time stepping of one system: Newton with a kept factorisation, rollout with forward sensitivities, adjoint sweep.
+/* Time stepping of one system: Newton with a kept factorisation, rollout with forward sensitivities, adjoint.
  *
- * The generated part before this text defines the sizes (N, NZ, M, NU, NC, NF, NY, NT, NTHETA), the index tables and the
- * CasADi functions residual, linear, matrix, pull and scales; see codegen.py. All matrices are row-major.
+ * The generated part before this text defines the sizes N, NZ, M, NU, NC, NF, NY and NT, counts of nonzeros (NNZ_...),
+ * sizes of CasADi's work arrays (SZ_W, SZ_IW), what the system needs (ROW_SCALED, CLOSED, CLOSED_LEFT, CLOSED_RIGHT),
+ * the index tables and the CasADi functions residual, linear, matrix, pull and scales; see codegen.py.
  *   N coordinates, NZ internal ones, M constraints, NU inputs, NC prescribed and NF free coordinates,
  *   NT = N + NZ + M rows, NY = NF + NZ + M unknowns of a step, NX = 2 N + NZ state (q, p, z).
+ * All matrices are row-major. compiled.py declares the structs of the three entry points at the end once more.
  */
 #include <math.h>
 #include <stdlib.h>
@@ -13,7 +15,14 @@
 #define NQZ (N + NZ)
 #define ONE(x) ((x) > 0 ? (x) : 1)
 
-enum { OK = 0, NOT_CONVERGED = 1, SINGULAR = 2, NOT_FINITE = 3 };
+/* A test puts its own in their place. */
+#ifndef YID_ALLOCATE
+#define YID_ALLOCATE calloc
+#define YID_FREE free
+#endif
+
+/* The values of StepCode in step_model.py. */
+enum { OK = 0, NOT_CONVERGED = 1, SINGULAR = 2, NOT_FINITE = 3, OUT_OF_MEMORY = 4 };
 
 typedef int (*theta_function)(const double **, double **, long long *, double *, int);
 
@@ -35,16 +44,16 @@ typedef struct {
 } Work;
 
 static void work_free(Work *k) {
-    free(k->w);
-    free(k->iw);
-    free(k);
+    YID_FREE(k->w);
+    YID_FREE(k->iw);
+    YID_FREE(k);
 }
 
 static Work *work_new(void) {
-    Work *k = calloc(1, sizeof(Work));
+    Work *k = YID_ALLOCATE(1, sizeof(Work));
     if (!k) return NULL;
-    k->w = malloc(sizeof(double) * ONE(SZ_W));
-    k->iw = malloc(sizeof(long long) * ONE(SZ_IW));
+    k->w = YID_ALLOCATE(ONE(SZ_W), sizeof(double));
+    k->iw = YID_ALLOCATE(ONE(SZ_IW), sizeof(long long));
     if (k->w && k->iw) return k;
     work_free(k);
     return NULL;
@@ -450,22 +459,74 @@ static void multiply_rows(const double *A, int width, const int *start, const in
     }
 }
 
-static void add_sparse(const double *nz, const long long *pattern, int first, int rows, double *C, int d) {
-    /* CasADi's compressed columns: rows, columns, column offsets, row indices. */
-    const long long columns = pattern[1], *offset = pattern + 2, *row = pattern + 3 + columns;
-    if (pattern[0] != rows) return;
-    for (long long c = 0; c < columns; c++)
-        for (long long e = offset[c]; e < offset[c + 1]; e++) C[(size_t)(first + row[e]) * d + c] += nz[e];
-}
-
+/* What to differentiate by: `count` columns, the first `theta_count` of which are parameters. A pattern is CasADi's
+ * compressed columns (rows, columns, column offsets, row indices); compiled.py checks that they fit this kernel. */
 typedef struct {
-    int count;                       /* sensitivity directions; the first `theta_count` are parameters */
-    int theta_count;
+    int count, theta_count;
     theta_function by_theta;
     const long long *rows_pattern, *p1_pattern, *effort_pattern;
     double *rows_nz, *p1_nz, *effort_nz, *w;
     long long *iw;
 } Directions;
+
+/* Feedback u_k = ubar_k - K_k (x_k[index] - xbar_k); gain is (steps, NU, count), reference (steps, count). */
+typedef struct {
+    int count;
+    const int *index;
+    const double *gain, *reference;
+} Feedback;
+
+/* What the three entry points are asked about; feedback and directions may be NULL. The nominal torque (steps, NU), the
+ * path (steps + 1, NC) and Newton's tolerance and limit matter to a rollout only. */
+typedef struct {
+    int steps, limit;
+    double time_step, tolerance;
+    const double *theta, *torque, *path;
+    const Feedback *feedback;
+    const Directions *directions;
+} Motion;
+
+/* state (steps + 1, NX), multipliers (steps, M), effort (steps, NC) and applied torque (steps, NU). A rollout is given
+ * the first state and writes the rest, the others read; effort matters to a rollout only. */
+typedef struct {
+    double *state, *multipliers, *effort, *applied;
+} Trajectory;
+
+/* Forward sensitivities of a rollout, each with d columns: state (steps + 1, NX, d), its first block given, multipliers
+ * (steps, M, d), effort (steps, NC, d); given torque (steps, NU, d) and path (steps + 1, NC, d) may be NULL. */
+typedef struct {
+    double *state, *multipliers, *effort;
+    const double *torque, *path;
+} Sensitivities;
+
+/* Partial derivatives of a cost by what a rollout gives; the last two may be NULL. */
+typedef struct {
+    const double *state, *multipliers, *effort;
+} Partials;
+
+/* By the chosen parameters (theta_count), the initial state (NX), the torque (steps, NU) and the path (steps + 1, NC). */
+typedef struct {
+    double *theta, *start, *torque, *path;
+} Gradient;
+
+/* Rows (steps, NT) and p1 (steps, N) with their Jacobians; these may be NULL together. */
+typedef struct {
+    double *rows, *p1, *rows_new, *rows_old, *rows_input, *p1_new, *p1_old, *p1_input, *rows_theta, *p1_theta;
+} Linearization;
+
+/* The step reached, Newton's last correction, totals of iterations and factorisations, and the memory that was asked
+ * for [bytes]. */
+typedef struct {
+    int step;
+    double error;
+    long long iterations, factorisations, memory;
+} Outcome;
+
+static void add_sparse(const double *nz, const long long *pattern, double *C, int d) {
+    const long long columns = pattern[1], *offset = pattern + 2, *row = pattern + 3 + columns;
+    for (long long c = 0; c < columns; c++)
+        for (long long e = offset[c]; e < offset[c + 1]; e++) C[(size_t)row[e] * d + c] += nz[e];
+}
 
 static void theta_columns(const Directions *dir, const Point *a) {
     const double *args[9];
@@ -474,12 +535,21 @@ static void theta_columns(const Directions *dir, const Point *a) {
     dir->by_theta(args, res, dir->iw, dir->w, 0);
 }
 
-/* Forward sensitivities of one converged step. X0, X1: (NX, d); input: (NU, d) or NULL; path: next prescribed (NC, d)
- * or NULL; buffers rows (NT, d), joined (NT, d), Y (NY, d). */
-static void sensitivity_step(Work *k, const Point *a, const Directions *dir, const double *X0, const double *input,
-                             const double *path, double *X1, double *multipliers, double *effort, double *rows,
-                             double *joined, double *Y, double *start) {
+/* Columns of one step, each (rows, d): of the state before (NX) and after, the input (NU) or NULL, the prescribed
+ * coordinates after (NC) or NULL, multipliers and effort or NULL; then room for rows (NT), joined (NT), Y (NY), input
+ * (NU) and start (NQZ). */
+typedef struct {
+    const double *before, *input, *path;
+    double *after, *multipliers, *effort;
+    double *rows, *joined, *Y, *input_room, *start;
+} Columns;
+
+/* Forward sensitivities of one converged step. */
+static void sensitivity_step(Work *k, const Point *a, const Directions *dir, const Columns *columns) {
     const int d = dir->count;
+    const double *X0 = columns->before, *input = columns->input, *path = columns->path;
+    double *X1 = columns->after, *effort = columns->effort, *rows = columns->rows, *joined = columns->joined;
+    double *Y = columns->Y, *start = columns->start;
     /* (q, z) of X0 side by side */
     memcpy(start, X0, sizeof(double) * N * d);
     memcpy(start + (size_t)N * d, X0 + (size_t)2 * N * d, sizeof(double) * NZ * d);
@@ -490,8 +560,8 @@ static void sensitivity_step(Work *k, const Point *a, const Directions *dir, con
     memset(p1, 0, sizeof(double) * N * d);
     if (dir->theta_count) {
         theta_columns(dir, a);
-        add_sparse(dir->rows_nz, dir->rows_pattern, 0, NT, rows, d);
-        add_sparse(dir->p1_nz, dir->p1_pattern, 0, N, p1, d);
+        add_sparse(dir->rows_nz, dir->rows_pattern, rows, d);
+        add_sparse(dir->p1_nz, dir->p1_pattern, p1, d);
     }
     if (input)
         for (int r = 0; r < N; r++)
@@ -519,12 +589,12 @@ static void sensitivity_step(Work *k, const Point *a, const Directions *dir, con
         memcpy(joined + (size_t)unknown_row[order[b]] * d, Y + (size_t)b * d, sizeof(double) * d);
     memcpy(X1, joined, sizeof(double) * N * d);
     memcpy(X1 + (size_t)2 * N * d, joined + (size_t)N * d, sizeof(double) * NZ * d);
-    if (multipliers) memcpy(multipliers, joined + (size_t)(N + NZ) * d, sizeof(double) * M * d);
+    if (columns->multipliers) memcpy(columns->multipliers, joined + (size_t)(N + NZ) * d, sizeof(double) * M * d);
     multiply_rows(&k->P0[0][0], ONE(NQZ), p1_old_start, p1_old_col, N, start, d, p1);
     multiply_rows(&k->P1[0][0], ONE(NT), p1_new_start, p1_new_col, N, joined, d, p1);
     if (effort) {
         memset(effort, 0, sizeof(double) * NC * d);
-        if (dir->theta_count) add_sparse(dir->effort_nz, dir->effort_pattern, 0, NC, effort, d);
+        if (dir->theta_count) add_sparse(dir->effort_nz, dir->effort_pattern, effort, d);
 
         for (int j = 0; j < NC; j++) {
             const int at = prescribed_index[j];
@@ -545,13 +615,6 @@ static void effort_of(const Work *k, double *effort) {
     for (int j = 0; j < NC; j++) effort[j] = -k->balance[prescribed_index[j]] / k->h;
 }
 
-/* Feedback u_k = ubar_k - K_k (x_k[index] - xbar_k); K is (steps, NU, count). */
-typedef struct {
-    int count;
-    const int *index;
-    const double *gain, *reference;
-} Feedback;
-
 static void apply_feedback(const Feedback *f, int step, const double *state, const double *nominal, double *u) {
     for (int i = 0; i < NU; i++) {
         double value = nominal[i];
@@ -562,113 +625,138 @@ static void apply_feedback(const Feedback *f, int step, const double *state, con
     }
 }
 
-/* Rollout over `steps` steps. state: (steps+1, NX), first row given; path: (steps+1, NC); torque: (steps, NU) nominal.
- * With directions: X (steps+1, NX, d), first block given. Returns a status; info = {step reached, error, iterations,
- * factorisations}. */
-int yid_rollout(int steps, const double *theta, double time_step, const double *torque, const double *path,
-                const Feedback *feedback, double *state, double *multipliers, double *effort, double *applied,
-                const Directions *dir, double *X, double *XL, double *XE, const double *X_torque,
-                const double *X_path, double tolerance, int limit, double *info) {
-    Work *k = work_new();
-    if (!k) return SINGULAR;
-    prepare(k, theta, &time_step);
-    const int d = dir ? dir->count : 0;
-    const int feeds = feedback && feedback->count > 0;
-    const size_t buffered = (size_t)d * (2 * ONE(NT) + ONE(NY) + ONE(NU) + ONE(NQZ)) + BLOCK;
-    double *buffer = d ? calloc(buffered, sizeof(double)) : NULL;
-    if (d && !buffer) {
-        work_free(k);
-        return SINGULAR;
+/* Columns of the torque of one step: those of the nominal one (or NULL) less what the feedback makes of the state's.
+ * NULL where neither is there. */
+static const double *input_columns(const Feedback *f, int step, int d, const double *given, const double *state,
+                                   double *room) {
+    const int feeds = f && f->count > 0;
+    if (!NU || !(feeds || given)) return NULL;
+    if (given) memcpy(room, given, sizeof(double) * NU * d);
+    else memset(room, 0, sizeof(double) * NU * d);
+    for (int i = 0; feeds && i < NU; i++)
+        for (int j = 0; j < f->count; j++) {
+            const double gain = f->gain[((size_t)step * NU + i) * f->count + j];
+            const double *source = state + (size_t)f->index[j] * d;
+            for (int c = 0; gain != 0.0 && c < d; c++) room[(size_t)i * d + c] -= gain * source[c];
+        }
+    return room;
+}
+
+/* Where a step from the last of the states x is looked for first: q and z extrapolated, prescribed entries known. */
+static void guess(const double *x, int step, const double *prescribed, double *q1, double *z1) {
+    for (int i = 0; i < N; i++) {
+        q1[i] = x[i];
+        if (step > 1) q1[i] = 3 * (x[i] - x[i - NX]) + x[i - 2 * NX];
+        else if (step == 1) q1[i] = 2 * x[i] - x[i - NX];
     }
-    double *rows = buffer, *joined = rows + (size_t)d * ONE(NT), *Y = joined + (size_t)d * ONE(NT);
-    double *input = Y + (size_t)d * ONE(NY), *start = input + (size_t)d * ONE(NU);
+    for (int i = 0; i < NZ; i++) z1[i] = step > 0 ? 2 * x[2 * N + i] - x[2 * N + i - NX] : x[2 * N + i];
+    for (int j = 0; j < NC; j++) q1[prescribed_index[j]] = prescribed[j];
+}
+
+/* Room for one step's work and `doubles` more; 0 where there is not so much memory. */
+static int room_for(size_t doubles, Work **k, double **buffer, Outcome *outcome) {
+    memset(outcome, 0, sizeof *outcome);
+    outcome->memory = (long long)(sizeof(Work) + sizeof(double) * (SZ_W + doubles) + sizeof(long long) * SZ_IW);
+    *k = work_new();
+    *buffer = *k && doubles ? YID_ALLOCATE(doubles, sizeof(double)) : NULL;
+    if (*k && (*buffer || !doubles)) return 1;
+    if (*k) work_free(*k);
+    return 0;
+}
+
+/* Rollout, with forward sensitivities where there are directions; a status. */
+int yid_rollout(const Motion *motion, const Trajectory *out, const Sensitivities *by, Outcome *outcome) {
+    const Directions *dir = motion->directions;
+    const Feedback *feedback = motion->feedback;
+    const size_t d = dir ? dir->count : 0;
+    Work *k;
+    double *buffer;
+    if (!room_for(d ? d * (2 * ONE(NT) + ONE(NY) + ONE(NU) + ONE(NQZ)) + BLOCK : 0, &k, &buffer, outcome))
+        return OUT_OF_MEMORY;
+    prepare(k, motion->theta, &motion->time_step);
+    Columns columns = {0};
+    if (d) {
+        columns.rows = buffer;
+        columns.joined = columns.rows + d * ONE(NT);
+        columns.Y = columns.joined + d * ONE(NT);
+        columns.input_room = columns.Y + d * ONE(NY);
+        columns.start = columns.input_room + d * ONE(NU);
+    }
     double q1[ONE(N)], z1[ONE(NZ)], lam[ONE(M)], u[ONE(NU)];
     memset(lam, 0, sizeof lam);
     int status = OK, step = 0;
     double error = 0;
-    for (; step < steps; step++) {
-        const double *x = state + (size_t)step * NX;
-        double *next = state + (size_t)(step + 1) * NX;
+    for (; step < motion->steps; step++) {
+        const double *x = out->state + (size_t)step * NX;
+        double *next = out->state + (size_t)(step + 1) * NX;
         if (NU) {
-            memcpy(u, torque + (size_t)step * NU, sizeof(double) * NU);
-            if (feeds) apply_feedback(feedback, step, x, torque + (size_t)step * NU, u);
-            if (applied) memcpy(applied + (size_t)step * NU, u, sizeof(double) * NU);
+            const double *nominal = motion->torque + (size_t)step * NU;
+            memcpy(u, nominal, sizeof(double) * NU);
+            if (feedback && feedback->count > 0) apply_feedback(feedback, step, x, nominal, u);
+            memcpy(out->applied + (size_t)step * NU, u, sizeof(double) * NU);
         }
-        for (int i = 0; i < N; i++) {
-            q1[i] = x[i];
-            if (step > 1) q1[i] = 3 * (x[i] - x[i - NX]) + x[i - 2 * NX];
-            else if (step == 1) q1[i] = 2 * x[i] - x[i - NX];
-        }
-        for (int i = 0; i < NZ; i++) z1[i] = step > 0 ? 2 * x[2 * N + i] - x[2 * N + i - NX] : x[2 * N + i];
-        for (int j = 0; j < NC; j++) q1[prescribed_index[j]] = path[(size_t)(step + 1) * NC + j];
-        Point a = {x, x + N, x + 2 * N, u, theta, &time_step, q1, z1, lam};
-        status = one_step(k, &a, tolerance, limit, &error);
+        guess(x, step, motion->path + (size_t)(step + 1) * NC, q1, z1);
+        Point a = {x, x + N, x + 2 * N, u, motion->theta, &motion->time_step, q1, z1, lam};
+        status = one_step(k, &a, motion->tolerance, motion->limit, &error);
         memcpy(next, q1, sizeof(double) * N);
         memcpy(next + N, k->p1, sizeof(double) * N);
         memcpy(next + 2 * N, z1, sizeof(double) * NZ);
         if (status) break;
-        if (multipliers) memcpy(multipliers + (size_t)step * M, lam, sizeof(double) * M);
-        if (effort) effort_of(k, effort + (size_t)step * NC);
+        memcpy(out->multipliers + (size_t)step * M, lam, sizeof(double) * M);
+        effort_of(k, out->effort + (size_t)step * NC);
         if (d) {
             linearise(k, &a, 1);
             if (NY && (status = factorise(k))) break;
-            const double *X0 = X + (size_t)step * NX * d, *given = X_torque ? X_torque + (size_t)step * NU * d : NULL;
-            if (NU && (feeds || given)) {
-                if (given) memcpy(input, given, sizeof(double) * NU * d);
-                else memset(input, 0, sizeof(double) * NU * d);
-                for (int i = 0; feeds && i < NU; i++)
-                    for (int j = 0; j < feedback->count; j++) {
-                        const double gain = feedback->gain[((size_t)step * NU + i) * feedback->count + j];
-                        const double *source = X0 + (size_t)feedback->index[j] * d;
-                        for (int c = 0; gain != 0.0 && c < d; c++) input[(size_t)i * d + c] -= gain * source[c];
-                    }
-            }
-            sensitivity_step(k, &a, dir, X0, NU && (feeds || given) ? input : NULL,
-                             X_path ? X_path + (size_t)(step + 1) * NC * d : NULL, X + (size_t)(step + 1) * NX * d,
-                             XL ? XL + (size_t)step * M * d : NULL, XE ? XE + (size_t)step * NC * d : NULL, rows,
-                             joined, Y, start);
+            columns.before = by->state + (size_t)step * NX * d;
+            columns.after = by->state + (size_t)(step + 1) * NX * d;
+            columns.input = input_columns(feedback, step, (int)d, by->torque ? by->torque + (size_t)step * NU * d : NULL,
+                                          columns.before, columns.input_room);
+            columns.path = by->path ? by->path + (size_t)(step + 1) * NC * d : NULL;
+            columns.multipliers = by->multipliers + (size_t)step * M * d;
+            columns.effort = by->effort + (size_t)step * NC * d;
+            sensitivity_step(k, &a, dir, &columns);
         }
     }
-    info[0] = step;
-    info[1] = error;
-    info[2] = (double)k->iterations;
-    info[3] = (double)k->factorisations;
-    free(buffer);
+    outcome->step = step;
+    outcome->error = error;
+    outcome->iterations = k->iterations;
+    outcome->factorisations = k->factorisations;
+    YID_FREE(buffer);
     work_free(k);
     return status;
 }
 
-/* Backward sweep along a finished rollout. by_state: (steps+1, NX) partial derivatives of the cost, by_multiplier
- * (steps, M), by_effort (steps, NC) or NULL. Writes the gradient by the chosen parameters (theta_count), by the initial
- * state (NX), by the nominal torque (steps, NU) where asked for, and by the path (steps+1, NC). */
-int yid_adjoint(int steps, const double *theta, double time_step, const double *applied, const Feedback *feedback,
-                const double *state, const double *multipliers, const Directions *dir, const double *by_state,
-                const double *by_multiplier, const double *by_effort, double *gradient, double *by_start,
-                double *by_torque, double *by_path, double *info) {
-    Work *k = work_new();
-    if (!k) return SINGULAR;
-    prepare(k, theta, &time_step);
-    const int feeds = feedback && feedback->count > 0;
+/* Gradient of a cost along a finished rollout, step by step from its end; a status. */
+int yid_adjoint(const Motion *motion, const Trajectory *rollout, const Partials *by, const Gradient *gradient,
+                Outcome *outcome) {
+    const Directions *dir = motion->directions;
+    const Feedback *feedback = motion->feedback;
+    const int steps = motion->steps, feeds = feedback && feedback->count > 0, thetas = dir ? dir->theta_count : 0;
+    Work *k;
+    double *buffer;
+    if (!room_for(0, &k, &buffer, outcome)) return OUT_OF_MEMORY;
+    prepare(k, motion->theta, &motion->time_step);
     double costate[ONE(NX)], g[ONE(NY)], nu[ONE(NY)], full[ONE(NT)], mu[ONE(NX)], mu_u[ONE(NU)];
     double q1[ONE(N)], z1[ONE(NZ)], lam[ONE(M)], none[ONE(NU)];
     memset(none, 0, sizeof none);
-    memset(gradient, 0, sizeof(double) * (dir ? dir->theta_count : 0));
-    memcpy(costate, by_state + (size_t)steps * NX, sizeof(double) * NX);
+    memset(gradient->theta, 0, sizeof(double) * thetas);
+    memcpy(costate, by->state + (size_t)steps * NX, sizeof(double) * NX);
     int status = OK, step = steps - 1;
     for (; step >= 0; step--) {
-        const double *x = state + (size_t)step * NX, *next = state + (size_t)(step + 1) * NX;
+        const double *x = rollout->state + (size_t)step * NX, *next = rollout->state + (size_t)(step + 1) * NX;
+        const double *u = NU ? rollout->applied + (size_t)step * NU : none;
         memcpy(q1, next, sizeof(double) * N);
         memcpy(z1, next + 2 * N, sizeof(double) * NZ);
-        memcpy(lam, multipliers + (size_t)step * M, sizeof(double) * M);
-        Point a = {x, x + N, x + 2 * N, NU ? applied + (size_t)step * NU : none, theta, &time_step, q1, z1, lam};
+        memcpy(lam, rollout->multipliers + (size_t)step * M, sizeof(double) * M);
+        Point a = {x, x + N, x + 2 * N, u, motion->theta, &motion->time_step, q1, z1, lam};
         constraint_matrix(k, &a);
         linearise(k, &a, 1);
         if (NY && (status = factorise(k))) break;
-        const double *weight = costate + N, *effort = by_effort ? by_effort + (size_t)step * NC : NULL;
+        const double *weight = costate + N, *effort = by->effort ? by->effort + (size_t)step * NC : NULL;
         for (int b = 0; b < NY; b++) {
             const int column = unknown_row[b];
             double sum = column < N ? costate[column] : column < N + NZ ? costate[N + column] : 0.0;
-            if (column >= N + NZ && by_multiplier) sum += by_multiplier[(size_t)step * M + column - N - NZ];
+            if (column >= N + NZ && by->multipliers) sum += by->multipliers[(size_t)step * M + column - N - NZ];
             for (int i = 0; i < N; i++) sum += k->P1[i][column] * weight[i];
             for (int j = 0; effort && j < NC; j++) sum -= k->R1[prescribed_index[j]][column] * effort[j] / k->h;
             g[b] = -sum;
@@ -682,7 +770,7 @@ int yid_adjoint(int steps, const double *theta, double time_step, const double *
             double sum = costate[at];
             for (int r = 0; r < NT; r++) sum += k->R1[r][at] * full[r];
             for (int r = 0; r < N; r++) sum += k->P1[r][at] * weight[r];
-            by_path[(size_t)(step + 1) * NC + j] = sum;
+            gradient->path[(size_t)(step + 1) * NC + j] = sum;
         }
         for (int i = 0; i < NQZ; i++) {
             double sum = 0;
@@ -695,70 +783,72 @@ int yid_adjoint(int steps, const double *theta, double time_step, const double *
             mu_u[j] = 0;
             for (int r = 0; r < NT; r++) mu_u[j] += k->Ru[r][j] * full[r];
             for (int r = 0; r < N; r++) mu_u[j] += k->Pu[r][j] * weight[r];
-            if (by_torque) by_torque[(size_t)step * NU + j] = mu_u[j];
+            gradient->torque[(size_t)step * NU + j] = mu_u[j];
         }
         for (int j = 0; feeds && j < NU; j++)
             for (int c = 0; c < feedback->count; c++)
                 mu[feedback->index[c]] -= feedback->gain[((size_t)step * NU + j) * feedback->count + c] * mu_u[j];
-        if (dir && dir->theta_count) {
+        if (thetas) {
             for (int j = 0; effort && j < NC; j++) full[prescribed_index[j]] = 0;
             theta_columns(dir, &a);
             const long long *patterns[3] = {dir->rows_pattern, dir->p1_pattern, dir->effort_pattern};
             const double *values[3] = {dir->rows_nz, dir->p1_nz, dir->effort_nz}, *weights[3] = {full, weight, effort};
             for (int part = 0; part < 3; part++) {
-                const long long *offset = patterns[part] + 2, *row = patterns[part] + 3 + dir->theta_count;
+                const long long *offset = patterns[part] + 2, *row = patterns[part] + 3 + thetas;
                 if (!weights[part]) continue;
-                for (int c = 0; c < dir->theta_count; c++)
+                for (int c = 0; c < thetas; c++)
                     for (long long e = offset[c]; e < offset[c + 1]; e++)
-                        gradient[c] += weights[part][row[e]] * values[part][e];
+                        gradient->theta[c] += weights[part][row[e]] * values[part][e];
             }
         }
-        for (int i = 0; i < NX; i++) costate[i] = mu[i] + by_state[(size_t)step * NX + i];
+        for (int i = 0; i < NX; i++) costate[i] = mu[i] + by->state[(size_t)step * NX + i];
     }
-    memcpy(by_start, costate, sizeof(double) * NX);
-    for (int j = 0; j < NC; j++) by_path[j] = costate[prescribed_index[j]];
-    info[0] = step;
+    memcpy(gradient->start, costate, sizeof(double) * NX);
+    for (int j = 0; j < NC; j++) gradient->path[j] = costate[prescribed_index[j]];
+    outcome->step = step;
     work_free(k);
     return status;
 }
 
-/* Rows, p1 and their Jacobians at `count` steps of a trajectory that need not satisfy the equations (a transcription's
- * iterate). state: (count + 1, NX). Matrix arguments may be NULL together; with directions also the parameter columns. */
-int yid_linearize(int count, const double *theta, double time_step, const double *state, const double *multipliers,
-               const double *applied, const Directions *dir, double *rows, double *p1, double *R1, double *R0,
-               double *Ru, double *P1, double *P0, double *Pu, double *Rtheta, double *Ptheta) {
-    Work *k = work_new();
-    if (!k) return SINGULAR;
-    prepare(k, theta, &time_step);
+/* Rows, p1 and their Jacobians at the steps of a trajectory that need not satisfy the equations (a transcription's
+ * iterate); a status. */
+int yid_linearize(const Motion *motion, const Trajectory *along, const Linearization *out, Outcome *outcome) {
+    const Directions *dir = motion->directions;
+    Work *k;
+    double *buffer;
+    if (!room_for(0, &k, &buffer, outcome)) return OUT_OF_MEMORY;
+    prepare(k, motion->theta, &motion->time_step);
     double q1[ONE(N)], z1[ONE(NZ)], lam[ONE(M)], none[ONE(NU)];
     memset(none, 0, sizeof none);
-    for (int step = 0; step < count; step++) {
-        const double *x = state + (size_t)step * NX, *next = x + NX;
+    for (int step = 0; step < motion->steps; step++) {
+        const double *x = along->state + (size_t)step * NX, *next = x + NX;
+        const double *u = NU ? along->applied + (size_t)step * NU : none;
         memcpy(q1, next, sizeof(double) * N);
         memcpy(z1, next + 2 * N, sizeof(double) * NZ);
-        memcpy(lam, multipliers + (size_t)step * M, sizeof(double) * M);
-        Point a = {x, x + N, x + 2 * N, NU ? applied + (size_t)step * NU : none, theta, &time_step, q1, z1, lam};
+        memcpy(lam, along->multipliers + (size_t)step * M, sizeof(double) * M);
+        Point a = {x, x + N, x + 2 * N, u, motion->theta, &motion->time_step, q1, z1, lam};
         constraint_matrix(k, &a);
         evaluate(k, &a);
-        double *r = rows + (size_t)step * NT;
+        double *r = out->rows + (size_t)step * NT;
         memcpy(r, k->balance, sizeof(double) * N);
         memcpy(r + N, k->internal, sizeof(double) * NZ);
         memcpy(r + N + NZ, k->constraint, sizeof(double) * M);
-        memcpy(p1 + (size_t)step * N, k->p1, sizeof(double) * N);
-        if (!R1) continue;
+        memcpy(out->p1 + (size_t)step * N, k->p1, sizeof(double) * N);
+        if (!out->rows_new) continue;
         linearise(k, &a, 1);
-        memcpy(R1 + (size_t)step * NT * NT, k->R1, sizeof(double) * NT * NT);
-        memcpy(R0 + (size_t)step * NT * NQZ, k->R0, sizeof(double) * NT * NQZ);
-        memcpy(P1 + (size_t)step * N * NT, k->P1, sizeof(double) * N * NT);
-        memcpy(P0 + (size_t)step * N * NQZ, k->P0, sizeof(double) * N * NQZ);
+        memcpy(out->rows_new + (size_t)step * NT * NT, k->R1, sizeof(double) * NT * NT);
+        memcpy(out->rows_old + (size_t)step * NT * NQZ, k->R0, sizeof(double) * NT * NQZ);
+        memcpy(out->p1_new + (size_t)step * N * NT, k->P1, sizeof(double) * N * NT);
+        memcpy(out->p1_old + (size_t)step * N * NQZ, k->P0, sizeof(double) * N * NQZ);
         if (NU) {
-            memcpy(Ru + (size_t)step * NT * NU, k->Ru, sizeof(double) * NT * NU);
-            memcpy(Pu + (size_t)step * N * NU, k->Pu, sizeof(double) * N * NU);
+            memcpy(out->rows_input + (size_t)step * NT * NU, k->Ru, sizeof(double) * NT * NU);
+            memcpy(out->p1_input + (size_t)step * N * NU, k->Pu, sizeof(double) * N * NU);
         }
         if (dir && dir->theta_count) {
+            const int d = dir->count;
             theta_columns(dir, &a);
-            add_sparse(dir->rows_nz, dir->rows_pattern, 0, NT, Rtheta + (size_t)step * NT * dir->count, dir->count);
-            add_sparse(dir->p1_nz, dir->p1_pattern, 0, N, Ptheta + (size_t)step * N * dir->count, dir->count);
+            add_sparse(dir->rows_nz, dir->rows_pattern, out->rows_theta + (size_t)step * NT * d, d);
+            add_sparse(dir->p1_nz, dir->p1_pattern, out->p1_theta + (size_t)step * N * d, d);
         }
     }
     work_free(k);

@@ -11,8 +11,9 @@ import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import ModelError
-from yid_ocp.integrator.codegen import Mapped
-from yid_ocp.integrator.step import Feedback, Step, compile_step
+from yid_ocp.integrator.mapped import Mapped
+from yid_ocp.integrator.step import Step, compile_step
+from yid_ocp.integrator.step_model import Feedback
 from yid_ocp.model.system import Effect, System
 
 Array = NDArray[np.float64]

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import ModelError
-from yid_ocp.integrator.step import Directions, Feedback, Gradient, Rollout, Step, check_shape
+from yid_ocp.integrator.step import Step, check_shape
+from yid_ocp.integrator.step_model import Directions, Feedback, Gradient, Rollout
 
 Array = NDArray[np.float64]
 

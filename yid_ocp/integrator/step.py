@@ -1,9 +1,10 @@
-"""One step of a system, compiled or interpreted: Newton, its Jacobians, and the sweeps built from it."""
+"""One step of a system, compiled or interpreted: the step map and its Jacobians."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,76 +12,63 @@ from numpy.typing import ArrayLike, NDArray
 from yid_ocp.errors import ModelError
 from yid_ocp.integrator import codegen, compiler
 from yid_ocp.integrator.compiled import CompiledKernel
-from yid_ocp.integrator.discrete import DiscreteEquations, ForceSplit, discrete_equations
+from yid_ocp.integrator.discrete import DiscreteEquations, ForceSplit
 from yid_ocp.integrator.interpreted import InterpretedKernel
 from yid_ocp.integrator.step_model import Directions as Directions
 from yid_ocp.integrator.step_model import Feedback as Feedback
-from yid_ocp.integrator.step_model import Gradient as Gradient
-from yid_ocp.integrator.step_model import Kernel as Kernel
+from yid_ocp.integrator.step_model import Kernel, StepModel, StepStatus, step_model
 from yid_ocp.integrator.step_model import Rollout as Rollout
-from yid_ocp.integrator.step_model import StepCode as StepCode
-from yid_ocp.integrator.step_model import StepLinearization as StepLinearization
-from yid_ocp.integrator.step_model import StepStatus as StepStatus
 from yid_ocp.model.system import System
 
 Array = NDArray[np.float64]
 
-# Newton stops when a correction of the coordinates is below TOLERANCE [rad or m], with short time steps below
-# RATE_TOLERANCE times the step: what is left undone is momentum lost in every step, mass times correction over step.
-TOLERANCE, RATE_TOLERANCE, ROUNDING = 1e-12, 1e-10, 1e-15
 
-
+@dataclass(frozen=True, eq=False)
 class Step:
-    """The compiled time step of a system; made by `compile_step`.
+    """The time step of a system; made by `compile_step`.
 
     Attributes
     ----------
-    system : System
-    time_step : float
-        h [s]
-    force_split : str
-    tolerance : float
-        Newton's, on the coordinates [rad or m].
-    equations : DiscreteEquations
+    model : StepModel
+        Its equations, functions, sizes, time step and tolerance.
     kernel : Kernel
     compiled : bool
         Whether generated C code is used.
     """
 
-    def __init__(
-        self,
-        system: System,
-        time_step: float,
-        force_split: ForceSplit,
-        use_compiler: bool,
-    ) -> None:
-        self.system = system
-        self.time_step = float(time_step)
-        self.force_split: ForceSplit = force_split
-        self.tolerance = max(ROUNDING, min(TOLERANCE, RATE_TOLERANCE * self.time_step))
-        self.equations: DiscreteEquations = discrete_equations(system, force_split)
-        self.functions = codegen.step_functions(self.equations)
-        self.structure = codegen.structure(self.functions)
-        library = (
-            compiler.compile_library(codegen.kernel_source(self.functions, self.structure)) if use_compiler else None
-        )
-        self.compiled = library is not None
-        self.kernel: Kernel = InterpretedKernel(self) if library is None else CompiledKernel(self, library)
+    model: StepModel
+    kernel: Kernel
+    compiled: bool
+
+    @property
+    def system(self) -> System:
+        """The system that is stepped."""
+        return self.model.system
+
+    @property
+    def time_step(self) -> float:
+        """h [s]."""
+        return self.model.time_step
+
+    @property
+    def force_split(self) -> ForceSplit:
+        """How the force of a step is shared between its ends."""
+        return self.model.equations.force_split
+
+    @property
+    def equations(self) -> DiscreteEquations:
+        """The symbolic equations of a step."""
+        return self.model.equations
+
+    @property
+    def functions(self) -> codegen.StepFunctions:
+        """CasADi functions of these equations."""
+        return self.model.functions
 
     @property
     def sizes(self) -> dict[str, int]:
         """n, nz, m, nu, nc, nx and ntheta."""
-        e = self.equations
-        n, nz = self.system.size, e.z0.numel()
-        return {
-            "n": n,
-            "nz": nz,
-            "m": e.lam.numel(),
-            "nu": e.u.numel(),
-            "nc": len(self.system.prescribed),
-            "nx": 2 * n + nz,
-            "ntheta": e.theta.numel(),
-        }
+        return self.model.sizes
 
     def __call__(
         self,
@@ -186,6 +174,7 @@ def compile_step(
     force_split: ForceSplit = "symmetric",
     *,
     use_compiler: bool = True,
+    tolerance: float | None = None,
 ) -> Step:
     """Turn a system into a time step.
 
@@ -198,6 +187,8 @@ def compile_step(
         Order two; the rule of the paper's engine; or order two but for the dampers (see `discrete_equations`).
     use_compiler : bool
         Whether to generate and compile C; without a compiler on the machine the interpreter is used with one notice.
+    tolerance : float, optional
+        Newton's, on the coordinates [rad or m]; follows from the time step when absent.
 
     Returns
     -------
@@ -210,7 +201,12 @@ def compile_step(
     """
     if not (math.isfinite(time_step) and time_step > 0):
         raise ModelError(f"time_step = {time_step}", allowed="a positive number of seconds")
-    return Step(system, time_step, force_split, use_compiler)
+    model = step_model(system, time_step, force_split, tolerance)
+    source = codegen.kernel_source(model.functions, model.structure) if use_compiler else None
+    library = None if source is None else compiler.compile_library(source)
+    if library is None:
+        return Step(model, InterpretedKernel(model), compiled=False)
+    return Step(model, CompiledKernel(model, library), compiled=True)
 
 
 def check_shape(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:

@@ -1,18 +1,75 @@
-"""What the sweeps over a rollout take and return, whichever kernel computes them."""
+"""What every kernel needs: the model of a step, and what rollouts, adjoints and linearizations take and return."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from yid_ocp.errors import ModelError, ResourceError
+from yid_ocp.integrator import codegen
+from yid_ocp.integrator.discrete import DiscreteEquations, ForceSplit, discrete_equations
+from yid_ocp.model.system import System
+
 Array = NDArray[np.float64]
 
 # Newton iterations of one step before it is given up.
 ITERATION_LIMIT = 60
+
+# Newton stops when a correction of the coordinates is below TOLERANCE [rad or m], with short time steps below
+# RATE_TOLERANCE times the step: what is left undone is momentum lost in every step, mass times correction over step.
+TOLERANCE, RATE_TOLERANCE, ROUNDING = 1e-12, 1e-10, 1e-15
+
+
+@dataclass(frozen=True, eq=False)
+class StepModel:
+    """One step of a system, before any kernel computes it.
+
+    Attributes
+    ----------
+    system : System
+    equations : DiscreteEquations
+    functions : StepFunctions
+    structure : Structure
+    sizes : dict of str to int
+        n, nz, m, nu, nc, nx and ntheta.
+    time_step : float
+        h [s]
+    tolerance : float
+        Newton's, on the coordinates [rad or m].
+    """
+
+    system: System
+    equations: DiscreteEquations
+    functions: codegen.StepFunctions
+    structure: codegen.Structure
+    sizes: dict[str, int]
+    time_step: float
+    tolerance: float
+
+
+def step_model(system: System, time_step: float, force_split: ForceSplit, tolerance: float | None = None) -> StepModel:
+    """Equations, functions and tables of a system's step; see `compile_step`."""
+    e = discrete_equations(system, force_split)
+    functions = codegen.step_functions(e)
+    n, nz = system.size, e.z0.numel()
+    sizes = {
+        "n": n,
+        "nz": nz,
+        "m": e.lam.numel(),
+        "nu": e.u.numel(),
+        "nc": len(system.prescribed),
+        "nx": 2 * n + nz,
+        "ntheta": e.theta.numel(),
+    }
+    if tolerance is None:
+        tolerance = max(ROUNDING, min(TOLERANCE, RATE_TOLERANCE * time_step))
+    return StepModel(system, e, functions, codegen.structure(functions), sizes, float(time_step), tolerance)
 
 
 class StepCode(IntEnum):
@@ -22,6 +79,7 @@ class StepCode(IntEnum):
     NOT_CONVERGED = 1
     SINGULAR = 2
     NOT_FINITE = 3
+    OUT_OF_MEMORY = 4
 
 
 MESSAGES = {
@@ -29,6 +87,7 @@ MESSAGES = {
     StepCode.NOT_CONVERGED: "Newton did not converge; try a smaller time step, more damping, or a fitting start",
     StepCode.SINGULAR: "the step's equations are singular; look for redundant grasps or a coordinate without inertia",
     StepCode.NOT_FINITE: "the state is no longer finite; the motion is unstable open loop: add feedback or damping",
+    StepCode.OUT_OF_MEMORY: "there is not enough memory",
 }
 
 
@@ -93,6 +152,10 @@ class Directions:
     torque: Array | None = None
     path: Array | None = None
 
+    def __post_init__(self) -> None:
+        if self.count < len(self.names):
+            raise ModelError(f"{self.count} directions for {len(self.names)} parameters", allowed="one or more each")
+
     @property
     def count(self) -> int:
         """d, the number of directions."""
@@ -129,7 +192,7 @@ class Rollout:
     multipliers : ndarray, shape (N, m)
         [N s]
     effort : ndarray, shape (N, nc)
-        Effort of prescribed coordinates at nodes 0..N-1 [N m]; at node 0 it presumes that p_0 came from a step before
+        Effort of prescribed coordinates at nodes 0..N-1 [N m]; at node 0 it assumes that p_0 came from a step before
         (`Rest` gives such a p_0); after p_0 = dL/dv it holds only half a step's impulse, half the effort.
     torque : ndarray, shape (N, nu)
         Applied torque [N m].
@@ -150,7 +213,7 @@ class Rollout:
 
 @dataclass(frozen=True)
 class Gradient:
-    """Derivatives of a scalar cost along a rollout, from the adjoint sweep.
+    """Derivatives of a scalar cost along a rollout, from the adjoint.
 
     Attributes
     ----------
@@ -204,7 +267,7 @@ class StepLinearization:
 
 
 class Kernel(Protocol):
-    """What the compiled and the interpreted implementation of the sweeps have in common."""
+    """What the compiled and the interpreted implementation have in common."""
 
     def rollout(
         self,
@@ -244,35 +307,51 @@ class Kernel(Protocol):
         ...
 
 
-# The order in which `yid_linearize` takes them.
-LINEARIZATION_MATRICES = (
-    "rows_new",
-    "rows_old",
-    "rows_input",
-    "p1_new",
-    "p1_old",
-    "p1_input",
-    "rows_theta",
-    "p1_theta",
-)
+def empty_rollout(sizes: dict[str, int], steps: int, count: int | None) -> Rollout:
+    """NaN in the shapes of a rollout with `count` directions (None: without), not begun yet."""
+    shapes: dict[str, tuple[int, ...]] = {
+        "state": (steps + 1, sizes["nx"]),
+        "multipliers": (steps, sizes["m"]),
+        "effort": (steps, sizes["nc"]),
+        "torque": (steps, sizes["nu"]),
+    }
+    if count is not None:
+        shapes |= {f"by_{name}": (*shapes[name], count) for name in ("state", "multipliers", "effort")}
+    arrays = _arrays(f"a rollout of {steps} steps with {count or 0} derivatives", shapes, math.nan)
+    by_state, by_multipliers, by_effort = (arrays.pop(f"by_{name}", None) for name in list(shapes)[:3])
+    status = StepStatus(StepCode.OK, 0, 0.0, 0, 0)
+    return Rollout(**arrays, by_state=by_state, by_multipliers=by_multipliers, by_effort=by_effort, status=status)
 
 
 def empty_linearization(sizes: dict[str, int], count: int, width: int, derivatives: bool) -> StepLinearization:
     """Zeros in the shapes of `count` steps and `width` parameters, without matrices where no derivatives are wanted."""
     n, nz, m, nu = sizes["n"], sizes["nz"], sizes["m"], sizes["nu"]
     nt, steps = n + nz + m, count if derivatives else 0
-    return StepLinearization(
-        np.zeros((count, nt)),
-        np.zeros((count, n)),
-        *(np.zeros((steps, rows, columns)) for rows in (nt, n) for columns in (nt, n + nz, nu)),
-        *(np.zeros((steps, rows, width)) for rows in (nt, n)),
+    shapes: dict[str, tuple[int, ...]] = {"rows": (count, nt), "p1": (count, n)}
+    for name, columns in {"new": nt, "old": n + nz, "input": nu, "theta": width}.items():
+        shapes |= {f"rows_{name}": (steps, nt, columns), f"p1_{name}": (steps, n, columns)}
+    return StepLinearization(**_arrays(f"the derivatives of {count} steps", shapes, 0.0))
+
+
+def _arrays(what: str, shapes: Mapping[str, tuple[int, ...]], value: float) -> dict[str, Array]:
+    try:
+        return {name: np.full(shape, value) if value else np.zeros(shape) for name, shape in shapes.items()}
+    except MemoryError as error:
+        raise out_of_memory(what, 8 * sum(math.prod(shape) for shape in shapes.values())) from error
+
+
+def out_of_memory(what: str, size: int) -> ResourceError:
+    """The error for something that needs `size` bytes."""
+    return ResourceError(
+        f"{MESSAGES[StepCode.OUT_OF_MEMORY]} for {what}: it takes {size / 1e6:.3g} MB",
+        hint="estimate fewer parameters at once, use a shorter part of the recording, or close other programs",
     )
 
 
-def status_of(code: int, info: Array, effort: Array, state: Array, sizes: dict[str, int]) -> StepStatus:
-    """Status from a kernel's code and its (steps done, last correction, iterations, factorisations)."""
-    done = int(info[0])
-    last = effort[done - 1] if done else np.zeros(sizes["nc"])
-    return StepStatus(
-        StepCode(code), done, float(info[1]), int(info[2]), int(info[3]), last, state[done, 2 * sizes["n"] :]
-    )
+def ended(
+    rollout: Rollout, sizes: dict[str, int], code: int, step: int, error: float, counts: tuple[int, int]
+) -> Rollout:
+    """The rollout with its status: step reached, last correction, iterations and factorisations."""
+    last = rollout.effort[step - 1] if step else np.zeros(sizes["nc"])
+    inner = rollout.state[step, 2 * sizes["n"] :]
+    return replace(rollout, status=StepStatus(StepCode(code), step, error, *counts, last, inner))

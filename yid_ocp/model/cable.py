@@ -29,9 +29,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import DataError, ModelError, nearest
 from yid_ocp.model import Grasp, Mechanism, System, flexible_object
-from yid_ocp.model.flexible import FlexibleObject, Segment, polyline_rotations
+from yid_ocp.model.flexible import AXES, FlexibleObject, Segment, polyline_rotations
 from yid_ocp.model.mechanism import Frame, Placement
 from yid_ocp.model.parameters import Parameter, Parameters
+from yid_ocp.model.rotations import about_axis
 from yid_ocp.model.system import floating_clamp
 from yid_ocp.options import About
 
@@ -291,7 +292,7 @@ def cable_system(lengths: Mapping[tuple[str, str], float], cable: Cable, options
     end_roll = Parameter(END_ROLL, 0.0, "rad", -np.pi, np.pi, "roll of the end clamp about the last edge")
     if options.end == "weld":
         clamps = Mechanism(clamps.name, clamps.joints, clamps.frames, clamps.parameters.joined([end_roll]))
-    rotation = _about_z(end_roll.symbol) if options.end == "weld" else ca.SX(ca.DM.eye(3))
+    rotation = about_axis(AXES["z"], end_roll.symbol) if options.end == "weld" else ca.SX(ca.DM.eye(3))
     return System.build(
         clamps,
         objects=((_with_vertices(item, cable), START_EDGE, None),),
@@ -348,17 +349,12 @@ def _with_vertices(item: FlexibleObject, cable: Cable) -> FlexibleObject:
     return replace(item, mechanism=replace(tree, frames=frames))
 
 
-def _about_z(angle: ca.SX) -> ca.SX:
-    c, s = ca.cos(angle), ca.sin(angle)
-    return ca.vertcat(ca.horzcat(c, -s, 0), ca.horzcat(s, c, 0), ca.horzcat(0, 0, 1))
-
-
 def _start_clamp(length: float, cable: Cable) -> Mechanism:
     clamp = floating_clamp(START)
     roll = Parameter(START_ROLL, 0.0, "rad", -np.pi, np.pi, "roll of the start clamp about the first edge")
     edge = Parameter(f"{START}.length", length, "m", 1e-9, np.inf, "length of the first edge")
     carrier = clamp.frame(START)
-    tip = Frame(carrier.joint, Placement(_about_z(roll.symbol), ca.vertcat(0, 0, edge.symbol)))
+    tip = Frame(carrier.joint, Placement(about_axis(AXES["z"], roll.symbol), ca.vertcat(0, 0, edge.symbol)))
     frames = {**clamp.frames, cable.parent[0]: carrier, cable.parent[1]: tip, START_EDGE: tip}
     return Mechanism(START, clamp.joints, frames, Parameters([roll, edge]))
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Literal
 
 import casadi as ca
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from yid_ocp.errors import ModelError, nearest
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement
 from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.model.rotations import snapped
+from yid_ocp.model.rotations import snapped, turn
 
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
@@ -168,82 +168,86 @@ def flexible_object(
         Unknown parent, parent after child, non-positive length, mass or radius, links that do not fit.
     """
     root = Placement.identity() if foot is None else Placement.of(foot)
-    parameters: list[Parameter] = []
-    joints: list[Joint] = []
-    frames: dict[str, Frame] = {"object_root": Frame(-1, root)}
-    elastic: list[ElasticJoint] = []
-    layouts: dict[str, SegmentLayout] = {}
-
+    parts = _Parts(frames={"object_root": Frame(-1, root)})
+    fraction = None if gravity_fraction == 1 else ca.SX(gravity_fraction)
     for segment in segments:
-        _check(segment, layouts)
-        own = _segment_parameters(segment)
-        parameters += own.values()
-        mass, cross = own["mass"].symbol, _cross_section(own)
-        shares = _shares(segment)
-        if segment.link_length_parameters:
-            lengths = tuple(own[f"length_{i}"].symbol for i in range(len(shares)))
-        else:
-            lengths = tuple(own["length"].symbol * float(share) for share in shares)
-        later: Sequence[ArrayLike | None] = (
-            [None] * (len(shares) - 1) if segment.link_rotations is None else segment.link_rotations
-        )
-        rotations = [_rotation(entry) for entry in (segment.rotation, *later)]
-        before: ca.SX | None
-        if segment.parent is None:
-            carrier, tip = -1, root
-            before = None if segment.length_before is None or segment.clamped else ca.SX(segment.length_before)
-        else:
-            above = layouts[segment.parent]
-            at = len(above.links) - 1 if segment.at_link is None else segment.at_link
-            frame = frames[f"{segment.parent}_{at}_tip"]
-            carrier, tip = frame.joint, frame.placement
-            before = None if segment.clamped else above.lengths[at]
-        links: list[tuple[str, ...]] = []
-        for i, length in enumerate(lengths):
-            along = ca.vertcat(0, 0, length)
-            slender = length**2 / 12
-            squares = ca.vertcat(slender + cross.y, slender + cross.x, cross.x + cross.y)
-            share = mass * float(shares[i])
-            body = Inertia(
-                share, along / 2, ca.diag(squares) * share, None if gravity_fraction == 1 else ca.SX(gravity_fraction)
-            )
-            names = tuple(f"{segment.name}_{i}_{axis}" for axis in segment.joint_order)
-            for a, axis in enumerate(segment.joint_order):
-                placement = tip @ Placement(ca.SX(ca.DM(rotations[i])), ca.SX(ca.DM.zeros(3)))
-                joints.append(
-                    Joint(
-                        names[a],
-                        "revolute",
-                        carrier,
-                        placement if a == 0 else Placement.identity(),
-                        AXES[axis],
-                        (body,) if a == len(segment.joint_order) - 1 else (),
-                    )
-                )
-                carrier = len(joints) - 1
-                kind: Literal["bend", "twist"] = "twist" if axis == "z" else "bend"
-                factor = _per_joint(segment, length, before)
-                damping = own.get("twist_damping", own["damping"]) if kind == "twist" else own["damping"]
-                elastic.append(
-                    ElasticJoint(
-                        names[a],
-                        segment.name,
-                        kind,
-                        axis,
-                        own[kind].symbol * factor,
-                        damping.symbol * factor,
-                        ca.SX(0),
-                    )
-                )
-            links.append(names)
-            tip = Placement(ca.SX(ca.DM.eye(3)), along)
-            frames[f"{segment.name}_{i}_tip"] = Frame(carrier, tip)
-            before = length
-        frames[f"w_{segment.name}"] = frames[f"{segment.name}_{len(lengths) - 1}_tip"]
-        layouts[segment.name] = SegmentLayout(segment.name, tuple(links), lengths, cross.radius, mass, segment.parent)
+        _check(segment, parts.layouts)
+        _add_segment(parts, segment, root, fraction)
+    mechanism = Mechanism(name, tuple(parts.joints), parts.frames, Parameters(parts.parameters))
+    return FlexibleObject(mechanism, tuple(parts.elastic), tuple(parts.layouts.values()))
 
-    mechanism = Mechanism(name, tuple(joints), frames, Parameters(parameters))
-    return FlexibleObject(mechanism, tuple(elastic), tuple(layouts.values()))
+
+@dataclass(frozen=True)
+class _Parts:
+    """An object as far as it is built."""
+
+    frames: dict[str, Frame]
+    parameters: list[Parameter] = field(default_factory=list)
+    joints: list[Joint] = field(default_factory=list)
+    elastic: list[ElasticJoint] = field(default_factory=list)
+    layouts: dict[str, SegmentLayout] = field(default_factory=dict)
+
+
+def _add_segment(parts: _Parts, segment: Segment, root: Placement, gravity_fraction: ca.SX | None) -> None:
+    """Hang a segment's links on what is there already."""
+    own = _segment_parameters(segment)
+    parts.parameters.extend(own.values())
+    mass, cross = own["mass"].symbol, _cross_section(own)
+    shares = _shares(segment)
+    if segment.link_length_parameters:
+        lengths = tuple(own[f"length_{i}"].symbol for i in range(len(shares)))
+    else:
+        lengths = tuple(own["length"].symbol * float(share) for share in shares)
+    later: Sequence[ArrayLike | None] = (
+        [None] * (len(shares) - 1) if segment.link_rotations is None else segment.link_rotations
+    )
+    rotations = [_rotation(entry) for entry in (segment.rotation, *later)]
+    before: ca.SX | None
+    if segment.parent is None:
+        carrier = Frame(-1, root)
+        before = None if segment.length_before is None or segment.clamped else ca.SX(segment.length_before)
+    else:
+        above = parts.layouts[segment.parent]
+        at = len(above.links) - 1 if segment.at_link is None else segment.at_link
+        carrier = parts.frames[f"{segment.parent}_{at}_tip"]
+        before = None if segment.clamped else above.lengths[at]
+    links: list[tuple[str, ...]] = []
+    for i, length in enumerate(lengths):
+        along = ca.vertcat(0, 0, length)
+        slender = length**2 / 12
+        squares = ca.vertcat(slender + cross.y, slender + cross.x, cross.x + cross.y)
+        share = mass * float(shares[i])
+        body = Inertia(share, along / 2, ca.diag(squares) * share, gravity_fraction)
+        turned = carrier.placement @ Placement(ca.SX(ca.DM(rotations[i])), ca.SX(ca.DM.zeros(3)))
+        names = tuple(f"{segment.name}_{i}_{axis}" for axis in segment.joint_order)
+        _add_link(parts, segment, names, Frame(carrier.joint, turned), body)
+        parts.elastic.extend(_springs(segment, names, own, _per_joint(segment, length, before)))
+        links.append(names)
+        carrier = Frame(len(parts.joints) - 1, Placement(ca.SX(ca.DM.eye(3)), along))
+        parts.frames[f"{segment.name}_{i}_tip"] = carrier
+        before = length
+    parts.frames[f"w_{segment.name}"] = carrier
+    layout = SegmentLayout(segment.name, tuple(links), lengths, cross.radius, mass, segment.parent)
+    parts.layouts[segment.name] = layout
+
+
+def _add_link(parts: _Parts, segment: Segment, names: Sequence[str], at: Frame, body: Inertia) -> None:
+    """The joints before a link, the last of which carries its body."""
+    parent, placement = at.joint, at.placement
+    for name, axis in zip(names, segment.joint_order, strict=True):
+        bodies = (body,) if name == names[-1] else ()
+        parts.joints.append(Joint(name, "revolute", parent, placement, AXES[axis], bodies))
+        parent, placement = len(parts.joints) - 1, Placement.identity()
+
+
+def _springs(
+    segment: Segment, names: Sequence[str], own: Mapping[str, Parameter], factor: ca.SX
+) -> Iterator[ElasticJoint]:
+    """Springs and dampers of the joints before a link; `factor` makes stiffnesses of rigidities."""
+    for name, axis in zip(names, segment.joint_order, strict=True):
+        kind: Literal["bend", "twist"] = "twist" if axis == "z" else "bend"
+        damping = own.get("twist_damping", own["damping"]) if kind == "twist" else own["damping"]
+        yield ElasticJoint(name, segment.name, kind, axis, own[kind].symbol * factor, damping.symbol * factor, ca.SX(0))
 
 
 def polyline_rotations(vertices: ArrayLike, start: ArrayLike | None = None) -> list[NDArray[np.float64]]:
@@ -276,9 +280,8 @@ def polyline_rotations(vertices: ArrayLike, start: ArrayLike | None = None) -> l
     rotations = []
     for edge in edges:
         local = frame.T @ (edge / np.linalg.norm(edge))
-        turn = _shortest_turn(local)
-        rotations.append(turn)
-        frame = frame @ turn
+        rotations.append(_shortest_turn(local))
+        frame = frame @ rotations[-1]
     return rotations
 
 
@@ -287,9 +290,7 @@ def _shortest_turn(direction: NDArray[np.float64]) -> NDArray[np.float64]:
     sine, cosine = float(np.linalg.norm(axis)), float(direction[2])
     if sine < 1e-12:
         return np.eye(3) if cosine > 0 else np.diag([1.0, -1.0, -1.0])
-    u = axis / sine
-    skew = np.array([[0, -u[2], u[1]], [u[2], 0, -u[0]], [-u[1], u[0], 0]])
-    return np.eye(3) + sine * skew + (1 - cosine) * skew @ skew
+    return turn(axis / sine, sine, cosine)
 
 
 def _rotation(matrix: ArrayLike | None) -> NDArray[np.float64]:

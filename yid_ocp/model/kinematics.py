@@ -8,12 +8,12 @@ origin, force); with both in one fixed frame the derivatives of the Lagrangian t
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import casadi as ca
-import numpy as np
 
 from yid_ocp.model.mechanism import Frame, Inertia, Mechanism, Placement
+from yid_ocp.model.rotations import about_axis
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ def forward_kinematics(mechanism: Mechanism, q: ca.SX) -> Kinematics:
             rotation = rotations[joint.parent] @ rotation
         axis = rotation @ ca.SX(ca.DM(joint.axis))
         if joint.kind == "revolute":
-            rotations.append(rotation @ _axis_rotation(joint.axis, q[j]))
+            rotations.append(rotation @ about_axis(joint.axis, q[j]))
             screws.append(ca.vertcat(axis, cross(origin, axis)))
         else:
             origin = origin + axis * q[j]
@@ -155,75 +155,30 @@ def rigid_body(kinematics: Kinematics, v: ca.SX, gravity: ca.SX) -> RigidBody:
     gravity : casadi.SX, shape (3, 1)
         Acceleration of free fall in the world frame [m/s^2].
     """
-    mechanism = kinematics.mechanism
-    n = len(mechanism.joints)
-    S = kinematics.screws
-    zero6 = ca.SX(ca.DM.zeros(6))
+    joints, S = kinematics.mechanism.joints, kinematics.screws
     velocity: list[ca.SX] = []
     D: list[ca.SX] = []
-    for j, joint in enumerate(mechanism.joints):
-        above = velocity[joint.parent] if joint.parent >= 0 else zero6
-        D.append(motion_cross(above, S[j]) if joint.parent >= 0 else zero6)
+    for j, joint in enumerate(joints):
+        above = velocity[joint.parent] if joint.parent >= 0 else ca.SX(ca.DM.zeros(6))
+        D.append(motion_cross(above, S[j]) if joint.parent >= 0 else above)
         velocity.append(above + S[j] * v[j])
-
-    mass = [ca.SX(0)] * n
-    first = [ca.SX(ca.DM.zeros(3))] * n
-    second = [ca.SX(ca.DM.zeros(3, 3))] * n
-    momentum = [zero6] * n
-    # with one body whose weight is not its mass times gravity, weight is summed apart from inertia
-    apart = any(body.gravity_fraction is not None for joint in mechanism.joints for body in joint.bodies)
-    heavy, heavy_first = list(mass), list(first)
-    kinetic, potential = ca.SX(0), ca.SX(0)
-    for j, joint in enumerate(mechanism.joints):
-        for body in joint.bodies:
-            com = kinematics.rotations[j] @ body.com + kinematics.origins[j]
-            about_com = _rotated_tensor(body, kinematics.rotations[j])
-            angular, linear = velocity[j][:3], velocity[j][3:] + cross(velocity[j][:3], com)
-            impulse = body.mass * linear
-            spin = about_com @ angular
-            wrench = ca.vertcat(spin + cross(com, impulse), impulse)
-            kinetic += 0.5 * (ca.dot(impulse, linear) + ca.dot(spin, angular))
-            heaviness = body.mass if body.gravity_fraction is None else body.mass * body.gravity_fraction
-            potential -= heaviness * ca.dot(gravity, com)
-            mass[j] = mass[j] + body.mass
-            first[j] = first[j] + body.mass * com
-            if apart:
-                heavy[j], heavy_first[j] = heavy[j] + heaviness, heavy_first[j] + heaviness * com
-            second[j] = second[j] + about_com + body.mass * (ca.dot(com, com) * ca.SX.eye(3) - com @ com.T)
-            momentum[j] = momentum[j] + wrench
-    for j in reversed(range(n)):
-        parent = mechanism.joints[j].parent
-        if parent >= 0:
-            mass[parent] = mass[parent] + mass[j]
-            first[parent] = first[parent] + first[j]
-            heavy[parent] = heavy[parent] + heavy[j]
-            heavy_first[parent] = heavy_first[parent] + heavy_first[j]
-            second[parent] = second[parent] + second[j]
-            momentum[parent] = momentum[parent] + momentum[j]
-
-    if not apart:
-        heavy, heavy_first = mass, first
-
-    def inertia_times(j: int, motion: ca.SX) -> ca.SX:
-        force = mass[j] * motion[3:] + cross(motion[:3], first[j])
-        return ca.vertcat(second[j] @ motion[:3] + cross(first[j], motion[3:]), force)
-
+    moved, kinetic, potential = _moved(kinematics, velocity, gravity)
     by_q, by_v, F, B, G = [], [], [], [], []
-    for j in range(n):
-        moment, weight = cross(heavy_first[j], gravity), heavy[j] * gravity
+    for j, part in enumerate(moved):
+        moment, weight = cross(part.heavy_first, gravity), part.heavy * gravity
         axis, linear = S[j][:3], S[j][3:]
-        by_v.append(ca.dot(S[j], momentum[j]))
-        by_q.append(ca.dot(D[j], momentum[j]) + ca.dot(axis, moment) + ca.dot(linear, weight))
-        F.append(inertia_times(j, S[j]))
-        B.append(inertia_times(j, D[j]) + force_cross(S[j], momentum[j]))
-        G.append(cross(axis, moment) + cross(linear, weight) + cross(heavy_first[j], cross(gravity, axis)))
+        by_v.append(ca.dot(S[j], part.momentum))
+        by_q.append(ca.dot(D[j], part.momentum) + ca.dot(axis, moment) + ca.dot(linear, weight))
+        F.append(part.inertia_times(S[j]))
+        B.append(part.inertia_times(D[j]) + force_cross(S[j], part.momentum))
+        G.append(cross(axis, moment) + cross(linear, weight) + cross(part.heavy_first, cross(gravity, axis)))
 
     def columns(entries: Sequence[ca.SX], rows: int) -> ca.SX:
         return ca.densify(ca.horzcat(ca.SX(rows, 0), *entries))
 
     return RigidBody(
-        ca.densify(ca.vertcat(*by_q)) if n else ca.SX(0, 1),
-        ca.densify(ca.vertcat(*by_v)) if n else ca.SX(0, 1),
+        ca.densify(ca.vertcat(*by_q)) if joints else ca.SX(0, 1),
+        ca.densify(ca.vertcat(*by_v)) if joints else ca.SX(0, 1),
         kinetic,
         potential,
         columns(S, 6),
@@ -232,6 +187,58 @@ def rigid_body(kinematics: Kinematics, v: ca.SX, gravity: ca.SX) -> RigidBody:
         columns(B, 6),
         columns(G, 3),
     )
+
+
+@dataclass
+class _Moved:
+    """All that a joint moves: mass moments about the world origin and momentum.
+
+    `heavy` and `heavy_first` are mass and first moment as gravity pulls at them.
+    """
+
+    mass: ca.SX = field(default_factory=lambda: ca.SX(0))
+    first: ca.SX = field(default_factory=lambda: ca.SX(ca.DM.zeros(3)))
+    second: ca.SX = field(default_factory=lambda: ca.SX(ca.DM.zeros(3, 3)))
+    momentum: ca.SX = field(default_factory=lambda: ca.SX(ca.DM.zeros(6)))
+    heavy: ca.SX = field(default_factory=lambda: ca.SX(0))
+    heavy_first: ca.SX = field(default_factory=lambda: ca.SX(ca.DM.zeros(3)))
+
+    def add(self, other: _Moved) -> None:
+        for name in vars(self):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+
+    def inertia_times(self, motion: ca.SX) -> ca.SX:
+        force = self.mass * motion[3:] + cross(motion[:3], self.first)
+        return ca.vertcat(self.second @ motion[:3] + cross(self.first, motion[3:]), force)
+
+
+def _moved(kinematics: Kinematics, velocity: Sequence[ca.SX], gravity: ca.SX) -> tuple[list[_Moved], ca.SX, ca.SX]:
+    """What every joint moves, and the bodies' kinetic and potential energy [J]."""
+    joints = kinematics.mechanism.joints
+    moved = [_Moved() for _ in joints]
+    kinetic, potential = ca.SX(0), ca.SX(0)
+    # with one body whose weight is not its mass times gravity, weight is summed apart from inertia
+    apart = any(body.gravity_fraction is not None for joint in joints for body in joint.bodies)
+    for j, joint in enumerate(joints):
+        for body in joint.bodies:
+            com = kinematics.rotations[j] @ body.com + kinematics.origins[j]
+            about_com = _rotated_tensor(body, kinematics.rotations[j])
+            angular, linear = velocity[j][:3], velocity[j][3:] + cross(velocity[j][:3], com)
+            impulse = body.mass * linear
+            spin = about_com @ angular
+            kinetic += 0.5 * (ca.dot(impulse, linear) + ca.dot(spin, angular))
+            heavy = body.mass if body.gravity_fraction is None else body.mass * body.gravity_fraction
+            potential -= heavy * ca.dot(gravity, com)
+            second = about_com + body.mass * (ca.dot(com, com) * ca.SX.eye(3) - com @ com.T)
+            momentum = ca.vertcat(spin + cross(com, impulse), impulse)
+            moved[j].add(_Moved(body.mass, body.mass * com, second, momentum, heavy, heavy * com))
+    for j in reversed(range(len(joints))):
+        if joints[j].parent >= 0:
+            moved[joints[j].parent].add(moved[j])
+    if not apart:
+        for part in moved:
+            part.heavy, part.heavy_first = part.mass, part.first
+    return moved, kinetic, potential
 
 
 def mass_matrix(rigid: RigidBody, mechanism: Mechanism) -> ca.SX:
@@ -265,20 +272,6 @@ def _from_pairs(mechanism: Mechanism, entry: Callable[[int, int], tuple[ca.SX, c
             matrix[j, i] = lower
             matrix[i, j] = upper
     return matrix
-
-
-def _axis_rotation(axis: tuple[float, float, float], angle: ca.SX) -> ca.SX:
-    c, s = ca.cos(angle), ca.sin(angle)
-    for k in range(3):
-        if abs(abs(axis[k]) - 1.0) < 1e-15:
-            s = s * axis[k]
-            a, b = (k + 1) % 3, (k + 2) % 3
-            matrix = ca.SX(ca.DM.eye(3))
-            matrix[a, a], matrix[a, b], matrix[b, a], matrix[b, b] = c, -s, s, c
-            return ca.densify(matrix)
-    u = np.asarray(axis)
-    skew = np.array([[0, -u[2], u[1]], [u[2], 0, -u[0]], [-u[1], u[0], 0]])
-    return ca.SX(ca.DM(np.outer(u, u))) + c * ca.SX(ca.DM(np.eye(3) - np.outer(u, u))) + s * ca.SX(ca.DM(skew))
 
 
 def _rotated_tensor(body: Inertia, rotation: ca.SX) -> ca.SX:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -41,13 +43,45 @@ def roll_pitch_yaw(roll: float, pitch: float, yaw: float) -> Matrix:
     )
 
 
-def _cs(angle: float) -> tuple[float, float]:
-    return math.cos(angle), math.sin(angle)
-
-
-def _angles(rotation: Matrix) -> tuple[float, float, float]:
+def angles_of(rotation: Matrix) -> tuple[float, float, float]:
+    """Roll, pitch and yaw [rad] with which `roll_pitch_yaw` gives a rotation matrix."""
     # the roll is taken in the frame that yaw and pitch leave, which holds at and near pitch = 90 degrees too
     yaw = math.atan2(rotation[1, 0], rotation[0, 0])
     pitch = math.atan2(-rotation[2, 0], math.hypot(rotation[0, 0], rotation[1, 0]))
     c, s = _cs(yaw)
     return math.atan2(s * rotation[0, 2] - c * rotation[1, 2], c * rotation[1, 1] - s * rotation[0, 1]), pitch, yaw
+
+
+def turn(axis: ArrayLike, sine: float, cosine: float) -> Matrix:
+    """Rotation matrix about a unit axis by the angle with this sine and cosine (Rodrigues' formula)."""
+    skew = _skew(np.asarray(axis, float))
+    return np.eye(3) + sine * skew + (1 - cosine) * skew @ skew
+
+
+def about_axis(axis: Sequence[float], angle: ca.SX) -> ca.SX:
+    """Rotation matrix about a numeric unit axis by a symbolic angle [rad], shape (3, 3)."""
+    c, s = ca.cos(angle), ca.sin(angle)
+    for k in range(3):
+        if abs(abs(axis[k]) - 1.0) < 1e-15:
+            s = s * axis[k]
+            a, b = (k + 1) % 3, (k + 2) % 3
+            matrix = ca.SX(ca.DM.eye(3))
+            matrix[a, a], matrix[a, b], matrix[b, a], matrix[b, b] = c, -s, s, c
+            return ca.densify(matrix)
+    u = np.asarray(axis)
+    along = np.outer(u, u)
+    return ca.SX(ca.DM(along)) + c * ca.SX(ca.DM(np.eye(3) - along)) + s * ca.SX(ca.DM(_skew(u)))
+
+
+def symbolic_roll_pitch_yaw(roll: ca.SX, pitch: ca.SX, yaw: ca.SX | None = None) -> ca.SX:
+    """Rotation matrix Rz(yaw) Ry(pitch) Rx(roll) of symbolic angles [rad], shape (3, 3); without yaw Ry Rx."""
+    turned = about_axis((0.0, 1.0, 0.0), pitch) @ about_axis((1.0, 0.0, 0.0), roll)
+    return ca.densify(turned if yaw is None else about_axis((0.0, 0.0, 1.0), yaw) @ turned)
+
+
+def _cs(angle: float) -> tuple[float, float]:
+    return math.cos(angle), math.sin(angle)
+
+
+def _skew(u: Matrix) -> Matrix:
+    return np.array([[0, -u[2], u[1]], [u[2], 0, -u[0]], [-u[1], u[0], 0]])

@@ -375,20 +375,12 @@ class System:
         if acceleration.shape != (3,) or not np.all(np.isfinite(acceleration)):
             raise ModelError(f"gravity = {acceleration}", allowed="three numbers [m/s^2]")
         tree = mechanism if mechanism is not None else Mechanism("system", (), {})
-        entries: list[Parameter] = []
-        coefficients: dict[str, ca.SX] = {}
         wanted = dict(damping) if isinstance(damping, Mapping) else dict.fromkeys(tree.joint_names, float(damping))
-        for joint, value in wanted.items():
-            tree.joint_index(joint)
-            parameter = Parameter(f"{joint}.damping", value, "N m s/rad", 0.0, math.inf, f"viscous damping of {joint}")
-            entries.append(parameter)
-            coefficients[joint] = parameter.symbol
+        dampers = _damping_parameters(tree, wanted)
+        entries = list(dampers.values())
         elastic: list[ElasticJoint] = []
         for joint, spring in (springs or {}).items():
-            unit = tree.joints[tree.joint_index(joint)].unit
-            per = "N m/rad" if unit == "rad" else "N/m"
-            stiffness = Parameter(f"{joint}.stiffness", spring.stiffness, per, 0.0, math.inf, f"spring on {joint}")
-            rest = Parameter(f"{joint}.rest", spring.rest, unit, description=f"where the spring on {joint} is relaxed")
+            stiffness, rest = _spring_parameters(tree, joint, spring)
             entries += [stiffness, rest]
             elastic.append(ElasticJoint(joint, joint, "bend", "", stiffness.symbol, ca.SX(0), rest.symbol))
         segments: list[SegmentLayout] = []
@@ -396,32 +388,13 @@ class System:
             tree = tree.joined(item.mechanism, frame, placement)
             elastic += item.elastic
             segments += item.segments
-        if not tree.joints:
-            raise ModelError("the system has no joint", hint="give a robot, an object, or both")
-        for joint in [*driven, *prescribed]:
-            tree.joint_index(joint)
-        for kind, names in (
-            ("driven joints", driven),
-            ("prescribed joints", prescribed),
-            ("grasps", [grasp.name for grasp in grasps]),
-        ):
-            twice = sorted({name for name in names if list(names).count(name) > 1})
-            if twice:
-                raise ModelError(f"'{twice[0]}' stands twice among the {kind}", allowed="each name once")
-        both = sorted(set(driven) & set(prescribed))
-        if both:
-            raise ModelError(f"joint '{both[0]}' is both driven and prescribed", allowed="one of the two")
-        for grasp in grasps:
-            tree.frame(grasp.holder)
-            tree.frame(grasp.held)
         seen = tuple(points) if points is not None else tuple(name for name in tree.frames if name.startswith("w_"))
-        for point in seen:
-            tree.frame(point)
+        _check_names(tree, grasps, driven, prescribed, seen)
         system = System(
             tree,
             tree.parameters.joined(entries),
             tuple(elastic),
-            coefficients,
+            {joint: parameter.symbol for joint, parameter in dampers.items()},
             tuple(grasps),
             tuple(driven),
             tuple(prescribed),
@@ -543,6 +516,51 @@ class System:
         """Diagonal of C in phi(q_{k+1}) = C lam_k / h, shape (m, 1)."""
         rows = [grasp.compliance for grasp in self.grasps for _ in range(grasp.equations)]
         return ca.vertcat(*rows) if rows else ca.SX(0, 1)
+
+
+def _damping_parameters(tree: Mechanism, wanted: Mapping[str, float]) -> dict[str, Parameter]:
+    found = {}
+    for joint, value in wanted.items():
+        tree.joint_index(joint)
+        text = f"viscous damping of {joint}"
+        found[joint] = Parameter(f"{joint}.damping", value, "N m s/rad", 0.0, math.inf, text)
+    return found
+
+
+def _spring_parameters(tree: Mechanism, joint: str, spring: Spring) -> tuple[Parameter, Parameter]:
+    """Stiffness and rest of a spring on a joint of the robot."""
+    unit = tree.joints[tree.joint_index(joint)].unit
+    per = "N m/rad" if unit == "rad" else "N/m"
+    return (
+        Parameter(f"{joint}.stiffness", spring.stiffness, per, 0.0, math.inf, f"spring on {joint}"),
+        Parameter(f"{joint}.rest", spring.rest, unit, description=f"where the spring on {joint} is relaxed"),
+    )
+
+
+def _check_names(
+    tree: Mechanism, grasps: Sequence[Grasp], driven: Sequence[str], prescribed: Sequence[str], points: Sequence[str]
+) -> None:
+    """Raise `ModelError` for a name that does not exist or is used twice, or a tree without joints."""
+    if not tree.joints:
+        raise ModelError("the system has no joint", hint="give a robot, an object, or both")
+    for joint in [*driven, *prescribed]:
+        tree.joint_index(joint)
+    for kind, names in (
+        ("driven joints", list(driven)),
+        ("prescribed joints", list(prescribed)),
+        ("grasps", [grasp.name for grasp in grasps]),
+    ):
+        repeated = sorted({name for name in names if names.count(name) > 1})
+        if repeated:
+            raise ModelError(f"'{repeated[0]}' is named twice among the {kind}", allowed="each name once")
+    both = sorted(set(driven) & set(prescribed))
+    if both:
+        raise ModelError(f"joint '{both[0]}' is both driven and prescribed", allowed="one of the two")
+    for grasp in grasps:
+        tree.frame(grasp.holder)
+        tree.frame(grasp.held)
+    for point in points:
+        tree.frame(point)
 
 
 def floating_clamp(name: str, frame: str | None = None) -> Mechanism:

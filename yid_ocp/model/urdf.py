@@ -8,8 +8,8 @@ import math
 import site
 import sys
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Iterable, Mapping, Sequence, Set
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +20,12 @@ from numpy.typing import NDArray
 from yid_ocp.errors import ModelError, nearest
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement, merged
 from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.model.rotations import Matrix, _angles, snapped, transform
+from yid_ocp.model.rotations import Matrix, angles_of, snapped, transform, turn
 
 # Stands for no limit where URDF asks for a number.
 UNLIMITED = 1e9
+
+MOVABLE = {"revolute", "continuous", "prismatic"}
 
 
 def robot_description_file(robot: str) -> Path:
@@ -90,138 +92,187 @@ def read_urdf(
     ModelError
         Missing or malformed file, unknown joint, joint type that is not revolute, continuous, prismatic or fixed.
     """
-    import yourdfpy
-
-    path, chosen, locked, without = Path(str(path)), joints, dict(locked or {}), exclude_links
-
-    text = str(path)
-    if text.startswith("package:"):
-        path = robot_description_file(text.removeprefix("package:"))
-    if not path.is_file():
-        raise ModelError(f"there is no URDF file '{path}'", hint="give a path, or package:NAME for example-robot-data")
-    try:
-        ElementTree.parse(path)  # yourdfpy would read what it can of a broken file and say nothing
-        with contextlib.redirect_stderr(io.StringIO()):
-            robot = yourdfpy.URDF.load(
-                str(path), build_scene_graph=False, load_meshes=False, load_collision_meshes=False
-            ).robot
-    except Exception as error:  # yourdfpy and lxml raise many kinds for a malformed file
-        raise ModelError(f"the URDF cannot be read: {error}", where=str(path)) from error
-
-    movable = {"revolute", "continuous", "prismatic"}
+    kept, locked = joints, dict(locked or {})
+    file = _file(path)
+    robot = _parsed(file)
+    links = _checked(robot, file, (*(kept or ()), *locked))
+    dropped = _with_all_below(exclude_links, links, str(file))
     for joint in robot.joints:
-        if joint.type not in movable | {"fixed"}:
-            raise ModelError(
-                f"joint '{joint.name}' has type '{joint.type}'",
-                where=str(path),
-                allowed="revolute, continuous, prismatic, fixed",
-            )
-        if joint.type in movable and joint.axis is not None and np.linalg.norm(joint.axis) < 1e-9:
-            raise ModelError(f"joint '{joint.name}' has a zero axis", where=str(path))
-    known = [joint.name for joint in robot.joints if joint.type in movable]
-    for wanted in [*(chosen or ()), *locked]:
-        if wanted not in known:
-            raise ModelError(f"there is no movable joint '{wanted}'", where=str(path), hint=nearest(wanted, known))
-    kept = set(known if chosen is None else chosen)
-
-    links = {link.name: link for link in robot.links}
-    children: dict[str, list] = {}
-    for joint in robot.joints:
-        for link in (joint.parent, joint.child):
-            if link not in links:
-                raise ModelError(
-                    f"joint '{joint.name}' names a link '{link}' that is not there",
-                    where=str(path),
-                    hint=nearest(str(link), links),
-                )
-        children.setdefault(joint.parent, []).append(joint)
-    below = [joint.child for joint in robot.joints]
-    roots = [link for link in links if link not in below]
-    if len(roots) != 1:
-        raise ModelError(f"the URDF has {len(roots)} root links", where=str(path), allowed="exactly one")
-    for kind, names in (
-        ("links are called", [link.name for link in robot.links]),
-        ("joints are called", [joint.name for joint in robot.joints]),
-        ("joints carry the link", below),
-    ):
-        twice = sorted({entry for entry in names if names.count(entry) > 1})
-        if twice:
-            raise ModelError(f"two {kind} '{twice[0]}'", where=str(path), allowed="a tree with unique names")
-    dropped = _with_all_below(without, links, children, str(path))
-    for joint in robot.joints:
-        if joint.child in dropped and joint.name in (*(chosen or ()), *locked):
-            raise ModelError(f"joint '{joint.name}' carries a link that is left out", where=str(path))
-    rank = {joint: i for i, joint in enumerate(chosen if chosen is not None else known)}
-
-    collected: dict[str, tuple[str | None, Matrix, Any]] = {}
-    bodies: dict[str | None, list[Inertia]] = {}
-    frames: dict[str, tuple[str | None, Matrix]] = {}
-    stack: list[tuple[str, str | None, Matrix]] = [(roots[0], None, np.eye(4))]
-    while stack:
-        link, carrier, at = stack.pop()
-        frames[link] = (carrier, at)
-        inertial = links[link].inertial
-        if inertial is not None and inertial.mass:
-            origin = np.eye(4) if inertial.origin is None else np.asarray(inertial.origin, float)
-            tensor = np.zeros((3, 3)) if inertial.inertia is None else np.asarray(inertial.inertia, float)
-            body = Inertia.of(float(inertial.mass), np.zeros(3), tensor)
-            bodies.setdefault(carrier, []).append(body.moved(Placement.of(at @ origin)))
-        for joint in children.get(link, ()):
-            if joint.child in dropped:
-                continue
-            origin = np.eye(4) if joint.origin is None else np.asarray(joint.origin, float)
-            if joint.name in kept:
-                collected[joint.name] = (carrier, at @ origin, joint)
-                stack.append((joint.child, joint.name, np.eye(4)))
-            else:
-                stack.append((joint.child, carrier, at @ origin @ _locked_motion(joint, locked)))
-    loose = sorted(set(links) - set(frames) - dropped)
-    if loose:
-        raise ModelError(f"link '{loose[0]}' does not hang on '{roots[0]}'", where=str(path), allowed="one tree")
-
-    order: list[str] = []
-    waiting = sorted(collected, key=lambda entry: rank[entry])
-    while waiting:
-        ready = next(entry for entry in waiting if collected[entry][0] is None or collected[entry][0] in order)
-        order.append(ready)
-        waiting.remove(ready)
+        if joint.child in dropped and joint.name in (*(kept or ()), *locked):
+            raise ModelError(f"joint '{joint.name}' carries a link that is left out", where=str(file))
+    movable = [joint.name for joint in robot.joints if joint.type in MOVABLE]
+    found = _walk(links, dropped, movable if kept is None else kept, locked, str(file))
+    order = _parents_first(found.joints, movable if kept is None else kept)
 
     parameters: list[Parameter] = []
     made: list[Joint] = []
     for entry in order:
-        carrier, at, source = collected[entry]
-        carried = merged(bodies.get(entry, ()))
+        carrier, at, source = found.joints[entry]
+        carried = merged(found.bodies.get(entry, ()))
         if carried is not None and parametric:
             mass = float(carried.mass)
             parameter = Parameter(f"{entry}.mass", mass, "kg", 0.0, math.inf, f"mass of what {entry} carries")
             parameters.append(parameter)
             carried = replace(carried.scaled(parameter.symbol / mass), mass=parameter.symbol)
-        limit = source.limit
-        axis = snapped(_unit_axis(source))
-        continuous = source.type == "continuous" or limit is None
-
-        def bound(value: float | None, otherwise: float) -> float:
-            return otherwise if value is None or abs(value) >= UNLIMITED else float(value)
-
-        made.append(
-            Joint(
-                entry,
-                "prismatic" if source.type == "prismatic" else "revolute",
-                order.index(carrier) if carrier is not None else -1,
-                Placement.of(at),
-                (float(axis[0]), float(axis[1]), float(axis[2])),
-                () if carried is None else (carried,),
-                -math.inf if continuous else bound(limit.lower, -math.inf),
-                math.inf if continuous else bound(limit.upper, math.inf),
-                math.inf if limit is None else bound(limit.effort, math.inf),
-                math.inf if limit is None else bound(limit.velocity, math.inf),
-            )
-        )
+        parent = order.index(carrier) if carrier is not None else -1
+        made.append(_joint(source, parent, Placement.of(at), () if carried is None else (carried,)))
     named = {
         link: Frame(-1 if carrier is None else order.index(carrier), Placement.of(at))
-        for link, (carrier, at) in frames.items()
+        for link, (carrier, at) in found.frames.items()
     }
     return Mechanism(name or robot.name, tuple(made), named, Parameters(parameters))
+
+
+@dataclass(frozen=True)
+class _Link:
+    """A link of the file with the joints that leave it."""
+
+    name: str
+    inertial: Any
+    joints: tuple[Any, ...]
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What hangs on which kept joint (None: the world), and where in that joint's frame.
+
+    Attributes
+    ----------
+    joints : mapping of joint name to (carrier, placement (4, 4), the file's joint)
+    bodies : mapping of carrier to bodies in its frame
+    frames : mapping of link name to (carrier, placement (4, 4))
+    """
+
+    joints: dict[str, tuple[str | None, Matrix, Any]] = field(default_factory=dict)
+    bodies: dict[str | None, list[Inertia]] = field(default_factory=dict)
+    frames: dict[str, tuple[str | None, Matrix]] = field(default_factory=dict)
+
+
+def _file(path: str | Path) -> Path:
+    text = str(Path(str(path)))
+    file = robot_description_file(text.removeprefix("package:")) if text.startswith("package:") else Path(text)
+    if not file.is_file():
+        raise ModelError(f"there is no URDF file '{file}'", hint="give a path, or package:NAME for example-robot-data")
+    return file
+
+
+def _parsed(file: Path) -> Any:
+    import yourdfpy
+
+    try:
+        ElementTree.parse(file)  # yourdfpy would read what it can of a broken file and say nothing
+        with contextlib.redirect_stderr(io.StringIO()):
+            return yourdfpy.URDF.load(
+                str(file), build_scene_graph=False, load_meshes=False, load_collision_meshes=False
+            ).robot
+    except Exception as error:  # yourdfpy and lxml raise many kinds for a malformed file
+        raise ModelError(f"the URDF cannot be read: {error}", where=str(file)) from error
+
+
+def _checked(robot: Any, file: Path, wanted: Sequence[str]) -> dict[str, _Link]:
+    """The links by name, the root first, after all that could be wrong with joints and links was looked at."""
+    where = str(file)
+    for joint in robot.joints:
+        if joint.type not in MOVABLE | {"fixed"}:
+            allowed = "revolute, continuous, prismatic, fixed"
+            raise ModelError(f"joint '{joint.name}' has type '{joint.type}'", where=where, allowed=allowed)
+        if joint.type in MOVABLE and joint.axis is not None and np.linalg.norm(joint.axis) < 1e-9:
+            raise ModelError(f"joint '{joint.name}' has a zero axis", where=where)
+    known = [joint.name for joint in robot.joints if joint.type in MOVABLE]
+    for name in wanted:
+        if name not in known:
+            raise ModelError(f"there is no movable joint '{name}'", where=where, hint=nearest(name, known))
+    names = [link.name for link in robot.links]
+    for joint in robot.joints:
+        for link in (joint.parent, joint.child):
+            if link not in names:
+                raise ModelError(
+                    f"joint '{joint.name}' names a link '{link}' that is not there",
+                    where=where,
+                    hint=nearest(str(link), names),
+                )
+    below = [joint.child for joint in robot.joints]
+    roots = [name for name in dict.fromkeys(names) if name not in below]
+    if len(roots) != 1:
+        raise ModelError(f"the URDF has {len(roots)} root links", where=where, allowed="exactly one")
+    for kind, entries in (
+        ("links are called", names),
+        ("joints are called", [joint.name for joint in robot.joints]),
+        ("joints carry the link", below),
+    ):
+        repeated = sorted({entry for entry in entries if entries.count(entry) > 1})
+        if repeated:
+            raise ModelError(f"two {kind} '{repeated[0]}'", where=where, allowed="a tree with unique names")
+    links = {
+        link.name: _Link(link.name, link.inertial, tuple(j for j in robot.joints if j.parent == link.name))
+        for link in robot.links
+    }
+    return {roots[0]: links[roots[0]], **links}
+
+
+def _walk(
+    links: Mapping[str, _Link], dropped: Set[str], kept: Collection[str], locked: Mapping[str, float], where: str
+) -> _Found:
+    """Go through the tree from its root, the first of the links, and merge what is fixed together."""
+    root = next(iter(links))
+    found = _Found()
+    stack: list[tuple[str, str | None, Matrix]] = [(root, None, np.eye(4))]
+    while stack:
+        link, carrier, at = stack.pop()
+        found.frames[link] = (carrier, at)
+        inertial = links[link].inertial
+        if inertial is not None and inertial.mass:
+            origin = np.eye(4) if inertial.origin is None else np.asarray(inertial.origin, float)
+            tensor = np.zeros((3, 3)) if inertial.inertia is None else np.asarray(inertial.inertia, float)
+            body = Inertia.of(float(inertial.mass), np.zeros(3), tensor)
+            found.bodies.setdefault(carrier, []).append(body.moved(Placement.of(at @ origin)))
+        for joint in links[link].joints:
+            if joint.child in dropped:
+                continue
+            origin = np.eye(4) if joint.origin is None else np.asarray(joint.origin, float)
+            if joint.name in kept:
+                found.joints[joint.name] = (carrier, at @ origin, joint)
+                stack.append((joint.child, joint.name, np.eye(4)))
+            else:
+                stack.append((joint.child, carrier, at @ origin @ _locked_motion(joint, locked)))
+    loose = sorted(set(links) - set(found.frames) - dropped)
+    if loose:
+        raise ModelError(f"link '{loose[0]}' does not hang on '{root}'", where=where, allowed="one tree")
+    return found
+
+
+def _parents_first(joints: Mapping[str, tuple[str | None, Matrix, Any]], wanted: Sequence[str]) -> list[str]:
+    """The joints in the wanted order as far as parents come first."""
+    order: list[str] = []
+    waiting = [name for name in dict.fromkeys(wanted) if name in joints]
+    while waiting:
+        ready = next(name for name in waiting if joints[name][0] is None or joints[name][0] in order)
+        order.append(ready)
+        waiting.remove(ready)
+    return order
+
+
+def _joint(source: Any, parent: int, placement: Placement, bodies: tuple[Inertia, ...]) -> Joint:
+    """The file's joint with its limits, infinite where there are none."""
+    limit = source.limit
+    axis = snapped(_unit_axis(source))
+    continuous = source.type == "continuous" or limit is None
+
+    def bound(value: float | None, otherwise: float) -> float:
+        return otherwise if value is None or abs(value) >= UNLIMITED else float(value)
+
+    return Joint(
+        source.name,
+        "prismatic" if source.type == "prismatic" else "revolute",
+        parent,
+        placement,
+        (float(axis[0]), float(axis[1]), float(axis[2])),
+        bodies,
+        -math.inf if continuous else bound(limit.lower, -math.inf),
+        math.inf if continuous else bound(limit.upper, math.inf),
+        math.inf if limit is None else bound(limit.effort, math.inf),
+        math.inf if limit is None else bound(limit.velocity, math.inf),
+    )
 
 
 def _locked_motion(joint: Any, locked: Mapping[str, float]) -> Matrix:
@@ -236,13 +287,10 @@ def _locked_motion(joint: Any, locked: Mapping[str, float]) -> Matrix:
     axis = _unit_axis(joint)
     if joint.type == "prismatic":
         return transform(np.eye(3), value * axis)
-    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    return transform(np.eye(3) + math.sin(value) * cross + (1 - math.cos(value)) * cross @ cross, np.zeros(3))
+    return transform(turn(axis, math.sin(value), math.cos(value)), np.zeros(3))
 
 
-def _with_all_below(
-    without: Sequence[str], links: Mapping[str, Any], children: Mapping[str, Sequence[Any]], where: str
-) -> set[str]:
+def _with_all_below(without: Sequence[str], links: Mapping[str, _Link], where: str) -> set[str]:
     found: set[str] = set()
     waiting = list(without)
     while waiting:
@@ -250,7 +298,7 @@ def _with_all_below(
         if link not in links:
             raise ModelError(f"there is no link '{link}' to leave out", where=where, hint=nearest(link, links))
         found.add(link)
-        waiting += [joint.child for joint in children.get(link, ())]
+        waiting += [joint.child for joint in links[link].joints]
     return found
 
 
@@ -266,14 +314,7 @@ def urdf_text(mechanism: Mechanism, values: Mapping[str, float] | None = None) -
     `read_urdf(..., parametric=False)` gives the same numbers to 1e-12.
     """
     mechanism = mechanism.numeric(values)
-
-    def text(values: Iterable[float]) -> str:
-        return " ".join(f"{0.0 if abs(v) < 1e-16 else v:.17g}" for v in values)
-
-    def origin(element: ElementTree.Element, placement: Placement) -> None:
-        rotation = np.array(ca.DM(placement.rotation))
-        translation = np.array(ca.DM(placement.translation)).ravel()
-        ElementTree.SubElement(element, "origin", xyz=text(translation), rpy=text(_angles(rotation)))
+    robot = ElementTree.Element("robot", name=mechanism.name)
 
     def link_name(wanted: str, joint: int) -> str:
         frame = mechanism.frames.get(wanted)
@@ -282,41 +323,11 @@ def urdf_text(mechanism: Mechanism, values: Mapping[str, float] | None = None) -
         same = frame.joint == joint and np.array_equal(np.array(ca.DM(frame.placement.matrix())), np.eye(4))
         return wanted if same else link_name(f"{wanted}_", joint)
 
-    def bounded(value: float) -> float:
-        return max(-UNLIMITED, min(value, UNLIMITED))
-
-    robot = ElementTree.Element("robot", name=mechanism.name)
     links = [link_name("world", -1)] + [link_name(f"{joint.name}_link", i) for i, joint in enumerate(mechanism.joints)]
     ElementTree.SubElement(robot, "link", name=links[0])
     for i, joint in enumerate(mechanism.joints):
-        link = ElementTree.SubElement(robot, "link", name=links[i + 1])
-        body = merged(joint.bodies)
-        if body is not None:
-            inertial = ElementTree.SubElement(link, "inertial")
-            ElementTree.SubElement(inertial, "origin", xyz=text(np.array(ca.DM(body.com)).ravel()), rpy="0 0 0")
-            ElementTree.SubElement(inertial, "mass", value=text([float(body.mass)]))
-            tensor = np.array(ca.DM(body.about_com))
-            keys = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
-            ElementTree.SubElement(inertial, "inertia", {k: text([tensor[ij]]) for k, ij in keys.items()})
-        limits = {
-            key: text([bounded(value)])
-            for key, value in (
-                ("lower", joint.lower),
-                ("upper", joint.upper),
-                ("effort", joint.effort_limit),
-                ("velocity", joint.velocity_limit),
-            )
-        }
-        kind: str = joint.kind
-        if kind == "revolute" and math.isinf(joint.lower) and math.isinf(joint.upper):
-            kind, limits = "continuous", {key: limits[key] for key in ("effort", "velocity")}
-        element = ElementTree.SubElement(robot, "joint", name=joint.name, type=kind)
-        origin(element, joint.placement)
-        ElementTree.SubElement(element, "parent", link=links[joint.parent + 1])
-        ElementTree.SubElement(element, "child", link=links[i + 1])
-        ElementTree.SubElement(element, "axis", xyz=text(joint.axis))
-        if kind != "continuous" or math.isfinite(joint.effort_limit) or math.isfinite(joint.velocity_limit):
-            ElementTree.SubElement(element, "limit", limits)
+        _write_link(robot, links[i + 1], joint)
+        _write_joint(robot, joint, links[joint.parent + 1], links[i + 1])
     for name, frame in mechanism.frames.items():
         if name in links:
             continue
@@ -325,8 +336,49 @@ def urdf_text(mechanism: Mechanism, values: Mapping[str, float] | None = None) -
         while fixed in mechanism.joint_names:
             fixed += "_"
         element = ElementTree.SubElement(robot, "joint", name=fixed, type="fixed")
-        origin(element, frame.placement)
-        ElementTree.SubElement(element, "parent", link=links[frame.joint + 1])
-        ElementTree.SubElement(element, "child", link=name)
+        _connect(element, frame.placement, links[frame.joint + 1], name)
     ElementTree.indent(robot)
     return ElementTree.tostring(robot, encoding="unicode") + "\n"
+
+
+def _write_link(robot: ElementTree.Element, name: str, joint: Joint) -> None:
+    """The link that a joint moves, with the joint's bodies merged."""
+    link = ElementTree.SubElement(robot, "link", name=name)
+    body = merged(joint.bodies)
+    if body is None:
+        return
+    inertial = ElementTree.SubElement(link, "inertial")
+    ElementTree.SubElement(inertial, "origin", xyz=_digits(np.array(ca.DM(body.com)).ravel()), rpy="0 0 0")
+    ElementTree.SubElement(inertial, "mass", value=_digits([float(body.mass)]))
+    tensor = np.array(ca.DM(body.about_com))
+    keys = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
+    ElementTree.SubElement(inertial, "inertia", {key: _digits([tensor[ij]]) for key, ij in keys.items()})
+
+
+def _write_joint(robot: ElementTree.Element, joint: Joint, parent: str, child: str) -> None:
+    values = {
+        "lower": joint.lower,
+        "upper": joint.upper,
+        "effort": joint.effort_limit,
+        "velocity": joint.velocity_limit,
+    }
+    limits = {key: _digits([max(-UNLIMITED, min(value, UNLIMITED))]) for key, value in values.items()}
+    kind: str = joint.kind
+    if kind == "revolute" and math.isinf(joint.lower) and math.isinf(joint.upper):
+        kind, limits = "continuous", {key: limits[key] for key in ("effort", "velocity")}
+    element = ElementTree.SubElement(robot, "joint", name=joint.name, type=kind)
+    _connect(element, joint.placement, parent, child)
+    ElementTree.SubElement(element, "axis", xyz=_digits(joint.axis))
+    if kind != "continuous" or math.isfinite(joint.effort_limit) or math.isfinite(joint.velocity_limit):
+        ElementTree.SubElement(element, "limit", limits)
+
+
+def _connect(element: ElementTree.Element, placement: Placement, parent: str, child: str) -> None:
+    rotation, translation = np.array(ca.DM(placement.rotation)), np.array(ca.DM(placement.translation)).ravel()
+    ElementTree.SubElement(element, "origin", xyz=_digits(translation), rpy=_digits(angles_of(rotation)))
+    ElementTree.SubElement(element, "parent", link=parent)
+    ElementTree.SubElement(element, "child", link=child)
+
+
+def _digits(values: Iterable[float]) -> str:
+    return " ".join(f"{0.0 if abs(v) < 1e-16 else v:.17g}" for v in values)

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.integrator.codegen import Mapped
+from yid_ocp.integrator.mapped import Mapped
 from yid_ocp.integrator.step import Feedback
 from yid_ocp.model.system import RecordedEffect, System
 from yid_ocp.parallel import Once

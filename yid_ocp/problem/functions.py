@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.integrator.codegen import Mapped
 from yid_ocp.integrator.lqr import MomentumShift
+from yid_ocp.integrator.mapped import Mapped
 from yid_ocp.integrator.statics import Rest, Statics
 from yid_ocp.integrator.step import Step
 from yid_ocp.parallel import Once
