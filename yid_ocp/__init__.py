@@ -108,12 +108,7 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
-        from importlib import metadata
-
-        try:
-            return metadata.version("yid-ocp")
-        except metadata.PackageNotFoundError:
-            return "0+unknown"
+        return import_module(f"{__name__}.files").package_version()
     if name in _MODULE_OF:
         return getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
     raise AttributeError(f"module '{__name__}' has no attribute '{name}'")

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, hashes of files and of plain data, and plain data for JSON."""
+"""Files that appear whole or not at all, hashes of files and of plain data, plain data for JSON, the version."""
 
 from __future__ import annotations
 
@@ -9,12 +9,21 @@ import math
 import os
 import secrets
 from collections.abc import Iterator, Mapping
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from yid_ocp.errors import DataError, OutputError
+
+
+def package_version() -> str:
+    """Version of this package, `0+unknown` where it is not installed."""
+    try:
+        return metadata.version("yid-ocp")
+    except metadata.PackageNotFoundError:
+        return "0+unknown"
 
 
 @contextlib.contextmanager

@@ -32,7 +32,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from yid_ocp.errors import OutputError
-from yid_ocp.files import content_hash, file_sha256, reason, write_json
+from yid_ocp.files import content_hash, file_sha256, package_version, reason, write_json
 
 FORMAT = "yid-task/1"
 log = logging.getLogger(__name__)
@@ -205,12 +205,10 @@ def task_input(function: Function, task: Task) -> dict[str, Any]:
     DataError
         A file that cannot be read.
     """
-    from yid_ocp import __version__
-
     if "<" in function.__qualname__:
         raise ValueError(f"{function.__qualname__} does not stand at the top of a module")
     name = f"{function.__module__}.{function.__qualname__}"
-    return {"function": name, "version": __version__, "arguments": _described(task.arguments)}
+    return {"function": name, "version": package_version(), "arguments": _described(task.arguments)}
 
 
 def _described(value: Any) -> Any:
