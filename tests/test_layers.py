@@ -37,21 +37,6 @@ LAYERS = (
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
 
-# Files that still import each other. A pair whose circle is gone has to leave this list, and none may join it.
-KNOWN_CIRCLES: frozenset[tuple[str, str]] = frozenset(
-    {
-        # corrections names the problem's types while the problem calls corrections
-        ("problem.corrections", "problem.problem"),
-        # each section takes its base from the package, which imports every section to register it
-        ("report.sections", "report.sections.diagnosis"),
-        ("report.sections", "report.sections.fit"),
-        ("report.sections", "report.sections.identifiability"),
-        ("report.sections", "report.sections.inputs"),
-        ("report.sections", "report.sections.search"),
-        ("report.sections", "report.sections.summary"),
-    }
-)
-
 
 def dotted(path: Path) -> tuple[list[str], list[str]]:
     """Name of a module and of the package that it stands in, without `yid_ocp`."""
@@ -130,9 +115,8 @@ def inner(target: str) -> str:
     return target.removeprefix(f"{NAME}.") if target.startswith(f"{NAME}.") else ""
 
 
-def circles(graph: Mapping[str, Set[str]], allowed: Set[tuple[str, str]] = frozenset()) -> list[list[str]]:
-    """Groups of files that import each other, after the two edges of every allowed pair are taken out."""
-    edges = {a: {b for b in to if tuple(sorted((a, b))) not in allowed} for a, to in graph.items()}
+def circles(edges: Mapping[str, Set[str]]) -> list[list[str]]:
+    """Groups of files that import each other."""
 
     def reached(start: str) -> set[str]:
         seen: set[str] = set()
@@ -191,12 +175,7 @@ def graph() -> dict[str, set[str]]:
 
 
 def test_no_two_files_import_each_other(graph: dict[str, set[str]]) -> None:
-    assert circles(graph, KNOWN_CIRCLES) == []
-
-
-@pytest.mark.parametrize("pair", sorted(KNOWN_CIRCLES), ids=" and ".join)
-def test_the_known_circles_are_still_there(graph: dict[str, set[str]], pair: tuple[str, str]) -> None:
-    assert any(set(pair) <= set(group) for group in circles(graph)), "open by now: take it off KNOWN_CIRCLES"
+    assert circles(graph) == []
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: ".".join(dotted(path)[0]))
@@ -272,12 +251,6 @@ def test_the_check_for_circles_itself(files: dict[str, str], groups: list[list[s
     packages = {name: [name] if f"{name}.x" in files else [name.split(".")[0]] for name in files}
     graph = {name: neighbours(source, packages[name], set(files)) for name, source in files.items()}
     assert circles(graph) == groups
-
-
-def test_an_allowed_pair_hides_no_other_circle() -> None:
-    graph = {"x": {"y"}, "y": {"x", "z"}, "z": {"x"}}
-    assert circles(graph, {("x", "y")}) == []
-    assert circles({**graph, "x": {"y", "z"}}, {("x", "y")}) == [["x", "z"]]
 
 
 @pytest.mark.parametrize(

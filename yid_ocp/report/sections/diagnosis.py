@@ -17,7 +17,7 @@ from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.prediction import EpisodeResult
 from yid_ocp.report import figures
 from yid_ocp.report.figures import Change, Curve, Ranked, Row
-from yid_ocp.report.sections import Findings, section
+from yid_ocp.report.sections.base import Findings, section
 
 Array = NDArray[np.float64]
 

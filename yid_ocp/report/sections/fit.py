@@ -10,7 +10,7 @@ import numpy as np
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.prediction import EpisodeResult
 from yid_ocp.report import figures
-from yid_ocp.report.sections import Findings, section
+from yid_ocp.report.sections.base import Findings, section
 from yid_ocp.report.tables import held_out_rows, medians
 from yid_ocp.sensors import Sensor
 

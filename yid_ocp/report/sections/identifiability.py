@@ -7,7 +7,7 @@ from typing import Any
 
 from yid_ocp.analysis.profile import LEVEL
 from yid_ocp.report import figures
-from yid_ocp.report.sections import Findings, section
+from yid_ocp.report.sections.base import Findings, section
 from yid_ocp.solvers.words import VERDICT_WORDS
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from yid_ocp.report.sections import Findings, section
+from yid_ocp.report.sections.base import Findings, section
 
 
 @section("inputs", 90, "What it was made from")

@@ -1,0 +1,97 @@
+"""What every report section has in common: what it is told, how it registers, how it is drawn.
+
+A section's function turns `Findings` into what its template needs, or into None where it has nothing to say.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.prediction import EpisodeResult
+from yid_ocp.registry import Registry
+from yid_ocp.solvers import Solution
+
+if TYPE_CHECKING:
+    import jinja2
+
+
+@dataclass(frozen=True)
+class Findings:
+    """All that a report can be about.
+
+    Attributes
+    ----------
+    name, description : str
+        Of the run.
+    result : mapping
+        Contents of result.json; `format` says of which command.
+    problem : EstimationProblem, optional
+    solution : Solution, optional
+    held_out : sequence of (Episode, EpisodeResult or text)
+    more : mapping
+        Whatever else a command's own sections need.
+    """
+
+    name: str
+    description: str
+    result: Mapping[str, Any]
+    problem: EstimationProblem | None = None
+    solution: Solution | None = None
+    held_out: Sequence[tuple[Episode, EpisodeResult | str]] = ()
+    more: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def episodes(self) -> list[tuple[str, Episode, EpisodeResult]]:
+        """Role (estimate, held_out), episode and prediction of all that could be predicted."""
+        found: list[tuple[str, Episode, EpisodeResult]] = []
+        if self.problem is not None and self.solution is not None and self.solution.evaluation is not None:
+            done = self.solution.evaluation.episodes
+            found += [("estimate", e, r) for e, r in zip(self.problem.episodes, done, strict=True)]
+        return found + [("held_out", e, r) for e, r in self.held_out if not isinstance(r, str)]
+
+
+Prepare = Callable[[Findings], Mapping[str, Any] | None]
+
+
+@dataclass(frozen=True)
+class Section:
+    """One part of the page: place, heading and the function that prepares its template."""
+
+    order: int
+    title: str
+    prepare: Prepare
+
+    @property
+    def folder(self) -> Path:
+        """Where a template may stand beside the function; those of the package have a folder of their own."""
+        return Path(inspect.getfile(self.prepare)).parent
+
+
+SECTIONS: Registry[Section] = Registry("report section")
+
+
+def section(name: str, order: int, title: str) -> Callable[[Prepare], Prepare]:
+    """Register a function as the section `name`, drawn by the template `NAME.html`, lower orders first."""
+
+    def enter(prepare: Prepare) -> Prepare:
+        SECTIONS.register(name)(Section(order, title, prepare))
+        return prepare
+
+    return enter
+
+
+def written_sections(findings: Findings, environment: jinja2.Environment) -> list[dict[str, str]]:
+    """The sections that have something to say: name, title and HTML, in order."""
+    result = []
+    for name in sorted(SECTIONS, key=lambda entry: SECTIONS[entry].order):
+        context = SECTIONS[name].prepare(findings)
+        if context is not None:
+            html = environment.get_template(f"{name}.html").render(context)
+            result.append({"name": name, "title": SECTIONS[name].title, "html": html})
+    return result
