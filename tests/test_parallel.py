@@ -280,11 +280,11 @@ if __name__ == "__main__":
 """
 
 
-def begun(folder: Path, count: int) -> None:
-    """Wait until so many tasks began."""
+def wait_for(folder: Path, pattern: str, count: int) -> None:
+    """Wait until there are so many files."""
     until = time.monotonic() + 60
-    while len(list(folder.glob("*.begun"))) < count:
-        assert time.monotonic() < until, "the tasks do not begin"
+    while len(list(folder.glob(pattern))) < count:
+        assert time.monotonic() < until, f"there is no {pattern}"
         time.sleep(0.05)
 
 
@@ -314,7 +314,8 @@ def gone(processes: set[int]) -> bool:
 def test_an_interrupted_or_killed_run_leaves_its_results_and_no_process(tmp_path, how):
     (tmp_path / "sleepers.py").write_text(textwrap.dedent(SLEEPERS))
     process = subprocess.Popen([sys.executable, str(tmp_path / "sleepers.py"), str(tmp_path)])
-    begun(tmp_path, 2 if (os.cpu_count() or 1) > 1 else 1)
+    wait_for(tmp_path, "results/*.json", 1)
+    wait_for(tmp_path, "*.begun", 2)
     workers = workers_of(process.pid)
     assert workers
     process.send_signal(how)
