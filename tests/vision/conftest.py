@@ -13,7 +13,17 @@ import pytest
 from yid_ocp.data.hdf5 import read_recording
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.errors import DataError
-from yid_ocp.vision import DepthCamera, FrameTiming, TrackOptions, look_at, read_frames, track, virtual_frames
+from yid_ocp.vision import (
+    DepthCamera,
+    FrameTiming,
+    Scene,
+    TrackOptions,
+    VirtualCamera,
+    look_at,
+    read_frames,
+    track,
+    virtual_frames,
+)
 from yid_ocp.vision.fit import ShapeFit
 from yid_ocp.vision.frames import open3d_module
 
@@ -56,7 +66,7 @@ def shape(system):
 @pytest.fixture(scope="session")
 def run(system):
     """Three seconds in MuJoCo."""
-    pytest.importorskip("mujoco", reason="virtual films need MuJoCo")
+    pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo")
     from yid_ocp.virtual.engine import Simulation, simulate_in_mujoco
     from yid_ocp.virtual.motion import Excitation, multisine
     from yid_ocp.virtual.posture import initial_posture
@@ -80,10 +90,12 @@ def tracked(system, run, recording, shape):
 
     def make(options=None, outliers=0.0, seed=0, frames=None, stages=(), **timing):
         when = FrameTiming(**{"rate": 4.0, "latency": LATENCY, **timing})
-        made = virtual_frames(system, run.t, run.q, POSE, camera=DepthCamera(outliers=outliers), timing=when, seed=seed)
+        scene = Scene(system, "package:baxter")
+        camera = VirtualCamera(POSE, DepthCamera(outliers=outliers), when, seed=seed)
+        made = virtual_frames(scene, run.t, run.q, camera)
         seen = made.sequence if frames is None else made.sequence.select(frames)
         chosen = replace(options or TrackOptions(), points=system.points)
-        found = track(system, recording, seen, urdf="package:baxter", options=chosen, stages=stages)
+        found = track(scene, recording, seen, chosen, stages=stages)
         were = np.array([shape.place(made.course(t)) for t in found.t])
         errors = np.linalg.norm(found.position - were, axis=2)
         return SimpleNamespace(made=made, track=found, latency=when.latency, errors=errors)

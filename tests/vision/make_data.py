@@ -16,7 +16,16 @@ from yid_ocp.virtual.engine import Simulation, simulate_in_mujoco
 from yid_ocp.virtual.experiment import paper_system
 from yid_ocp.virtual.motion import Excitation, multisine
 from yid_ocp.virtual.posture import initial_posture
-from yid_ocp.vision import FilterOptions, FrameSequence, FrameTiming, look_at, virtual_frames, write_frames
+from yid_ocp.vision import (
+    FilterOptions,
+    FrameSequence,
+    FrameTiming,
+    Scene,
+    VirtualCamera,
+    look_at,
+    virtual_frames,
+    write_frames,
+)
 from yid_ocp.vision.filters import ObjectRegion, voxel_grid, without_outliers, without_robot
 from yid_ocp.vision.fit import ShapeFit
 from yid_ocp.vision.meshes import Surfaces, numeric_mechanism, robot_meshes
@@ -30,9 +39,8 @@ def main() -> None:
     posture = initial_posture(system)
     motion = multisine(system, seed=1, posture=posture, excitation=Excitation(travel=0.15))
     run = simulate_in_mujoco(system, None, motion, Simulation(1.5, time_step=2.5e-4), posture=posture)
-    made = virtual_frames(
-        system, run.t, run.q, look_at([2.6, 0.0, 0.45], [0.85, 0.0, -0.1]), timing=FrameTiming(rate=2.7), seed=5
-    )
+    camera = VirtualCamera(look_at([2.6, 0.0, 0.45], [0.85, 0.0, -0.1]), timing=FrameTiming(rate=2.7), seed=5)
+    made = virtual_frames(Scene(system, "package:baxter"), run.t, run.q, camera)
     tree = numeric_mechanism(system)
     robot = Surfaces(tree, robot_meshes("package:baxter", tree))
     region = ObjectRegion(system, FilterOptions())

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.errors import ConfigError, DataError
-from yid_ocp.vision import Background, DepthCamera, FrameTiming, look_at, virtual_frames
+from yid_ocp.vision import Background, DepthCamera, FrameTiming, Scene, VirtualCamera, look_at, virtual_frames
 
 SHAPE = (480, 640)
 
@@ -62,7 +62,7 @@ def test_outliers_are_as_many_as_asked_for():
     assert (np.abs(seen - 2.0) > 0.04).mean() == pytest.approx(0.2 * 0.9, abs=0.02)
 
 
-def test_the_shutter():
+def test_frame_timing():
     rng = np.random.default_rng(0)
     when = FrameTiming(rate=10.0, spread=0.25, dropped=1 / 3, latency=0.05, latency_std=0.002, late=0.1, late_by=0.2)
     taken, stamps = when.times(0.0, 300.0, rng)
@@ -74,10 +74,10 @@ def test_the_shutter():
         FrameTiming(rate=0.0).times(0.0, 1.0, rng)
 
 
-def test_a_film_is_the_same_every_time(system, run):
+def test_virtual_frames_are_the_same_every_time(system, run):
     pose = look_at([2.6, 0.0, 0.45], [0.85, 0.0, -0.1])
-    options = {"urdf": None, "background": Background(None, None), "timing": FrameTiming(rate=2.0)}
-    one, two = (virtual_frames(system, run.t, run.q, pose, seed=seed, **options) for seed in (3, 4))
+    camera = VirtualCamera(pose, timing=FrameTiming(rate=2.0), background=Background(None, None))
+    one, two = (virtual_frames(Scene(system), run.t, run.q, replace(camera, seed=seed)) for seed in (3, 4))
     first = one.sequence.load(1)
     one.sequence.load(0)
     assert np.array_equal(first, one.sequence.load(1))
@@ -91,4 +91,4 @@ def test_a_film_is_the_same_every_time(system, run):
     assert np.median(away) < 0.006
     assert len(away) > 5000
     with pytest.raises(DataError, match="pose of the camera is missing"):
-        virtual_frames(system, run.t, run.q, None, **options)
+        virtual_frames(Scene(system), run.t, run.q, replace(camera, pose=None))

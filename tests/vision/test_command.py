@@ -88,7 +88,7 @@ def test_wrong_input_is_said_and_leaves_nothing(cli, config, tmp_path, settings,
 
 @pytest.mark.parametrize("name", ["track_single_arm", "track_dual_arm"])
 def test_the_examples_run(cli, repository, tmp_path, name):
-    pytest.importorskip("mujoco", reason="virtual films need MuJoCo")
+    pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo")
     file = repository / "configs" / f"{name}.yaml"
     short = ("duration=1.2", "rate=2.5", "dropped=0.0")
     arguments = [part for setting in short for part in ("--set", f"track.virtual.{setting}")]

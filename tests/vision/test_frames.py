@@ -48,7 +48,7 @@ def test_look_at_puts_the_target_ahead():
     assert POSE[2, 1] < 0  # y points down
 
 
-def test_a_film_survives_the_disk(folder):
+def test_a_sequence_survives_the_disk(folder):
     sequence = read_frames(folder)
     assert np.array_equal(sequence.t, [0.5, 0.9])
     assert np.allclose(sequence.pose, POSE)

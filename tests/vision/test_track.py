@@ -9,7 +9,7 @@ from matplotlib.image import imread
 from yid_ocp.data.hdf5 import read_recording, write_recording
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import ConfigError, DataError, ModelError
-from yid_ocp.vision import ClockOptions, FilterOptions, FrameSequence, TrackOptions, track
+from yid_ocp.vision import ClockOptions, FilterOptions, FrameSequence, Scene, TrackOptions, track
 from yid_ocp.vision.pictures import STAGES, draw_stages, draw_track
 
 MILLIMETRE = 1e-3
@@ -33,7 +33,7 @@ def test_a_third_of_the_frames_lost_and_a_fifth_of_the_points_wrong(tracked):
     assert np.nanmax(hard.errors) < 40 * MILLIMETRE
 
 
-def test_errors_are_within_the_stated_deviations(clean, system):
+def test_errors_are_within_the_stated_standard_deviations(clean, system):
     truth = np.array([clean.track._place(clean.made.course(t)) for t in clean.track.t])
     relative = (clean.track.position - truth) / clean.track.std
     assert np.mean(relative**2) < 1.5
@@ -83,10 +83,10 @@ def test_a_displaced_camera_is_noticed(system, recording, clean):
     sequence = clean.made.sequence.select([1, 4, 6, 8, 9])
     pose = sequence.pose.copy()
     pose[:3, 3] += [0.01, -0.012, 0.006]
-    found = track(system, recording, replace(sequence, pose=pose), urdf="package:baxter")
+    found = track(Scene(system, "package:baxter"), recording, replace(sequence, pose=pose))
     assert found.clock.shift == pytest.approx([-0.01, 0.012, -0.006], abs=0.006)
     assert "the camera sees the arm" in found.clock.message
-    # and the points' deviations say so
+    # and so are the points' standard deviations
     truth = np.array([found._place(clean.made.course(t)) for t in found.t])[:, [0, 2]]
     assert np.mean(((found.position - truth) / found.std) ** 2) < 1.5
 
@@ -95,9 +95,7 @@ def test_without_motion_the_offset_is_as_given(system, clean, small):
     joints = small.recording.joints
     still = replace(joints, position=np.tile(joints.position[:1], (len(joints.t), 1)))
     sequence = clean.made.sequence.select([0, 1, 2])
-    found = track(
-        system, Recording(still), sequence, urdf="package:baxter", options=TrackOptions(d_max=0.05, worse=10.0)
-    )
+    found = track(Scene(system, "package:baxter"), Recording(still), sequence, TrackOptions(d_max=0.05, worse=10.0))
     assert not found.clock.estimated
     assert found.clock.offset == 0.0
     assert "as given: the arm hardly moves" in found.clock.message
@@ -125,10 +123,10 @@ def test_a_recording_that_solve_reads(tmp_path, clean, recording, system):
 
 
 def test_the_points_are_those_that_no_arm_holds(system, small):
-    found = track(system, small.recording, small.sequence)
+    found = track(Scene(system), small.recording, small.sequence)
     assert found.names == ("w_T1", "w_T3")
     with pytest.raises(ConfigError, match="no point 'w_T9'"):
-        track(system, small.recording, small.sequence, options=TrackOptions(points=("w_T9",)))
+        track(Scene(system), small.recording, small.sequence, TrackOptions(points=("w_T9",)))
 
 
 def test_the_spline_passes_through_the_good_frames(clean, system):
@@ -153,16 +151,21 @@ def test_pictures_of_every_stage(clean, tmp_path):
         assert image[..., :3].std() > 0.01
 
 
-def test_progress_is_told(system, small):
-    told = []
-    track(system, small.recording, small.sequence, progress=lambda done, total, text: told.append((done, total, text)))
-    assert [done for done, _, _ in told] == sorted(done for done, _, _ in told)
-    assert told[-1] == (6, 6, "done")
-    assert told[0][2] == "reading 000000.ply"
+def test_progress_is_reported(system, small):
+    calls = []
+    track(
+        Scene(system),
+        small.recording,
+        small.sequence,
+        progress=lambda done, total, text: calls.append((done, total, text)),
+    )
+    assert [done for done, _, _ in calls] == sorted(done for done, _, _ in calls)
+    assert calls[-1] == (6, 6, "done")
+    assert calls[0][2] == "reading 000000.ply"
 
 
-def test_a_small_film_from_disk(system, small):
-    found = track(system, small.recording, small.sequence, options=TrackOptions(points=system.points))
+def test_a_small_sequence_from_disk(system, small):
+    found = track(Scene(system), small.recording, small.sequence, TrackOptions(points=system.points))
     errors = np.linalg.norm(found.position - small.truth, axis=2)
     assert errors.max() < 8 * MILLIMETRE
     assert [frame.raw for frame in found.frames] == [len(cloud) for cloud in small.clouds]
@@ -189,7 +192,7 @@ def spoilt(small, **changes):
     ],
 )
 def test_one_bad_cloud_does_not_stop_the_rest(system, small, cloud, reason):
-    found = track(system, small.recording, spoilt(small, cloud1=cloud(small.clouds[1])))
+    found = track(Scene(system), small.recording, spoilt(small, cloud1=cloud(small.clouds[1])))
     assert [frame.good for frame in found.frames] == [True, False, True]
     assert reason in found.frames[1].reason
     assert len(found.t) == 2
@@ -199,7 +202,7 @@ def test_one_bad_cloud_does_not_stop_the_rest(system, small, cloud, reason):
 def test_random_points_are_no_object(system, small):
     rng = np.random.default_rng(0)
     dust = small.clouds[1] + rng.uniform(-0.3, 0.3, small.clouds[1].shape)
-    found = track(system, small.recording, spoilt(small, cloud1=dust))
+    found = track(Scene(system), small.recording, spoilt(small, cloud1=dust))
     assert not found.frames[1].good
 
 
@@ -214,7 +217,7 @@ def test_random_points_are_no_object(system, small):
 def test_nothing_but_bad_clouds_is_an_error(system, small, cloud, message):
     clouds = {f"cloud{i}": cloud(points) for i, points in enumerate(small.clouds)}
     with pytest.raises(DataError, match="not one frame could be used") as caught:
-        track(system, small.recording, spoilt(small, **clouds))
+        track(Scene(system), small.recording, spoilt(small, **clouds))
     assert message in caught.value.what
     assert caught.value.hint
 
@@ -222,31 +225,31 @@ def test_nothing_but_bad_clouds_is_an_error(system, small, cloud, message):
 def test_all_points_filtered(system, small):
     options = TrackOptions(filters=FilterOptions(lower=(0.0, 0.0, 5.0)))
     with pytest.raises(DataError, match="no point lies where the object can be"):
-        track(system, small.recording, small.sequence, options=options)
+        track(Scene(system), small.recording, small.sequence, options)
 
 
-def test_stamps_out_of_order_twice_or_none_at_all(system, small):
+def test_stamps_out_of_order_duplicated_or_missing(system, small):
     t = small.sequence.t
     clouds = [*small.clouds, small.clouds[0], small.clouds[0]]
     sequence = FrameSequence.of(
         [t[2], t[0], t[1], t[0], np.nan], [clouds[2], *clouds[:2], *clouds[3:]], small.sequence.pose
     )
-    found = track(system, small.recording, sequence)
+    found = track(Scene(system), small.recording, sequence)
     assert np.array_equal(found.t, t)
     assert [frame.index for frame in found.frames] == [1, 3, 2, 0, 4]
     assert "a duplicate" in found.frames[1].reason
     assert "not a number" in found.frames[4].reason
-    straight = track(system, small.recording, small.sequence)
+    straight = track(Scene(system), small.recording, small.sequence)
     assert np.abs(found.position - straight.position).max() < 2 * MILLIMETRE
 
 
 def test_the_time_of_another_clock(system, small):
     with pytest.raises(DataError, match="their clocks are not the same") as caught:
-        track(system, small.recording, spoilt(small, t=small.sequence.t + 1.7e9))
+        track(Scene(system), small.recording, spoilt(small, t=small.sequence.t + 1.7e9))
     assert "give the clock offset" in caught.value.hint
     options = TrackOptions(clock=ClockOptions(offset=1.7e9))
-    assert len(track(system, small.recording, spoilt(small, t=small.sequence.t + 1.7e9), options=options).t) == 3
-    late = track(system, small.recording, spoilt(small, t=[*small.sequence.t[:2], 99.0]))
+    assert len(track(Scene(system), small.recording, spoilt(small, t=small.sequence.t + 1.7e9), options).t) == 3
+    late = track(Scene(system), small.recording, spoilt(small, t=[*small.sequence.t[:2], 99.0]))
     assert late.frames[2].reason == "there are no joint angles at its time"
 
 
@@ -256,19 +259,21 @@ def test_a_file_that_cannot_be_read(system, small):
             raise DataError("the cloud is empty or cannot be read")
         return small.clouds[index]
 
-    found = track(system, small.recording, replace(small.sequence, load=load))
+    found = track(Scene(system), small.recording, replace(small.sequence, load=load))
     assert found.frames[1].reason == "the cloud is empty or cannot be read"
 
 
 def test_a_recording_that_does_not_fit(system, small, urdf_folder):
     joints = small.recording.joints
     with pytest.raises(DataError, match="no joint angles"):
-        track(system, Recording(points=(PointGroup("points", ("a",), [0.0], np.zeros((1, 1, 3))),)), small.sequence)
+        track(
+            Scene(system), Recording(points=(PointGroup("points", ("a",), [0.0], np.zeros((1, 1, 3))),)), small.sequence
+        )
     names = ("left_s9", *joints.names[1:])
     with pytest.raises(DataError, match="joint 'left_s0' of the model is not recorded"):
-        track(system, Recording(JointGroup(names, joints.t, joints.position)), small.sequence)
+        track(Scene(system), Recording(JointGroup(names, joints.t, joints.position)), small.sequence)
     with pytest.raises(ModelError, match="no visual meshes"):
-        track(system, small.recording, small.sequence, urdf=urdf_folder / "double_pendulum.urdf")
+        track(Scene(system, urdf_folder / "double_pendulum.urdf"), small.recording, small.sequence)
     with pytest.raises(DataError, match="pose of the camera is missing"):
         FrameSequence.of([0.0], [small.clouds[0]], None)
     with pytest.raises(ConfigError, match="d_max = 0"):

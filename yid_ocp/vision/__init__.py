@@ -3,6 +3,7 @@
 from yid_ocp.vision.camera import Background as Background
 from yid_ocp.vision.camera import DepthCamera as DepthCamera
 from yid_ocp.vision.camera import FrameTiming as FrameTiming
+from yid_ocp.vision.camera import VirtualCamera as VirtualCamera
 from yid_ocp.vision.camera import VirtualFrames as VirtualFrames
 from yid_ocp.vision.camera import virtual_frames as virtual_frames
 from yid_ocp.vision.clock import Clock as Clock
@@ -16,6 +17,7 @@ from yid_ocp.vision.frames import Pinhole as Pinhole
 from yid_ocp.vision.frames import look_at as look_at
 from yid_ocp.vision.frames import read_frames as read_frames
 from yid_ocp.vision.frames import write_frames as write_frames
+from yid_ocp.vision.meshes import Scene as Scene
 from yid_ocp.vision.skeleton import WalkOptions as WalkOptions
 from yid_ocp.vision.track import FrameReport as FrameReport
 from yid_ocp.vision.track import Track as Track

@@ -12,7 +12,7 @@ Khoshelham & Elberink (2012), Sensors 12:1437, doi:10.3390/s120201437, equations
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,9 +21,8 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
 from yid_ocp.errors import ConfigError
-from yid_ocp.model.system import System
 from yid_ocp.vision.frames import XTION, FrameSequence, Pinhole, checked_pose
-from yid_ocp.vision.meshes import Mesh, Surfaces, numeric_mechanism, robot_meshes, tube_meshes
+from yid_ocp.vision.meshes import Mesh, Scene, Surfaces, numeric_mechanism, robot_meshes, tube_meshes
 
 Array = NDArray[np.float64]
 
@@ -40,7 +39,7 @@ class DepthCamera:
     nearest, furthest : float
         Range of depths that it measures [m].
     disparity_std : float
-        Deviation of the disparity [pixels]; 1/16 gives 6 mm at 2 m.
+        Standard deviation of the disparity [pixels]; 1/16 gives 6 mm at 2 m.
     disparity_step : float
         Step of the disparity [pixels]; 1/8 gives 12 mm at 2 m.
     correlation : float
@@ -75,7 +74,7 @@ class DepthCamera:
     outlier_span: float = 0.4
 
     def depth_std(self, depth: ArrayLike) -> Array:
-        """Deviation of a measured depth, noise and steps together [m]:  z^2/(f b) sqrt(std^2 + step^2/12)."""
+        """Standard deviation of a measured depth, noise and steps together [m]:  z^2/(f b) sqrt(std^2 + step^2/12)."""
         z = np.asarray(depth, float)
         spread = math.hypot(self.disparity_std, self.disparity_step / math.sqrt(12.0))
         return np.asarray(z**2 / (self.pinhole.fx * self.baseline) * spread)
@@ -149,7 +148,7 @@ class FrameTiming:
     latency : float
         By how much every stamp is later than the picture, and the camera's clock ahead, taken together [s].
     latency_std : float
-        Deviation of the latency from frame to frame [s].
+        Standard deviation of the latency from frame to frame [s].
     late : float
         Share of frames that are stamped `late_by` [s] too late.
     late_by : float
@@ -244,41 +243,42 @@ class _Images(Sequence[Array]):
         return self._kept[number]
 
 
-def virtual_frames(
-    system: System,
-    t: ArrayLike,
-    q: ArrayLike,
-    pose: ArrayLike,
-    *,
-    urdf: str | None = "package:baxter",
-    camera: DepthCamera | None = None,
-    timing: FrameTiming | None = None,
-    background: Background | None = None,
-    values: Mapping[str, float] | None = None,
-    seed: int = 0,
-) -> VirtualFrames:
+@dataclass(frozen=True, eq=False)
+class VirtualCamera:
+    """A depth camera, where it stands and when it looks.
+
+    Attributes
+    ----------
+    pose : array_like, shape (4, 4)
+        Camera in the world (x right, y down, z ahead) [m].
+    sensor : DepthCamera
+        An Asus Xtion Pro Live where absent.
+    timing : FrameTiming
+    background : Background, optional
+        A floor under the paper's Y and a wall behind Baxter where absent; nothing where there is no robot either.
+    seed : int
+        Of all that is drawn at random.
+    """
+
+    pose: ArrayLike | None
+    sensor: DepthCamera = field(default_factory=DepthCamera)
+    timing: FrameTiming = field(default_factory=FrameTiming)
+    background: Background | None = None
+    seed: int = 0
+
+
+def virtual_frames(scene: Scene, t: ArrayLike, q: ArrayLike, camera: VirtualCamera) -> VirtualFrames:
     """Let a virtual camera look at a motion.
 
     Parameters
     ----------
-    system : System
+    scene : Scene
+        The object, and the robot whose meshes are seen where a URDF is given.
     t : array_like, shape (N,)
         [s]
     q : array_like, shape (N, n)
         Configurations at these times, from whatever simulator; interpolated by a cubic spline in between.
-    pose : array_like, shape (4, 4)
-        Camera in the world (x right, y down, z ahead) [m].
-    urdf : str, optional
-        File of the robot whose meshes are seen; None to see the object alone.
-    camera : DepthCamera, optional
-        An Asus Xtion Pro Live where absent.
-    timing : FrameTiming, optional
-    background : Background, optional
-        A floor under the paper's Y and a wall behind Baxter where absent; nothing where there is no robot either.
-    values : mapping of str to float, optional
-        Parameter values (lengths, radii); nominal where absent.
-    seed : int
-        Of all that is drawn at random.
+    camera : VirtualCamera
 
     Returns
     -------
@@ -290,17 +290,26 @@ def virtual_frames(
     DataError, ModelError
         No Open3D, no object, a mesh that cannot be read, or a pose that is none.
     """
-    sensor, when = camera or DepthCamera(), timing or FrameTiming()
-    matrix = checked_pose(pose, "sequence")
+    sensor = camera.sensor
+    pose = checked_pose(camera.pose, "sequence")
     times, path = np.asarray(t, float), np.asarray(q, float)
-    rng = np.random.default_rng(seed)
-    taken, stamps = when.times(float(times[0]), float(times[-1]), rng)
+    taken, stamps = camera.timing.times(float(times[0]), float(times[-1]), np.random.default_rng(camera.seed))
     course = CubicSpline(times, path, axis=0)
     configuration = np.asarray(course(taken))
-    tree = numeric_mechanism(system, values)
-    meshes = tube_meshes(system, values)
-    fixed = [] if background is None and urdf is None else [(background or Background()).mesh()]
-    for joint, mesh in (robot_meshes(urdf, tree) if urdf is not None else {}).items():
+    images = _Images(_surfaces(scene, camera.background), sensor, pose, configuration, camera.seed)
+    names = tuple(f"frame {i}" for i in range(len(taken)))
+    made = FrameSequence(
+        stamps, names, pose, lambda i: sensor.pinhole.cloud(images[i]), sensor.pinhole, "virtual camera"
+    )
+    return VirtualFrames(made, taken, configuration, images, lambda at: np.asarray(course(at)))
+
+
+def _surfaces(scene: Scene, background: Background | None) -> Surfaces:
+    """Object, robot and what stands around them."""
+    tree = numeric_mechanism(scene.system, scene.values)
+    meshes = tube_meshes(scene.system, scene.values)
+    fixed = [] if background is None and scene.urdf is None else [(background or Background()).mesh()]
+    for joint, mesh in (robot_meshes(scene.urdf, tree) if scene.urdf is not None else {}).items():
         if joint < 0:
             fixed.append(mesh)
         else:
@@ -308,9 +317,4 @@ def virtual_frames(
     still = [mesh for mesh in fixed if mesh is not None]
     if still:
         meshes[-1] = Mesh.joined(still)
-    images = _Images(Surfaces(tree, meshes), sensor, matrix, configuration, seed)
-    names = tuple(f"frame {i}" for i in range(len(taken)))
-    made = FrameSequence(
-        stamps, names, matrix, lambda i: sensor.pinhole.cloud(images[i]), sensor.pinhole, "virtual camera"
-    )
-    return VirtualFrames(made, taken, configuration, images, lambda at: np.asarray(course(at)))
+    return Surfaces(tree, meshes)

@@ -13,7 +13,7 @@ itself finds those that were stamped late.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -29,16 +29,17 @@ Array = NDArray[np.float64]
 
 _POINTS, _FEW = 1000, 150  # of every frame: for the result, for the first search
 _COARSE = 0.02  # [s]
-_FEWEST = 40  # points that tell anything of a frame
+_FEWEST = 40  # points without which nothing is known of a frame
 _CONTRAST = 0.05  # by which a minimum must be lower than the highest sum, of that
 _NARROWING = (1.0, 0.7, 0.5, 0.35, 0.35)  # of the reach, from iteration to iteration
 _SHARE = 0.3  # of a frame's points must lie on the arm, or they are something else
 _CLEARLY = 0.8  # of the misfit at the common offset, below which a frame's own minimum elsewhere is believed
 _LEAST_LATE = 0.02  # [s]; a stamp that is off by less is like the others
-_SHIFT = 1e-2  # weight, against that of the points, that keeps a shift that they do not tell small
+_SHIFT = 1e-2  # weight, against that of the points, that keeps a shift small which they do not determine
 _NOTED_SHIFT = 0.006  # [m]
 _MEDIAN_SQUARE = 0.4549  # of a normal variable
 _STEP = 0.01  # over which velocities are taken [s]
+_LARGEST_CHANGE = 0.05  # of an offset in one iteration [s]
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ class Clock:
     offset : float
         Stamp minus joint time, latency included [s].
     std : float
-        Its deviation; infinite where it was not estimated [s].
+        Its standard deviation; infinite where it was not estimated [s].
     estimated : bool
     delay : ndarray, shape (M,)
         Each frame's own offset minus the common one [s]; NaN where it cannot be told.
@@ -124,164 +125,204 @@ def estimate_clock(
         With the offset of the options where the arm is not seen or hardly moves.
     """
     chosen = options or ClockOptions()
-    count = len(stamps)
-    nothing = np.full(count, np.nan)
-
-    def taken(reason: str) -> Clock:
+    try:
+        if chosen.search == 0:
+            raise _UndeterminedError("it was not to be estimated")
+        arm, samples = _Arm(robot, posture), {}
+        for i, cloud in enumerate(clouds):
+            points = arm.points_near(cloud, float(stamps[i]), rng, chosen)
+            if points is not None:
+                samples[i] = points
+        if not samples:
+            raise _UndeterminedError("the arm is not in view")
+        return _estimated(arm, samples, stamps, rng, chosen)
+    except _UndeterminedError as reason:
+        nothing = np.full(len(stamps), np.nan)
         text = f"clock offset {1e3 * chosen.offset:.0f} ms as given: {reason}"
         return Clock(chosen.offset, math.inf, False, nothing, nothing, np.zeros(3), text)
 
-    if chosen.search == 0:
-        return taken("it was not to be estimated")
-    steps = math.ceil(chosen.search / _COARSE)
-    coarse = chosen.offset + _COARSE * np.arange(-steps, steps + 1)
-    samples: dict[int, Array] = {}
-    for i, cloud in enumerate(clouds):
-        points = _arm_points(robot, cloud, float(stamps[i]), posture, rng, chosen)
-        if points is not None:
-            samples[i] = points
-    if not samples:
-        return taken("the arm is not in view")
+
+class _UndeterminedError(Exception):
+    """Why the offset cannot be estimated, so that the given one is used."""
+
+
+@dataclass(frozen=True)
+class _OwnOffset:
+    """One frame by itself: its offset [s], mean square of its points' distances there [m^2], how much it says of it."""
+
+    offset: float
+    misfit: float
+    information: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Arm:
+    """The robot's surface along its recorded motion."""
+
+    robot: Surfaces
+    posture: Callable[[float], Array]
+
+    def poses(self, t: float) -> Array:
+        """Poses of the parts, shape (parts, 4, 4)."""
+        return self.robot.poses(self.posture(t))
+
+    def speed(self, t: float) -> float:
+        """Largest component of the velocity of any part's origin [m/s]."""
+        ahead, behind = self.poses(t + _STEP), self.poses(t - _STEP)
+        return float(np.abs((ahead[:, :3, 3] - behind[:, :3, 3]) / (2 * _STEP)).max())
+
+    def points_near(
+        self, cloud: Cloud | None, stamp: float, rng: np.random.Generator, options: ClockOptions
+    ) -> Array | None:
+        """Points of a frame near the moving links, the fastest of them; None for too few."""
+        if cloud is None or len(cloud) < _FEWEST:
+            return None
+        t = stamp - options.offset
+        speed = max(self.speed(t + d) for d in (-options.search, 0.0, options.search))
+        within = options.reach + min(speed * options.search, 0.1)
+        _, _, part = self.robot.closest(cloud.points, self.posture(t), within)
+        near = np.flatnonzero(part >= 0)
+        if len(near) < _FEWEST:
+            return None
+        points = cloud.points[near]
+        before, after = self.poses(t - 0.1)[part[near]], self.poses(t + 0.1)[part[near]]
+        local = np.einsum("nji,nj->ni", before[:, :3, :3], points - before[:, :3, 3])
+        moved = np.einsum("nij,nj->ni", after[:, :3, :3], local) + after[:, :3, 3] - points
+        fastest = np.argsort(-np.linalg.norm(moved, axis=1), kind="stable")[: 2 * _POINTS]
+        return points[rng.choice(fastest, min(_POINTS, len(fastest)), replace=False)]
+
+    def rows(self, points: Array, t: float, reach: float) -> Array:
+        """Linear equations in changes of offset and camera: (rate, normal (3), distance) of each point within reach."""
+        distance, normal, part = self.robot.closest(points, self.posture(t), reach)
+        near = np.flatnonzero(part >= 0)
+        behind, now, ahead = (self.poses(t + d)[part[near]] for d in (-_STEP, 0.0, _STEP))
+        local = np.einsum("nji,nj->ni", now[:, :3, :3], points[near] - now[:, :3, 3])
+        moved = np.einsum("nij,nj->ni", ahead[:, :3, :3] - behind[:, :3, :3], local)
+        velocity = (moved + ahead[:, :3, 3] - behind[:, :3, 3]) / (2 * _STEP)
+        # a later offset takes the surface back along its velocity, away from the point
+        rate = np.einsum("ni,ni->n", normal[near], velocity)
+        return np.column_stack([rate, normal[near], distance[near]])
+
+    def own_offset(
+        self, points: Array, stamp: float, start: float, reach: float, narrowing: Sequence[float]
+    ) -> _OwnOffset:
+        """The offset of one frame, not far from a start."""
+        offset, information = start, 0.0
+        for share in narrowing:
+            rows = self.rows(points, stamp - offset, share * reach)
+            information = float(rows[:, 0] @ rows[:, 0])
+            if information > 0:
+                offset -= float(np.clip(rows[:, 0] @ rows[:, 4] / information, -_LARGEST_CHANGE, _LARGEST_CHANGE))
+        distance = np.full(len(points), reach)
+        last = self.rows(points, stamp - offset, reach)[:, 4]
+        distance[: len(last)] = last
+        on_arm = np.count_nonzero(last < narrowing[-1] * reach)
+        enough = on_arm >= _SHARE * len(points)
+        return _OwnOffset(offset, float(np.mean(distance**2)), information if enough else 0.0)
+
+
+def _estimated(
+    arm: _Arm, samples: Mapping[int, Array], stamps: Array, rng: np.random.Generator, options: ClockOptions
+) -> Clock:
+    """The offset that most frames agree on; `_UndeterminedError` where there is none."""
+    steps = math.ceil(options.search / _COARSE)
+    coarse: Array = options.offset + _COARSE * np.arange(-steps, steps + 1, dtype=float)
+    curves = _coarse_curves(arm, samples, stamps, rng, coarse, options.reach)
+    offset, shift = _lowest(curves, coarse, options), np.zeros(3)
+    usual = sorted(samples)
+    own, information = np.full(len(stamps), np.nan), np.zeros(len(stamps))
+    for narrowing in (_NARROWING, _NARROWING[-2:], _NARROWING[-2:]):
+        chosen = {i: samples[i] for i in usual}
+        offset, shift = _aligned(arm, chosen, stamps, (offset, shift), [share * options.reach for share in narrowing])
+        for i, points in samples.items():
+            moved, stamp = points + shift, float(stamps[i])
+            trial = arm.own_offset(moved, stamp, offset, options.reach, _NARROWING[-3:])
+            lowest = float(coarse[int(np.argmin(curves[i]))])
+            if abs(lowest - offset) > _LEAST_LATE:
+                other = arm.own_offset(moved, stamp, lowest, options.reach, _NARROWING[1:])
+                trial = other if other.misfit < _CLEARLY * trial.misfit else trial
+            own[i], information[i] = trial.offset, trial.information
+        if np.linalg.norm(shift) > options.reach:
+            raise _UndeterminedError("what the camera sees does not lie on the arm")
+        offset, usual = _agreed(own, information, list(samples))
+    return _summary(own, information, usual, offset, shift, options)
+
+
+def _coarse_curves(
+    arm: _Arm, samples: Mapping[int, Array], stamps: Array, rng: np.random.Generator, coarse: Array, reach: float
+) -> dict[int, Array]:
+    """Mean square distance of some points of every frame at the offsets of a coarse grid [m^2]."""
     curves = {}
     for i, points in samples.items():
         few = points[rng.choice(len(points), min(_FEW, len(points)), replace=False)]
         sums = np.empty(len(coarse))
         for k, offset in enumerate(coarse):
-            away = robot.distance(few, posture(stamps[i] - offset), chosen.reach, moving_only=True)
-            sums[k] = np.mean(np.minimum(away, chosen.reach) ** 2)
+            away = arm.robot.distance(few, arm.posture(stamps[i] - offset), reach, moving_only=True)
+            sums[k] = np.mean(np.minimum(away, reach) ** 2)
         curves[i] = sums
+    return curves
+
+
+def _lowest(curves: Mapping[int, Array], coarse: Array, options: ClockOptions) -> float:
+    """The offset of the grid at which all frames together fit best [s]."""
     total = np.sum(list(curves.values()), axis=0)
     best = int(np.argmin(total))
     if total.max() - total.min() < _CONTRAST * total.max():
-        return taken("the arm hardly moves")
+        raise _UndeterminedError("the arm hardly moves")
     if best in (0, len(coarse) - 1):
-        return taken(f"no best offset within {chosen.search:g} s of it; the clocks may differ by more")
-    offset = float(coarse[best])
-    shift: Array = np.zeros(3)
-    usual = sorted(samples)
-    own, information = nothing.copy(), np.zeros(count)
-    for narrowing in (_NARROWING, _NARROWING[-2:], _NARROWING[-2:]):
-        for share in narrowing:
-            reach = share * chosen.reach
-            rows = [_rows(robot, samples[i] + shift, float(stamps[i]) - offset, posture, reach) for i in usual]
-            stacked = np.concatenate(rows)
-            if len(stacked) < _FEWEST:
-                return taken("the arm is not in view")
-            held = np.diag([1e-9, *[len(stacked) * _SHIFT] * 3])
-            gradient = stacked[:, :4].T @ stacked[:, 4] + held @ np.append(0.0, shift)
-            change = np.linalg.solve(stacked[:, :4].T @ stacked[:, :4] + held, -gradient)
-            offset += float(np.clip(change[0], -0.05, 0.05))
-            shift = shift + change[1:]
-        for i, points in samples.items():
-            trial = _own(robot, points + shift, float(stamps[i]), offset, posture, chosen.reach, _NARROWING[-3:])
-            lowest = float(coarse[int(np.argmin(curves[i]))])
-            if abs(lowest - offset) > _LEAST_LATE:
-                other = _own(robot, points + shift, float(stamps[i]), lowest, posture, chosen.reach, _NARROWING[1:])
-                trial = other if other[0] < _CLEARLY * trial[0] else trial
-            _, own[i], information[i] = trial
-        if np.linalg.norm(shift) > chosen.reach:
-            return taken("what the camera sees does not lie on the arm")
-        told = information > 0
-        usual = [i for i in samples if told[i]]
-        if len(usual) < 2:
-            return taken("the arm is hardly in view")
-        # frames that were stamped late must not pull the others
-        offset = weighted_median(own[usual], information[usual])
-        deviation = own - offset
-        variance = float(np.median((information * deviation**2)[usual])) / _MEDIAN_SQUARE
-        limit = np.maximum(_LEAST_LATE, 4 * np.sqrt(variance / np.maximum(information, 1e-12)))
-        usual = [i for i in usual if abs(deviation[i]) < limit[i]]
-        if len(usual) < 2:
-            return taken("the frames do not agree on one")
-    return _summary(own, information, usual, offset, shift, chosen)
+        raise _UndeterminedError(f"no best offset within {options.search:g} s of it; the clocks may differ by more")
+    return float(coarse[best])
+
+
+def _aligned(
+    arm: _Arm, samples: Mapping[int, Array], stamps: Array, start: tuple[float, Array], reaches: Sequence[float]
+) -> tuple[float, Array]:
+    """Offset and shift of the camera by Gauss-Newton steps on all frames, within one reach after the other."""
+    offset, shift = start
+    for reach in reaches:
+        rows = [arm.rows(points + shift, float(stamps[i]) - offset, reach) for i, points in samples.items()]
+        stacked = np.concatenate(rows)
+        if len(stacked) < _FEWEST:
+            raise _UndeterminedError("the arm is not in view")
+        held = np.diag([1e-9, *[len(stacked) * _SHIFT] * 3])
+        gradient = stacked[:, :4].T @ stacked[:, 4] + held @ np.append(0.0, shift)
+        change = np.linalg.solve(stacked[:, :4].T @ stacked[:, :4] + held, -gradient)
+        offset += float(np.clip(change[0], -_LARGEST_CHANGE, _LARGEST_CHANGE))
+        shift = shift + change[1:]
+    return offset, shift
+
+
+def _agreed(own: Array, information: Array, frames: Sequence[int]) -> tuple[float, list[int]]:
+    """Median of the frames' own offsets, and the frames near it: those stamped late must not pull the others."""
+    usual = [i for i in frames if information[i] > 0]
+    if len(usual) < 2:
+        raise _UndeterminedError("the arm is hardly in view")
+    offset = weighted_median(own[usual], information[usual])
+    apart = own - offset
+    variance = float(np.median((information * apart**2)[usual])) / _MEDIAN_SQUARE
+    limit = np.maximum(_LEAST_LATE, 4 * np.sqrt(variance / np.maximum(information, 1e-12)))
+    usual = [i for i in usual if abs(apart[i]) < limit[i]]
+    if len(usual) < 2:
+        raise _UndeterminedError("the frames do not agree on one")
+    return offset, usual
 
 
 def _summary(
     own: Array, information: Array, usual: list[int], offset: float, shift: Array, options: ClockOptions
 ) -> Clock:
-    """Common offset and deviations, from the scatter of the frames' own offsets."""
-    deviation = own[usual] - offset
-    heft = information[usual]
-    # the errors of one frame's points are alike to an unknown degree: how much a frame tells, its scatter must say
-    variance = max(float(np.mean(heft * deviation**2)), 1e-12)
+    """Common offset and standard deviations, from the scatter of the frames' own offsets."""
+    apart = own[usual] - offset
+    weight = information[usual]
+    # the errors of one frame's points are alike to an unknown degree: only the scatter says how much a frame knows
+    variance = max(float(np.mean(weight * apart**2)), 1e-12)
     own_std = np.sqrt(variance / np.maximum(information, 1e-12))
     count = len(usual)
-    offset += float(heft @ deviation / heft.sum())
-    std = math.sqrt(float(heft**2 @ (own[usual] - offset) ** 2) * count / (count - 1)) / float(heft.sum())
+    offset += float(weight @ apart / weight.sum())
+    std = math.sqrt(float(weight**2 @ (own[usual] - offset) ** 2) * count / (count - 1)) / float(weight.sum())
     if not std < options.determined:
-        nothing = np.full(len(own), np.nan)
-        text = f"clock offset {1e3 * options.offset:.0f} ms as given: the arm moves too little to tell"
-        return Clock(options.offset, math.inf, False, nothing, nothing, np.zeros(3), text)
+        raise _UndeterminedError("the arm moves too little to tell")
     own_std = np.where(np.isfinite(own), own_std, np.nan)
     text = f"clock offset {1e3 * offset:.1f} ms ± {1e3 * std:.1f} ms (stamp minus joint time, from {count} frames)"
     if np.linalg.norm(shift) > _NOTED_SHIFT:
         text += f"; the camera sees the arm {1e3 * np.linalg.norm(shift):.0f} mm from where the joints have it"
     return Clock(offset, std, True, own - offset, own_std, shift, text)
-
-
-def _arm_points(
-    robot: Surfaces,
-    cloud: Cloud | None,
-    stamp: float,
-    posture: Callable[[float], Array],
-    rng: np.random.Generator,
-    options: ClockOptions,
-) -> Array | None:
-    """Points of a frame near the moving links, the fastest of them; None for too few."""
-    if cloud is None or len(cloud) < _FEWEST:
-        return None
-    t = stamp - options.offset
-    sweep = max(float(np.abs(_movement(robot, posture, t + d)).max()) for d in (-options.search, 0.0, options.search))
-    within = options.reach + min(sweep * options.search, 0.1)
-    _, _, part = robot.closest(cloud.points, posture(t), within)
-    near = np.flatnonzero(part >= 0)
-    if len(near) < _FEWEST:
-        return None
-    points = cloud.points[near]
-    before, after = robot.poses(posture(t - 0.1))[part[near]], robot.poses(posture(t + 0.1))[part[near]]
-    local = np.einsum("nji,nj->ni", before[:, :3, :3], points - before[:, :3, 3])
-    moved = np.einsum("nij,nj->ni", after[:, :3, :3], local) + after[:, :3, 3] - points
-    fastest = np.argsort(-np.linalg.norm(moved, axis=1), kind="stable")[: 2 * _POINTS]
-    return points[rng.choice(fastest, min(_POINTS, len(fastest)), replace=False)]
-
-
-def _movement(robot: Surfaces, posture: Callable[[float], Array], t: float) -> Array:
-    """Velocity of the parts' origins [m/s], shape (parts, 3)."""
-    ahead, behind = robot.poses(posture(t + _STEP)), robot.poses(posture(t - _STEP))
-    return np.asarray((ahead[:, :3, 3] - behind[:, :3, 3]) / (2 * _STEP))
-
-
-def _own(
-    robot: Surfaces,
-    points: Array,
-    stamp: float,
-    start: float,
-    posture: Callable[[float], Array],
-    reach: float,
-    narrowing: Sequence[float],
-) -> tuple[float, float, float]:
-    """One frame's misfit, its own offset (not far from a start), and how much it tells of it."""
-    offset, information = start, 0.0
-    for share in narrowing:
-        rows = _rows(robot, points, stamp - offset, posture, share * reach)
-        information = float(rows[:, 0] @ rows[:, 0])
-        if information > 0:
-            offset -= float(np.clip(rows[:, 0] @ rows[:, 4] / information, -0.05, 0.05))
-    distance = np.full(len(points), reach)
-    last = _rows(robot, points, stamp - offset, posture, reach)[:, 4]
-    distance[: len(last)] = last
-    lies = np.count_nonzero(last < narrowing[-1] * reach)
-    return float(np.mean(distance**2)), offset, information if lies >= _SHARE * len(points) else 0.0
-
-
-def _rows(robot: Surfaces, points: Array, t: float, posture: Callable[[float], Array], reach: float) -> Array:
-    """Linear equations in a change of offset and a shift of the camera: (rate, normal (3), distance) of each point."""
-    distance, normal, part = robot.closest(points, posture(t), reach)
-    near = np.flatnonzero(part >= 0)
-    behind, now, ahead = (robot.poses(posture(t + d))[part[near]] for d in (-_STEP, 0.0, _STEP))
-    local = np.einsum("nji,nj->ni", now[:, :3, :3], points[near] - now[:, :3, 3])
-    moved = np.einsum("nij,nj->ni", ahead[:, :3, :3] - behind[:, :3, :3], local)
-    velocity = (moved + ahead[:, :3, 3] - behind[:, :3, 3]) / (2 * _STEP)
-    # a later offset takes the surface back along its velocity, away from the point
-    rate = np.einsum("ni,ni->n", normal[near], velocity)
-    return np.column_stack([rate, normal[near], distance[near]])

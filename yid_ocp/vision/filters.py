@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 Triple = tuple[float, float, float]
 Mask = NDArray[np.bool_]
 
-_TO_SIGMA = 1.4826  # from the median absolute deviation of a normal distribution to its deviation
+_TO_SIGMA = 1.4826  # from the median absolute deviation of a normal distribution to its standard deviation
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,8 +228,8 @@ def without_outliers(cloud: Cloud, neighbours: int, ratio: float) -> Mask:
     """Which points have company: statistical outlier removal.
 
     A point stays where the mean distance d to its nearest neighbours satisfies  d <= median(d) + ratio s,  with s the
-    median absolute deviation turned into a standard one. Median and deviation are weighted, so that wrong points, each
-    alone in its voxel, count for little; unlike mean and standard deviation they hardly move with the outliers.
+    median absolute deviation turned into a standard deviation. Both are weighted, so that wrong points, each alone in
+    its voxel, count for little; unlike mean and standard deviation themselves they hardly move with the outliers.
 
     Parameters
     ----------

@@ -243,18 +243,7 @@ def read_frames(
         raise DataError(f"the frame of the clouds is '{frame}'", where=where, allowed="camera, world")
     intrinsics = _intrinsics(head.get("intrinsics"), where)
     names, times = _read_stamps(path / STAMP_FILE)
-    for name in names:
-        if Path(name).suffix.lower() not in (*CLOUD_ENDINGS, DEPTH_ENDING):
-            allowed = ", ".join((*CLOUD_ENDINGS, DEPTH_ENDING))
-            raise DataError(
-                f"'{name}' is neither a cloud nor a depth image", where=str(path / STAMP_FILE), allowed=allowed
-            )
-        if Path(name).suffix.lower() == DEPTH_ENDING and intrinsics is None:
-            raise DataError(
-                "there are depth images but the camera's intrinsics are missing",
-                where=where,
-                hint="add `intrinsics` with width, height, fx, fy, cx, cy [pixels]",
-            )
+    _check_kinds(names, path, intrinsics)
     depth_unit = _number(head.get("depth_unit", 1e-3), "depth_unit", where)
 
     def load(index: int) -> Array:
@@ -329,6 +318,20 @@ def _read_camera(path: Path) -> dict[str, Any]:
     if head.get("format", FORMAT) != FORMAT:
         raise DataError(f"the format of the frames is '{head['format']}'", where=str(path), allowed=FORMAT)
     return head
+
+
+def _check_kinds(names: Sequence[str], folder: Path, intrinsics: Pinhole | None) -> None:
+    for name in names:
+        kind = Path(name).suffix.lower()
+        if kind not in (*CLOUD_ENDINGS, DEPTH_ENDING):
+            what, allowed = f"'{name}' is neither a cloud nor a depth image", ", ".join((*CLOUD_ENDINGS, DEPTH_ENDING))
+            raise DataError(what, where=str(folder / STAMP_FILE), allowed=allowed)
+        if kind == DEPTH_ENDING and intrinsics is None:
+            raise DataError(
+                "there are depth images but the camera's intrinsics are missing",
+                where=str(folder / CAMERA_FILE),
+                hint="add `intrinsics` with width, height, fx, fy, cx, cy [pixels]",
+            )
 
 
 def _intrinsics(entry: object, where: str) -> Pinhole | None:

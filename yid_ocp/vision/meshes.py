@@ -32,6 +32,24 @@ _TOUCHING = 5e-4  # [m]
 _NEAR = 0.05  # [m]; closer than this a box is not projected but taken to fill the image
 
 
+@dataclass(frozen=True)
+class Scene:
+    """Robot and object that a camera looks at.
+
+    Attributes
+    ----------
+    system : System
+    urdf : str or Path, optional
+        File of the robot, for its meshes (`package:baxter`); None for the object alone.
+    values : mapping of str to float, optional
+        Parameter values (lengths, radii, relative stiffnesses); nominal where absent.
+    """
+
+    system: System
+    urdf: str | Path | None = None
+    values: Mapping[str, float] | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class Mesh:
     """Triangles: `vertices` (V, 3) [m], `faces` (F, 3) indices."""
@@ -307,24 +325,27 @@ def robot_meshes(urdf: str | Path, mechanism: Mechanism, kind: MeshKind = "visua
         placement = np.array(ca.DM(frame.placement.matrix()))
         for shape in link.visuals if kind == "visual" else link.collisions:
             origin = np.eye(4) if shape.origin is None else np.asarray(shape.origin, float)
-            geometry = shape.geometry
-            if geometry.box is not None:
-                mesh = Mesh.box(geometry.box.size)
-            elif geometry.cylinder is not None:
-                half = 0.5 * geometry.cylinder.length
-                mesh = Mesh.cylinder(geometry.cylinder.radius, -half, half)
-            elif geometry.sphere is not None:
-                mesh = Mesh.sphere(geometry.sphere.radius)
-            elif geometry.mesh is not None:
-                scale = np.ones(3) if geometry.mesh.scale is None else np.asarray(geometry.mesh.scale, float)
-                loaded = _loaded(mesh_file(geometry.mesh.filename, path))
-                mesh = replace(loaded, vertices=loaded.vertices * scale)
-            else:
-                continue
-            parts.setdefault(frame.joint, []).append(mesh.moved(placement @ origin))
+            mesh = _shape_mesh(shape.geometry, path)
+            if mesh is not None:
+                parts.setdefault(frame.joint, []).append(mesh.moved(placement @ origin))
     if not parts:
         raise ModelError(f"the URDF has no {kind} meshes", where=str(path), hint="choose the other kind")
     return {joint: Mesh.joined(entries) for joint, entries in parts.items()}
+
+
+def _shape_mesh(geometry: Any, urdf: Path) -> Mesh | None:
+    if geometry.box is not None:
+        return Mesh.box(geometry.box.size)
+    if geometry.cylinder is not None:
+        half = 0.5 * geometry.cylinder.length
+        return Mesh.cylinder(geometry.cylinder.radius, -half, half)
+    if geometry.sphere is not None:
+        return Mesh.sphere(geometry.sphere.radius)
+    if geometry.mesh is None:
+        return None
+    scale = np.ones(3) if geometry.mesh.scale is None else np.asarray(geometry.mesh.scale, float)
+    loaded = _loaded(mesh_file(geometry.mesh.filename, urdf))
+    return replace(loaded, vertices=loaded.vertices * scale)
 
 
 @lru_cache(maxsize=64)

@@ -48,9 +48,21 @@ def draw_stages(stages: Stages, folder: str | os.PathLike[str]) -> list[Path]:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"the folder cannot be made: {error.strerror}", where=str(path)) from error
+    near = np.concatenate([stages.filtered, stages.fit.centre_line.reshape(-1, 3)])
+    stem = "".join(letter if letter.isalnum() else "_" for letter in Path(stages.name).stem)
+    written = []
+    for number, (name, (title, draw)) in enumerate(zip(STAGES, _drawings(stages), strict=True), start=1):
+        target = path / f"{stem}_{number}_{name}.png"
+        frame = stages.cloud if name == "cloud" else near
+        _write(target, f"{stages.name}: {title}", frame, stages.camera, draw)
+        written.append(target)
+    return written
+
+
+def _drawings(stages: Stages) -> tuple[tuple[str, Callable[[Any], None]], ...]:
+    """Title and drawing of every stage, in the order of `STAGES`."""
     rng = np.random.default_rng(0)
-    skeleton, fit = stages.skeleton, stages.fit
-    near = stages.filtered
+    skeleton, fit, near = stages.skeleton, stages.fit, stages.filtered
 
     def cloud(axes: Any) -> None:
         _scatter(axes, _some(stages.cloud, rng), _GREY, 0.4)
@@ -74,26 +86,17 @@ def draw_stages(stages: Stages, folder: str | os.PathLike[str]) -> list[Path]:
         _scatter(axes, fit.centre_line.reshape(-1, 3), _GREEN, 18)
         _scatter(axes, fit.points, _ORANGE, 40)
 
-    counts = {
-        "cloud": f"{len(stages.cloud)} points of the camera",
-        "filtered": f"{len(near)} points of the object",
-        "skeleton": f"{len(skeleton.nodes)} nodes of the walk",
-        "graph": f"{len(skeleton.edges)} edges, {len(set(skeleton.part.tolist()))} connected parts",
-        "fit": f"fitted shape, {1e3 * fit.distance:.1f} mm off on average",
-    }
-    stem = "".join(letter if letter.isalnum() else "_" for letter in Path(stages.name).stem)
-    written = []
-    drawings = (cloud, filtered, nodes, graph, shape)
-    for number, (name, draw) in enumerate(zip(STAGES, drawings, strict=True), start=1):
-        target = path / f"{stem}_{number}_{name}.png"
-        frame = stages.cloud if name == "cloud" else np.concatenate([near, fit.centre_line.reshape(-1, 3)])
-        _write(target, f"{stages.name}: {counts[name]}", frame, stages.camera, draw)
-        written.append(target)
-    return written
+    return (
+        (f"{len(stages.cloud)} points of the camera", cloud),
+        (f"{len(near)} points of the object", filtered),
+        (f"{len(skeleton.nodes)} nodes of the walk", nodes),
+        (f"{len(skeleton.edges)} edges, {len(set(skeleton.part.tolist()))} connected parts", graph),
+        (f"fitted shape, {1e3 * fit.distance:.1f} mm off on average", shape),
+    )
 
 
 def draw_track(track: Track, file: str | os.PathLike[str]) -> None:
-    """Write a picture of the points over time: the good frames with two deviations, and the spline between them.
+    """Write a picture of the points over time: the good frames with two standard deviations, and the spline between.
 
     Raises
     ------
@@ -118,7 +121,9 @@ def draw_track(track: Track, file: str | os.PathLike[str]) -> None:
             panel.axvline(t, color=_GREY, linewidth=0.6, linestyle=":")
         panel.set_ylabel(f"{name} [mm]")
     axes[0].legend(loc="upper right", ncols=3, frameon=False)
-    axes[0].set_title(f"about the mean, two deviations; dotted: dropped frames\n{track.clock.message}", fontsize=9)
+    axes[0].set_title(
+        f"about the mean, two standard deviations; dotted: dropped frames\n{track.clock.message}", fontsize=9
+    )
     axes[-1].set_xlabel("t [s]")
     with new_file(Path(file)) as temporary:
         figure.savefig(temporary, format="png", dpi=110)

@@ -105,23 +105,14 @@ def walk(
     label = np.full(len(cloud), -1)
     alive = np.arange(len(cloud))
     points, weight = cloud.points, cloud.weight
-    reach = chosen.radius**2
     nodes: list[Array] = []
     size: list[float] = []
     seed = points[int(np.argmax(points @ np.asarray(down, float)))] if len(points) else np.zeros(3)
 
-    def near(centre: Array) -> Integers:
-        away = points - centre
-        square = np.einsum("ij,ij->i", away, away)
-        if len(square) > chosen.neighbours:
-            found = np.argpartition(square, chosen.neighbours - 1)[: chosen.neighbours]
-            return np.asarray(found[square[found] <= reach])
-        return np.flatnonzero(square <= reach)
-
     while len(alive):
-        first = near(seed)
-        centred = near(np.average(points[first], axis=0, weights=weight[first]))
-        if not len(centred):  # a ring about its own centre: take the segment itself, or the walk would stand still
+        first = _near(points, seed, chosen)
+        centred = _near(points, np.average(points[first], axis=0, weights=weight[first]), chosen)
+        if not len(centred):  # a ring about its own centre: take the segment itself, or the walk would not go on
             centred = first
         centre = np.average(points[centred], axis=0, weights=weight[centred])
         if len(centred) >= chosen.least:
@@ -136,10 +127,21 @@ def walk(
         away = points - centre
         square = np.einsum("ij,ij->i", away, away)
         following = int(np.argmin(square))
-        if square[following] > reach:
+        if square[following] > chosen.radius**2:
             following = int(rng.integers(len(alive)))
         seed = points[following]
     return np.array(nodes).reshape(-1, 3), np.array(size), label
+
+
+def _near(points: Array, centre: Array, options: WalkOptions) -> Integers:
+    """The nearest points of a centre within the radius, no more than a segment has."""
+    away = points - centre
+    square = np.einsum("ij,ij->i", away, away)
+    within = options.radius**2
+    if len(square) > options.neighbours:
+        found = np.argpartition(square, options.neighbours - 1)[: options.neighbours]
+        return np.asarray(found[square[found] <= within])
+    return np.flatnonzero(square <= within)
 
 
 def connect(nodes: Array, options: WalkOptions | None = None) -> tuple[Integers, Integers]:

@@ -8,9 +8,8 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -26,7 +25,7 @@ from yid_ocp.vision.clock import Clock, ClockOptions, estimate_clock
 from yid_ocp.vision.filters import Cloud, FilterOptions, ObjectRegion, voxel_grid, without_outliers, without_robot
 from yid_ocp.vision.fit import Fit, FitOptions, ShapeFit, Sight
 from yid_ocp.vision.frames import FrameSequence
-from yid_ocp.vision.meshes import MeshKind, Surfaces, numeric_mechanism, robot_meshes
+from yid_ocp.vision.meshes import MeshKind, Scene, Surfaces, numeric_mechanism, robot_meshes
 from yid_ocp.vision.skeleton import Skeleton, WalkOptions, skeleton
 
 Array = NDArray[np.float64]
@@ -220,13 +219,11 @@ class Track:
 
 
 def track(
-    system: System,
+    scene: Scene,
     recording: Recording,
     sequence: FrameSequence,
-    *,
-    urdf: str | Path | None = None,
     options: TrackOptions | None = None,
-    values: Mapping[str, float] | None = None,
+    *,
     stages: Sequence[int] = (),
     progress: Progress | None = None,
 ) -> Track:
@@ -234,16 +231,13 @@ def track(
 
     Parameters
     ----------
-    system : System
-        Robot and object. Its joints that are not elastic must be in the recording.
+    scene : Scene
+        Robot and object; joints that are not elastic must be in the recording. Without a URDF file there is no
+        self-filter and no clock offset.
     recording : Recording
         Joint angles, for the self-filter, the grasps and the clock.
     sequence : FrameSequence
-    urdf : str or Path, optional
-        File of the robot, for its meshes (`package:baxter`); without it there is no self-filter and no clock offset.
     options : TrackOptions, optional
-    values : mapping of str to float, optional
-        Parameter values (lengths, radii, relative stiffnesses); nominal where absent.
     stages : sequence of int
         Frames of the frame sequence of which all stages are kept for pictures.
     progress : callable, optional
@@ -262,26 +256,26 @@ def track(
     ModelError
         Meshes that cannot be read.
     """
-    return _Tracker(system, recording, sequence, urdf, options or TrackOptions(), values, stages, progress).run()
+    tracker = _Tracker(scene, recording, sequence, options or TrackOptions())
+    return tracker.run(frozenset(stages), progress or (lambda done, total, text: None))
+
+
+@dataclass(frozen=True, eq=False)
+class _Reading:
+    """A frame that was read: its cloud where the object can be, None with a reason; how many points it had."""
+
+    index: int
+    cloud: Cloud | None
+    raw: int = 0
+    reason: str = ""
 
 
 class _Tracker:
     """The state of one call of `track`."""
 
-    def __init__(
-        self,
-        system: System,
-        recording: Recording,
-        sequence: FrameSequence,
-        urdf: str | Path | None,
-        options: TrackOptions,
-        values: Mapping[str, float] | None,
-        stages: Sequence[int],
-        progress: Progress | None,
-    ) -> None:
+    def __init__(self, scene: Scene, recording: Recording, sequence: FrameSequence, options: TrackOptions) -> None:
+        system, values = scene.system, scene.values
         self.system, self.sequence, self.options = system, sequence, options
-        self.wanted = frozenset(stages)
-        self.tell = progress or (lambda done, total, text: None)
         self.shape = ShapeFit(system, options.fit, values)
         self.names = _chosen_points(system, options.points)
         self.region = ObjectRegion(system, options.filters, values)
@@ -289,10 +283,10 @@ class _Tracker:
         self.span, self.angles = _joint_angles(system, recording, self.shape.known)
         tree = numeric_mechanism(system, values)
         self.robot: Surfaces | None = None
-        if urdf is not None:
-            meshes = robot_meshes(urdf, tree, options.mesh)
+        if scene.urdf is not None:
+            meshes = robot_meshes(scene.urdf, tree, options.mesh)
             if all(joint < 0 for joint in meshes):
-                raise ModelError("no link of the robot moves with the model's joints", where=str(urdf))
+                raise ModelError("no link of the robot moves with the model's joints", where=str(scene.urdf))
             self.robot = Surfaces(tree, meshes)
         self.rng = np.random.default_rng(options.seed)
 
@@ -303,44 +297,50 @@ class _Tracker:
             q[[self.system.mechanism.joint_index(name) for name in self.shape.known]] = self.angles(t)
         return q
 
-    def run(self) -> Track:
+    def run(self, wanted: frozenset[int], progress: Progress) -> Track:
         """Both passes over the sequence."""
-        sequence, total = self.sequence, len(self.sequence)
-        order, reasons = _sorted_frames(sequence.t)
-        self._check_clock([i for i in order if i not in reasons])
-        clouds: list[Cloud | None] = []
-        raw: dict[int, int] = {}
-        for done, i in enumerate(order):
-            self.tell(done, 2 * total, f"reading {sequence.names[i]}")
-            cloud = None
-            if i not in reasons:
-                try:
-                    cloud, raw[i] = self._read(i)
-                except DataError as error:
-                    reasons[i] = error.what
-            clouds.append(cloud)
-        stamps = sequence.t[order]
-        self.tell(total, 2 * total, "comparing the clocks")
-        clock = self._clock(clouds, stamps)
+        total = 2 * len(self.sequence)
+        readings = self._readings(progress)
+        stamps = self.sequence.t[[reading.index for reading in readings]]
+        progress(len(self.sequence), total, "comparing the clocks")
+        clock = self._clock([reading.cloud for reading in readings], stamps)
         frames: list[FrameReport] = []
         kept: list[Stages] = []
         last: tuple[Array, float] | None = None
-        for k, i in enumerate(order):
-            self.tell(total + k, 2 * total, f"fitting {sequence.names[i]}")
-            report, stage = self._frame(i, clouds[k], clock, k, reasons.get(i, ""), raw.get(i, 0), last)
-            clouds[k] = None
+        for k in range(len(readings)):
+            reading = readings[k]
+            readings[k] = replace(reading, cloud=None)  # a long sequence would fill the memory
+            progress(len(self.sequence) + k, total, f"fitting {self.sequence.names[reading.index]}")
+            report, stage = self._frame(reading, clock, k, last)
             frames.append(report)
             if report.good and report.fit is not None:
                 last = report.fit.q, report.t
-            if stage is not None and report.good:
-                kept.append(stage)
-        self.tell(2 * total, 2 * total, "done")
+            if stage is not None and report.good and reading.index in wanted:
+                kept.append(stage())
+        progress(total, total, "done")
         fits = [frame.fit for frame in frames if frame.good and frame.fit is not None]
         if fits:
             usual = float(np.median([fit.distance for fit in fits]))
             gap = np.median([fit.gap for fit in fits], axis=0)
             frames = [self._compared(frame, usual, gap) for frame in frames]
         return self._track(frames, clock, kept)
+
+    def _readings(self, progress: Progress) -> list[_Reading]:
+        """All frames by their stamps, filtered as far as that needs no clock."""
+        order, reasons = _sorted_frames(self.sequence.t)
+        self._check_clock([i for i in order if i not in reasons])
+        readings = []
+        for done, i in enumerate(order):
+            progress(done, 2 * len(order), f"reading {self.sequence.names[i]}")
+            reading = _Reading(i, None, reason=reasons.get(i, ""))
+            if i not in reasons:
+                try:
+                    cloud, raw = self._read(i)
+                    reading = _Reading(i, cloud, raw)
+                except DataError as error:
+                    reading = _Reading(i, None, reason=error.what)
+            readings.append(reading)
+        return readings
 
     def _check_clock(self, usable: Sequence[int]) -> None:
         if self.span is None or not usable:
@@ -383,20 +383,15 @@ class _Tracker:
         return estimate_clock(self.robot, clouds, stamps, self.posture, self.rng, options)
 
     def _frame(
-        self,
-        index: int,
-        cloud: Cloud | None,
-        clock: Clock,
-        row: int,
-        reason: str,
-        raw: int,
-        last: tuple[Array, float] | None,
-    ) -> tuple[FrameReport, Stages | None]:
-        options = self.options
+        self, reading: _Reading, clock: Clock, row: int, last: tuple[Array, float] | None
+    ) -> tuple[FrameReport, Callable[[], Stages] | None]:
+        """What became of a frame, and its stages if it has a shape; `last`: shape and time of the good frame before."""
+        options, index, cloud = self.options, reading.index, reading.cloud
         stamp = float(self.sequence.t[index])
         t, delay = stamp - clock.offset, float(clock.delay[row])
-        report = FrameReport(index, self.sequence.names[index], stamp, t, reason, raw, 0, 0, delay, 0.0, None)
-        if reason or cloud is None:
+        name = self.sequence.names[index]
+        report = FrameReport(index, name, stamp, t, reading.reason, reading.raw, 0, 0, delay, 0.0, None)
+        if reading.reason or cloud is None:
             return report, None
         if self.span is not None and not self.span[0] <= t <= self.span[1]:
             return replace(report, reason="there are no joint angles at its time"), None
@@ -421,10 +416,7 @@ class _Tracker:
         fit = self.shape.solve(sight, q, before, None if last is None else (last[0], t - last[1]))
         spent = time.process_time() - begun
         report = replace(report, fit=fit, reason=self._judge(fit), seconds=spent)
-        stage = None
-        if index in self.wanted:
-            stage = Stages(self.sequence.names[index], self.sequence.world(index), rest.points, found, fit, self.camera)
-        return report, stage
+        return report, lambda: Stages(name, self.sequence.world(index), rest.points, found, fit, self.camera)
 
     def _judge(self, fit: Fit) -> str:
         options = self.options

@@ -19,9 +19,10 @@ from yid_ocp.errors import ConfigError
 from yid_ocp.files import file_sha256
 from yid_ocp.model.system import System
 from yid_ocp.report.terminal import track_summary
-from yid_ocp.vision.camera import DepthCamera, FrameTiming, VirtualFrames, virtual_frames
+from yid_ocp.vision.camera import DepthCamera, FrameTiming, VirtualCamera, VirtualFrames, virtual_frames
 from yid_ocp.vision.fit import ShapeFit
 from yid_ocp.vision.frames import FrameSequence, look_at, read_frames, write_frames
+from yid_ocp.vision.meshes import Scene
 from yid_ocp.vision.pictures import draw_stages, draw_track
 from yid_ocp.vision.track import Track, track
 from yid_ocp.workflow.build import build_system, located, recording_file
@@ -97,15 +98,8 @@ def run_track(run: Run, out: str | Path | None = None, progress: Progress = SILE
         progress.stage("tracking")
         drawn = sorted({int(i) for i in np.linspace(0, len(seen) - 1, settings.pictures + 2)[1:-1]})
         with located(run, "track"):
-            found = track(
-                system,
-                recording,
-                seen,
-                urdf=run.model.robot,
-                options=settings.options,
-                stages=drawn,
-                progress=progress.advance,
-            )
+            scene = Scene(system, run.model.robot)
+            found = track(scene, recording, seen, settings.options, stages=drawn, progress=progress.advance)
         progress.stage("drawing")
         for stages in found.stages:
             draw_stages(stages, folder.path / "pictures")
@@ -205,21 +199,15 @@ def virtual_film(run: Run, system: System, settings: VirtualFramesSettings) -> t
         recording = virtual_experiment(system, None, experiment)
         # the same once more, for the shape that a recording does not hold
         truth = simulate_in_mujoco(system, None, motion, simulation, posture=posture)
-        made = virtual_frames(
-            system,
-            truth.t,
-            truth.q,
-            look_at(settings.eye, settings.target),
-            urdf=run.model.robot,
-            camera=DepthCamera(outliers=settings.outliers),
-            timing=FrameTiming(
-                settings.rate,
-                dropped=settings.dropped,
-                latency=settings.latency,
-                latency_std=settings.latency_std,
-            ),
-            seed=settings.seed,
+        timing = FrameTiming(
+            settings.rate,
+            dropped=settings.dropped,
+            latency=settings.latency,
+            latency_std=settings.latency_std,
         )
+        pose = look_at(settings.eye, settings.target)
+        camera = VirtualCamera(pose, DepthCamera(outliers=settings.outliers), timing, seed=settings.seed)
+        made = virtual_frames(Scene(system, run.model.robot), truth.t, truth.q, camera)
     return recording, made
 
 
