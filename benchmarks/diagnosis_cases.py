@@ -25,7 +25,7 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis import Finding, Thresholds, diagnose
 from yid_ocp.diagnosis.blind import finer_values
 from yid_ocp.diagnosis.hypotheses import CandidateProblem, chosen_effects
-from yid_ocp.diagnosis.select import refit
+from yid_ocp.diagnosis.refit import refit
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.virtual.experiment import Motion, initial_posture
 from yid_ocp.virtual.injected import InjectedEffect, injected_experiment

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 from dataclasses import replace
 from types import SimpleNamespace
@@ -12,7 +13,7 @@ import pytest
 
 from yid_ocp.config.reader import DIAGNOSIS_DEFAULT, load_config
 from yid_ocp.data import read_recording, write_recording
-from yid_ocp.diagnosis import Refitted, select
+from yid_ocp.diagnosis import Refitted
 from yid_ocp.workflow.diagnose import reproducing, run_diagnose
 from yid_ocp.workflow.folder import new_run_folder
 from yid_ocp.workflow.refits import Refits
@@ -79,14 +80,15 @@ def close(one, other) -> bool:
 def counted(monkeypatch):
     """How often the solver of refits is called."""
     calls = SimpleNamespace(count=0)
-    solver = select.SOLVER
+    module = importlib.import_module("yid_ocp.diagnosis.refit")
+    solver = module.SOLVER
 
     class Counting:
         def run(self, *arguments):
             calls.count += 1
             return solver.run(*arguments)
 
-    monkeypatch.setattr(select, "SOLVER", Counting())
+    monkeypatch.setattr(module, "SOLVER", Counting())
     return calls
 
 
@@ -121,7 +123,7 @@ def test_an_interrupted_diagnosis_takes_up_its_finished_refits(rubbing, tmp_path
     assert close(without_times(again.folder), without_times(whole.folder))
     lines = [json.loads(line) for line in (again.folder / "log.jsonl").read_text().splitlines()]
     assert {"the nominal model"} < {line["refit"] for line in lines if line["event"] == "taken_up"}
-    assert any("took up the refit with" in line.get("text", "") for line in lines)
+    assert any("resumed the refit with" in line.get("text", "") for line in lines)
     assert not (tmp_path / "run.partial").exists()
     assert not list(tmp_path.glob(".*"))
 

@@ -15,8 +15,8 @@ KV = InjectedEffect("kelvin_voigt", "T1", {"tau": 0.05})
 GUST = InjectedEffect("gusts", "T3", {"size": 0.1})
 
 
-def label(category, *withheld, multiple=None, case="case_000"):
-    return Label(case, category, withheld, multiple, {"T1.bend": 12.0})
+def label(category, *injected, multiple=None, case="case_000"):
+    return Label(case, category, injected, multiple, {"T1.bend": 12.0})
 
 
 def result(verdict, which=(), effects=(), where=(), confusable=(), closure=None, values=None):
@@ -38,7 +38,7 @@ def test_sealed_labels_open_only_as_they_were():
     labels = [label("single", KV, multiple=3.0), label("null", case="case_001")]
     text, digest = seal(labels)
     again = opened(text, digest)
-    assert again[0].withheld == (KV,)
+    assert again[0].injected == (KV,)
     assert [entry.category for entry in again] == ["single", "null"]
     with pytest.raises(DataError, match="committed"):
         opened(text.replace("0.05", "0.06"), digest)

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
-from yid_ocp.diagnosis import smoother
+from yid_ocp.diagnosis import smoother_model
 from yid_ocp.diagnosis.localise import Place, attributed, informed_map, localise, merged
-from yid_ocp.diagnosis.smoother import Interval, Linear, Source, _filter, _run, _scores, linear_model, smooth
+from yid_ocp.diagnosis.smoother import _filter, _run, _scores, smooth
+from yid_ocp.diagnosis.smoother_model import Interval, Linear, Source, linear_model
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
@@ -153,7 +154,7 @@ def test_the_linear_model_predicts_what_a_small_push_does(driven, monkeypatch):
         none = np.zeros((observed.shape[1], observed.shape[1]))
         return Interval(observed, by_state, by_unknown, transition, drive, none, len(observed))
 
-    monkeypatch.setattr(smoother, "_compressed", as_they_are)
+    monkeypatch.setattr(smoother_model, "_compressed", as_they_are)
     recording = recorded(driven, {}, 1)
     problem = problem_of(driven, recording)
     x = problem.start

@@ -10,8 +10,9 @@ import scipy.stats
 
 from yid_ocp.diagnosis import closure, confusability, linearise, null_test, refit, residual_series, scores, visibility
 from yid_ocp.diagnosis.hypotheses import CandidateProblem, Series, chosen_effects, smoothed_colour
+from yid_ocp.diagnosis.refit import Loss
 from yid_ocp.diagnosis.screening import robust, shape_grid
-from yid_ocp.diagnosis.select import Loss, gain, out_of_shape, oversized, within_reach
+from yid_ocp.diagnosis.select import gain, out_of_shape, oversized, within_reach
 from yid_ocp.effects import make_effect
 
 

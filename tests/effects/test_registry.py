@@ -9,6 +9,7 @@ import pytest
 
 from yid_ocp.effects import EFFECTS, SENSORS, candidates, make_effect, vocabulary
 from yid_ocp.effects import base as places
+from yid_ocp.effects.base import ASPECTS
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model import Effect, Segment, System, flexible_object
 from yid_ocp.model.system import RecordedEffect
@@ -55,6 +56,7 @@ def test_every_kind_describes_itself(one_arm) -> None:
     for kind, equation, _ in vocabulary():
         assert equation
         assert EFFECTS[kind].__doc__
+        assert EFFECTS[kind].depends_on in ASPECTS
     for kind, place in candidates(one_arm, SENSORS):
         effect = make_effect(kind, place, one_arm)
         assert isinstance(effect, Effect)

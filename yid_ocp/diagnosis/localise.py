@@ -8,15 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.diagnosis.smoother import Smoothed, Source, Trace
+from yid_ocp.diagnosis.smoother import Smoothed, Trace
+from yid_ocp.diagnosis.smoother_model import Source
+from yid_ocp.diagnosis.thresholds import DEFAULTS
 from yid_ocp.model.system import System
 
 Array = NDArray[np.float64]
-
-SURE = 3.0
-"""Deviations that an unknown must be away from zero to say when the gap is there."""
-MAPPED = 0.5
-"""1 - posterior/prior variance from which an unknown's value is informed by the data."""
 
 
 @dataclass(frozen=True)
@@ -40,12 +37,14 @@ class Place:
     windows: tuple[tuple[float, float], ...]
 
 
-def localise(smoothed: Smoothed) -> tuple[Place, ...]:
+def localise(smoothed: Smoothed, sure: float = DEFAULTS.sure) -> tuple[Place, ...]:
     """Places by their share of the log evidence, largest first; places without a share where a gap would have shown.
 
     Parameters
     ----------
     smoothed : Smoothed
+    sure : float
+        Standard deviations that an unknown must be away from zero to say when the gap is there.
     """
     weight: dict[str, float] = {}
     observable: dict[str, bool] = {}
@@ -59,19 +58,19 @@ def localise(smoothed: Smoothed) -> tuple[Place, ...]:
             location,
             value / total if total > 0 else 0.0,
             observable[location],
-            _windows(smoothed, [s for s in smoothed.weight if s.location == location and smoothed.variance[s]]),
+            _windows(smoothed, [s for s in smoothed.weight if s.location == location and smoothed.variance[s]], sure),
         )
         for location, value in weight.items()
     ]
     return tuple(sorted(found, key=lambda place: (-place.share, not place.observable)))
 
 
-def _windows(smoothed: Smoothed, sources: Sequence[Source]) -> tuple[tuple[float, float], ...]:
+def _windows(smoothed: Smoothed, sources: Sequence[Source], limit: float) -> tuple[tuple[float, float], ...]:
     spans = []
     for trace in smoothed.traces:
         own = [i for i, source in enumerate(trace.sources) if source in sources]
         if own:
-            sure = np.any(np.abs(trace.mean[:, own]) > SURE * np.maximum(trace.std[:, own], 1e-12), axis=1)
+            sure = np.any(np.abs(trace.mean[:, own]) > limit * np.maximum(trace.std[:, own], 1e-12), axis=1)
             spans += [(float(trace.edges[j]), float(trace.edges[j + 1])) for j in np.flatnonzero(sure)]
     return merged(spans)
 
@@ -121,8 +120,17 @@ def attributed(
     return tuple(sorted(found, key=lambda place: (-place.share, not place.observable)))
 
 
-def informed_map(smoothed: Smoothed, recording: int = 0) -> tuple[Array, tuple[str, ...], Array]:
-    """Unknowns of one recording in deviations of their posterior, NaN where the data do not inform them.
+def informed_map(
+    smoothed: Smoothed, recording: int = 0, mapped: float = DEFAULTS.mapped
+) -> tuple[Array, tuple[str, ...], Array]:
+    """Unknowns of one recording in standard deviations of their posterior, NaN where the data do not inform them.
+
+    Parameters
+    ----------
+    smoothed : Smoothed
+    recording : int
+    mapped : float
+        1 - posterior/prior variance from which an unknown's value is informed.
 
     Returns
     -------
@@ -135,7 +143,7 @@ def informed_map(smoothed: Smoothed, recording: int = 0) -> tuple[Array, tuple[s
     prior = np.array([smoothed.variance[source] for source in trace.sources])
     with np.errstate(divide="ignore", invalid="ignore"):
         informed = 1 - trace.std**2 / prior
-        values = np.where((prior > 0) & (informed > MAPPED), trace.mean / trace.std, np.nan)
+        values = np.where((prior > 0) & (informed > mapped), trace.mean / trace.std, np.nan)
     return trace.edges, trace.unknowns, values
 
 

@@ -1,8 +1,8 @@
 """Steps one and two: the noise floor, and whether the residual is larger or less random than noise alone would be.
 
-Under the null hypothesis the whitened residual r is noise of unit deviation whose colour rho is known (white, or that
-of the smoothing filter). Then r'r/n has the variance 2/n (1 + 2 sum rho_l^2), which is that of a chi-squared variable
-with n/(1 + 2 sum rho_l^2) degrees of freedom; a free parameter takes one of them.
+Under the null hypothesis the whitened residual r is noise of unit standard deviation whose colour rho is known (white,
+or that of the smoothing filter). Then r'r/n has the variance 2/n (1 + 2 sum rho_l^2), which is that of a chi-squared
+variable with n/(1 + 2 sum rho_l^2) degrees of freedom; a free parameter takes one of them.
 """
 
 from __future__ import annotations
@@ -15,23 +15,21 @@ import scipy.stats
 from numpy.typing import NDArray
 
 from yid_ocp.diagnosis.hypotheses import Series
+from yid_ocp.diagnosis.thresholds import DEFAULTS
 from yid_ocp.problem import EstimationProblem
 
 Array = NDArray[np.float64]
 
-WINDOW = 0.5
-"""Length of the windows in which the residual is looked at [s]."""
-
 
 @dataclass(frozen=True)
 class Floor:
-    """Noise deviation of one channel.
+    """Noise of one channel.
 
     Attributes
     ----------
     channel, unit : str
     std : float
-        Median deviation of its samples, after smoothing where they are smoothed, in `unit`.
+        Median standard deviation of its samples, after smoothing where they are smoothed, in `unit`.
     samples : int
     """
 
@@ -51,7 +49,7 @@ class Window:
     begin, end : float
         [s]
     z : float
-        Excess of r'r over its expectation, in deviations.
+        Excess of r'r over its expectation, in standard deviations.
     flagged : bool
         Whether it is more than chance among all windows (false-discovery rate).
     """
@@ -91,7 +89,7 @@ class NullTest:
 
 
 def noise_floor(problem: EstimationProblem) -> tuple[Floor, ...]:
-    """Noise levels that the problem presumes, channel by channel."""
+    """Noise levels that the problem assumes, channel by channel."""
     found: dict[str, list[Array]] = {}
     units: dict[str, str] = {}
     for episode in problem.episodes:
@@ -108,18 +106,26 @@ def spread(colour: Array) -> float:
     return float(1 + 2 * np.sum(colour[1:] ** 2))
 
 
-def null_test(series: Sequence[Series], residual: Array, parameters: int, level: float = 0.01) -> NullTest:
+def null_test(
+    series: Sequence[Series],
+    residual: Array,
+    parameters: int,
+    level: float = DEFAULTS.level,
+    window: float = DEFAULTS.window,
+) -> NullTest:
     """Compare a whitened residual with noise.
 
     Parameters
     ----------
     series : sequence of Series
     residual : ndarray, shape (nr,)
-        Rows that belong to no series (priors) are passed over.
+        Rows that belong to no series (priors) do not count.
     parameters : int
         Free ones, which took part of the noise with them.
     level : float
         False-discovery rate of the windows.
+    window : float
+        Their length [s].
     """
     count = sum(len(s.rows) for s in series)
     effective = max(sum(len(s.rows) / spread(s.colour) for s in series) - parameters, 1.0)
@@ -131,7 +137,7 @@ def null_test(series: Sequence[Series], residual: Array, parameters: int, level:
         own = [s for s in series if s.channel == channel]
         channels[channel] = float(np.mean(np.concatenate([residual[s.rows] for s in own]) ** 2))
         whiteness[channel] = _whiteness([residual[s.rows] for s in own]) if len(own[0].colour) == 1 else float("nan")
-    return NullTest(ratio, effective, p_value, channels, whiteness, _windows(series, residual, level))
+    return NullTest(ratio, effective, p_value, channels, whiteness, _windows(series, residual, level, window))
 
 
 def _whiteness(parts: Sequence[Array], lags: int = 10) -> float:
@@ -150,24 +156,24 @@ def _whiteness(parts: Sequence[Array], lags: int = 10) -> float:
     return float(scipy.stats.chi2.sf(statistic, degrees)) if degrees else float("nan")
 
 
-def _windows(series: Sequence[Series], residual: Array, level: float) -> tuple[Window, ...]:
+def _windows(series: Sequence[Series], residual: Array, level: float, length: float) -> tuple[Window, ...]:
     raw: list[tuple[str, str, float, float, float, float]] = []
     merged: dict[tuple[str, str], list[Series]] = {}
     for s in series:
         merged.setdefault((s.recording, s.channel), []).append(s)
     for (recording, channel), own in merged.items():
         last = max(float(s.t[-1]) for s in own)
-        for k in range(int(last / WINDOW) + 1):
-            begin, total, degrees, count = k * WINDOW, 0.0, 0.0, 0
+        for k in range(int(last / length) + 1):
+            begin, total, degrees, count = k * length, 0.0, 0.0, 0
             for s in own:
-                inside = (s.t >= begin) & (s.t < begin + WINDOW)
+                inside = (s.t >= begin) & (s.t < begin + length)
                 r = residual[s.rows[inside]]
                 total, count = total + float(r @ r), count + len(r)
                 degrees += len(r) / spread(s.colour)
             if count:
                 p = float(scipy.stats.chi2.sf(total / count * degrees, degrees))
                 z = (total / count - 1) * np.sqrt(degrees / 2)
-                raw.append((recording, channel, begin, min(begin + WINDOW, last), float(z), p))
+                raw.append((recording, channel, begin, min(begin + length, last), float(z), p))
     p_values = np.array([entry[5] for entry in raw])
     order = np.argsort(p_values)
     # Benjamini and Hochberg (1995), doi:10.1111/j.2517-6161.1995.tb02031.x

@@ -5,9 +5,9 @@ amplitudes of candidate j and P = I - J_theta J_theta^+:
 
     G_j = J_j' P J_j,  s_j = -J_j' P r,  LM_j = s_j' S_j^-1 s_j,
 
-S_j = G_j for white noise of unit deviation, and the sum of the scores' autocovariances for a coloured one, taken as
-it would be with the candidate's step done (Bartlett's weights, Newey and West 1987, doi:10.2307/1913610). The decrease
-of r'r that the linear model promises is s_j' G_j^-1 s_j, less where the amplitude would leave its bounds.
+S_j = G_j for white noise of unit standard deviation, and the sum of the scores' autocovariances for a coloured one,
+taken as it would be with the candidate's step done (Bartlett's weights, Newey and West 1987, doi:10.2307/1913610). The
+decrease of r'r that the linear model promises is s_j' G_j^-1 s_j, less where the amplitude would leave its bounds.
 
 Parameters that say nothing while the amplitude is neutral (relaxation times and the like) are taken over a grid, the
 best one counting as the best of that many tries (Davies 1987, doi:10.1093/biomet/74.1.33, bounded by Bonferroni).
@@ -25,15 +25,11 @@ import scipy.stats
 from numpy.typing import NDArray
 
 from yid_ocp.diagnosis.hypotheses import CandidateProblem, Series, residual_series
+from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import SolverError
 
 Array = NDArray[np.float64]
-
-GRID = 4
-"""Values tried of every shape parameter."""
-DETECTION = 2.576 + 1.282
-"""Deviations of a detectable amplitude: found at the 1 % level nine times out of ten."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +113,7 @@ class Score:
     p_value: float
 
 
-def shape_grid(effect: EffectBase, count: int = GRID) -> list[dict[str, float]]:
+def shape_grid(effect: EffectBase, count: int = DEFAULTS.shape_values) -> list[dict[str, float]]:
     """Values at which a candidate's shape parameters are tried: even over their range, or even in the logarithm."""
     if not effect.shapes:
         return [{}]
@@ -129,7 +125,10 @@ def shape_grid(effect: EffectBase, count: int = GRID) -> list[dict[str, float]]:
 
 
 def linearise(
-    problem: CandidateProblem, base: Sequence[EffectBase], values: Mapping[str, float], grid: int = GRID
+    problem: CandidateProblem,
+    base: Sequence[EffectBase],
+    values: Mapping[str, float],
+    grid: int = DEFAULTS.shape_values,
 ) -> Linearisation:
     """Residual and signatures of all candidates but those in the model already.
 
@@ -191,8 +190,8 @@ def _basis(matrix: Array) -> Array:
     return np.asarray(u[:, singular > 1e-7 * max(singular.max(initial=0.0), 1e-300)])
 
 
-def visibility(point: Linearisation) -> tuple[Visibility, ...]:
-    """Detectable amplitude of every candidate: `DETECTION` deviations under the noise's colour, from J alone."""
+def visibility(point: Linearisation, detection: float = DEFAULTS.detection) -> tuple[Visibility, ...]:
+    """Detectable amplitude of every candidate: so many standard deviations under the noise's colour, from J alone."""
     found: dict[str, Visibility] = {}
     for signature in point.signatures:
         effect = signature.effect
@@ -204,7 +203,7 @@ def visibility(point: Linearisation) -> tuple[Visibility, ...]:
         visible = False
         for i, name in enumerate(effect.amplitudes):
             informed = information[i, i] > 1e-16
-            size = DETECTION * float(np.sqrt(max(covariance[i, i], 0.0))) if informed else float("inf")
+            size = detection * float(np.sqrt(max(covariance[i, i], 0.0))) if informed else float("inf")
             detectable[name] = size
             quantity = next(q for q in effect.quantities if name.endswith(f".{q.name}"))
             visible |= size < max(abs(bound - quantity.neutral) for bound in effect.prior_range[name])
@@ -340,3 +339,35 @@ def confusability(point: Linearisation, chosen: Sequence[Score] = ()) -> Confusa
             cross = gram[row, column]
             matrix[j, i] = float(np.trace(cross @ inverses[i] @ cross.T)) / size if size > 0 else 0.0
     return Confusability(tuple(s.effect.label for s in kept), np.clip(matrix, 0.0, 1.0))
+
+
+@dataclass(frozen=True)
+class Screened:
+    """All candidates at one point.
+
+    Attributes
+    ----------
+    visible : tuple of Visibility
+    scores : tuple of Score
+        Best first.
+    alike : Confusability
+    """
+
+    visible: tuple[Visibility, ...]
+    scores: tuple[Score, ...]
+    alike: Confusability
+
+    @property
+    def unseen(self) -> list[str]:
+        """Labels of candidates that the data could not show."""
+        return [entry.effect.label for entry in self.visible if not entry.visible]
+
+
+def screen(
+    problem: CandidateProblem, base: Sequence[EffectBase], values: Mapping[str, float], limits: Thresholds = DEFAULTS
+) -> Screened:
+    """Linearise, then visibility, scores and confusability of all candidates but those of `base`."""
+    point = linearise(problem, base, values, limits.shape_values)
+    visible = visibility(point, limits.detection)
+    ranked = scores(point, residual_series(problem.freeing(())), visible)
+    return Screened(visible, ranked, confusability(point, ranked))

@@ -1,137 +1,24 @@
-"""Steps six and seven: full refits, judged on held-out recordings; several effects one after the other.
+"""Step seven: which effects are added, one after the other, by what they close of the held-out gap.
 
-Every loss is a mean square of whitened residuals over blocks of held-out time, the same blocks for every model, so that
-differences between models are paired. G = max(0, chi2/n - 1) is the gap, 1 - G_after/G_before what was closed; its
-interval comes from resampling blocks (Kuensch 1989, doi:10.1214/aos/1176347265).
+1 - G_after/G_before of the held-out losses is what was closed; its interval comes from resampling blocks (Kuensch 1989,
+doi:10.1214/aos/1176347265).
 """
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from yid_ocp.diagnosis.hypotheses import CandidateProblem, describe, residual_series, sample_times
-from yid_ocp.diagnosis.screening import robust
-from yid_ocp.effects import EffectBase, Reported
-from yid_ocp.problem.problem import Evaluation
-from yid_ocp.solvers import GaussNewton
-from yid_ocp.solvers.base import Outcome, uncertainty
+from yid_ocp.diagnosis.hypotheses import describe
+from yid_ocp.diagnosis.refit import Fit, Loss, Search, refit, refit_all
+from yid_ocp.diagnosis.screening import Confusability, Score, Screened, screen
+from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
+from yid_ocp.effects import EffectBase
 
-Array = NDArray[np.float64]
-
-SOLVER = GaussNewton(iterations=25, step_tolerance=1e-3, cost_tolerance=1e-5)
-"""A refit starts near its end and must be good to a small part of its deviation, and of `TIE`, only."""
-POOR, PROMISING = 1.1, 0.2
-"""A refit that ends above this chi2/n, but lowers the excess by this part or more, is tried again from the initial
-values of the nominal parameters."""
-STAND_IN = 0.05
-"""Part of chi2/n by which an effect of an unlikely shape must beat all others to count."""
 RESAMPLES = 1000
-TIE = 0.01
-"""Part of chi2/n by which two models may differ and still count as equal, however sure the difference."""
-
-
-@dataclass(frozen=True)
-class Loss:
-    """How badly held-out recordings are predicted.
-
-    Attributes
-    ----------
-    squares, counts : ndarray, shape (nb,)
-        Sum of whitened squares and number of samples of every block; infinite where a rollout failed.
-    channels : dict of channel to (float, str)
-        Root mean square error and its unit.
-    """
-
-    squares: Array
-    counts: Array
-    channels: dict[str, tuple[float, str]]
-
-    @property
-    def mean(self) -> float:
-        """chi2/n."""
-        return float(self.squares.sum() / max(self.counts.sum(), 1.0))
-
-    @property
-    def gap(self) -> float:
-        """G."""
-        return max(0.0, self.mean - 1.0)
-
-
-@dataclass(frozen=True)
-class Fit:
-    """The model with some effects, refitted.
-
-    Attributes
-    ----------
-    effects : tuple of EffectBase
-    problem : CandidateProblem
-    values : dict of str to float
-        Unknowns.
-    std : dict of str to float
-        Their deviations; see `deviations`.
-    cost : float
-    evaluation : Evaluation
-    loss : Loss
-        Held-out.
-    message : str
-        Why the solver ended.
-    taken_up : bool
-        Whether it comes from a store instead of the solver.
-    """
-
-    effects: tuple[EffectBase, ...]
-    problem: CandidateProblem
-    values: dict[str, float]
-    std: dict[str, float]
-    cost: float
-    evaluation: Evaluation
-    loss: Loss
-    message: str
-    taken_up: bool = False
-
-    @property
-    def size(self) -> int:
-        """Number of the effects' parameters."""
-        return sum(len(effect.parameters) for effect in self.effects)
-
-    def reported(self, effect: EffectBase) -> dict[str, Reported]:
-        """An effect's quantities as people read them."""
-        return effect.reported(self.values, self.std)
-
-
-@dataclass(frozen=True)
-class Refitted:
-    """What a refit found: enough to have its `Fit` again by one evaluation.
-
-    Attributes
-    ----------
-    values, std : dict of str to float
-        Of every unknown.
-    message : str
-    """
-
-    values: dict[str, float]
-    std: dict[str, float]
-    message: str
-
-
-class Store(Protocol):
-    """Keeps finished refits of one diagnosis, so that another run of it need not repeat them; used by two threads."""
-
-    def get(self, name: str) -> Refitted | None:
-        """The refit of this name, None where it is not known."""
-        ...
-
-    def put(self, name: str, refitted: Refitted) -> None:
-        """Keep a refit."""
-        ...
+"""Draws of held-out blocks for the interval of a closure."""
 
 
 @dataclass(frozen=True)
@@ -143,177 +30,25 @@ class Closure:
     high: float
 
 
-def refit(
-    problem: CandidateProblem,
-    effects: Sequence[EffectBase],
-    start: Mapping[str, float],
-    store: Store | None = None,
-    name: str = "",
-) -> Fit | None:
-    """Fit the nominal parameters and those of some effects, and predict the held-out recordings.
+@dataclass(frozen=True)
+class Added:
+    """An effect that was added, in its round.
 
-    Parameters
+    Attributes
     ----------
-    problem : CandidateProblem
-    effects : sequence of EffectBase
-    start : mapping of str to float
-        Where unknowns begin; a start that cannot be rolled out is drawn back towards neutral effects.
-    store : Store, optional
-        Asked before the solver is, and told what it finds.
-    name : str
-        In the store; the effects' labels where empty, which do for refits that differ by their effects alone.
-
-    Returns
-    -------
-    Fit or None
-        None where the model cannot be rolled out at all.
+    effect : EffectBase
+    fit : Fit
+        With all effects up to this one.
+    closure : Closure
+        Of the whole gap by all effects up to this one.
+    rivals : tuple of EffectBase
+        That pass within one standard error, the chosen one first.
     """
-    known = recalled(problem, effects, store, name)
-    if known is not None:
-        return known
-    own = problem.freeing(effects)
-    best = _attempt(own, effects, start)
-    if best is not None and _half_done(own, effects, start, best[1]):
-        # the nominal fit may have driven its parameters to where this model cannot come back from
-        nominal = {*problem.nominal}
-        fresh = {
-            key: value
-            for key, value in start.items()
-            if key.split("[")[0] not in nominal and not key.startswith("start.")
-        }
-        again = _attempt(own, effects, fresh) if len(fresh) < len(start) else None
-        best = again if again is not None and again[1].cost < best[1].cost else best
-    if best is None:
-        return None
-    outcome, finish = best
-    deviation = deviations(own, finish)
-    std = dict(zip(own.names, map(float, deviation), strict=True))
-    loss = held_out_loss(own, outcome.x)
-    values = own.named(outcome.x)
-    if store is not None:
-        store.put(name or describe(effects), Refitted(values, std, outcome.message))
-    return Fit(tuple(effects), own, values, std, finish.cost, finish, loss, outcome.message)
 
-
-def _half_done(
-    own: CandidateProblem, effects: Sequence[EffectBase], start: Mapping[str, float], finish: Evaluation
-) -> bool:
-    """Whether a refit explains much of what the model without the effects leaves, but by far not all."""
-    count = len(finish.residual)
-    neutral = {name: value for effect in effects for name, value in effect.neutral.items()}
-    before = own.evaluate(own.unknowns({**start, **neutral}), derivatives=False)
-    if 2 * finish.cost < POOR * count or not before.ok:
-        return False
-    return before.cost - finish.cost > PROMISING * (before.cost - count / 2)
-
-
-def _attempt(
-    own: CandidateProblem, effects: Sequence[EffectBase], start: Mapping[str, float]
-) -> tuple[Outcome, Evaluation] | None:
-    """One run from one start and the evaluation at its end; None where the model cannot be rolled out."""
-    neutral = {name: value for effect in effects for name, value in effect.neutral.items()}
-    x = own.unknowns(start)
-    for pull in (1.0, 0.5, 0.2, 0.05, 0.0):
-        drawn = {name: value + pull * (start.get(name, value) - value) for name, value in neutral.items()}
-        x = own.unknowns({**start, **drawn})
-        if own.evaluate(x, derivatives=False).ok:
-            break
-    else:
-        return None
-    outcome = SOLVER.run(own, x, None)
-    finish = own.evaluate(outcome.x)
-    return (outcome, finish) if finish.ok else None
-
-
-def recalled(
-    problem: CandidateProblem, effects: Sequence[EffectBase], store: Store | None, name: str = ""
-) -> Fit | None:
-    """A refit that a store knows, evaluated once; None where it knows none."""
-    known = None if store is None else store.get(name or describe(effects))
-    own = problem.freeing(effects)
-    if known is None or not set(known.values) == set(known.std) == set(own.names):
-        return None
-    x = own.unknowns(known.values)
-    finish = own.evaluate(x)
-    if not finish.ok:
-        return None
-    loss = held_out_loss(own, x)
-    return Fit(tuple(effects), own, known.values, known.std, finish.cost, finish, loss, known.message, True)
-
-
-def deviations(problem: CandidateProblem, finish: Evaluation) -> Array:
-    """Standard deviation of every unknown, shape (nx,): the larger of two.
-
-    The first scales (J'J)^-1 by chi2 per degree of freedom; the second is the sandwich (J'J)^-1 S (J'J)^-1 with the
-    scores' autocovariances in S, which knows that samples of a coloured residual repeat each other.
-    """
-    covariance, _ = uncertainty(problem, finish)
-    plain = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    if finish.jacobian is None or not plain.size:
-        return plain
-    rows = len(finish.residual) - problem.weak_prior_rows
-    scale = problem.scales
-    jacobian = finish.jacobian[:rows] * scale
-    inverse = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-10, hermitian=True)
-    middle = robust(jacobian, finish.residual[:rows], residual_series(problem))
-    return np.maximum(plain, scale * np.sqrt(np.maximum(np.diag(inverse @ middle @ inverse), 0.0)))
-
-
-def refit_all(
-    problem: CandidateProblem,
-    base: Sequence[EffectBase],
-    tried: Sequence[tuple[EffectBase, Mapping[str, float]]],
-    values: Mapping[str, float],
-    progress: Callable[[str], None] | None = None,
-    store: Store | None = None,
-) -> list[Fit]:
-    """Refit the model with each of several effects added to those of `base`, two at a time; failures are left out."""
-
-    def one(entry: tuple[EffectBase, Mapping[str, float]]) -> Fit | None:
-        effect, step = entry
-        fit = refit(problem, (*base, effect), {**values, **step}, store)
-        if progress is not None and fit is not None:
-            done = "took up the refit" if fit.taken_up else "refitted"
-            progress(f"{done} with {effect.label}: held-out chi2/n {fit.loss.mean:.4g}")
-        return fit
-
-    with ThreadPoolExecutor(max_workers=min(2, os.cpu_count() or 1)) as pool:
-        return [fit for fit in pool.map(one, tried) if fit is not None]
-
-
-def block_length(problem: CandidateProblem) -> float:
-    """Length of the blocks of held-out time [s]: some forty of them, between half a second and two seconds long."""
-    total = sum(episode.grid.steps * episode.grid.time_step for episode in problem.held_out)
-    return float(np.clip(total / 40, 0.5, 2.0))
-
-
-def held_out_loss(problem: CandidateProblem, x: Array) -> Loss:
-    """Predict the held-out recordings; initial states are found in the same way for every model."""
-    length = block_length(problem)
-    squares: list[Array] = []
-    counts: list[Array] = []
-    results, episodes = [], []
-    for episode, result in problem.validate(x):
-        number = int(episode.grid.steps * episode.grid.time_step / length) + 1
-        total, count = np.zeros(number), np.zeros(number)
-        for k, samples in enumerate(episode.samples):
-            block = np.minimum((sample_times(episode, samples) / length).astype(int), number - 1)
-            good = samples.weight > 0
-            count += np.bincount(block, good.sum(axis=1), number)
-            if not isinstance(result, str):
-                r = samples.weight * np.where(good, result.predicted[k] - samples.value, 0.0)
-                total += np.bincount(block, np.sum(r**2, axis=1), number)
-        if isinstance(result, str):
-            total[:] = np.inf
-        else:
-            results.append(result)
-            episodes.append(episode)
-        keep = count > 0
-        squares.append(total[keep])
-        counts.append(count[keep])
-    errors = problem.channel_errors(results, episodes) if results else {}
-    channels = {name: (float(entry["rmse"]), str(entry["unit"])) for name, entry in errors.items()}
-    return Loss(np.concatenate(squares), np.concatenate(counts), channels)
+    effect: EffectBase
+    fit: Fit
+    closure: Closure
+    rivals: tuple[EffectBase, ...]
 
 
 def closure(before: Loss, after: Loss, seed: int = 0) -> Closure:
@@ -341,37 +76,145 @@ def gain(before: Loss, after: Loss) -> tuple[float, float]:
     return float(difference.sum()) / total, float(error) / total
 
 
-def within_reach(fits: Sequence[Fit]) -> list[Fit]:
-    """Fits whose held-out loss is within one standard error of the best one's (or `TIE` of it), the simplest first.
+def within_reach(fits: Sequence[Fit], limits: Thresholds = DEFAULTS) -> list[Fit]:
+    """Fits whose held-out loss is within one standard error of the best one's (or `tie` of it), the simplest first.
 
     An effect whose shape is far from what an engineer would expect (`out_of_shape`) counts only where no other comes
     near it: a solid that relaxes in a tenth of the shortest time expected is a damper. One whose amplitude is
     (`oversized`) comes last.
     """
     best = min(fits, key=lambda fit: fit.loss.mean)
-    shapely = [fit for fit in fits if not (fit.effects and out_of_shape(fit.effects[-1], fit.values))]
-    if shapely and min(fit.loss.mean for fit in shapely) <= (1 + STAND_IN) * best.loss.mean:
+    shapely = [fit for fit in fits if not (fit.effects and out_of_shape(fit.effects[-1], fit.values, limits))]
+    if shapely and min(fit.loss.mean for fit in shapely) <= (1 + limits.stand_in) * best.loss.mean:
         fits = shapely
         best = min(fits, key=lambda fit: fit.loss.mean)
     near = []
     for fit in fits:
         lost, error = gain(fit.loss, best.loss)
-        if fit is best or lost <= max(error, TIE * best.loss.mean):
+        if fit is best or lost <= max(error, limits.tie * best.loss.mean):
             near.append(fit)
-    return sorted(near, key=lambda f: (bool(f.effects) and oversized(f.effects[-1], f.values), f.size, f.loss.mean))
+
+    def order(fit: Fit) -> tuple[bool, int, float]:
+        return bool(fit.effects) and oversized(fit.effects[-1], fit.values, limits), fit.size, fit.loss.mean
+
+    return sorted(near, key=order)
 
 
-def out_of_shape(effect: EffectBase, values: Mapping[str, float]) -> bool:
-    """Whether a shape parameter lies outside its range by more than a factor of two, or than the range's width."""
+def out_of_shape(effect: EffectBase, values: Mapping[str, float], limits: Thresholds = DEFAULTS) -> bool:
+    """Whether a shape parameter lies outside its range by more than `shape_factor`, or `range_widths` widths of it."""
     for name in effect.shapes:
         low, high = effect.prior_range[name]
-        near, far = (low / 2, high * 2) if low > 0 else (2 * low - high, 2 * high - low)
+        room = limits.range_widths * (high - low)
+        factor = limits.shape_factor
+        near, far = (low / factor, high * factor) if low > 0 else (low - room, high + room)
         if not near <= values[name] <= far:
             return True
     return False
 
 
-def oversized(effect: EffectBase, values: Mapping[str, float]) -> bool:
-    """Whether an amplitude lies outside its range by more than the range's width."""
-    ranges = ((values[name], *effect.prior_range[name]) for name in effect.amplitudes)
-    return any(not 2 * low - high <= value <= 2 * high - low for value, low, high in ranges)
+def oversized(effect: EffectBase, values: Mapping[str, float], limits: Thresholds = DEFAULTS) -> bool:
+    """Whether an amplitude lies outside its range by more than `range_widths` widths of it."""
+    for name in effect.amplitudes:
+        low, high = effect.prior_range[name]
+        room = limits.range_widths * (high - low)
+        if not low - room <= values[name] <= high + room:
+            return True
+    return False
+
+
+# -- several effects --------------------------------------------------------------------------------------------------
+
+
+def shortlist(
+    ranked: Sequence[Score], alike: Confusability, limits: Thresholds
+) -> list[tuple[EffectBase, Mapping[str, float]]]:
+    """The best candidates of the first pass, and those that can stand in for them."""
+    best = list(ranked[: limits.refits])
+    extra: list[Score] = []
+    for score in best:
+        names = alike.like(score.effect.label, limits.alike)
+        extra += [s for s in ranked if s.effect.label in names and s not in best and s not in extra]
+    extra.sort(key=lambda s: -s.decrease)
+    return [(s.effect, s.step) for s in [*best, *extra[: limits.refits]]]
+
+
+def compose(search: Search, nominal: Fit, screened: Screened) -> tuple[tuple[Fit, ...], tuple[Added, ...]]:
+    """Add effects one after the other while the held-out gap closes, then try without each.
+
+    Parameters
+    ----------
+    search : Search
+    nominal : Fit
+        Without any effect.
+    screened : Screened
+        All candidates at that fit.
+
+    Returns
+    -------
+    fits : tuple of Fit
+        Of the first round, the chosen one first, then by held-out loss.
+    added : tuple of Added
+    """
+    limits = search.limits
+    current = nominal
+    first: tuple[Fit, ...] = ()
+    added: list[Added] = []
+    while len(added) < limits.effects:
+        base = [entry.effect for entry in added]
+        if added:
+            search.progress(f"scoring what is left beside {', '.join(e.label for e in base)}")
+            screened = screen(search.problem, base, current.values, limits)
+        tried = shortlist([s for s in screened.scores if s.p_value < limits.level], screened.alike, limits)
+        fits = refit_all(search, base, tried, current.values)
+        if not fits:
+            break
+        near = within_reach(fits, limits)
+        chosen = near[0]
+        if not added:
+            first = (chosen, *sorted((fit for fit in fits if fit is not chosen), key=lambda fit: fit.loss.mean))
+        gained, error = gain(current.loss, chosen.loss)
+        if gained <= error or gained < limits.closure * current.loss.gap or current.loss.gap <= 0:
+            break
+        total = closure(nominal.loss, chosen.loss)
+        added.append(Added(chosen.effects[-1], chosen, total, tuple(fit.effects[-1] for fit in near)))
+        search.progress(f"added {chosen.effects[-1].label}: {100 * total.value:.3g} % of the held-out gap closed")
+        current = chosen
+        if current.loss.mean < 1 + limits.smallest_gap:
+            break
+    return first, _pruned(search, nominal, tuple(added))
+
+
+def _pruned(search: Search, nominal: Fit, added: tuple[Added, ...]) -> tuple[Added, ...]:
+    """Leave out effects without which held-out recordings are predicted as well."""
+    kept = list(added)
+    for entry in added[:-1]:
+        if len(kept) < 2:
+            break
+        rest = [other for other in kept if other is not entry]
+        full = kept[-1].fit
+        # it begins elsewhere than a refit of the same effects in an earlier round
+        name = f"{describe(full.effects)} without {entry.effect.label}"
+        without = _again(search, [other.effect for other in rest], full, name)
+        if without is None:
+            continue
+        gained, error = gain(without.loss, full.loss)
+        if gained <= error:
+            search.progress(f"left {entry.effect.label} out again: the others do as well")
+            kept = _rebuilt(search, nominal, rest, without)
+    return tuple(kept)
+
+
+def _rebuilt(search: Search, nominal: Fit, rest: Sequence[Added], last: Fit) -> list[Added]:
+    """Effects that were kept when another was left out, each with the fit of all up to it."""
+    found = []
+    for i, entry in enumerate(rest):
+        effects = [other.effect for other in rest[: i + 1]]
+        fit = last if i == len(rest) - 1 else _again(search, effects, last, f"{describe(effects)} again")
+        if fit is not None:
+            found.append(Added(entry.effect, fit, closure(nominal.loss, fit.loss), entry.rivals))
+    return found
+
+
+def _again(search: Search, effects: Sequence[EffectBase], near: Fit, name: str) -> Fit | None:
+    """A refit that begins where another one ended."""
+    return refit(search.problem, effects, near.values, search.store, name, search.limits)

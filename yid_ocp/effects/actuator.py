@@ -26,6 +26,7 @@ class SeriesElasticity(EffectBase):
     """
 
     equation = "measured angle = q + effort/stiffness"
+    depends_on = "how hard it pulls at its ends"
     needs: ClassVar[frozenset[str]] = frozenset({"joints.position", "joints.effort"})
 
     @classmethod
@@ -56,6 +57,7 @@ class Backlash(EffectBase):
     """A gear with play, the encoder on the motor's side: measured angle = q + width/2 tanh(effort/`PLAY_TORQUE`)."""
 
     equation = "measured angle = q + width/2 tanh(effort/0.2 N m)"
+    depends_on = "how hard it pulls at its ends"
     needs: ClassVar[frozenset[str]] = frozenset({"joints.position", "joints.effort"})
 
     @classmethod
@@ -87,6 +89,7 @@ class EffortGain(EffectBase):
     """Measured effort = scale x true effort."""
 
     equation = "measured effort = scale x true"
+    depends_on = "how it stands against gravity"
     needs: ClassVar[frozenset[str]] = frozenset({"joints.effort"})
 
     @classmethod
@@ -113,6 +116,7 @@ class EffortOffset(EffectBase):
     """Measured effort = true effort + offset."""
 
     equation = "measured effort = true + offset"
+    depends_on = "how it stands against gravity"
     needs: ClassVar[frozenset[str]] = frozenset({"joints.effort"})
 
     @classmethod
@@ -143,6 +147,7 @@ class EffortDelay(EffectBase):
     """
 
     equation = "the torque that acts at t was recorded at t - delay"
+    depends_on = "when it is read"
     needs: ClassVar[frozenset[str]] = frozenset({"joints.effort"})
 
     @classmethod

@@ -20,6 +20,18 @@ from yid_ocp.registry import Registry
 
 SMOOTHING = 0.02
 """v_s in sgn(v) = tanh(v/v_s) [rad/s]."""
+ASPECTS = (
+    "how fast it moves",
+    "how long it is held",
+    "how hard it accelerates",
+    "how far it bends",
+    "how it stands against gravity",
+    "how hard it pulls at its ends",
+    "when it is read",
+    "where the camera stands",
+    "how long it is",
+)
+"""What equations of the library depend on, in the order in which sentences name it."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +96,13 @@ class EffectBase(ABC):
         Internal coordinates, named `kind@location.joint`.
     joints : tuple of str
         Joints that an arm's name stands for.
+    equation : str
+        What the kind adds, as people read it.
+    depends_on : str
+        What has to vary in a motion for the kind to be told from others: one of `ASPECTS`, or words that continue
+        "vary ...".
+    needs : frozenset of str
+        Sensors without which nothing shows it.
     """
 
     kind: str
@@ -94,6 +113,7 @@ class EffectBase(ABC):
     joints: tuple[str, ...] = ()
 
     equation: ClassVar[str] = ""
+    depends_on: ClassVar[str] = ""
     needs: ClassVar[frozenset[str]] = frozenset()
 
     @classmethod

@@ -16,6 +16,7 @@ class KelvinVoigt(EffectBase):
     """Damping in proportion to stiffness: F = -tau kappa v on all joints of a segment, beside the model's damping."""
 
     equation = "F = -tau kappa v"
+    depends_on = "how fast it moves"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
@@ -44,6 +45,7 @@ class StandardLinearSolid(EffectBase):
     """
 
     equation = "V += 1/2 ratio kappa (q - z)^2, q - z = relaxation_time dz/dt"
+    depends_on = "how long it is held"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
@@ -88,6 +90,7 @@ class Hysteresis(EffectBase):
     """
 
     equation = "F = -stiffness z, dz/dt = v - |v| z / yield_angle"
+    depends_on = "how long it is held"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:

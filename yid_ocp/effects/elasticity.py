@@ -49,6 +49,7 @@ class CubicStiffness(EffectBase):
     """Springs of a segment that stiffen (k3 > 0) or soften with the angle: V += 1/4 k3 q^4 on every joint."""
 
     equation = "V += 1/4 k3 q^4"
+    depends_on = "how far it bends"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
@@ -86,6 +87,7 @@ class RestCurvature(EffectBase):
     """A segment that is bent at rest: V = 1/2 kappa (q - q_rest)^2, the same rest angles at every joint."""
 
     equation = "V = 1/2 kappa (q - q_rest)^2"
+    depends_on = "how far it bends"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
@@ -117,6 +119,7 @@ class BendAnisotropy(EffectBase):
     """A segment that bends more easily one way than the other: kappa_y = kappa_x (1 + ratio)."""
 
     equation = "kappa_y = kappa_x (1 + ratio)"
+    depends_on = "how far it bends"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
@@ -144,6 +147,7 @@ class JointSpring(EffectBase):
     """A spring across an arm joint: V += 1/2 stiffness (q - rest_angle)^2."""
 
     equation = "V += 1/2 stiffness (q - rest_angle)^2"
+    depends_on = "how far it bends"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
@@ -172,6 +176,7 @@ class MountCompliance(EffectBase):
     """
 
     equation = "two joints with V = 1/2 stiffness q^2 before the first link"
+    depends_on = "how hard it pulls at its ends"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
@@ -200,6 +205,7 @@ class JunctionCompliance(EffectBase):
     """
 
     equation = "two joints with V = 1/2 stiffness q^2 before the branches"
+    depends_on = "how hard it pulls at its ends"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:

@@ -33,6 +33,7 @@ class AerodynamicDrag(EffectBase):
     """
 
     equation = "F = -J_c' 1/2 rho_air cd 2 r l |v_n| v_n"
+    depends_on = "how fast it moves"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
@@ -71,6 +72,7 @@ class GravityScale(EffectBase):
     """A fraction of the object's full weight added to what the model has, the inertia unchanged."""
 
     equation = "V += -fraction x sum of m g.x over the object"
+    depends_on = "how it stands against gravity"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
@@ -101,6 +103,7 @@ class GravityTilt(EffectBase):
     """The gravity vector turned by rx about x, then by ry about y of the world."""
 
     equation = "g = Ry(ry) Rx(rx) g_0"
+    depends_on = "how it stands against gravity"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:

@@ -15,6 +15,7 @@ class JointViscous(EffectBase):
     """F = -b v, beside the model's damping."""
 
     equation = "F = -b v"
+    depends_on = "how fast it moves"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
@@ -36,6 +37,7 @@ class JointCoulomb(EffectBase):
     """F = -tau_c tanh(v/v_s), v_s = `SMOOTHING`."""
 
     equation = "F = -tau_c tanh(v/v_s)"
+    depends_on = "how fast it moves"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
@@ -57,6 +59,7 @@ class JointStribeck(EffectBase):
     """F = -tau_s exp(-(v/v_stribeck)^2) tanh(v/v_s), v_s = `SMOOTHING`: what sticking adds to sliding friction."""
 
     equation = "F = -tau_s exp(-(v/v_stribeck)^2) tanh(v/v_s)"
+    depends_on = "how fast it moves"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:

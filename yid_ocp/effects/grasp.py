@@ -15,6 +15,7 @@ class GraspOffset(EffectBase):
     """The grasped point sits at (dx, dy, dz) beside its nominal place in the gripper's frame."""
 
     equation = "phi = (holder + R (dx, dy, dz)) - held"
+    depends_on = "how hard it pulls at its ends"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
@@ -46,6 +47,7 @@ class GraspCompliance(EffectBase):
     """
 
     equation = "phi + C damping dphi/dt = C force"
+    depends_on = "how hard it pulls at its ends"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
@@ -79,6 +81,7 @@ class GraspSlip(EffectBase):
     """
 
     equation = "d(offset)/dt = slip_per_load x axial load"
+    depends_on = "how long it is held"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:

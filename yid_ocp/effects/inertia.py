@@ -24,6 +24,7 @@ class Density(EffectBase):
     """All masses and inertias of a segment times a factor."""
 
     equation = "masses and inertias times scale"
+    depends_on = "how hard it accelerates"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
@@ -45,6 +46,7 @@ class LinkMass(EffectBase):
     """Mass and inertia of what an arm joint carries, up to the next joint, times a factor."""
 
     equation = "mass and inertia of the child link times scale"
+    depends_on = "how hard it accelerates"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
@@ -67,6 +69,7 @@ class PointMass(EffectBase):
     """A point of some mass fixed to a frame: T += 1/2 mass |v|^2, V += -mass g.x."""
 
     equation = "T += 1/2 mass |v|^2, V -= mass g.x"
+    depends_on = "how hard it accelerates"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
@@ -100,6 +103,7 @@ class LengthScale(EffectBase):
     """Link lengths of a segment times a factor; its mass stays."""
 
     equation = "link lengths times scale"
+    depends_on = "how long it is"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
@@ -122,6 +126,7 @@ class RotorInertia(EffectBase):
     """Inertia of a motor's rotor, seen at its joint: T += 1/2 armature v^2."""
 
     equation = "T += 1/2 armature v^2"
+    depends_on = "how hard it accelerates"
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:

@@ -26,6 +26,7 @@ class EncoderOffset(EffectBase):
     """
 
     equation = "measured angle = true + offset"
+    depends_on = "how it stands against gravity"
     needs: ClassVar[frozenset[str]] = frozenset({"joints.position"})
 
     @classmethod
@@ -53,6 +54,7 @@ class CameraTranslation(EffectBase):
     """Seen point = true point + (x, y, z), along the world's axes."""
 
     equation = "seen point = true + (x, y, z)"
+    depends_on = "where the camera stands"
     needs: ClassVar[frozenset[str]] = CAMERA
 
     @classmethod
@@ -75,6 +77,7 @@ class CameraRotation(EffectBase):
     """Seen point = true point turned about the camera's origin, by Rz(rz) Ry(ry) Rx(rx) in the world's axes."""
 
     equation = "seen point = c + R (true - c)"
+    depends_on = "where the camera stands"
     needs: ClassVar[frozenset[str]] = CAMERA
 
     @classmethod
@@ -100,6 +103,7 @@ class CameraScale(EffectBase):
     """Depth times scale: a pixel's ray stays, so that the whole vector from the camera to the point is scaled."""
 
     equation = "seen point = c + scale (true - c)"
+    depends_on = "where the camera stands"
     needs: ClassVar[frozenset[str]] = CAMERA
 
     @classmethod
@@ -124,6 +128,7 @@ class CameraLatency(EffectBase):
     """Seen point = where it was delay ago."""
 
     equation = "seen point(t) = true point(t - delay)"
+    depends_on = "when it is read"
     needs: ClassVar[frozenset[str]] = CAMERA
 
     @classmethod
@@ -146,6 +151,7 @@ class SurfaceOffset(EffectBase):
     """The camera sees the near surface: a fraction of the tube's radius from its axis towards the camera."""
 
     equation = "seen point = true + fraction r (c - true)/|c - true|"
+    depends_on = "where the camera stands"
     needs: ClassVar[frozenset[str]] = CAMERA
 
     @classmethod
@@ -172,6 +178,7 @@ class ClockScale(EffectBase):
     """Recorded time = true time x scale, for a recording whose clock is only nominal."""
 
     equation = "recorded time = true x scale"
+    depends_on = "when it is read"
     needs: ClassVar[frozenset[str]] = frozenset({"nominal_clock"})
 
     @classmethod

@@ -42,14 +42,14 @@ class Refits:
         return len(self._known)
 
     def get(self, name: str) -> Refitted | None:
-        """See `yid_ocp.diagnosis.select.Store`; what is taken up is said in the log."""
+        """See `yid_ocp.diagnosis.refit.Store`; what is taken up is said in the log."""
         found = self._known.get(name)
         if found is not None:
             self._folder.log("taken_up", refit=name)
         return found
 
     def put(self, name: str, refitted: Refitted) -> None:
-        """See `yid_ocp.diagnosis.select.Store`."""
+        """See `yid_ocp.diagnosis.refit.Store`."""
         with self._lock:
             self._known[name] = refitted
             refits = {

@@ -23,7 +23,6 @@ Array = NDArray[np.float64]
 LISTED = 15  # candidates; the rest is in result.json
 MAPS = 3  # recordings of which a map is drawn; trajectories.h5 has them all
 CURVES = 3  # held-out channels
-ALIKE = 0.9  # part of a signature from which a pair is named in words
 NOMINAL, EXTENDED = "nominal model", "with the effects"
 COLORS = {NOMINAL: figures.BEFORE, EXTENDED: figures.AFTER}
 Prediction = tuple[Episode, EpisodeResult, EpisodeResult]
@@ -165,7 +164,7 @@ def _where(finding: Finding) -> Chapter | None:
         kept.sort(key=lambda k: (-smoothed.weight[trace.sources[k]], trace.sources[k].location, trace.sources[k].kind))
         if not kept:
             break
-        _, _, values = informed_map(smoothed, i)
+        _, _, values = informed_map(smoothed, i, finding.limits.mapped)
         shown = units(finding.nominal.problem.system, trace)
         axis = "value in its standard deviations"
         blank = not np.any(np.isfinite(values))
@@ -186,7 +185,7 @@ def _where(finding: Finding) -> Chapter | None:
             rows.append(Row(trace.unknowns[k], group, values[:, k], texts))
         pictures.append((f"Recording {trace.recording}", figures.html(figures.time_map(trace.edges, rows, axis))))
         if i == 0:
-            sentences.append(_surest(smoothed, shown, blank))
+            sentences.append(_surest(smoothed, shown, None if blank else values))
     if pictures:
         sentences.append("Red is a force, offset or bias in the positive direction, blue in the negative one.")
     else:
@@ -214,14 +213,14 @@ def _side(smoothed: Smoothed) -> str:
     )
 
 
-def _surest(smoothed: Smoothed, shown: Sequence[str], blank: bool) -> str:
+def _surest(smoothed: Smoothed, shown: Sequence[str], ratio: Array | None) -> str:
+    """The value farthest from zero in its standard deviations, `ratio` (J, nd); None where the data inform none."""
     trace = smoothed.traces[0]
-    if blank:
+    if ratio is None:
         return (
             "Nowhere do the data say more than half of what can be said of a single value, so that values are shown in "
             "units of the deviation expected beforehand: take the picture for a hint only."
         )
-    ratio = informed_map(smoothed)[2]
     j, k = divmod(int(np.nanargmax(np.abs(ratio))), ratio.shape[1])
     value, std = (array[j, k] * trace.reference[k] for array in (trace.mean, trace.std))
     return (
@@ -287,7 +286,7 @@ def _alike(finding: Finding, result: Mapping[str, Any]) -> Chapter | None:
         for i in range(len(names))
         for j in range(i + 1, len(names))
     ]
-    close = [f"{a} and {b} ({100 * v:.0f} %)" for v, a, b in sorted(pairs, reverse=True) if v >= ALIKE]
+    close = [f"{a} and {b} ({100 * v:.0f} %)" for v, a, b in sorted(pairs, reverse=True) if v >= finding.limits.alike]
     listed = f"{', '.join(close[:5])}{f' and {len(close) - 5} more' if len(close) > 5 else ''}"
     v, a, b = max(pairs)
     sentences = [

@@ -1,30 +1,25 @@
-"""The blind proof: recordings whose effect is withheld, answers given without it, labels opened only by the scorer.
+"""Cases drawn at random, and their labels.
 
-An ensemble of virtual experiments is drawn at random: some clean, some with one effect at one, three or ten times its
-detectable size, some with two, some with an effect that is in no library or that the library was robbed of, some with
-twice as many links as the model. Labels are written apart from the recordings and their hash is published before any
-recording is looked at.
+Some are clean, some have one effect at one, three or ten times its detectable size, some two, some an effect that is in
+no library or that was left out of the library, some twice as many links as the model. Labels are written apart from
+the recordings and their hash is published before any recording is looked at.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from yid_ocp.data.recording import Recording
-from yid_ocp.diagnosis.diagnose import diagnose, nominal_fit
+from yid_ocp.diagnosis.diagnose import nominal_fit
 from yid_ocp.diagnosis.hypotheses import CandidateProblem, Choice, chosen_effects
-from yid_ocp.diagnosis.screening import DETECTION, Linearisation, linearise
-from yid_ocp.diagnosis.select import closure, refit
-from yid_ocp.diagnosis.verdict import Finding, Thresholds
-from yid_ocp.effects import EFFECTS
+from yid_ocp.diagnosis.screening import Linearisation, Signature, linearise
+from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
 from yid_ocp.effects.base import Quantity, segment_springs
 from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.model.system import System
@@ -32,10 +27,6 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.virtual.experiment import Motion
 from yid_ocp.virtual.injected import KINDS, OUTSIDE, InjectedEffect, injected_experiment
 
-Array = NDArray[np.float64]
-Progress = Callable[[str], None]
-
-FORMAT = "yid-blind/1"
 SIZES = (1.0, 3.0, 10.0)
 """Multiples of the detectable size."""
 SHARES: Mapping[str, float] = {"null": 0.2, "single": 0.5, "outside": 0.15, "left_out": 0.05, "pair": 0.05}
@@ -55,7 +46,7 @@ class Label:
     case : str
     category : str
         null, single, pair, outside, left_out or finer_chain.
-    withheld : tuple of InjectedEffect
+    injected : tuple of InjectedEffect
     multiple : float, optional
         Of the detectable size, as made; None where that has no meaning.
     truth : dict of str to float
@@ -64,19 +55,19 @@ class Label:
 
     case: str
     category: str
-    withheld: tuple[InjectedEffect, ...]
+    injected: tuple[InjectedEffect, ...]
     multiple: float | None
     truth: Mapping[str, float]
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON."""
-        return asdict(self) | {"withheld": [asdict(e) for e in self.withheld]}
+        return asdict(self) | {"injected": [asdict(e) for e in self.injected]}
 
     @staticmethod
     def from_dict(data: Mapping[str, Any]) -> Label:
         """From JSON."""
-        withheld = tuple(InjectedEffect(**entry) for entry in data["withheld"])
-        return Label(data["case"], data["category"], withheld, data["multiple"], data["truth"])
+        injected = tuple(InjectedEffect(**entry) for entry in data["injected"])
+        return Label(data["case"], data["category"], injected, data["multiple"], data["truth"])
 
 
 @dataclass(frozen=True)
@@ -88,7 +79,7 @@ class Case:
     name : str
     estimate, held_out : Recording
     without : tuple of str
-        Kinds that the library is robbed of; mostly one that has nothing to do with the case.
+        Kinds that are left out of the library; mostly one that has nothing to do with the case.
     """
 
     name: str
@@ -116,9 +107,6 @@ def opened(text: str, commitment: str) -> list[Label]:
     return [Label.from_dict(entry) for entry in json.loads(text)]
 
 
-# -- the ensemble -----------------------------------------------------------------------------------------------------
-
-
 class Ensemble:
     """Draws cases of one experiment.
 
@@ -131,6 +119,8 @@ class Ensemble:
         The system with so many times its links.
     candidates : "all" or sequence of str
         The library.
+    limits : Thresholds
+        For the detectable size.
 
     Raises
     ------
@@ -144,6 +134,7 @@ class Ensemble:
         seed: int,
         finer: Callable[[int], System] | None = None,
         candidates: Choice = "all",
+        limits: Thresholds = DEFAULTS,
     ) -> None:
         if not problem.system.driven or problem.system.prescribed:
             raise ConfigError(
@@ -154,7 +145,7 @@ class Ensemble:
         if seed < 0:
             raise ConfigError(f"seed = {seed}", where="--seed", allowed="a whole number from 0")
         self.problem, self.seed, self._finer = problem, seed, finer
-        self._candidates = candidates
+        self._candidates, self._limits = candidates, limits
         recording = problem.episodes[0].recording
         assert recording.joints is not None
         names = list(recording.joints.names)
@@ -180,7 +171,7 @@ class Ensemble:
     def record(
         self,
         truth: Mapping[str, float],
-        withheld: Sequence[InjectedEffect],
+        injected: Sequence[InjectedEffect],
         rng: np.random.Generator,
         name: str,
         links: int = 1,
@@ -196,7 +187,7 @@ class Ensemble:
         made = injected_experiment(
             system,
             truth if links == 1 else finer_values(self.problem.system, system, truth),
-            withheld,
+            injected,
             motion=motion,
             seed=int(rng.integers(2**31)),
             posture=self.posture,
@@ -212,7 +203,8 @@ class Ensemble:
             problem = self.of(clean)
             effects = chosen_effects(problem.system, [clean], self._candidates)
             composed = CandidateProblem.of(problem, effects, [self.record(self.truth(rng), (), rng, "other")])
-            self._point = linearise(composed, (), nominal_fit(problem, composed).values)
+            nominal = nominal_fit(problem, composed, limits=self._limits)
+            self._point = linearise(composed, (), nominal.values, self._limits.shape_values)
         return self._point
 
     def of(self, recording: Recording) -> EstimationProblem:
@@ -233,18 +225,18 @@ class Ensemble:
             rng = self._rng(1, number, attempt)
             category = self._category(number, count)
             truth = self.truth(rng)
-            withheld, multiple = self._withheld(category, rng)
+            injected, multiple = self._injected(category, rng)
             links = 2 if category == "finer_chain" else 1
             name = f"case_{number:03d}"
             try:
                 estimate, held_out = (
-                    self.record(truth, withheld, rng, f"{name}_{purpose}", links)
+                    self.record(truth, injected, rng, f"{name}_{purpose}", links)
                     for purpose in ("estimate", "held_out")
                 )
             except ModelError:
                 continue  # the motion throws the object about; draw another
-            robbed = (withheld[0].kind,) if category == "left_out" else self._other_kind(withheld, rng)
-            return Case(name, estimate, held_out, robbed), Label(name, category, withheld, multiple, truth)
+            left_out = (injected[0].kind,) if category == "left_out" else self._other_kind(injected, rng)
+            return Case(name, estimate, held_out, left_out), Label(name, category, injected, multiple, truth)
         raise ModelError("no motion of this experiment can be simulated", where=f"case {number}")
 
     def _category(self, number: int, count: int) -> str:
@@ -256,12 +248,12 @@ class Ensemble:
         category = [*SHARES, "finer_chain"][place]
         return "single" if category == "finer_chain" and self._finer is None else category
 
-    def _other_kind(self, withheld: Sequence[InjectedEffect], rng: np.random.Generator) -> tuple[str, ...]:
-        at_work = {effect.kind for effect in withheld}
+    def _other_kind(self, injected: Sequence[InjectedEffect], rng: np.random.Generator) -> tuple[str, ...]:
+        at_work = {effect.kind for effect in injected}
         kinds = sorted({s.effect.kind for s in self.point().signatures} - at_work)
         return (str(rng.choice(kinds)),) if len(kinds) > 1 else ()
 
-    def _withheld(self, category: str, rng: np.random.Generator) -> tuple[tuple[InjectedEffect, ...], float | None]:
+    def _injected(self, category: str, rng: np.random.Generator) -> tuple[tuple[InjectedEffect, ...], float | None]:
         if category in ("null", "finer_chain"):
             return (), None
         if category == "outside":
@@ -284,29 +276,35 @@ class Ensemble:
         for _ in range(40):
             kind = str(rng.choice(sorted(groups)))
             place = str(rng.choice(sorted(groups[kind])))
-            signature = self.point().signatures[int(rng.choice(groups[kind][place]))]
-            effect = signature.effect
-            quantities: dict[str, Quantity] = {f"{effect.label}.{q.name}": q for q in effect.quantities}
-            room = {n: effect.prior_range[n] for n in effect.amplitudes}
-            neutral = np.array([quantities[n].neutral for n in effect.amplitudes])
-            low, high = (np.array([room[n][side] for n in effect.amplitudes]) - neutral for side in (0, 1))
-            way = rng.uniform(low, high)
-            seen = float(np.linalg.norm(signature.columns @ way))
-            if seen <= 0:
+            drawn = self._sized(self.point().signatures[int(rng.choice(groups[kind][place]))], rng, wanted)
+            if drawn is None:
                 continue
-            factor = wanted * DETECTION / seen
-            # as far as the range allows along this way
-            reach = np.min(np.where(way > 0, high, low)[way != 0] / way[way != 0])
-            factor = min(factor, float(reach))
-            values = dict(zip(effect.amplitudes, neutral + factor * way, strict=True)) | signature.shape
-            made = InjectedEffect(kind, place, {n: r.value for n, r in effect.reported(values).items()})
-            multiple = factor * seen / DETECTION
+            made, multiple = drawn
             if multiple > 0.9 * wanted:
                 return made, wanted
             if best is None or multiple > best[1]:
                 best = made, multiple
         assert best is not None
         return best
+
+    def _sized(
+        self, signature: Signature, rng: np.random.Generator, wanted: float
+    ) -> tuple[InjectedEffect, float] | None:
+        """Amplitudes in a random proportion at so many times the detectable size, as far as the range allows."""
+        effect = signature.effect
+        quantities: dict[str, Quantity] = {f"{effect.label}.{q.name}": q for q in effect.quantities}
+        room = {n: effect.prior_range[n] for n in effect.amplitudes}
+        neutral = np.array([quantities[n].neutral for n in effect.amplitudes])
+        low, high = (np.array([room[n][side] for n in effect.amplitudes]) - neutral for side in (0, 1))
+        way = rng.uniform(low, high)
+        seen = float(np.linalg.norm(signature.columns @ way))
+        if seen <= 0:
+            return None
+        reach = np.min(np.where(way > 0, high, low)[way != 0] / way[way != 0])
+        factor = min(wanted * self._limits.detection / seen, float(reach))
+        values = dict(zip(effect.amplitudes, neutral + factor * way, strict=True)) | signature.shape
+        reported = {name: entry.value for name, entry in effect.reported(values).items()}
+        return InjectedEffect(effect.kind, effect.location, reported), factor * seen / self._limits.detection
 
     def _outside(self, rng: np.random.Generator) -> InjectedEffect:
         system = self.problem.system
@@ -346,194 +344,3 @@ def finer_values(nominal: System, finer: System, truth: Mapping[str, float]) -> 
             if name in start:
                 values[name] = truth.get(name, start[name]) * factor
     return values
-
-
-# -- answers and score ------------------------------------------------------------------------------------------------
-
-
-def answer(
-    ensemble: Ensemble,
-    case: Case,
-    candidates: Choice = "all",
-    thresholds: Thresholds | None = None,
-    progress: Progress | None = None,
-) -> Finding:
-    """The diagnosis of a case, from its recordings alone."""
-    problem = ensemble.of(case.estimate)
-    choice = library(problem.system, case, candidates)
-    return diagnose(problem, choice, [case.held_out], thresholds=thresholds, progress=progress)
-
-
-def library(system: System, case: Case, candidates: Choice) -> list[str]:
-    """Candidates of a case, as `kind@location`."""
-    effects = chosen_effects(system, [case.estimate], candidates)
-    return [effect.label for effect in effects if effect.kind not in case.without]
-
-
-def best_closure(ensemble: Ensemble, case: Case, label: Label, candidates: Choice = "all") -> float:
-    """Held-out closure of the true effects, refitted: the most that a diagnosis could reach."""
-    problem = ensemble.of(case.estimate)
-    effects = chosen_effects(problem.system, [case.estimate], candidates)
-    composed = CandidateProblem.of(problem, effects, [case.held_out])
-    nominal = nominal_fit(problem, composed)
-    true = {entry.label: entry for entry in label.withheld}
-    chosen = [effect for effect in effects if effect.label in true]
-    start = {}
-    for effect in chosen:
-        start.update(_internal(effect.label, true[effect.label].values, effect.quantities))
-    fit = refit(composed, chosen, {**nominal.values, **start})
-    return math.nan if fit is None or len(chosen) < len(true) else closure(nominal.loss, fit.loss).value
-
-
-def _internal(label: str, values: Mapping[str, float], quantities: Sequence[Quantity]) -> dict[str, float]:
-    """Reported values in the parameters' own unit."""
-    found = {}
-    for quantity in quantities:
-        name, _ = quantity.reported
-        if name in values:
-            value = values[name]
-            found[f"{label}.{quantity.name}"] = 1 / value if quantity.reciprocal else value
-    return found
-
-
-@dataclass(frozen=True)
-class Mark:
-    """How one answer compares with its label.
-
-    Attributes
-    ----------
-    case, category, truth, verdict, answer : str
-    multiple : float
-    gap : bool
-        Whether a gap was reported.
-    kind_first, kind_second, location_first : bool
-        The true kind at the true place is first, or among the first two, of the candidates; the true place comes first.
-    confusable : tuple of str
-        Set that was named as not separable.
-    right : bool
-        As the verdict asks: no_gap of a clean one, the true effect alone or in a set of at most three, unknown at the
-        right place outside the library.
-    closure, best : float
-        Held out, of what was added and of the true effects refitted.
-    errors : dict of str to (float, bool)
-        Relative error of every parameter of the true effect where it was added, and whether its 95 % interval has it.
-    seconds : float
-    """
-
-    case: str
-    category: str
-    truth: str
-    verdict: str
-    answer: str
-    multiple: float
-    gap: bool
-    kind_first: bool
-    kind_second: bool
-    location_first: bool
-    confusable: tuple[str, ...]
-    right: bool
-    closure: float
-    best: float
-    errors: Mapping[str, tuple[float, bool]] = field(default_factory=dict)
-    seconds: float = math.nan
-
-
-def mark(label: Label, result: Mapping[str, Any], best: float = math.nan, seconds: float = math.nan) -> Mark:
-    """Compare a `yid-diagnosis/1` result with its label.
-
-    Parameters
-    ----------
-    label : Label
-    result : mapping
-    best : float
-        Of `best_closure`.
-    seconds : float
-    """
-    verdict = str(result["verdict"])
-    named = [f"{e['kind']}@{e['location']}" for e in result["effects"]]
-    listed = [f"{e['kind']}@{e['location']}" for e in result["which"]]
-    groups = [tuple(f"{e['kind']}@{e['location']}" for e in group) for group in result["confusable"]]
-    alike = next((group for group in groups if named and named[0] in group), ())
-    true = [effect.label for effect in label.withheld]
-    places = [p["location"] for p in result["where"]]
-    gap = verdict not in ("no_gap", "insufficient_data")
-    located = bool(true) and bool(places) and places[0] in {effect.location for effect in label.withheld}
-    if label.category in ("null",):
-        right = verdict == "no_gap"
-    elif label.category in ("outside", "left_out"):
-        right = verdict == "unknown" and located
-    elif label.category == "pair":
-        right = set(true) <= {*named, *alike}
-    else:
-        right = bool(true) and (named[:1] == true or (true[0] in alike and len(alike) <= 3))
-    errors: dict[str, tuple[float, bool]] = {}
-    for effect in label.withheld:
-        if effect.label not in named or effect.kind not in EFFECTS:
-            continue
-        entry = result["which"][listed.index(effect.label)]
-        for name, value in effect.values.items():
-            found = entry["parameters"].get(name, {})
-            if found.get("value") is None or found.get("std") is None or not math.isfinite(value):
-                continue
-            miss = found["value"] - value
-            errors[f"{effect.label}.{name}"] = (abs(miss) / max(abs(value), 1e-9), abs(miss) <= 1.96 * found["std"])
-    closed = result["gap"]["closure"]
-    return Mark(
-        label.case,
-        label.category,
-        " + ".join(true) or "-",
-        verdict,
-        " + ".join(named) or "-",
-        math.nan if label.multiple is None else label.multiple,
-        gap,
-        bool(true) and listed[:1] == true[:1],
-        bool(true) and true[0] in listed[:2],
-        located,
-        alike,
-        right,
-        math.nan if closed is None else float(closed),
-        best,
-        errors,
-        seconds,
-    )
-
-
-def score(marks: Sequence[Mark]) -> dict[str, Any]:
-    """Rates over an ensemble; None where there was no case of the sort."""
-
-    def rate(values: Sequence[bool | float]) -> float | None:
-        return float(np.mean(values)) if len(values) else None
-
-    singles = [m for m in marks if m.category == "single"]
-    seen = [m for m in singles if m.gap]
-    named = [m for m in seen if m.confusable]
-    strange = [m for m in marks if m.category in ("outside", "left_out")]
-    errors = [entry for m in singles for entry in m.errors.values()]
-    relative = [m.closure / m.best for m in singles if m.best > 0 and math.isfinite(m.closure)]
-    sizes = sorted({m.multiple for m in singles if math.isfinite(m.multiple)})
-    return {
-        "format": FORMAT,
-        "cases": len(marks),
-        "false_alarms": rate([m.gap for m in marks if m.category == "null"]),
-        "detection": {
-            f"{size:.3g}": {
-                "cases": sum(m.multiple == size for m in singles),
-                "gap": rate([m.gap for m in singles if m.multiple == size]),
-                "right": rate([m.right for m in singles if m.multiple == size]),
-            }
-            for size in sizes
-        },
-        "kind_first": rate([m.kind_first for m in seen]),
-        "kind_in_two": rate([m.kind_second for m in seen]),
-        "location_first": rate([m.location_first for m in seen]),
-        "confusable_covers": rate([m.truth in m.confusable for m in named]),
-        "confusable_size": rate([len(m.confusable) for m in named]),
-        "unknown_recall": rate([m.verdict == "unknown" for m in strange]),
-        "unknown_location": rate([m.location_first for m in strange if m.gap]),
-        "pairs_right": rate([m.right for m in marks if m.category == "pair"]),
-        "closure_of_best": rate(relative),
-        "parameter_error": None if not errors else float(np.median([e for e, _ in errors])),
-        "interval_coverage": rate([inside for _, inside in errors]),
-        "seconds": rate([m.seconds for m in marks if math.isfinite(m.seconds)]),
-        "marks": [asdict(m) for m in marks],
-    }

@@ -1,0 +1,83 @@
+"""A threshold that is changed changes what it stands for."""
+
+from __future__ import annotations
+
+from typing import Annotated, get_args, get_origin, get_type_hints
+
+import numpy as np
+import pytest
+
+from yid_ocp.diagnosis import Thresholds, diagnose
+from yid_ocp.diagnosis.localise import informed_map, localise
+from yid_ocp.diagnosis.select import out_of_shape, oversized
+from yid_ocp.effects import make_effect
+from yid_ocp.options import About
+
+KIND = "joint_coulomb@elbow"
+
+
+def found(bench, **limits):
+    recordings = [bench.recording({KIND: {"tau_c": 0.1}}, seed, duration=2.0) for seed in (1, 2)]
+    return diagnose(
+        bench.problem(recordings[:1]), (KIND, "joint_stribeck@elbow"), recordings[1:], thresholds=Thresholds(**limits)
+    )
+
+
+@pytest.fixture(scope="module")
+def usual(bench):
+    return found(bench)
+
+
+def test_every_threshold_says_what_it_is():
+    for name, hint in get_type_hints(Thresholds, include_extras=True).items():
+        assert get_origin(hint) is Annotated, name
+        assert any(isinstance(entry, About) and entry.text for entry in get_args(hint)), name
+        assert name in (Thresholds.__doc__ or "")
+
+
+def test_the_whole_diagnosis_goes_by_what_it_is_given(bench, usual):
+    other = found(
+        bench, window=1.0, detection=2 * 3.858, shape_values=2, force=0.2, noticed=40.0, worth=6.0, refits=1, alike=1.0
+    )
+    assert usual.verdict == other.verdict == "effect"
+    assert max(round(w.end - w.begin, 6) for w in usual.before.windows) == 0.5
+    assert max(round(w.end - w.begin, 6) for w in other.before.windows) == 1.0
+    sizes = [
+        {v.effect.label: v.detectable[f"{KIND}.tau_c"] for v in f.visibility if v.effect.label == KIND}
+        for f in (usual, other)
+    ]
+    assert sizes[1][KIND] == pytest.approx(2 * sizes[0][KIND])
+    assert other.smoothed.worth == 6.0
+    # unknowns of twice the size raise r'r four times as much, and have to
+    for source, size in usual.smoothed.detectable.items():
+        assert other.smoothed.detectable[source] == pytest.approx(size)
+    assert len(other.fits) == 1 < len(usual.fits)
+
+
+def test_too_few_samples_by_another_measure(bench):
+    assert found(bench, samples_per_unknown=1e4).verdict == "insufficient_data"
+
+
+@pytest.mark.parametrize(
+    ("limits", "verdict"),
+    [({"closure": 0.999}, "unknown"), ({"explained": 5.0}, "unknown"), ({"effects": 1}, "effect")],
+)
+def test_a_verdict_goes_by_its_thresholds(bench, limits, verdict):
+    assert found(bench, **limits).verdict == verdict
+
+
+def test_a_gap_is_there_by_so_many_standard_deviations(usual):
+    loose, strict = (localise(usual.smoothed, sure)[0].windows for sure in (0.5, 20.0))
+    assert sum(b - a for a, b in loose) > sum(b - a for a, b in strict)
+    informed = [np.isfinite(informed_map(usual.smoothed, 0, mapped)[2]).sum() for mapped in (0.1, 0.999)]
+    assert informed[0] > informed[1]
+
+
+def test_how_far_a_value_may_leave_its_range(bench):
+    effect = make_effect("joint_stribeck", "elbow", bench.system)
+    _, high = effect.prior_range["joint_stribeck@elbow.v_stribeck"]
+    values = {"joint_stribeck@elbow.tau_s": 4.1, "joint_stribeck@elbow.v_stribeck": 2.5 * high}
+    assert out_of_shape(effect, values)
+    assert not out_of_shape(effect, values, Thresholds(shape_factor=3.0))
+    assert oversized(effect, values)
+    assert not oversized(effect, values, Thresholds(range_widths=1.5))

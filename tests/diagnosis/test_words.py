@@ -1,0 +1,108 @@
+"""What a finding says in sentences."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+
+from yid_ocp.diagnosis import Place, Thresholds, diagnose
+from yid_ocp.diagnosis.words import next_experiment, sentences, separating, shortage
+from yid_ocp.effects import make_effect
+
+
+@pytest.fixture(scope="module")
+def finding(bench):
+    recordings = [bench.recording({"joint_coulomb@elbow": {"tau_c": 0.1}}, seed, duration=2.0) for seed in (1, 2)]
+    return diagnose(bench.problem(recordings[:1]), ("joint_coulomb@elbow",), recordings[1:])
+
+
+@pytest.mark.parametrize(
+    ("level", "p_value", "chi2", "noise"),
+    [
+        (0.01, 0.03, 1.2, True),
+        (0.05, 0.03, 1.2, False),
+        (0.05, 0.06, 1.2, True),
+        (0.05, 0.03, 0.9, True),
+        (0.01, 0.003, 1.2, False),
+    ],
+)
+def test_what_remains_is_noise_by_the_level_of_the_diagnosis(finding, level, p_value, chi2, noise):
+    rest = replace(finding.remaining, p_value=p_value, chi2_per_dof=chi2)
+    place = Place("elbow", 1.0, True, ())
+    said = sentences(replace(finding, remaining=rest, remaining_where=(place,), limits=Thresholds(level=level)))
+    assert ("What remains is noise." in said) is noise
+    expected = f"What remains: held-out chi2 per degree of freedom {chi2:.3g}, most of it in elbow."
+    assert (expected in said) is not noise
+
+
+def test_a_finding_keeps_its_words_and_what_decided_them(finding):
+    assert finding.limits == Thresholds()
+    assert finding.summary == sentences(finding) == finding.to_dict()["summary"]
+
+
+def kind(label: str, depends_on: str):
+    return SimpleNamespace(label=label, location=label.partition("@")[2], depends_on=depends_on)
+
+
+@pytest.mark.parametrize(
+    ("labels", "said"),
+    [
+        (("joint_viscous@elbow", "joint_coulomb@elbow"), "Vary how fast it moves over a wider range."),
+        (
+            ("joint_coulomb@elbow", "joint_coulomb@shoulder"),
+            "Move so that elbow and shoulder work one at a time, or measure a point between them.",
+        ),
+        (
+            ("gravity_tilt@world", "link_mass@elbow", "joint_coulomb@elbow"),
+            "Vary how fast it moves and how hard it accelerates and how it stands against gravity independently of "
+            "each other, over a wide range, in one recording.",
+        ),
+    ],
+)
+def test_rivals_are_separated_by_what_they_depend_on(bench, labels, said):
+    effects = [make_effect(*label.split("@"), bench.system) for label in labels]
+    assert separating(effects) == said
+
+
+def test_an_aspect_that_the_library_does_not_know_comes_last():
+    rivals = [kind("melting@T1", "how hot it is"), kind("density@T1", "how hard it accelerates")]
+    assert separating(rivals).startswith("Vary how hard it accelerates and how hot it is independently")
+    assert separating([kind("odd@T1", "")]) == "Record other motions, faster and larger."
+
+
+@pytest.mark.parametrize(
+    ("verdict", "where", "unseen", "said"),
+    [
+        ("insufficient_data", (), (), "Record longer and larger motions; more of the object has to be seen."),
+        (
+            "unknown",
+            (Place("T2", 1.0, True, ()),),
+            (),
+            "Move T2 alone, slowly and fast, and hold it still in several postures.",
+        ),
+        ("no_gap", (), (), "None is needed."),
+        ("no_gap", (), ("a@b",), "None is needed; these motions could not have shown a@b."),
+        ("no_gap", (), tuple("abcde"), "None is needed; these motions could not have shown a, b, c, d, ...."),
+        ("effect", (), (), "Repeat with other motions to see whether the effect's parameters stay."),
+    ],
+)
+def test_the_next_experiment_follows_the_verdict(verdict, where, unseen, said):
+    assert next_experiment(verdict, (), where, unseen) == said
+
+
+def test_rivals_come_before_all_else():
+    rivals = (kind("a@T1", "when it is read"), kind("b@T1", "when it is read"))
+    added = [SimpleNamespace(rivals=rivals[:1]), SimpleNamespace(rivals=rivals)]
+    assert next_experiment("confusable", added, (), ()) == "Vary when it is read over a wider range."
+
+
+def test_a_shortage_says_what_is_needed():
+    before, limits = SimpleNamespace(degrees=11.6), Thresholds(samples_per_unknown=4.0)
+    seen = [SimpleNamespace(visible=True)]
+    assert shortage("effect", before, 5, seen, limits) == ""
+    said = shortage("insufficient_data", before, 5, seen, limits)
+    assert said.startswith("12 effective samples for 5 unknowns, at least 20 are needed")
+    hidden = shortage("insufficient_data", before, 5, [SimpleNamespace(visible=False)], limits)
+    assert hidden == "no candidate of the size that one would expect would show in these recordings."

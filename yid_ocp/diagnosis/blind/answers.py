@@ -1,0 +1,61 @@
+"""Answers to cases from their recordings alone, and the best that could have been answered."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+from yid_ocp.diagnosis.blind.ensemble import Case, Ensemble, Label
+from yid_ocp.diagnosis.diagnose import diagnose, nominal_fit
+from yid_ocp.diagnosis.finding import Finding
+from yid_ocp.diagnosis.hypotheses import CandidateProblem, Choice, chosen_effects
+from yid_ocp.diagnosis.refit import Progress, refit
+from yid_ocp.diagnosis.select import closure
+from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.effects.base import Quantity
+from yid_ocp.model.system import System
+
+
+def answer(
+    ensemble: Ensemble,
+    case: Case,
+    candidates: Choice = "all",
+    thresholds: Thresholds | None = None,
+    progress: Progress | None = None,
+) -> Finding:
+    """The diagnosis of a case, from its recordings alone."""
+    problem = ensemble.of(case.estimate)
+    choice = library(problem.system, case, candidates)
+    return diagnose(problem, choice, [case.held_out], thresholds=thresholds, progress=progress)
+
+
+def library(system: System, case: Case, candidates: Choice) -> list[str]:
+    """Candidates of a case, as `kind@location`."""
+    effects = chosen_effects(system, [case.estimate], candidates)
+    return [effect.label for effect in effects if effect.kind not in case.without]
+
+
+def best_closure(ensemble: Ensemble, case: Case, label: Label, candidates: Choice = "all") -> float:
+    """Held-out closure of the true effects, refitted: the most that a diagnosis could reach."""
+    problem = ensemble.of(case.estimate)
+    effects = chosen_effects(problem.system, [case.estimate], candidates)
+    composed = CandidateProblem.of(problem, effects, [case.held_out])
+    nominal = nominal_fit(problem, composed)
+    true = {entry.label: entry for entry in label.injected}
+    chosen = [effect for effect in effects if effect.label in true]
+    start = {}
+    for effect in chosen:
+        start.update(_internal(effect.label, true[effect.label].values, effect.quantities))
+    fit = refit(composed, chosen, {**nominal.values, **start})
+    return math.nan if fit is None or len(chosen) < len(true) else closure(nominal.loss, fit.loss).value
+
+
+def _internal(label: str, values: Mapping[str, float], quantities: Sequence[Quantity]) -> dict[str, float]:
+    """Reported values in the parameters' own unit."""
+    found = {}
+    for quantity in quantities:
+        name, _ = quantity.reported
+        if name in values:
+            value = values[name]
+            found[f"{label}.{quantity.name}"] = 1 / value if quantity.reciprocal else value
+    return found

@@ -1,0 +1,217 @@
+"""What a diagnosis says, as a value and as `yid-diagnosis/1`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from yid_ocp.diagnosis.localise import Place
+from yid_ocp.diagnosis.null_test import Floor, NullTest
+from yid_ocp.diagnosis.refit import Fit
+from yid_ocp.diagnosis.screening import Confusability, Score, Visibility
+from yid_ocp.diagnosis.select import Added, Closure, closure
+from yid_ocp.diagnosis.smoother import Smoothed
+from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.effects import EffectBase
+
+FORMAT = "yid-diagnosis/1"
+
+
+@dataclass(frozen=True)
+class Absorbed:
+    """How a nominal parameter moves when the effects are added."""
+
+    name: str
+    unit: str
+    before: float
+    after: float
+    std: float
+
+
+def absorption(before: Fit, after: Fit) -> tuple[Absorbed, ...]:
+    """How the nominal parameters move when the effects are added."""
+    parameters = before.problem.system.parameters
+    return tuple(
+        Absorbed(name, parameters[name].unit, before.values[name], after.values[name], after.std[name])
+        for name in before.problem.shared
+    )
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a diagnosis says.
+
+    Attributes
+    ----------
+    verdict : str
+        effect, confusable, no_gap, unknown or insufficient_data.
+    floor : tuple of Floor
+    before, held_out_before : NullTest
+        Nominal model, on the recordings to estimate on and on the held-out ones.
+    visibility : tuple of Visibility
+    confusability : Confusability
+    scores : tuple of Score
+        First pass, best first.
+    smoothed : Smoothed or None
+        Unknown forces, offsets and biases about the nominal model; None where there is no gap to locate.
+    where : tuple of Place
+    nominal : Fit
+    fits : tuple of Fit
+        Refits of the first round, best first.
+    added : tuple of Added
+    closure : Closure
+    remaining : NullTest
+        Held-out, with the effects added.
+    remaining_where : tuple of Place
+    absorbed : tuple of Absorbed
+    next_experiment : str
+    held_out : tuple of str
+        Names of the recordings.
+    in_blocks : bool
+        Whether one recording was split in blocks.
+    message : str
+        Why data do not suffice, or what else must be said.
+    limits : Thresholds
+        By which all this was decided.
+    seconds : dict of stage to float
+    summary : str
+        The report in words; see `words.sentences`.
+    """
+
+    verdict: str
+    floor: tuple[Floor, ...]
+    before: NullTest
+    held_out_before: NullTest
+    visibility: tuple[Visibility, ...]
+    confusability: Confusability
+    scores: tuple[Score, ...]
+    smoothed: Smoothed | None
+    where: tuple[Place, ...]
+    nominal: Fit
+    fits: tuple[Fit, ...]
+    added: tuple[Added, ...]
+    closure: Closure
+    remaining: NullTest
+    remaining_where: tuple[Place, ...]
+    absorbed: tuple[Absorbed, ...]
+    next_experiment: str
+    held_out: tuple[str, ...]
+    in_blocks: bool
+    message: str
+    limits: Thresholds
+    seconds: Mapping[str, float]
+    summary: str = ""
+
+    @property
+    def effects(self) -> tuple[EffectBase, ...]:
+        """What was added, in order."""
+        return tuple(entry.effect for entry in self.added) if self.verdict in ("effect", "confusable") else ()
+
+    @property
+    def last(self) -> Fit:
+        """The model with all that was added."""
+        return self.added[-1].fit if self.effects else self.nominal
+
+    def to_dict(self) -> dict[str, Any]:
+        """`yid-diagnosis/1`."""
+        return {
+            "format": FORMAT,
+            "verdict": self.verdict,
+            "gap": {
+                "before": _state(self.nominal, self.held_out_before),
+                "after": _state(self.last, self.remaining),
+                "closure": _number(self.closure.value) if self.effects else None,
+                "closure_ci": [_number(self.closure.low), _number(self.closure.high)] if self.effects else None,
+                "held_out": list(self.held_out),
+            },
+            "where": [_place(p) for p in self.where],
+            "which": which(self),
+            "effects": [{"kind": e.kind, "location": e.location} for e in self.effects],
+            "remaining": {"p_value": self.remaining.p_value, "where": [_place(p) for p in self.remaining_where]},
+            "confusable": [
+                [{"kind": e.kind, "location": e.location} for e in entry.rivals]
+                for entry in self.added
+                if self.effects and len(entry.rivals) > 1
+            ],
+            "next_experiment": self.next_experiment,
+            "side": None if self.smoothed is None else self.smoothed.side,
+            "evidence": {} if self.smoothed is None else dict(self.smoothed.evidence),
+            "explainable": None if self.smoothed is None else self.smoothed.explainable,
+            "summary": self.summary,
+            "message": self.message,
+            "held_out_in_blocks": self.in_blocks,
+            "absorption": {
+                a.name: {"before": a.before, "after": a.after, "std": _number(a.std), "unit": a.unit}
+                for a in self.absorbed
+            },
+            "steps": [
+                {
+                    "added": entry.effect.label,
+                    "closure": _number(entry.closure.value),
+                    "closure_ci": [_number(entry.closure.low), _number(entry.closure.high)],
+                    "chi2_per_dof": entry.fit.loss.mean,
+                    "rmse": {name: value for name, (value, _) in entry.fit.loss.channels.items()},
+                }
+                for entry in self.added
+            ],
+            "unseen": [v.effect.label for v in self.visibility if not v.visible],
+            "noise": {f.channel: {"std": f.std, "unit": f.unit, "samples": f.samples} for f in self.floor},
+            "seconds": dict(self.seconds),
+        }
+
+
+def _state(fit: Fit, test: NullTest) -> dict[str, Any]:
+    return {
+        "rmse": {name: value for name, (value, _) in fit.loss.channels.items()},
+        "unit": {name: unit for name, (_, unit) in fit.loss.channels.items()},
+        "chi2_per_dof": test.chi2_per_dof,
+        "p_value": test.p_value,
+    }
+
+
+def _place(place: Place) -> dict[str, Any]:
+    return {
+        "location": place.location,
+        "share": place.share,
+        "observable": place.observable,
+        "windows": [list(window) for window in place.windows],
+    }
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def which(finding: Finding) -> list[dict[str, Any]]:
+    """Candidates, best first: what was added, then the other refits by held-out loss, then the rest by score."""
+    scores = {score.effect.label: score for score in finding.scores}
+    listed: dict[str, dict[str, Any]] = {}
+    entries: list[tuple[EffectBase, Fit | None]] = [(a.effect, finding.last) for a in finding.added if finding.effects]
+    entries += [(fit.effects[0], fit) for fit in finding.fits]
+    entries += [(score.effect, None) for score in finding.scores]
+    alone = {fit.effects[0].label: fit for fit in finding.fits}
+    for effect, fit in entries:
+        if effect.label in listed:
+            continue
+        score = scores.get(effect.label)
+        if fit is None:
+            step = {} if score is None else score.step
+            reported = effect.reported(step)
+        else:
+            reported = fit.reported(effect)
+        own = alone.get(effect.label)
+        closed = None if own is None else closure(finding.nominal.loss, own.loss)
+        listed[effect.label] = {
+            "kind": effect.kind,
+            "location": effect.location,
+            "parameters": {
+                name: {"value": _number(r.value), "std": _number(r.std), "unit": r.unit} for name, r in reported.items()
+            },
+            "score": 0.0 if score is None else score.statistic,
+            "p_value": 1.0 if score is None else score.p_value,
+            "closure": None if closed is None else _number(closed.value),
+            "closure_ci": None if closed is None else [_number(closed.low), _number(closed.high)],
+        }
+    return list(listed.values())

@@ -1,0 +1,333 @@
+"""Step six: full refits of the nominal parameters and those of some effects, judged on held-out recordings.
+
+Every loss is a mean square of whitened residuals over blocks of held-out time, the same blocks for every model, so that
+differences between models are paired. G = max(0, chi2/n - 1) is the gap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.diagnosis.hypotheses import CandidateProblem, describe, residual_series, sample_times
+from yid_ocp.diagnosis.screening import robust
+from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
+from yid_ocp.effects import EffectBase, Reported
+from yid_ocp.parallel import map_threads
+from yid_ocp.problem.problem import Evaluation
+from yid_ocp.solvers import GaussNewton
+from yid_ocp.solvers.base import Outcome, uncertainty
+
+Array = NDArray[np.float64]
+
+Progress = Callable[[str], None]
+
+SOLVER = GaussNewton(iterations=25, step_tolerance=1e-3, cost_tolerance=1e-5)
+"""A refit starts near its end and must be good to a small part of its standard deviation, and of the `tie`, only."""
+
+
+@dataclass(frozen=True)
+class Loss:
+    """How badly held-out recordings are predicted.
+
+    Attributes
+    ----------
+    squares, counts : ndarray, shape (nb,)
+        Sum of whitened squares and number of samples of every block; infinite where a rollout failed.
+    channels : dict of channel to (float, str)
+        Root mean square error and its unit.
+    """
+
+    squares: Array
+    counts: Array
+    channels: dict[str, tuple[float, str]]
+
+    @property
+    def mean(self) -> float:
+        """chi2/n."""
+        return float(self.squares.sum() / max(self.counts.sum(), 1.0))
+
+    @property
+    def gap(self) -> float:
+        """G."""
+        return max(0.0, self.mean - 1.0)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The model with some effects, refitted.
+
+    Attributes
+    ----------
+    effects : tuple of EffectBase
+    problem : CandidateProblem
+    values : dict of str to float
+        Unknowns.
+    std : dict of str to float
+        Their standard deviations; see `deviations`.
+    cost : float
+    evaluation : Evaluation
+    loss : Loss
+        Held-out.
+    message : str
+        Why the solver ended.
+    resumed : bool
+        Whether it comes from a store instead of the solver.
+    """
+
+    effects: tuple[EffectBase, ...]
+    problem: CandidateProblem
+    values: dict[str, float]
+    std: dict[str, float]
+    cost: float
+    evaluation: Evaluation
+    loss: Loss
+    message: str
+    resumed: bool = False
+
+    @property
+    def size(self) -> int:
+        """Number of the effects' parameters."""
+        return sum(len(effect.parameters) for effect in self.effects)
+
+    def reported(self, effect: EffectBase) -> dict[str, Reported]:
+        """An effect's quantities as people read them."""
+        return effect.reported(self.values, self.std)
+
+
+@dataclass(frozen=True)
+class Refitted:
+    """What a refit found: enough to have its `Fit` again by one evaluation.
+
+    Attributes
+    ----------
+    values, std : dict of str to float
+        Of every unknown.
+    message : str
+    """
+
+    values: dict[str, float]
+    std: dict[str, float]
+    message: str
+
+
+class Store(Protocol):
+    """Keeps finished refits of one diagnosis, so that another run of it need not repeat them; used by two threads."""
+
+    def get(self, name: str) -> Refitted | None:
+        """The refit of this name, None where it is not known."""
+        ...
+
+    def put(self, name: str, refitted: Refitted) -> None:
+        """Keep a refit."""
+        ...
+
+
+@dataclass(frozen=True)
+class Search:
+    """What all refits of one diagnosis share.
+
+    Attributes
+    ----------
+    problem : CandidateProblem
+    limits : Thresholds
+    progress : callable
+        Told in words what is going on.
+    store : Store, optional
+    """
+
+    problem: CandidateProblem
+    limits: Thresholds
+    progress: Progress
+    store: Store | None = None
+
+
+def refit(
+    problem: CandidateProblem,
+    effects: Sequence[EffectBase],
+    start: Mapping[str, float],
+    store: Store | None = None,
+    name: str = "",
+    limits: Thresholds = DEFAULTS,
+) -> Fit | None:
+    """Fit the nominal parameters and those of some effects, and predict the held-out recordings.
+
+    Parameters
+    ----------
+    problem : CandidateProblem
+    effects : sequence of EffectBase
+    start : mapping of str to float
+        Where unknowns begin; a start that cannot be rolled out is drawn back towards neutral effects.
+    store : Store, optional
+        Asked before the solver is, and told what it finds.
+    name : str
+        In the store; the effects' labels where empty, which do for refits that differ by their effects alone.
+    limits : Thresholds
+        For when a refit is tried again.
+
+    Returns
+    -------
+    Fit or None
+        None where the model cannot be rolled out at all.
+    """
+    known = recalled(problem, effects, store, name)
+    if known is not None:
+        return known
+    own = problem.freeing(effects)
+    best = _attempt(own, effects, start)
+    if best is not None and _half_done(own, effects, start, best[1], limits):
+        # the nominal fit may have driven its parameters to where this model cannot come back from
+        nominal = {*problem.nominal}
+        fresh = {
+            key: value
+            for key, value in start.items()
+            if key.split("[")[0] not in nominal and not key.startswith("start.")
+        }
+        again = _attempt(own, effects, fresh) if len(fresh) < len(start) else None
+        best = again if again is not None and again[1].cost < best[1].cost else best
+    if best is None:
+        return None
+    outcome, finish = best
+    deviation = deviations(own, finish)
+    std = dict(zip(own.names, map(float, deviation), strict=True))
+    loss = held_out_loss(own, outcome.x)
+    values = own.named(outcome.x)
+    if store is not None:
+        store.put(name or describe(effects), Refitted(values, std, outcome.message))
+    return Fit(tuple(effects), own, values, std, finish.cost, finish, loss, outcome.message)
+
+
+def _half_done(
+    own: CandidateProblem,
+    effects: Sequence[EffectBase],
+    start: Mapping[str, float],
+    finish: Evaluation,
+    limits: Thresholds,
+) -> bool:
+    """Whether a refit explains much of what the model without the effects leaves, but by far not all."""
+    count = len(finish.residual)
+    neutral = {name: value for effect in effects for name, value in effect.neutral.items()}
+    before = own.evaluate(own.unknowns({**start, **neutral}), derivatives=False)
+    if 2 * finish.cost < limits.poor * count or not before.ok:
+        return False
+    return before.cost - finish.cost > limits.promising * (before.cost - count / 2)
+
+
+def _attempt(
+    own: CandidateProblem, effects: Sequence[EffectBase], start: Mapping[str, float]
+) -> tuple[Outcome, Evaluation] | None:
+    """One run from one start and the evaluation at its end; None where the model cannot be rolled out."""
+    neutral = {name: value for effect in effects for name, value in effect.neutral.items()}
+    x = own.unknowns(start)
+    for pull in (1.0, 0.5, 0.2, 0.05, 0.0):
+        drawn = {name: value + pull * (start.get(name, value) - value) for name, value in neutral.items()}
+        x = own.unknowns({**start, **drawn})
+        if own.evaluate(x, derivatives=False).ok:
+            break
+    else:
+        return None
+    outcome = SOLVER.run(own, x, None)
+    finish = own.evaluate(outcome.x)
+    return (outcome, finish) if finish.ok else None
+
+
+def recalled(
+    problem: CandidateProblem, effects: Sequence[EffectBase], store: Store | None, name: str = ""
+) -> Fit | None:
+    """A refit that a store knows, evaluated once; None where it knows none."""
+    known = None if store is None else store.get(name or describe(effects))
+    own = problem.freeing(effects)
+    if known is None or not set(known.values) == set(known.std) == set(own.names):
+        return None
+    x = own.unknowns(known.values)
+    finish = own.evaluate(x)
+    if not finish.ok:
+        return None
+    loss = held_out_loss(own, x)
+    return Fit(tuple(effects), own, known.values, known.std, finish.cost, finish, loss, known.message, True)
+
+
+def deviations(problem: CandidateProblem, finish: Evaluation) -> Array:
+    """Standard deviation of every unknown, shape (nx,): the larger of two.
+
+    The first scales (J'J)^-1 by chi2 per degree of freedom; the second is the sandwich (J'J)^-1 S (J'J)^-1 with the
+    scores' autocovariances in S, which knows that samples of a coloured residual repeat each other.
+    """
+    covariance, _ = uncertainty(problem, finish)
+    plain = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    if finish.jacobian is None or not plain.size:
+        return plain
+    rows = len(finish.residual) - problem.weak_prior_rows
+    scale = problem.scales
+    jacobian = finish.jacobian[:rows] * scale
+    inverse = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-10, hermitian=True)
+    middle = robust(jacobian, finish.residual[:rows], residual_series(problem))
+    return np.maximum(plain, scale * np.sqrt(np.maximum(np.diag(inverse @ middle @ inverse), 0.0)))
+
+
+def refit_all(
+    search: Search,
+    base: Sequence[EffectBase],
+    tried: Sequence[tuple[EffectBase, Mapping[str, float]]],
+    values: Mapping[str, float],
+) -> list[Fit]:
+    """Refit the model with each of several effects added to those of `base`; failures are left out.
+
+    Parameters
+    ----------
+    search : Search
+    base : sequence of EffectBase
+    tried : sequence of (EffectBase, mapping of parameter to float)
+        With the values at which each begins.
+    values : mapping of str to float
+        Where all other unknowns begin.
+    """
+
+    def one(entry: tuple[EffectBase, Mapping[str, float]]) -> Fit | None:
+        effect, step = entry
+        fit = refit(search.problem, (*base, effect), {**values, **step}, search.store, limits=search.limits)
+        if fit is not None:
+            done = "resumed the refit" if fit.resumed else "refitted"
+            search.progress(f"{done} with {effect.label}: held-out chi2/n {fit.loss.mean:.4g}")
+        return fit
+
+    return [fit for fit in map_threads(one, tried) if fit is not None]
+
+
+def block_length(problem: CandidateProblem) -> float:
+    """Length of the blocks of held-out time [s]: some forty of them, between half a second and two seconds long."""
+    total = sum(episode.grid.steps * episode.grid.time_step for episode in problem.held_out)
+    return float(np.clip(total / 40, 0.5, 2.0))
+
+
+def held_out_loss(problem: CandidateProblem, x: Array) -> Loss:
+    """Predict the held-out recordings; initial states are found in the same way for every model."""
+    length = block_length(problem)
+    squares: list[Array] = []
+    counts: list[Array] = []
+    results, episodes = [], []
+    for episode, result in problem.validate(x):
+        number = int(episode.grid.steps * episode.grid.time_step / length) + 1
+        total, count = np.zeros(number), np.zeros(number)
+        for k, samples in enumerate(episode.samples):
+            block = np.minimum((sample_times(episode, samples) / length).astype(int), number - 1)
+            good = samples.weight > 0
+            count += np.bincount(block, good.sum(axis=1), number)
+            if not isinstance(result, str):
+                r = samples.weight * np.where(good, result.predicted[k] - samples.value, 0.0)
+                total += np.bincount(block, np.sum(r**2, axis=1), number)
+        if isinstance(result, str):
+            total[:] = np.inf
+        else:
+            results.append(result)
+            episodes.append(episode)
+        keep = count > 0
+        squares.append(total[keep])
+        counts.append(count[keep])
+    errors = problem.channel_errors(results, episodes) if results else {}
+    channels = {name: (float(entry["rmse"]), str(entry["unit"])) for name, entry in errors.items()}
+    return Loss(np.concatenate(squares), np.concatenate(counts), channels)

@@ -1,0 +1,569 @@
+"""The linear model of a recording: how unknown forces, grasp offsets and sensor biases would move its residual.
+
+About the rollout of a fitted model every DEL row gets an unknown generalized force, every grasp an unknown offset and
+every output of a point sensor an unknown bias. To first order
+
+    x_{k+1} = A_k x_k + E_k d_j,   y_k = C_k x_k + b_j + noise,
+
+with unknowns d (and b alike) that are constant over an interval j. States inside an interval are eliminated, so that
+what follows is linear in the number of intervals.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import casadi as ca
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
+from yid_ocp.effects.base import grasp_names, robot_joints
+from yid_ocp.integrator.step_model import Feedback, Rollout
+from yid_ocp.model.system import System
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.episodes import apparent_inertia
+from yid_ocp.problem.measurements import huber
+from yid_ocp.problem.problem import Episode, EpisodeResult, Evaluation
+from yid_ocp.sensors import EffortSensor, Sensor
+
+Array = NDArray[np.float64]
+Kind = Literal["force", "offset", "bias"]
+
+MEMORY = 0.5
+"""Time in which an unknown forgets its value [s]."""
+INTERVAL = 0.1
+"""Shortest time over which unknowns are constant [s]."""
+INTERVALS = 150
+"""Number of intervals of a long recording, beyond which they become longer."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Unknowns that share a place and a standard deviation.
+
+    Attributes
+    ----------
+    location : str
+    kind : "force", "offset" or "bias"
+    read : bool
+        Whether a bias of an effort sensor would be the same: a force at a prescribed joint whose effort is measured.
+    """
+
+    location: str
+    kind: Kind
+    read: bool = False
+
+
+@dataclass(frozen=True)
+class Interval:
+    """One interval's share of the linear model.
+
+    Attributes
+    ----------
+    observed : ndarray, shape (r, 1 + ntheta)
+        Whitened residual with the opposite sign, then its derivative by the free parameters, with that sign too.
+    by_state : ndarray, shape (r, ns)
+        Its derivative by the state at the interval's beginning.
+    by_unknown : ndarray, shape (r, nd)
+    transition : ndarray, shape (ns, ns)
+        State at the end by that at the beginning.
+    drive : ndarray, shape (ns, nd)
+    rest : ndarray, shape (1 + ntheta, 1 + ntheta)
+        Products of what no state or unknown can reach.
+    samples : int
+        Before rows were compressed.
+    """
+
+    observed: Array
+    by_state: Array
+    by_unknown: Array
+    transition: Array
+    drive: Array
+    rest: Array
+    samples: int
+
+
+@dataclass(frozen=True)
+class Linear:
+    """The linear model of one recording.
+
+    Attributes
+    ----------
+    recording : str
+    intervals : tuple of Interval
+    edges : ndarray, shape (J + 1,)
+        Beginnings of the intervals and the end [s].
+    unknowns : tuple of str
+        Coordinate, grasp or channel of each of the nd unknowns.
+    sources : tuple of Source
+        That each of the nd unknowns belongs to.
+    reference : ndarray, shape (nd,)
+        Reference standard deviation of each; the matrices are by unknowns in this unit.
+    at_rest : ndarray, shape (ns, nd)
+        How the first state follows the first unknowns.
+    loose : ndarray, shape (ns,)
+        Standard deviation of the first state beside that.
+    decay : float
+        Correlation of an unknown with itself one interval later.
+    """
+
+    recording: str
+    intervals: tuple[Interval, ...]
+    edges: Array
+    unknowns: tuple[str, ...]
+    sources: tuple[Source, ...]
+    reference: Array
+    at_rest: Array
+    loose: Array
+    decay: float
+
+
+def linear_model(
+    problem: EstimationProblem, x: Array, evaluation: Evaluation, limits: Thresholds = DEFAULTS
+) -> tuple[Linear, ...]:
+    """Linearise a problem about its rollouts at the unknowns `x`, with unknown forces, offsets and biases.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    x : ndarray, shape (nx,)
+    evaluation : Evaluation
+        At `x`, with its Jacobian.
+    limits : Thresholds
+        For the reference size of unknowns.
+    """
+    assert evaluation.jacobian is not None
+    scale = problem.scales
+    found, row = [], 0
+    residual, slopes = problem.prior(x)
+    stated = slice(0, problem.stated_prior_rows)
+    prior = -np.column_stack([residual[stated], slopes[stated] * scale])
+    for i, (episode, result) in enumerate(zip(problem.episodes, evaluation.episodes, strict=True)):
+        theta = problem.own_theta(episode, problem.split(x, i)[0])
+        count = sum(int(np.count_nonzero(s.weight > 0)) for s in episode.samples)
+        rows = slice(row, row + count)
+        observed = -np.column_stack([evaluation.residual[rows], evaluation.jacobian[rows] * scale])
+        row += count
+        found.append(_recording(_Course(problem, episode, theta, result), observed, limits))
+    # stated priors of the free parameters are observations that no unknown reaches
+    first, *later = found[0].intervals
+    first = replace(first, rest=first.rest + prior.T @ prior)
+    return (replace(found[0], intervals=(first, *later)), *found[1:])
+
+
+@dataclass(frozen=True)
+class _Course:
+    """The rollout of one recording about which the model is linear.
+
+    Attributes
+    ----------
+    problem : EstimationProblem
+    episode : Episode
+    theta : ndarray, shape (ntheta,)
+    result : EpisodeResult
+    """
+
+    problem: EstimationProblem
+    episode: Episode
+    theta: Array
+    result: EpisodeResult
+
+    @property
+    def system(self) -> System:
+        return self.problem.system
+
+    @property
+    def rollout(self) -> Rollout:
+        return self.result.rollout
+
+    @property
+    def feedback(self) -> Feedback | None:
+        return self.problem.feedback(self.episode)
+
+    @property
+    def fixed(self) -> NDArray[np.int64]:
+        """Prescribed coordinates."""
+        return np.array(self.system.prescribed_indices, int)
+
+    @property
+    def free(self) -> NDArray[np.int64]:
+        """All others."""
+        return np.array(self.system.free_indices, int)
+
+
+# -- the unknowns -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Unknowns:
+    """What gets an unknown, and how large it may be.
+
+    Attributes
+    ----------
+    names : tuple of str, length nd
+        Coordinate, grasp and axis, or channel and axis: first forces, then offsets, then biases.
+    sources : tuple of Source, length nd
+    reference : ndarray, shape (nd,)
+    forced : ndarray of int
+        Coordinates with an unknown force.
+    grasped : ndarray of int
+        Constraint rows with an unknown offset.
+    biased : tuple of (int, int)
+        Group of samples and column with an unknown bias.
+    """
+
+    names: tuple[str, ...]
+    sources: tuple[Source, ...]
+    reference: Array
+    forced: NDArray[np.int64]
+    grasped: NDArray[np.int64]
+    biased: tuple[tuple[int, int], ...]
+
+    @property
+    def driving(self) -> int:
+        """How many of them move the state."""
+        return len(self.forced) + len(self.grasped)
+
+
+def _unknowns(course: _Course, limits: Thresholds) -> _Unknowns:
+    names, sources, reference, forced = _unknown_forces(course, limits.force)
+    grasped, row = [], 0
+    for grasp, name in zip(course.system.grasps, grasp_names(course.system), strict=True):
+        grasped += [row, row + 1, row + 2]
+        names += [f"{name}.{axis}" for axis in "xyz"]
+        sources += [Source(name, "offset")] * 3
+        reference += [limits.offset] * 3
+        row += grasp.equations
+    biased = []
+    for k, samples in enumerate(course.episode.samples):
+        if isinstance(samples.sensor, EffortSensor):
+            continue  # at a prescribed joint a bias and a force are the same
+        for column, channel in enumerate(samples.channel_of_column):
+            if not np.any(samples.weight[:, column] > 0):
+                continue
+            frame = samples.sensor.frames[column // samples.sensor.width]
+            biased.append((k, column))
+            names.append(f"{channel}.{'xyz'[column % 3]}")
+            sources.append(Source(_seen_by(course.system, samples.sensor, frame), "bias"))
+            reference.append(limits.bias * float(np.nanmedian(samples.std[:, column])))
+    return _Unknowns(tuple(names), tuple(sources), np.array(reference), forced, np.array(grasped, int), tuple(biased))
+
+
+def _unknown_forces(course: _Course, part: float) -> tuple[list[str], list[Source], list[float], NDArray[np.int64]]:
+    """Names, sources, reference sizes and coordinates of the unknown forces."""
+    system, joint_names = course.system, course.system.mechanism.joint_names
+    place = {joint: s.name for s in system.segments for link in s.links for joint in link}
+    place |= {joint: joint for joint in robot_joints(system)}
+    measured = {
+        joint
+        for samples in course.episode.samples
+        if isinstance(samples.sensor, EffortSensor)
+        for joint in samples.sensor.joints
+    }
+    silent = {joint_names[i] for i in course.fixed} - measured
+    names = [n for n in joint_names if n in place and n not in silent and n not in system.compliant]
+    forced = np.array([joint_names.index(name) for name in names], int)
+    load = _loads(course)
+    of_place: dict[str, list[float]] = {}
+    for name, index in zip(names, forced, strict=True):
+        of_place.setdefault(place[name], []).append(load[index])
+    largest = max((max(v) for v in of_place.values()), default=1.0)
+    size = {p: part * max(float(np.sqrt(np.mean(np.square(v)))), 1e-2 * largest) for p, v in of_place.items()}
+    sources = [Source(place[name], "force", name in measured) for name in names]
+    return names, sources, [size[place[name]] for name in names], forced
+
+
+def _seen_by(system: System, sensor: Sensor, frame: str) -> str:
+    """What could be wrong where a point is misread: the camera, the arm that holds it, else the sensor's group."""
+    if sensor.camera is not None:
+        return "camera"
+    for grasp in system.grasps:
+        if frame in (grasp.held, grasp.holder):
+            return grasp.name
+    return sensor.group
+
+
+def _loads(course: _Course) -> Array:
+    """Typical load of every coordinate: of its spring, its motor or its prescription, shape (n,) [N m or N]."""
+    system, rollout = course.system, course.rollout
+    load = np.zeros(system.size)
+    q = rollout.state[:, : system.size]
+    springs = [(system.mechanism.joint_index(s.joint), s) for s in system.elastic]
+    if springs:
+        symbols = ca.vertcat(*(ca.vertcat(s.stiffness, s.rest) for _, s in springs))
+        values = np.array(ca.Function("springs", [system.parameters.symbols], [symbols])(course.theta)).ravel()
+        for (index, _), stiffness, rest in zip(springs, values[::2], values[1::2], strict=True):
+            load[index] = stiffness * float(np.sqrt(np.mean((q[:, index] - rest) ** 2)))
+    for indices, force in ((system.driven_indices, rollout.torque), (system.prescribed_indices, rollout.effort)):
+        if len(indices):
+            load[list(indices)] = np.sqrt(np.mean(force**2, axis=0))
+    return load
+
+
+# -- the slopes of single steps ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Moving:
+    """What takes part: states that can move, and unknowns of a step (q, z, lam) that its equations are solved for.
+
+    Attributes
+    ----------
+    states : ndarray of int, shape (ns,)
+    solved : ndarray of int
+    """
+
+    states: NDArray[np.int64]
+    solved: NDArray[np.int64]
+
+
+def _moving(course: _Course, unknowns: _Unknowns, last: int) -> _Moving:
+    """All but states that cannot move and internal coordinates that nothing depends on."""
+    sizes = course.problem.step.sizes
+    n, nx = sizes["n"], sizes["nx"]
+    inner = np.arange(2 * n, nx)
+    solved = np.concatenate([course.free, np.arange(n, n + sizes["nz"] + sizes["m"])]).astype(int)
+    everything = _Moving(np.arange(nx), solved)
+    steps = [_steps(course, unknowns, everything, k, k + 1) for k in (0, last)]
+    a, e, effort = (sum(np.abs(found[i][0]) for found in steps) for i in range(3))
+    used = np.any(a[: 2 * n, inner] > 1e-12, axis=0) | np.any(effort[:, inner] > 1e-12, axis=0)
+    # a coordinate whose compliance is neutral neither moves nor is moved
+    active = np.any(a > 0, axis=1) | np.any(e > 0, axis=1)
+    active[course.fixed] = False
+    active[inner] = used
+    return _Moving(np.flatnonzero(active), np.setdiff1d(solved, n + np.flatnonzero(~used)))
+
+
+def _steps(course: _Course, unknowns: _Unknowns, moving: _Moving, first: int, last: int) -> tuple[Array, Array, Array]:
+    """A_k (steps, ns, ns), E_k (steps, ns, nd') and the effort's slopes (steps, nc, ns + nd') of some steps."""
+    step, rollout = course.problem.step, course.rollout
+    n, nz, nx, h = step.sizes["n"], step.sizes["nz"], step.sizes["nx"], step.time_step
+    free, fixed, solved = course.free, course.fixed, moving.solved
+    span = slice(first, last)
+    stages = step.kernel.linearize(
+        course.theta,
+        rollout.state[first : last + 1],
+        rollout.multipliers[span],
+        rollout.torque[span],
+        (),
+        True,
+    )
+    steps, nt = last - first, n + nz + step.sizes["m"]
+    forces = len(unknowns.forced)
+    width = nx + unknowns.driving
+    top, bottom = np.zeros((steps, nt, width)), np.zeros((steps, n, width))
+    for target, matrix in ((top, stages.rows_old), (bottom, stages.p1_old)):
+        target[:, :, :n], target[:, :, 2 * n : nx] = matrix[:, :, :n], matrix[:, :, n:]
+    top[:, np.arange(n), n + np.arange(n)] += 1.0
+    feedback = course.feedback
+    if feedback is not None:
+        gain = feedback.gain[span]
+        top[:, :, feedback.index] -= stages.rows_input @ gain
+        bottom[:, :, feedback.index] -= stages.p1_input @ gain
+    # an unknown force is held over the step and shared by both equations like any other
+    first_share = 1.0 if step.force_split == "left" else 0.5
+    column = nx + np.arange(forces)
+    unit = h * unknowns.reference[:forces]
+    top[:, unknowns.forced, column] = first_share * unit
+    bottom[:, unknowns.forced, column] = (1 - first_share) * unit
+    column = nx + np.arange(forces, unknowns.driving)
+    top[:, n + nz + unknowns.grasped, column] = unknowns.reference[forces : unknowns.driving]
+    columns = np.concatenate([moving.states, np.arange(nx, width)])
+    top, bottom = top[:, :, columns], bottom[:, :, columns]
+    new = -np.linalg.solve(stages.rows_new[:, solved[:, None], solved], top[:, solved])
+    after = np.zeros((steps, nx, len(columns)))
+    inner = solved[(solved >= n) & (solved < n + nz)]
+    after[:, free] = new[:, : len(free)]
+    after[:, n : 2 * n] = bottom + stages.p1_new[:, :, solved] @ new
+    after[:, n + inner] = new[:, len(free) : len(free) + len(inner)]
+    effort = -(top[:, fixed] + stages.rows_new[:, fixed[:, None], solved] @ new) / h
+    ns = len(moving.states)
+    return after[:, moving.states, :ns], after[:, moving.states, ns:], effort
+
+
+# -- from steps to intervals ------------------------------------------------------------------------------------------
+
+
+def _recording(course: _Course, observed: Array, limits: Thresholds) -> Linear:
+    """The linear model of one recording from its whitened residuals and their slopes."""
+    h, steps = course.problem.step.time_step, course.episode.grid.steps
+    length = int(max(round(INTERVAL / h), math.ceil(steps / INTERVALS), 1))
+    edges = np.unique(np.append(np.arange(0, steps, length), steps))
+    unknowns = _unknowns(course, limits)
+    moving = _moving(course, unknowns, int(edges[-1]) - 1)
+    reading = _reading(course, moving, edges)
+    rests = course.problem.options.initial_state != "fitted_to_points"
+    ns, driving = len(moving.states), unknowns.driving
+    at_rest = np.zeros((ns, len(unknowns.names)))
+    intervals = []
+    for j in range(len(edges) - 1):
+        slopes = _steps(course, unknowns, moving, int(edges[j]), int(edges[j + 1]))
+        if j == 0 and rests:
+            # rest under constant unknowns, x = A x + E d; what has no stiffness does not come to rest
+            at_rest[:, :driving] = np.linalg.lstsq(np.eye(ns) - slopes[0][0], slopes[1][0], rcond=1e-6)[0]
+        intervals.append(_interval(slopes, unknowns, reading, j, observed))
+    span = h * float(np.median(np.diff(edges)))
+    return Linear(
+        course.episode.name,
+        tuple(intervals),
+        h * edges,
+        unknowns.names,
+        unknowns.sources,
+        unknowns.reference,
+        at_rest,
+        np.zeros(ns) if rests else _loose_start(course)[moving.states],
+        math.exp(-span / MEMORY),
+    )
+
+
+def _loose_start(course: _Course) -> Array:
+    """Standard deviation of a start that was fitted to points, shape (nx,)."""
+    problem, free = course.problem, course.free
+    options, joints = problem.options, course.system.mechanism.joint_names
+    inertia = apparent_inertia(problem.step, course.theta, tuple(joints[i] for i in free))
+    loose = np.zeros(problem.step.sizes["nx"])
+    loose[free] = options.configuration_std
+    loose[course.system.size + free] = options.velocity_std * np.abs(inertia)
+    return loose
+
+
+def _interval(
+    slopes: tuple[Array, Array, Array], unknowns: _Unknowns, reading: _Reading, j: int, observed: Array
+) -> Interval:
+    """Interval `j` from the slopes of its steps (A_k, E_k, effort's), states inside it eliminated."""
+    a, e, by_effort = slopes
+    steps, ns, driving, count = len(a), a.shape[1], unknowns.driving, len(unknowns.names)
+    node = np.zeros((steps + 1, ns, ns + driving))
+    node[0, :, :ns] = np.eye(ns)
+    effort = np.zeros((steps + 1, by_effort.shape[1], ns + driving))
+    for k in range(steps):
+        node[k + 1] = a[k] @ node[k]
+        node[k + 1][:, ns:] += e[k]
+        effort[k] = by_effort[k][:, :ns] @ node[k]
+        effort[k][:, ns:] += by_effort[k][:, ns:]
+    effort[-1] = effort[-2]
+    rows, moved = reading.rows(j, node, effort)
+    by_unknown, drive = np.zeros((len(rows), count)), np.zeros((ns, count))
+    by_unknown[:, :driving] = moved[:, ns:]
+    by_unknown[:, driving:] = reading.bias(rows, unknowns.biased, unknowns.reference[driving:])
+    drive[:, :driving] = node[-1][:, ns:]
+    return _compressed(observed[rows], moved[:, :ns], by_unknown, node[-1][:, :ns], drive)
+
+
+def _compressed(observed: Array, by_state: Array, by_unknown: Array, transition: Array, drive: Array) -> Interval:
+    """An interval with no more rows than columns: what is orthogonal to all columns only adds to the products."""
+    joined, count = np.hstack([by_state, by_unknown]), len(observed)
+    rest = np.zeros((observed.shape[1], observed.shape[1]))
+    if len(joined) > joined.shape[1]:
+        q, r = scipy.linalg.qr(joined, mode="economic", check_finite=False)
+        turned = q.T @ observed
+        rest = observed.T @ observed - turned.T @ turned
+        observed, joined = turned, r
+    ns = by_state.shape[1]
+    return Interval(observed, joined[:, :ns], joined[:, ns:], transition, drive, rest, count)
+
+
+@dataclass(frozen=True)
+class _Reading:
+    """Slopes of the whitened samples of one recording by the states of the nodes about them.
+
+    Attributes
+    ----------
+    edges : ndarray of int, shape (J + 1,)
+        First nodes of the intervals and the last node.
+    interval, group, column, node : ndarray of int, shape (nr,)
+        Interval, group of samples, column in it and node before every row of the residual.
+    fraction, weight : ndarray, shape (nr,)
+        Place between that node and the next, and weight with the robust loss's factor.
+    slope : tuple of ndarray, shape (N + 1, k, ns)
+        Of every group's sensor by the states of a node.
+    load : tuple of ndarray, shape (N + 1, k, nc)
+        By the efforts of prescribed joints.
+    """
+
+    edges: NDArray[np.int64]
+    interval: NDArray[np.int64]
+    group: NDArray[np.int64]
+    column: NDArray[np.int64]
+    node: NDArray[np.int64]
+    fraction: Array
+    weight: Array
+    slope: tuple[Array, ...]
+    load: tuple[Array, ...]
+
+    def rows(self, j: int, node: Array, effort: Array) -> tuple[NDArray[np.int64], Array]:
+        """Rows of the residual in one interval and their slopes by its directions.
+
+        Parameters
+        ----------
+        j : int
+        node : ndarray, shape (steps + 1, ns, d)
+            Slopes of the states at its nodes.
+        effort : ndarray, shape (steps + 1, nc, d)
+        """
+        rows = np.flatnonzero(self.interval == j)
+        found = np.zeros((len(rows), node.shape[2]))
+        first = int(self.edges[j])
+        for k, (slope, load) in enumerate(zip(self.slope, self.load, strict=True)):
+            own = np.flatnonzero(self.group[rows] == k)
+            at, column = self.node[rows[own]], self.column[rows[own]]
+            fraction = self.fraction[rows[own]]
+            for shift, part in ((0, 1 - fraction), (1, fraction)):
+                used = part > 0
+                place = np.minimum(at[used] + shift, len(slope) - 1)
+                local = np.minimum(place - first, len(node) - 1)
+                value = np.einsum("rx,rxd->rd", slope[place, column[used]], node[local])
+                if effort.shape[1]:
+                    value += np.einsum("rx,rxd->rd", load[place, column[used]], effort[local])
+                found[own[used]] += part[used, None] * value
+        return rows, found * self.weight[rows, None]
+
+    def bias(self, rows: NDArray[np.int64], biased: Sequence[tuple[int, int]], reference: Array) -> Array:
+        """Slopes of rows by the biases, in units of their reference."""
+        found = np.zeros((len(rows), len(biased)))
+        for i, (k, column) in enumerate(biased):
+            own = (self.group[rows] == k) & (self.column[rows] == column)
+            found[own, i] = self.weight[rows[own]] * reference[i]
+        return found
+
+
+def _reading(course: _Course, moving: _Moving, edges: NDArray[np.int64]) -> _Reading:
+    problem, theta, n = course.problem, course.theta, course.system.size
+    state, efforts = course.rollout.state, problem.efforts(course.rollout)
+    group: list[NDArray[np.int64]] = []
+    column, node, fraction, weight, slope, load = [], [], [], [], [], []
+    for samples, predicted in zip(course.episode.samples, course.result.predicted, strict=True):
+        late = problem.lateness(samples, theta, ())
+        placed = samples if late is None else samples.late(late[0])
+        shape = samples.weight.shape
+        where = placed.node if placed.node.ndim > 1 else np.broadcast_to(placed.node[:, None], shape)
+        beyond = placed.fraction if placed.node.ndim > 1 else np.broadcast_to(placed.fraction[:, None], shape)
+        _, by_q, by_z, by_e, _ = problem.sensor(samples.sensor, ())(state[:, :n], state[:, 2 * n :], efforts, theta)
+        keep = samples.weight > 0
+        raw = samples.weight * np.where(keep, predicted - samples.value, 0.0)
+        factor = huber(raw, problem.options.huber_threshold)[1]
+        group.append(np.full(int(keep.sum()), len(group)))
+        column.append(np.broadcast_to(np.arange(shape[1]), shape)[keep])
+        node.append(where[keep])
+        fraction.append(beyond[keep])
+        weight.append((factor * samples.weight)[keep])
+        slope.append(np.concatenate([by_q, np.zeros((*by_q.shape[:2], n)), by_z], axis=2)[:, :, moving.states])
+        load.append(by_e[:, :, course.fixed])
+    nodes = np.concatenate(node)
+    interval = np.clip(np.searchsorted(edges, nodes, side="right") - 1, 0, len(edges) - 2)
+    return _Reading(
+        edges,
+        interval,
+        np.concatenate(group),
+        np.concatenate(column),
+        nodes,
+        np.concatenate(fraction),
+        np.concatenate(weight),
+        tuple(slope),
+        tuple(load),
+    )

@@ -1,0 +1,177 @@
+"""What a finding says in sentences, and the experiment that would say more."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from yid_ocp.diagnosis.finding import Finding
+from yid_ocp.diagnosis.localise import Place
+from yid_ocp.diagnosis.null_test import NullTest
+from yid_ocp.diagnosis.refit import Fit
+from yid_ocp.diagnosis.screening import Visibility
+from yid_ocp.diagnosis.select import Added
+from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.effects import EffectBase
+from yid_ocp.effects.base import ASPECTS
+
+NAMED = 0.1
+"""Share of the gap from which a place is named, and relative change from which a nominal parameter is."""
+ROOM = 0.25
+"""Part of its range by which an amplitude may leave it unnoticed."""
+SIDES = {
+    "plant": ", in the mechanics rather than in what sensors read",
+    "sensor": ", in what sensors read",
+    "either": ", in the mechanics or in what the effort sensor reads, which efforts alone do not tell apart",
+}
+NEXT = {
+    "insufficient_data": "Record longer and larger motions; more of the object has to be seen.",
+    "separate": "Vary {aspects} independently of each other, over a wide range, in one recording.",
+    "places": "Move so that {places} work one at a time, or measure a point between them.",
+    "vary": "Vary {aspects} over a wider range.",
+    "other": "Record other motions, faster and larger.",
+    "unknown": "Move {place} alone, slowly and fast, and hold it still in several postures.",
+    "unseen": "None is needed; these motions could not have shown {unseen}.",
+    "no_gap": "None is needed.",
+    "effect": "Repeat with other motions to see whether the effect's parameters stay.",
+}
+"""The next experiment."""
+
+
+def separating(rivals: Sequence[EffectBase]) -> str:
+    """The experiment that would tell rivals apart, from what their equations depend on."""
+    said = list(dict.fromkeys(effect.depends_on for effect in rivals if effect.depends_on))
+    aspects = sorted(said, key=lambda aspect: ASPECTS.index(aspect) if aspect in ASPECTS else len(ASPECTS))
+    places = list(dict.fromkeys(effect.location for effect in rivals))
+    if len(aspects) > 1:
+        return NEXT["separate"].format(aspects=" and ".join(aspects))
+    if len(places) > 1:
+        return NEXT["places"].format(places=" and ".join(places))
+    return NEXT["vary"].format(aspects=aspects[0]) if aspects else NEXT["other"]
+
+
+def next_experiment(verdict: str, added: Sequence[Added], where: Sequence[Place], unseen: Sequence[str]) -> str:
+    """What to record next."""
+    if verdict == "insufficient_data":
+        return NEXT["insufficient_data"]
+    rivals = next((entry.rivals for entry in added if len(entry.rivals) > 1), ())
+    if rivals:
+        return separating(rivals)
+    if verdict == "unknown" and where:
+        return NEXT["unknown"].format(place=where[0].location)
+    if verdict == "no_gap" and unseen:
+        return NEXT["unseen"].format(unseen=", ".join(unseen[:4]) + (", ..." if len(unseen) > 4 else ""))
+    return NEXT["no_gap"] if verdict == "no_gap" else NEXT["effect"]
+
+
+def shortage(verdict: str, before: NullTest, unknowns: int, seen: Sequence[Visibility], limits: Thresholds) -> str:
+    """Why data do not suffice, empty where they do.
+
+    Parameters
+    ----------
+    verdict : str
+    before : NullTest
+        Of the nominal model, on the recordings to estimate on.
+    unknowns : int
+    seen : sequence of Visibility
+    limits : Thresholds
+    """
+    if verdict != "insufficient_data":
+        return ""
+    if not any(entry.visible for entry in seen):
+        return "no candidate of the size that one would expect would show in these recordings."
+    return (
+        f"{before.degrees:.0f} effective samples for {unknowns} unknowns, at least "
+        f"{limits.samples_per_unknown * unknowns:.0f} are needed; record longer or free fewer parameters."
+    )
+
+
+def sentences(finding: Finding) -> str:
+    """The report in words."""
+    text = [_gap(finding)]
+    if finding.verdict not in ("insufficient_data", "no_gap"):
+        text.append(_places(finding))
+    if finding.effects:
+        text += _effects(finding)
+    elif finding.verdict == "unknown":
+        best = finding.fits[0] if finding.fits else None
+        said = "" if best is None else f" (the best, {best.effects[0].label}, does not explain enough of it)"
+        text.append(f"No known effect explains it{said}.")
+    if finding.in_blocks:
+        text.append("Only one set of recordings was given: alternate blocks of it were held out.")
+    text.append(f"Next experiment: {finding.next_experiment}")
+    return " ".join(part for part in text if part)
+
+
+def _gap(finding: Finding) -> str:
+    """Whether there is one."""
+    held, first = finding.held_out_before, finding.before
+    p = min(first.p_value, held.p_value)
+    if finding.verdict == "insufficient_data":
+        return f"The data do not suffice: {finding.message}"
+    if finding.verdict == "no_gap":
+        return (
+            f"There is no gap to speak of (chi2 per degree of freedom {first.chi2_per_dof:.3g}, held out "
+            f"{held.chi2_per_dof:.3g}; p = {p:.2g})."
+        )
+    small = f"= {p:.2g}" if p > 1e-12 else "< 1e-12"
+    return f"The gap is real (held-out chi2 per degree of freedom {held.chi2_per_dof:.3g}, p {small})."
+
+
+def _places(finding: Finding) -> str:
+    """Where it lies; empty where nothing says so."""
+    main = [p for p in finding.where if p.share > NAMED] or list(finding.where[:1])
+    named = " and ".join(f"{p.location} ({100 * p.share:.0f} %)" for p in main[:3])
+    side = "" if finding.smoothed is None else SIDES.get(finding.smoothed.side, "")
+    return f"It lies in {named}{side}." if named else ""
+
+
+def _effects(finding: Finding) -> list[str]:
+    """What was added, what it closes, what it cannot be told from, and what remains."""
+    last, total = finding.last, finding.closure
+    names = "; ".join(f"{e.label} with {_figures(e, last)}" for e in finding.effects)
+    verb = "closes" if len(finding.effects) == 1 else "together close"
+    text = [
+        f"{names} {verb} {100 * total.value:.3g} % of it on held-out motions "
+        f"(95 % interval {100 * total.low:.3g} to {100 * total.high:.3g} %)."
+    ]
+    for entry in finding.added:
+        others = [r.label for r in entry.rivals if r.label != entry.effect.label]
+        if others:
+            text.append(f"Not separable from {entry.effect.label}: {', '.join(others)}.")
+    odd = [said for effect in finding.effects for said in _out_of_range(effect, last)]
+    if odd:
+        text.append(f"Beyond what one would expect, and so perhaps standing in for something else: {', '.join(odd)}.")
+    text.append(_remains(finding))
+    moved = [a for a in finding.absorbed if abs(a.after - a.before) > NAMED * max(abs(a.before), 1e-9)]
+    if moved:
+        steps = (f"{a.name} goes from {a.before:.3g} to {a.after:.3g}" for a in moved[:6])
+        text.append(f"With it {', '.join(steps)}.")
+    return text
+
+
+def _remains(finding: Finding) -> str:
+    rest = finding.remaining
+    if rest.chi2_per_dof > 1 and rest.p_value < finding.limits.level:
+        place = f", most of it in {finding.remaining_where[0].location}" if finding.remaining_where else ""
+        return f"What remains: held-out chi2 per degree of freedom {rest.chi2_per_dof:.3g}{place}."
+    return "What remains is noise."
+
+
+def _figures(effect: EffectBase, fit: Fit) -> str:
+    parts = []
+    for name, r in fit.reported(effect).items():
+        std = f" ± {r.std:.2g}" if math.isfinite(r.std) else ""
+        parts.append(f"{name} = {r.value:.3g}{std} {r.unit}".strip().removesuffix(" 1"))
+    return ", ".join(parts)
+
+
+def _out_of_range(effect: EffectBase, fit: Fit) -> list[str]:
+    """Amplitudes beyond the range that an engineer would expect."""
+    found = []
+    for name in effect.amplitudes:
+        low, high = effect.prior_range[name]
+        room = ROOM * (high - low)
+        if not low - room <= fit.values[name] <= high + room and effect.neutral[name] != fit.values[name]:
+            found.append(f"{name} = {fit.values[name]:.3g} (range {low:.3g} to {high:.3g})")
+    return found
