@@ -30,7 +30,16 @@ import pytest
 LAYERS = ("model", "effects", "sensors", "integrator", "data", "vision", "virtual", "problem", "solvers", "analysis")
 LAYERS = (*LAYERS, "diagnosis", "report", "config", "workflow")
 """Packages from left to right; those to the left of the changed one are imported once."""
-LIBRARIES = ("numpy", "scipy.optimize", "scipy.stats", "scipy.signal", "scipy.interpolate", "casadi", "h5py", "pydantic")
+LIBRARIES = (
+    "numpy",
+    "scipy.optimize",
+    "scipy.stats",
+    "scipy.signal",
+    "scipy.interpolate",
+    "casadi",
+    "h5py",
+    "pydantic",
+)
 LIBRARIES = (*LIBRARIES, "ruamel.yaml", "hypothesis", "jsonschema", "pinocchio", "mujoco", "yourdfpy", "threadpoolctl")
 MEMORY = 8 * 2**30
 ARGUMENTS = ["-x", "-q", "-p", "no:cacheprovider", "-o", "addopts=", "-m", "not slow", "--no-header", "--tb=line"]
@@ -177,7 +186,11 @@ def judged(tree: Path, file: str, text: str, tests: list[str], seconds: float) -
     if status in (int(pytest.ExitCode.USAGE_ERROR), int(pytest.ExitCode.NO_TESTS_COLLECTED)):
         return {"error": f"pytest found nothing to run for {file}: {', '.join(tests)}"}
     killed = status != 0
-    return {"status": "killed" if killed else "survived", "by": by if killed else "", "seconds": time.monotonic() - begun}
+    return {
+        "status": "killed" if killed else "survived",
+        "by": by if killed else "",
+        "seconds": time.monotonic() - begun,
+    }
 
 
 def main() -> None:
