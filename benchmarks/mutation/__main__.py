@@ -1,6 +1,6 @@
 """Breaks lines on purpose, one at a time, and asks whether the tests notice.
 
-    python benchmarks/mutation [--mutants N] [--seed S] [--in PACKAGE] [--jobs N] [--again] [--out FILE]
+    python benchmarks/mutation [--mutants N] [--seed S] [--in PACKAGE] [--file NAME] [--jobs N] [--rules] [--again]
 
 First the named breaks of `breaks.yaml`, each against the tests named beside it; then so many mutants, drawn by the seed
 over diagnosis/, analysis/, problem/ and solvers/base.py (see `places.py`), each against those tests of its package's
@@ -25,7 +25,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -160,7 +160,7 @@ def files_of(package: str) -> list[str]:
     return [str(file.relative_to(ROOT)) for file in found if file.name != "__init__.py"]
 
 
-def job_of(mutant: Mutant, package: str, covered: dict[str, Any]) -> Job:
+def job_of(mutant: Mutant, package: str, covered: dict[str, Any], rules: bool) -> Job:
     """A mutant with the tests that run its statement, the quickest files first."""
     lines = covered["lines"].get(mutant.file, {})
     wanted = lines if mutant.at_import else [str(line) for line in range(mutant.first, mutant.last + 1)]
@@ -169,6 +169,7 @@ def job_of(mutant: Mutant, package: str, covered: dict[str, Any]) -> Job:
         name
         for name, entry in covered["tests"].items()
         if name in callers or any(f"fixture {fixture}" in callers for fixture in entry["fixtures"])
+        if not rules or _of_rules(name)
     ]
     seconds: dict[str, float] = {}
     for name in tests:
@@ -177,11 +178,15 @@ def job_of(mutant: Mutant, package: str, covered: dict[str, Any]) -> Job:
 
     def order(name: str) -> tuple[bool, float, str]:
         file = name.partition("::")[0]
-        return not Path(file).name.startswith("test_rules"), seconds[file], file
+        return not _of_rules(name), seconds[file], file
 
     name = f"{mutant.file}:{mutant.line}: {mutant.was}  ->  {mutant.becomes}"
     limit = 3 * sum(seconds.values()) + 20
     return Job(package, name, mutant.file, mutant.text(ROOT), tuple(sorted(tests, key=order)), limit)
+
+
+def _of_rules(test: str) -> bool:
+    return Path(test.partition("::")[0]).name.startswith("test_rules")
 
 
 # -- running ----------------------------------------------------------------------------------------------------------
@@ -282,6 +287,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--in", dest="chosen", action="append", default=[], help="only this package; may be repeated")
     parser.add_argument("--file", action="append", default=[], help="only files of this name; may be repeated")
     parser.add_argument("--jobs", type=int, default=2, help="how many at a time")
+    parser.add_argument("--rules", action="store_true", help="only against tests of rules, which are quick")
     parser.add_argument("--no-breaks", action="store_true", help="leave the named breaks out")
     parser.add_argument("--again", action="store_true", help="try known survivors once more")
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "mutation" / "results.json")
@@ -301,7 +307,7 @@ def jobs_of(given: argparse.Namespace, worker: Worker, store: Path) -> Iterator[
     print(f"drawing {given.mutants} mutants", flush=True)
     for mutant in drawn(ROOT, files, given.seed, given.mutants):
         folder = owner[mutant.file]
-        yield "mutants", job_of(mutant, packages[folder], covered[folder])
+        yield "mutants", job_of(mutant, packages[folder], covered[folder], given.rules)
 
 
 def main() -> int:

@@ -1,7 +1,7 @@
 """Where a line can be broken, and how: Cosmic Ray's operators, less what no test can or should notice.
 
-An operator is replaced by its like: + by -, * by /, a comparison by another one, `and` by `or`; a number moves by one; a
-condition is negated, a loop left out, a decorator taken away. Left out by rule, since nothing that the program does
+An operator is replaced by its like: + by -, * by /, a comparison by another one, `and` by `or`; a number moves by one;
+a condition is negated, a loop left out, a decorator taken away. Left out by rule, since nothing that the program does
 depends on them or since they only say something:
 
 - annotations, type aliases, protocols, blocks under TYPE_CHECKING; what `dataclass` is called with;
@@ -9,8 +9,8 @@ depends on them or since they only say something:
 - our own assertions: `assert`, and the arguments `strict` and `check_finite`;
 - numbers of threads, and caches of results (`functools.cache`).
 
-At every place one change is drawn, and of all places as many as wanted, both by a hash of the seed, the text of the line
-and the function that it stands in: an edit elsewhere changes neither.
+At every place one change is drawn, and of all places as many as wanted, both by a hash of the seed, the text of the
+line and the function that it stands in: an edit elsewhere changes neither.
 """
 
 from __future__ import annotations

@@ -97,7 +97,7 @@ def point(residual, *signatures: Signature) -> Linearisation:
 
 
 def score(of: EffectBase, p=0.5, decrease=1.0, statistic=1.0, step: Mapping[str, float] | None = None) -> Score:
-    return Score(of, {name: 0.1 for name in of.amplitudes} if step is None else dict(step), decrease, statistic, p)
+    return Score(of, dict.fromkeys(of.amplitudes, 0.1) if step is None else dict(step), decrease, statistic, p)
 
 
 def visible(of: EffectBase, seen=True, detectable=0.1) -> Visibility:

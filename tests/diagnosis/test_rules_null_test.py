@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from types import SimpleNamespace
 
@@ -90,7 +91,7 @@ def test_whiteness_adds_over_the_columns_of_a_channel():
 def test_too_short_a_column_says_nothing_of_whiteness(parts, judged):
     r = [noise(count, 7 + i) for i, count in enumerate(parts)]
     edges = np.cumsum([0, *parts])
-    rows = [np.arange(a, b) for a, b in zip(edges, edges[1:], strict=False)]
+    rows = [np.arange(a, b) for a, b in itertools.pairwise(edges)]
     found = null_test([series(own) for own in rows], np.concatenate(r), 0).whiteness["points.tip"]
     if judged:
         assert found == pytest.approx(ljung_box(*(r[i] for i in judged)), rel=1e-10)
