@@ -5,8 +5,10 @@ Every constructor of the package that the tests of rules need is called here, so
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -123,6 +125,11 @@ def evaluation(residual, jacobian=None, ok=True, message="") -> Evaluation:
     return Evaluation(0.5 * float(residual @ residual), residual, jacobian, ok, message, ())
 
 
+def costing(cost: float, rows: int) -> Evaluation:
+    """An evaluation of this cost, however its residual looks."""
+    return replace(evaluation(np.zeros(rows)), cost=cost)
+
+
 def fit(
     effects: Sequence[EffectBase] = (), lost: Loss | None = None, cost=1.0, values=None, std=None, problem=None
 ) -> Fit:
@@ -232,3 +239,100 @@ def samples(channels: Sequence[str], std, unit="m", width=1, **more):
     sensor = SimpleNamespace(channels=tuple(channels), unit=unit, width=width, group="points")
     columns = tuple(channel for channel in channels for _ in range(width))
     return SimpleNamespace(sensor=sensor, channel_of_column=columns, std=np.asarray(std, float), **more)
+
+
+# -- problems ---------------------------------------------------------------------------------------------------------
+
+
+class Candidates:
+    """A candidate problem whose residual is linear in the unknowns: y + sum of column(name, theta) times value.
+
+    Parameters
+    ----------
+    effects : sequence of EffectBase
+    y : ndarray, shape (nr,)
+    column : callable
+        From a parameter's name and all values to its column.
+    nominal : mapping of str to float
+        What the nominal problem frees, and where it starts.
+    """
+
+    def __init__(self, effects, y, column, nominal):
+        self.effects, self.y, self.column = tuple(effects), y, column
+        self.nominal = tuple(nominal)
+        self.theta = dict(nominal) | {n: v for of in effects for n, v in of.neutral.items()}
+        self.names: tuple[str, ...] = self.nominal
+        self.weak, self.fault, self.asked, self.parts = 0, "", [], []
+
+    def told(self, parts, problem):
+        """Keep what `residual_series` was asked of."""
+        self.asked, self.parts = list(problem.names), parts
+        return parts
+
+    def _like(self, **changed):
+        other = copy.copy(self)
+        vars(other).update(changed)
+        return other
+
+    def freeing(self, effects, names=None):
+        extra = [n for of in effects for n in of.parameters.names] if names is None else names
+        return self._like(names=(*self.nominal, *extra))
+
+    def at(self, values):
+        return self._like(theta=self.theta | dict(values))
+
+    def unknowns(self, values):
+        return np.array([values.get(name, self.theta[name]) for name in self.names])
+
+    def residual_at(self, values):
+        """The data's residual at some values of the unknowns."""
+        return self.y + sum(value * self.column(name, self.theta) for name, value in values.items())
+
+    @property
+    def weak_prior_rows(self):
+        return self.weak
+
+    def evaluate(self, x, derivatives=True):
+        values = dict(zip(self.names, x, strict=True))
+        if self.fault == "fails":
+            return evaluation([], ok=False, message="it snaps")
+        residual = np.append(self.residual_at(values), np.full(self.weak, 7.0))
+        jacobian = np.stack([self.column(name, self.theta) for name in self.names], axis=1)
+        jacobian = np.vstack([jacobian, np.full((self.weak, len(x)), 5.0)])
+        return evaluation(residual, None if self.fault else jacobian)
+
+
+class Recorded:
+    """One output of one held-out recording, measured at some times (a node every tenth of a second)."""
+
+    def __init__(self, times, value, weight):
+        value = np.asarray(value, float)
+        node = np.rint(np.asarray(times) / 0.1).astype(int)
+        self._samples = samples(
+            ["a"],
+            np.ones(value.shape),
+            node=node,
+            fraction=np.zeros(len(node)),
+            value=value,
+            weight=np.asarray(weight, float),
+        )
+
+    def predicted(self, prediction):
+        """A problem that predicts the recording so, or says why not; `asked` holds the values that it was asked at."""
+        asked = []
+        episode = SimpleNamespace(
+            name="other", grid=SimpleNamespace(steps=len(self._samples.node), time_step=0.1), samples=(self._samples,)
+        )
+        result = prediction
+        if not isinstance(prediction, str):
+            result = SimpleNamespace(predicted=(np.asarray(prediction, float),))
+        problem = SimpleNamespace(
+            asked=asked,
+            episodes=(),
+            held_out=(episode,),
+            options=SimpleNamespace(path_cutoff=math.inf),
+            unknowns=lambda values: asked.append(dict(values)),
+            validate=lambda x: [(episode, result)],
+        )
+        problem.freeing = lambda effects: SimpleNamespace(**vars(problem))
+        return problem

@@ -7,18 +7,23 @@ import math
 import numpy as np
 import pytest
 import scipy.stats
-from factories import alike, amplitude, effect, point, score, series, shape, signature, visible
+from factories import Candidates, alike, amplitude, effect, point, score, series, shape, signature, visible
 
+from yid_ocp.diagnosis import screening
 from yid_ocp.diagnosis.screening import (
     Screened,
     _basis,
     _coloured,
     confusability,
+    linearise,
     robust,
     scores,
+    screen,
     shape_grid,
     visibility,
 )
+from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.errors import SolverError
 
 CHI2 = scipy.stats.chi2
 ONE_SIDED = effect("friction@elbow", amplitude(lower=0.0, expected=(0.0, 1.0)))
@@ -105,7 +110,9 @@ def test_the_noise_of_a_signature_has_the_colour_of_its_rows(colour):
 
 def test_rows_that_hardly_move_do_not_count():
     columns = np.array([[1e6], [1.0], [0.5]])
-    assert _coloured(columns, [series([0]), series([1, 2])]) == pytest.approx(1e12, rel=1e-14)
+    assert _coloured(columns, [series([1, 2]), series([0])]) == pytest.approx(1e12, rel=1e-14)
+    assert _coloured(1e-16 * columns, [series([1, 2])]) == pytest.approx(0.0)
+    assert _coloured(1e-16 * columns, [series([0])]) == pytest.approx(1e-20, rel=1e-9, abs=0.0)
     assert _coloured(columns * [[1.0], [2.0], [0.0]], [series([1, 2])]) == pytest.approx(4.0)
     assert _coloured(np.zeros((3, 1)), [series([0, 1, 2])]) == pytest.approx(0.0)
 
@@ -184,6 +191,21 @@ def test_the_best_shape_tells_what_is_detectable(order):
     assert found.visible
 
 
+def test_a_shape_that_is_seen_comes_before_one_that_is_detectable_but_never_so_small():
+    of = effect("pair@x", amplitude("x", expected=(0.0, 0.05)), amplitude("y", expected=(0.0, 1.0)), shape())
+    hidden, seen = signature(of, [[20.0, 0.0]], s=0.1), signature(of, [[0.0, 4.0]], s=0.2)
+    [found] = visibility(point([0.0], hidden, seen), detection=2.0)
+    assert (found.detectable["pair@x.y"], found.visible) == (pytest.approx(0.5), True)
+    [other] = visibility(point([0.0], seen, hidden), detection=2.0)
+    assert (other.detectable["pair@x.x"], other.visible) == (pytest.approx(0.1), True)
+    weaker = signature(of, [[0.0, 3.0]], s=0.3)
+    [best] = visibility(point([0.0], seen, weaker), detection=2.0)
+    assert best.detectable["pair@x.y"] == pytest.approx(0.5)
+    larger = signature(of, [[10.0, 0.0]], s=0.4)
+    [first] = visibility(point([0.0], hidden, larger), detection=2.0)
+    assert (first.detectable["pair@x.x"], first.visible) == (pytest.approx(0.1), False)
+
+
 def test_candidates_are_judged_one_by_one():
     at = point([0.0], signature(ONE_SIDED, [9.0]), signature(TWO_SIDED, [1.0]))
     assert [(v.effect.label, v.visible) for v in visibility(at)] == [("friction@elbow", True), ("offset@elbow", False)]
@@ -221,13 +243,14 @@ def test_an_amplitude_of_one_sign_is_tested_on_one_side():
     assert one.p_value == pytest.approx(two.p_value / 2)
 
 
-def test_an_amplitude_of_the_wrong_sign_explains_nothing():
-    found = only(ONE_SIDED, np.ones(4), 1.5 * np.ones(4))
+@pytest.mark.parametrize("size", [1.5, 0.5])
+def test_an_amplitude_of_the_wrong_sign_explains_nothing(size):
+    found = only(ONE_SIDED, np.ones(4), size * np.ones(4))
     assert found.step == {"friction@elbow.a": 0.0}
     assert (found.decrease, found.statistic, found.p_value) == (0.0, 0.0, 1.0)
-    other = only(TWO_SIDED, np.ones(4), 1.5 * np.ones(4))
-    assert other.step == {"offset@elbow.a": pytest.approx(-1.5)}
-    assert other.p_value < 0.01
+    other = only(TWO_SIDED, np.ones(4), size * np.ones(4))
+    assert other.step == {"offset@elbow.a": pytest.approx(-size)}
+    assert other.p_value == pytest.approx(float(CHI2.sf(4 * size**2, 1)))
 
 
 def test_an_orthogonal_residual_scores_nothing():
@@ -256,6 +279,13 @@ def test_two_amplitudes_have_two_degrees_of_freedom():
     statistic = float(x.T @ r @ np.linalg.solve(x.T @ x, x.T @ r))
     assert found.statistic == pytest.approx(statistic)
     assert found.p_value == pytest.approx(float(CHI2.sf(statistic, 2)))
+
+
+def test_amplitudes_that_do_the_same_share_the_step():
+    found = only(PAIR, [[1.0, 1.0], [1.0, 1.0]], [-1.0, -1.0])
+    assert list(found.step.values()) == pytest.approx([0.5, 0.5])
+    assert found.decrease == pytest.approx(2.0)
+    assert found.statistic == pytest.approx(2.0)
 
 
 def test_two_amplitudes_that_start_at_zero_are_not_halved():
@@ -341,3 +371,90 @@ def test_what_was_not_seen_is_listed():
     table = alike([], np.zeros((0, 0)))
     screened = Screened((visible(ONE_SIDED), visible(TWO_SIDED, seen=False)), (), table)
     assert screened.unseen == ["offset@elbow"]
+
+
+# -- one sweep for all ------------------------------------------------------------------------------------------------
+
+ROWS = 12
+
+
+@pytest.fixture
+def swept(monkeypatch):
+    """Candidates of a linear model: two plain ones, one of two amplitudes, one with a shape; a parameter of the fit."""
+    rng = np.random.default_rng(5)
+    columns = {"k": rng.standard_normal(ROWS)}
+    for of in (ONE_SIDED, TWO_SIDED, PAIR, SHAPED):
+        columns |= {name: rng.standard_normal(ROWS) for name in of.parameters.names}
+
+    def column(name, theta):
+        return columns[name] * (1 + theta["branch@T1.s"] if name == "branch@T1.a" else 1.0)
+
+    made = Candidates((ONE_SIDED, TWO_SIDED, PAIR, SHAPED), rng.standard_normal(ROWS), column, {"k": 0.3})
+    parts = [series(range(8)), series(range(8, ROWS), colour=(1.0, 0.5))]
+    monkeypatch.setattr(screening, "residual_series", lambda problem: made.told(parts, problem))
+    return made
+
+
+def projected(basis, columns):
+    q = np.linalg.qr(basis)[0]
+    return columns - q @ (q.T @ columns)
+
+
+def test_every_candidate_is_linearised_beside_what_the_fit_frees(swept):
+    found = linearise(swept, (), {"k": 0.3}, grid=3)
+    labels = [s.effect.label for s in found.signatures]
+    assert labels == ["friction@elbow", "offset@elbow", "tilt@world", *["branch@T1"] * 3]
+    assert found.values == {"k": 0.3}
+    fitted = swept.column("k", swept.theta)[:, None]
+    np.testing.assert_allclose(found.residual, projected(fitted, swept.residual_at({"k": 0.3})), atol=1e-12)
+    for entry in found.signatures:
+        theta = swept.theta | entry.shape
+        plain = np.stack([swept.column(name, theta) for name in entry.effect.amplitudes], axis=1)
+        np.testing.assert_allclose(entry.columns, projected(fitted, plain), atol=1e-12)
+        np.testing.assert_allclose(entry.noise, _coloured(entry.columns, swept.parts), atol=1e-12)
+    tried = [s.shape for s in found.signatures if s.effect is SHAPED]
+    assert tried == shape_grid(SHAPED, 3)
+    assert all(s.shape == {} for s in found.signatures if s.effect is not SHAPED)
+    assert swept.asked == ["k"]
+
+
+def test_effects_in_the_model_are_free_and_no_candidates(swept):
+    values = {"k": 0.1, "tilt@world.x": 0.5, "tilt@world.y": -0.5}
+    found = linearise(swept, (PAIR,), values, grid=1)
+    assert [s.effect.label for s in found.signatures] == ["friction@elbow", "offset@elbow", "branch@T1"]
+    names = ("k", "tilt@world.x", "tilt@world.y")
+    fitted = np.stack([swept.column(name, swept.theta) for name in names], axis=1)
+    np.testing.assert_allclose(found.residual, projected(fitted, swept.residual_at(values)), atol=1e-12)
+    plain = swept.column("friction@elbow.a", swept.theta)[:, None]
+    np.testing.assert_allclose(found.signatures[0].columns, projected(fitted, plain), atol=1e-12)
+    assert swept.asked == list(names)
+
+
+def test_weak_priors_are_no_data(swept):
+    before = linearise(swept, (), {"k": 0.3})
+    swept.weak = 2
+    after = linearise(swept, (), {"k": 0.3})
+    assert len(after.residual) == ROWS
+    np.testing.assert_allclose(after.residual, before.residual)
+    np.testing.assert_allclose(after.signatures[0].columns, before.signatures[0].columns)
+
+
+def test_without_other_candidates_nothing_is_swept(swept):
+    found = linearise(swept, (ONE_SIDED, TWO_SIDED, PAIR, SHAPED), {"k": 0.3})
+    assert found.signatures == ()
+    assert found.residual.shape == (0,)
+
+
+@pytest.mark.parametrize("fault", ["fails", "has no Jacobian"])
+def test_a_model_that_cannot_be_rolled_out_cannot_be_linearised(swept, fault):
+    swept.fault = fault
+    with pytest.raises(SolverError, match="cannot be linearised"):
+        linearise(swept, (), {"k": 0.3})
+
+
+def test_screening_goes_by_its_thresholds(swept):
+    found = screen(swept, (), {"k": 0.3}, Thresholds(shape_values=2, detection=1.5))
+    at = linearise(swept, (), {"k": 0.3}, 2)
+    assert [v.detectable for v in found.visible] == [v.detectable for v in visibility(at, 1.5)]
+    assert found.scores == scores(at, swept.parts, visibility(at, 1.5))
+    np.testing.assert_array_equal(found.alike.matrix, confusability(at, found.scores).matrix)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from factories import alike, amplitude, effect, fit, loss, score, shape
 
-from yid_ocp.diagnosis.refit import Loss
-from yid_ocp.diagnosis.select import closure, gain, out_of_shape, oversized, shortlist, within_reach
+from yid_ocp.diagnosis import select
+from yid_ocp.diagnosis.refit import Loss, Search
+from yid_ocp.diagnosis.screening import Screened
+from yid_ocp.diagnosis.select import closure, compose, gain, out_of_shape, oversized, shortlist, within_reach
 from yid_ocp.diagnosis.thresholds import Thresholds
 
 LIMITS = Thresholds()
@@ -275,3 +278,181 @@ def test_as_many_more_as_are_refitted_and_each_once():
     assert shortlisted(scores, table, refits=2) == ["a", "b", "c", "d"]
     [(of, step), *_] = shortlist(scores, table, LIMITS)
     assert (of.kind, step) == ("a", {"a@x.a": 9.0})
+
+
+# -- one effect after the other ---------------------------------------------------------------------------------------
+
+A, B, C = (effect(f"{name}@x", amplitude()) for name in "abc")
+
+
+class Rounds:
+    """Refits whose held-out losses are given by the effects' kinds, screened as wanted; remembers what was asked."""
+
+    def __init__(self, monkeypatch, losses, p_values=(1e-9, 1e-9, 1e-9), fails=()):
+        self.losses, self.fails, self.refits, self.screens, self.said = losses, fails, [], [], []
+        kinds = [score(of, p=p, decrease=9.0 - i) for i, (of, p) in enumerate(zip((A, B, C), p_values, strict=True))]
+        self.scores = tuple(kinds)
+        monkeypatch.setattr(select, "refit_all", self.refit_all)
+        monkeypatch.setattr(select, "refit", self.refit)
+        monkeypatch.setattr(select, "screen", self.screen)
+
+    def fit(self, effects):
+        return fit(effects, loss(*self.losses["".join(of.kind for of in effects)]), values={"k": float(len(effects))})
+
+    def screened(self, base=()):
+        labels = {of.label for of in base}
+        left = tuple(s for s in self.scores if s.effect.label not in labels)
+        table = alike([s.effect.label for s in left], np.eye(len(left)))
+        return Screened((), left, table)
+
+    def screen(self, problem, base, values, limits):
+        self.screens.append(([of.kind for of in base], values["k"], problem, limits))
+        return self.screened(base)
+
+    def refit_all(self, search, base, tried, values):
+        self.refits.append(([of.kind for of in base], [of.kind for of, _ in tried], values["k"]))
+        return [self.fit((*base, of)) for of, _ in tried if "".join(e.kind for e in (*base, of)) in self.losses]
+
+    def refit(self, problem, effects, start, store, name, limits):
+        self.refits.append((name, [of.kind for of in effects], start["k"]))
+        kinds = "".join(of.kind for of in effects)
+        return None if kinds in self.fails else self.fit(effects)
+
+    def compose(self, **limits):
+        search = Search(SimpleNamespace(), Thresholds(**limits), self.said.append, None)
+        nominal = fit((), loss(*self.losses[""]), values={"k": 0.0})
+        first, added = compose(search, nominal, self.screened())
+        return [f.effects[0].kind for f in first], [entry.effect.kind for entry in added], added
+
+
+def test_one_effect_that_leaves_no_gap_is_enough(monkeypatch):
+    rounds = Rounds(monkeypatch, {"": (3.0, 3.2), "a": (1.0, 1.1), "b": (2.0, 2.2), "c": (1.5, 1.7)})
+    first, chosen, added = rounds.compose()
+    assert (first, chosen) == (["a", "c", "b"], ["a"])
+    assert rounds.refits == [([], ["a", "b", "c"], 0.0)]
+    assert rounds.screens == []
+    assert added[0].closure.value == pytest.approx(1 - 0.05 / 2.1)
+    assert [of.kind for of in added[0].rivals] == ["a"]
+    assert rounds.said == ["added a@x: 97.6 % of the held-out gap closed"]
+
+
+def test_rivals_are_those_within_reach(monkeypatch):
+    rounds = Rounds(monkeypatch, {"": (3.0, 3.2), "a": (1.0, 1.1), "b": (1.001, 1.101), "c": (1.5, 1.7)})
+    first, _, added = rounds.compose()
+    assert first == ["a", "b", "c"]
+    assert [of.kind for of in added[0].rivals] == ["a", "b"]
+
+
+GROWING = {
+    "": (5.0, 5.2),
+    "a": (3.0, 3.2),
+    "b": (4.0, 4.2),
+    "c": (4.5, 4.7),
+    "ab": (2.0, 2.2),
+    "ac": (2.5, 2.7),
+    "abc": (1.5, 1.7),
+    "bc": (3.5, 3.7),
+}
+
+
+def test_effects_are_added_while_the_gap_closes(monkeypatch):
+    rounds = Rounds(monkeypatch, GROWING)
+    first, chosen, added = rounds.compose()
+    assert (first, chosen) == (["a", "b", "c"], ["a", "b", "c"])
+    assert rounds.refits[:3] == [([], ["a", "b", "c"], 0.0), (["a"], ["b", "c"], 1.0), (["a", "b"], ["c"], 2.0)]
+    assert [screened[:2] for screened in rounds.screens] == [(["a"], 1.0), (["a", "b"], 2.0)]
+    assert rounds.screens[0][3] == Thresholds()
+    assert [entry.closure.value for entry in added] == pytest.approx([1 - 2.1 / 4.1, 1 - 1.1 / 4.1, 1 - 0.6 / 4.1])
+    assert [len(entry.fit.effects) for entry in added] == [1, 2, 3]
+    assert "scoring what is left beside a@x, b@x" in rounds.said
+
+
+def test_no_more_effects_than_allowed_nor_than_are_significant(monkeypatch):
+    assert Rounds(monkeypatch, GROWING).compose(effects=2)[1] == ["a", "b"]
+    assert Rounds(monkeypatch, GROWING).compose(effects=1)[1] == ["a"]
+    rounds = Rounds(monkeypatch, GROWING, p_values=(1e-9, 0.01, 0.009))
+    assert rounds.compose()[1] == ["a", "c"]
+    assert rounds.refits[0] == ([], ["a", "c"], 0.0)
+    assert Rounds(monkeypatch, GROWING, p_values=(0.02, 0.03, 0.04)).compose() == ([], [], ())
+
+
+def test_a_rest_below_the_smallest_gap_is_left(monkeypatch):
+    losses = {"": (3.0, 3.2), "a": (1.04, 1.14), "b": (2.0, 2.2), "c": (2.5, 2.7), "ab": (1.0, 1.0), "ac": (1.0, 1.0)}
+    assert Rounds(monkeypatch, losses).compose()[1] == ["a"]
+    assert Rounds(monkeypatch, losses).compose(smallest_gap=0.05)[1] == ["a", "b"]
+    # at the smallest gap another one is tried
+    assert Rounds(monkeypatch, losses).compose(smallest_gap=0.09)[1] == ["a", "b"]
+
+
+@pytest.mark.parametrize(
+    ("nominal", "best", "chosen"),
+    [
+        ((3.0, 3.0, 3.0), (2.91, 2.91, 2.91), []),
+        ((3.0, 3.0, 3.0), (2.89, 2.89, 2.89), ["a"]),
+        ((3.0, 5.0, 3.0), (4.4, 2.5, 2.9), []),
+        ((1.0, 1.0, 1.0), (0.9, 0.9, 0.9), []),
+        ((0.9, 0.9, 0.9), (0.5, 0.5, 0.5), []),
+        ((2.0, 2.0, 2.0), (2.0, 2.0, 2.0), []),
+    ],
+    ids=["too little", "enough", "not sure", "no gap", "below noise", "nothing"],
+)
+def test_an_effect_must_close_a_sure_part_of_the_gap(monkeypatch, nominal, best, chosen):
+    worse = tuple(9.0 for _ in nominal)
+    rounds = Rounds(monkeypatch, {"": nominal, "a": best, "b": worse, "c": worse})
+    first, found, _ = rounds.compose(effects=1)
+    assert (found, first[0]) == (chosen, "a")
+
+
+def test_nothing_is_added_where_no_refit_succeeds(monkeypatch):
+    assert Rounds(monkeypatch, {"": (3.0, 3.0)}).compose() == ([], [], ())
+
+
+def test_an_effect_that_others_make_superfluous_is_left_out_again(monkeypatch):
+    losses = GROWING | {"bc": (1.4, 1.6), "b": (4.0, 4.2)}
+    rounds = Rounds(monkeypatch, losses)
+    _, chosen, added = rounds.compose()
+    assert chosen == ["b", "c"]
+    assert [len(entry.fit.effects) for entry in added] == [1, 2]
+    assert added[1].fit.loss.mean == pytest.approx(1.5)
+    assert [entry.closure.value for entry in added] == pytest.approx([1 - 3.1 / 4.1, 1 - 0.5 / 4.1])
+    tried = rounds.refits[3:]
+    assert tried == [
+        ("a@x and b@x and c@x without a@x", ["b", "c"], 3.0),
+        ("b@x again", ["b"], 2.0),
+        ("b@x and c@x without b@x", ["c"], 2.0),
+    ]
+    assert [entry.effect for entry in added] == [B, C]
+    assert "left a@x out again: the others do as well" in rounds.said
+
+
+def test_the_last_of_three_may_make_both_others_superfluous(monkeypatch):
+    rounds = Rounds(monkeypatch, GROWING | {"bc": (1.4, 1.6), "c": (1.3, 1.5)}, p_values=(1e-9, 1e-9, 1e-9))
+    rounds.scores = rounds.scores[:2]
+    monkeypatch.setattr(rounds, "screened", lambda base=(), own=rounds.screened: screened_with(own, base))
+    _, chosen, added = rounds.compose()
+    assert chosen == ["c"]
+    assert added[0].closure.value == pytest.approx(1 - 0.4 / 4.1)
+
+
+def screened_with(usual, base):
+    """The third candidate shows only once two are in the model."""
+    found = usual(base)
+    if len(base) < 2:
+        return found
+    return Screened((), (score(C, p=1e-9),), alike([C.label], [[1.0]]))
+
+
+def test_an_effect_stays_where_the_others_do_worse_or_cannot_be_fitted(monkeypatch):
+    rounds = Rounds(monkeypatch, GROWING | {"bc": (1.4, 1.6), "ac": (9.0, 9.2)}, fails=("bc",))
+    assert rounds.compose()[1] == ["a", "b", "c"]
+    assert [entry[0] for entry in rounds.refits[3:]] == [
+        "a@x and b@x and c@x without a@x",
+        "a@x and b@x and c@x without b@x",
+    ]
+
+
+def test_of_two_effects_the_first_is_tried_without(monkeypatch):
+    losses = GROWING | {"ab": (2.0, 2.2), "b": (3.4, 3.5), "ac": (2.5, 2.7)}
+    rounds = Rounds(monkeypatch, losses)
+    assert rounds.compose(effects=2)[1] == ["a", "b"]
+    assert [entry[:2] for entry in rounds.refits[2:]] == [("a@x and b@x without a@x", ["b"])]

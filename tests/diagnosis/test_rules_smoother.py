@@ -44,7 +44,7 @@ def made(seed: int, parameters=2, recording="run", size=None, loose=0.3) -> Line
                 ROWS + 2,
             )
         )
-    at_rest, start = rng.standard_normal((STATES, len(SOURCES))), np.full(STATES, loose)
+    at_rest = rng.standard_normal((STATES, len(SOURCES)))
     edges = 0.1 * np.arange(COUNT + 1)
     names = tuple(f"u{i}" for i in range(len(SOURCES)))
     model = Linear(
