@@ -190,7 +190,7 @@ def _pruned(search: Search, nominal: Fit, added: tuple[Added, ...]) -> tuple[Add
     for entry in added[:-1]:
         if len(kept) < 2:
             break
-        rest = [other for other in kept if other is not entry]
+        rest = [other for other in kept if other.effect is not entry.effect]
         full = kept[-1].fit
         # it begins elsewhere than a refit of the same effects in an earlier round
         name = f"{describe(full.effects)} without {entry.effect.label}"

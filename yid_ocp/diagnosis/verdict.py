@@ -28,7 +28,7 @@ def has_gap(before: NullTest, held_out: NullTest, limits: Thresholds, ranked: Se
     p = min(1.0, 2 * min(before.p_value, held_out.p_value))
     if p < limits.level and max(before.chi2_per_dof, held_out.chi2_per_dof) > 1 + limits.smallest_gap:
         return True
-    best = min((score.p_value for score in ranked), default=1.0) * len(ranked)
+    best = _best_of(ranked)
     largest = max((*before.channels.values(), *held_out.channels.values()), default=1.0)
     return best < limits.level and largest > 1 + limits.smallest_gap
 
@@ -40,9 +40,14 @@ def shapeless(
 
     A sure excess without shape stays a gap: stated noise that is too small looks like that.
     """
-    best = min((score.p_value for score in ranked), default=1.0) * len(ranked)
+    best = _best_of(ranked)
     barely = min(before.p_value, held_out.p_value) > limits.shapeless * limits.level
     return barely and best >= limits.level and smoothed.side == "none"
+
+
+def _best_of(ranked: Sequence[Score]) -> float:
+    """Smallest p-value of candidates as the best of that many tries, one where there is none (Bonferroni)."""
+    return min((score.p_value for score in ranked), default=1.0) * max(len(ranked), 1)
 
 
 def decide(

@@ -1,0 +1,338 @@
+"""Small made-up inputs of the rules of a diagnosis: nothing is rolled out for them.
+
+Every constructor of the package that the tests of rules need is called here, so that a changed one is one edit.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+
+from yid_ocp.diagnosis.finding import Absorbed, Finding
+from yid_ocp.diagnosis.hypotheses import Series
+from yid_ocp.diagnosis.localise import Place
+from yid_ocp.diagnosis.null_test import Floor, NullTest, Window
+from yid_ocp.diagnosis.refit import Fit, Loss
+from yid_ocp.diagnosis.screening import Confusability, Linearisation, Score, Signature, Visibility
+from yid_ocp.diagnosis.select import Added, Closure
+from yid_ocp.diagnosis.smoother import Smoothed, Trace
+from yid_ocp.diagnosis.smoother_model import Source
+from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.effects.base import EffectBase, Quantity
+from yid_ocp.model.parameters import Parameter, Parameters
+from yid_ocp.problem.problem import Evaluation
+
+WHITE = (1.0,)
+
+
+# -- effects ----------------------------------------------------------------------------------------------------------
+
+
+class MadeUp(EffectBase):
+    """An effect that is nothing but its quantities."""
+
+    @classmethod
+    def locations(cls, system):
+        return ()
+
+    @classmethod
+    def quantities_at(cls, location, system):
+        return ()
+
+
+def amplitude(name="a", neutral=0.0, lower=0.0, upper=math.inf, expected=(0.0, 1.0), unit="N m"):
+    """A quantity whose neutral value alone makes the effect vanish."""
+    return Quantity(name, unit, neutral, lower, upper, expected, "made up")
+
+
+def shape(name="s", neutral=0.5, expected=(0.1, 1.0), lower=0.0, upper=math.inf):
+    """A quantity that says nothing while the amplitudes are neutral."""
+    return Quantity(name, "s", neutral, lower, upper, expected, "made up", shape=True)
+
+
+def effect(label="friction@elbow", *quantities: Quantity) -> EffectBase:
+    """An effect `kind@location` with some quantities, one amplitude where none are given."""
+    kind, _, location = label.partition("@")
+    chosen = quantities or (amplitude(),)
+    entries = (Parameter(f"{label}.{q.name}", q.neutral, q.unit, q.lower, q.upper, q.description) for q in chosen)
+    return MadeUp(kind, location, tuple(chosen), Parameters(entries))
+
+
+# -- null test --------------------------------------------------------------------------------------------------------
+
+
+def series(rows, t=None, recording="run", channel="points.tip", colour=WHITE, period=0.01) -> Series:
+    """One output of one recording; times at even intervals unless given."""
+    rows = np.asarray(rows)
+    t = period * np.arange(len(rows)) if t is None else np.asarray(t, float)
+    return Series(recording, channel, "points", "m", t, rows, np.asarray(colour, float))
+
+
+def outcome(p=0.5, chi2=1.0, degrees=100.0, channels=None, windows=()) -> NullTest:
+    """The outcome of a null test."""
+    channels = {"points.tip": chi2} if channels is None else channels
+    return NullTest(chi2, degrees, p, dict(channels), dict.fromkeys(channels, 0.5), tuple(windows))
+
+
+def window(begin, end, flagged=True, z=5.0) -> Window:
+    return Window("run", "points.tip", begin, end, z, flagged)
+
+
+# -- screening --------------------------------------------------------------------------------------------------------
+
+
+def signature(of: EffectBase, columns, noise=None, **shapes: float) -> Signature:
+    """A signature; its noise is white unless given."""
+    columns = np.asarray(columns, float)
+    columns = columns[:, None] if columns.ndim == 1 else columns
+    noise = columns.T @ columns if noise is None else np.atleast_2d(np.asarray(noise, float))
+    return Signature(of, {f"{of.label}.{name}": value for name, value in shapes.items()}, columns, noise)
+
+
+def point(residual, *signatures: Signature) -> Linearisation:
+    return Linearisation(np.asarray(residual, float), signatures, {})
+
+
+def score(of: EffectBase, p=0.5, decrease=1.0, statistic=1.0, step: Mapping[str, float] | None = None) -> Score:
+    return Score(of, dict.fromkeys(of.amplitudes, 0.1) if step is None else dict(step), decrease, statistic, p)
+
+
+def visible(of: EffectBase, seen=True, detectable=0.1) -> Visibility:
+    return Visibility(of, dict.fromkeys(of.amplitudes, detectable), seen)
+
+
+def alike(labels: Sequence[str], matrix) -> Confusability:
+    return Confusability(tuple(labels), np.asarray(matrix, float))
+
+
+# -- refits -----------------------------------------------------------------------------------------------------------
+
+
+def loss(*means: float, count=100.0, channels=None) -> Loss:
+    """A held-out loss with these chi2/n in its blocks, all with as many samples."""
+    counts = np.full(len(means), float(count))
+    return Loss(counts * np.asarray(means, float), counts, channels or {"points.tip": (0.01, "m")})
+
+
+def evaluation(residual, jacobian=None, ok=True, message="") -> Evaluation:
+    residual = np.asarray(residual, float)
+    jacobian = None if jacobian is None else np.asarray(jacobian, float)
+    return Evaluation(0.5 * float(residual @ residual), residual, jacobian, ok, message, ())
+
+
+def costing(cost: float, rows: int) -> Evaluation:
+    """An evaluation of this cost, however its residual looks."""
+    return replace(evaluation(np.zeros(rows)), cost=cost)
+
+
+def fit(
+    effects: Sequence[EffectBase] = (), lost: Loss | None = None, cost=1.0, values=None, std=None, problem=None
+) -> Fit:
+    """A refitted model; values are neutral unless given."""
+    neutral = {name: value for entry in effects for name, value in entry.neutral.items()}
+    values = neutral | dict(values or {})
+    std = dict.fromkeys(values, 0.01) | dict(std or {})
+    lost = loss(1.0, 1.0) if lost is None else lost
+    return Fit(tuple(effects), problem, values, std, cost, evaluation([1.0]), lost, "made up")
+
+
+def closed(value=0.9, low=0.8, high=0.95) -> Closure:
+    return Closure(value, low, high)
+
+
+def added(of: EffectBase, rivals: Sequence[EffectBase] = (), fitted: Fit | None = None, part: Closure | None = None):
+    """An effect that was added; it is the first of its rivals."""
+    return Added(of, fitted or fit([of]), part or closed(), (of, *rivals))
+
+
+# -- smoother ---------------------------------------------------------------------------------------------------------
+
+FORCE, OTHER_FORCE = Source("T1", "force"), Source("T2", "force")
+READ_FORCE, BIAS, OFFSET = Source("elbow", "force", True), Source("camera", "bias"), Source("left", "offset")
+
+
+def trace(sources: Sequence[Source], mean, std, recording="run", interval=0.5) -> Trace:
+    """Unknowns of a recording, one column each, over even intervals."""
+    mean, std = np.asarray(mean, float), np.asarray(std, float)
+    edges = interval * np.arange(len(mean) + 1)
+    names = tuple(f"{source.location}.{i}" for i, source in enumerate(sources))
+    return Trace(recording, edges, names, tuple(sources), np.ones(len(sources)), mean, std)
+
+
+def smoothed(
+    weight: Mapping[Source, float],
+    *,
+    evidence: Mapping[str, float] | None = None,
+    variance: Mapping[Source, float] | None = None,
+    detectable: Mapping[Source, float] | None = None,
+    traces: Sequence[Trace] = (),
+    chi2=(200.0, 100.0),
+    degrees=(100.0, 90.0),
+    **more: float,
+) -> Smoothed:
+    """What the smoother says."""
+    return Smoothed(
+        traces=tuple(traces),
+        variance={s: float(w > 0) for s, w in weight.items()} if variance is None else dict(variance),
+        weight=dict(weight),
+        detectable=dict.fromkeys(weight, 0.5) if detectable is None else dict(detectable),
+        before=chi2[0],
+        after=chi2[1],
+        degrees_before=degrees[0],
+        degrees_after=degrees[1],
+        evidence={"none": 0.0, "both": 0.0, "plant": 0.0, "sensor": 0.0} | dict(evidence or {}),
+        **more,
+    )
+
+
+# -- the whole finding ------------------------------------------------------------------------------------------------
+
+
+def place(location="T1", share=1.0, observable=True, windows=()) -> Place:
+    return Place(location, share, observable, tuple(windows))
+
+
+def absorbed(name, before, after, std=0.1, unit="N m/rad") -> Absorbed:
+    return Absorbed(name, unit, before, after, std)
+
+
+def finding(verdict="effect", **changed) -> Finding:
+    """A finding; everything that is not named is unremarkable."""
+    of = effect()
+    usual = {
+        "verdict": verdict,
+        "floor": (Floor("points.tip", "m", 0.001, 100),),
+        "before": outcome(p=1e-9, chi2=2.0),
+        "held_out_before": outcome(p=1e-8, chi2=2.1),
+        "visibility": (visible(of),),
+        "confusability": alike([of.label], [[1.0]]),
+        "scores": (score(of, p=1e-9, decrease=100.0, statistic=40.0),),
+        "smoothed": None,
+        "where": (place(),),
+        "nominal": fit(lost=loss(2.0, 2.2)),
+        "fits": (fit([of], loss(1.0, 1.1), values={f"{of.label}.a": 0.5}),),
+        "added": (added(of, fitted=fit([of], loss(1.0, 1.1), values={f"{of.label}.a": 0.5})),),
+        "closure": closed(),
+        "remaining": outcome(p=0.4, chi2=1.02),
+        "remaining_where": (),
+        "absorbed": (),
+        "next_experiment": "Repeat.",
+        "held_out": ("other",),
+        "in_blocks": False,
+        "message": "",
+        "limits": Thresholds(),
+        "seconds": {"nominal": 1.0},
+    }
+    return Finding(**(usual | changed))
+
+
+# -- recordings on nodes ----------------------------------------------------------------------------------------------
+
+
+def samples(channels: Sequence[str], std, unit="m", width=1, **more):
+    """What one sensor measured, as far as rules look at it."""
+    sensor = SimpleNamespace(channels=tuple(channels), unit=unit, width=width, group="points")
+    columns = tuple(channel for channel in channels for _ in range(width))
+    return SimpleNamespace(sensor=sensor, channel_of_column=columns, std=np.asarray(std, float), **more)
+
+
+# -- problems ---------------------------------------------------------------------------------------------------------
+
+
+class Candidates:
+    """A candidate problem whose residual is linear in the unknowns: y + sum of column(name, theta) times value.
+
+    Parameters
+    ----------
+    effects : sequence of EffectBase
+    y : ndarray, shape (nr,)
+    column : callable
+        From a parameter's name and all values to its column.
+    nominal : mapping of str to float
+        What the nominal problem frees, and where it starts.
+    """
+
+    def __init__(self, effects, y, column, nominal):
+        self.effects, self.y, self.column = tuple(effects), y, column
+        self.nominal = tuple(nominal)
+        self.theta = dict(nominal) | {n: v for of in effects for n, v in of.neutral.items()}
+        self.names: tuple[str, ...] = self.nominal
+        self.weak, self.fault, self.asked, self.parts = 0, "", [], []
+
+    def told(self, parts, problem):
+        """Keep what `residual_series` was asked of."""
+        self.asked, self.parts = list(problem.names), parts
+        return parts
+
+    def _like(self, **changed):
+        other = copy.copy(self)
+        vars(other).update(changed)
+        return other
+
+    def freeing(self, effects, names=None):
+        extra = [n for of in effects for n in of.parameters.names] if names is None else names
+        return self._like(names=(*self.nominal, *extra))
+
+    def at(self, values):
+        return self._like(theta=self.theta | dict(values))
+
+    def unknowns(self, values):
+        return np.array([values.get(name, self.theta[name]) for name in self.names])
+
+    def residual_at(self, values):
+        """The data's residual at some values of the unknowns."""
+        return self.y + sum(value * self.column(name, self.theta) for name, value in values.items())
+
+    @property
+    def weak_prior_rows(self):
+        return self.weak
+
+    def evaluate(self, x, derivatives=True):
+        values = dict(zip(self.names, x, strict=True))
+        if self.fault == "fails":
+            return evaluation([], ok=False, message="it snaps")
+        residual = np.append(self.residual_at(values), np.full(self.weak, 7.0))
+        jacobian = np.stack([self.column(name, self.theta) for name in self.names], axis=1)
+        jacobian = np.vstack([jacobian, np.full((self.weak, len(x)), 5.0)])
+        return evaluation(residual, None if self.fault else jacobian)
+
+
+class Recorded:
+    """One output of one held-out recording, measured at some times (a node every tenth of a second)."""
+
+    def __init__(self, times, value, weight):
+        value = np.asarray(value, float)
+        node = np.rint(np.asarray(times) / 0.1).astype(int)
+        self._samples = samples(
+            ["a"],
+            np.ones(value.shape),
+            node=node,
+            fraction=np.zeros(len(node)),
+            value=value,
+            weight=np.asarray(weight, float),
+        )
+
+    def predicted(self, prediction):
+        """A problem that predicts the recording so, or says why not; `asked` holds the values that it was asked at."""
+        asked = []
+        episode = SimpleNamespace(
+            name="other", grid=SimpleNamespace(steps=len(self._samples.node), time_step=0.1), samples=(self._samples,)
+        )
+        result = prediction
+        if not isinstance(prediction, str):
+            result = SimpleNamespace(predicted=(np.asarray(prediction, float),))
+        problem = SimpleNamespace(
+            asked=asked,
+            episodes=(),
+            held_out=(episode,),
+            options=SimpleNamespace(path_cutoff=math.inf),
+            unknowns=lambda values: asked.append(dict(values)),
+            validate=lambda x: [(episode, result)],
+        )
+        problem.freeing = lambda effects: SimpleNamespace(**vars(problem))
+        return problem

@@ -1,0 +1,367 @@
+"""The order of a diagnosis: what leads to which step, and what each step is given."""
+
+from __future__ import annotations
+
+import importlib
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from factories import (
+    FORCE,
+    Recorded,
+    added,
+    alike,
+    closed,
+    effect,
+    evaluation,
+    fit,
+    loss,
+    outcome,
+    place,
+    score,
+    series,
+    smoothed,
+    visible,
+    window,
+)
+
+from yid_ocp.diagnosis.refit import Search
+from yid_ocp.diagnosis.screening import Screened
+from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.errors import DataError, SolverError
+from yid_ocp.solvers import GaussNewton
+
+# the package's own name `diagnose` is the function
+module = importlib.import_module("yid_ocp.diagnosis.diagnose")
+FRICTION, OFFSET = effect("friction@elbow"), effect("offset@wrist")
+SEEN = smoothed({FORCE: 9.0}, evidence={"plant": 9.0, "both": 9.0})
+SILENT = smoothed({FORCE: 0.0})
+
+
+# -- the nominal fit --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def nominal(monkeypatch):
+    """What fits the nominal model is asked; nominal.outcome: what the refit gives."""
+    made = SimpleNamespace(outcome=fit(), known=None, starts=[], solved=[], found=None)
+
+    def refit(problem, effects, start, store, limits):
+        made.starts.append((problem, tuple(effects), dict(start), store, limits))
+        return made.outcome
+
+    def solve(problem, solver):
+        made.solved.append((problem, solver))
+        return made.found
+
+    monkeypatch.setattr(module, "refit", refit)
+    monkeypatch.setattr(module, "solve", solve)
+    monkeypatch.setattr(module, "recalled", lambda composed, effects, store: made.known)
+    return made
+
+
+def solution(value=2.0, evaluated=True):
+    return SimpleNamespace(
+        names=("k",), x=np.array([value]), evaluation=evaluation([1.0]) if evaluated else None, message="it snaps"
+    )
+
+
+@pytest.mark.parametrize(
+    ("blocks", "given", "solved", "start"),
+    [
+        (False, None, 1, {"k": 3.0}),
+        (False, solution(), 0, {"k": 2.0}),
+        (True, None, 0, {}),
+        (True, solution(), 0, {"k": 2.0}),
+    ],
+    ids=["solved first", "from a solution", "in blocks", "in blocks from a solution"],
+)
+def test_the_nominal_fit_begins_at_the_solution_of_all_data(nominal, blocks, given, solved, start):
+    nominal.found = solution(3.0)
+    composed, limits = SimpleNamespace(blocks=blocks), Thresholds(poor=2.0)
+    assert module.nominal_fit("problem", composed, given, "store", limits) is nominal.outcome
+    assert nominal.starts == [(composed, (), start, "store", limits)]
+    assert nominal.solved == [("problem", GaussNewton(iterations=30))][:solved]
+
+
+def test_a_nominal_fit_that_is_known_is_not_repeated(nominal):
+    nominal.known = fit(cost=7.0)
+    assert module.nominal_fit("problem", SimpleNamespace(blocks=False)) is nominal.known
+    assert nominal.starts == nominal.solved == []
+
+
+def test_a_nominal_model_that_cannot_be_rolled_out_is_said(nominal):
+    nominal.found = solution(evaluated=False)
+    with pytest.raises(SolverError, match="cannot be fitted: it snaps"):
+        module.nominal_fit("problem", SimpleNamespace(blocks=False))
+    nominal.outcome = None
+    with pytest.raises(SolverError, match="at its fit"):
+        module.nominal_fit("problem", SimpleNamespace(blocks=True))
+
+
+def test_the_largest_angles_are_those_of_a_segments_joints_in_all_recordings():
+    joints = ("a", "b", "c", "d")
+    segments = (SimpleNamespace(name="T1", links=(("a", "b"), ("c",))), SimpleNamespace(name="T2", links=(("d",),)))
+    system = SimpleNamespace(segments=segments, mechanism=SimpleNamespace(joint_index=joints.index))
+    states = [np.array([[0.1, -0.2, 0.3, 9.0], [0.0, -0.7, 0.2, 1.0]]), np.array([[0.5, 0.1, 0.6, -11.0]])]
+    episodes = tuple(SimpleNamespace(rollout=SimpleNamespace(state=state)) for state in states)
+    fitted = SimpleNamespace(problem=SimpleNamespace(system=system), evaluation=SimpleNamespace(episodes=episodes))
+    assert module.largest_angles(fitted) == {"T1": 0.7, "T2": 11.0}
+
+
+# -- null tests -------------------------------------------------------------------------------------------------------
+
+
+def test_the_test_on_the_fits_data_leaves_out_what_parameters_took(monkeypatch):
+    monkeypatch.setattr(module, "residual_series", lambda problem: [series(range(5))] if problem == "problem" else [])
+    fitted = SimpleNamespace(problem="problem", evaluation=evaluation([2.0] * 5), values={"k": 1.0, "l": 1.0})
+    found = module.fitted_test(fitted, Thresholds(window=0.02))
+    assert found.chi2_per_dof == pytest.approx(20 / 3)
+    assert found.degrees == 3.0
+    assert len(found.windows) == 3
+
+
+def test_held_out_data_are_tested_without_any_fit():
+    measured = Recorded(times=[0.0, 0.1, 0.2], value=[[1.0], [2.0], [math.nan]], weight=[[2.0], [3.0], [0.0]])
+    problem = measured.predicted([[2.0], [4.0], [9.0]])
+    found = module.held_out_test(SimpleNamespace(problem=problem, values={"k": 5.0}), Thresholds())
+    assert found.chi2_per_dof == pytest.approx((4.0 + 36.0) / 2)
+    assert found.degrees == 2.0
+    assert problem.asked == [{"k": 5.0}]
+
+
+def test_held_out_data_that_cannot_be_predicted_are_refused():
+    problem = Recorded([0.0], [[1.0]], [[1.0]]).predicted("it snaps")
+    with pytest.raises(DataError, match="cannot be predicted: it snaps"):
+        module.held_out_test(SimpleNamespace(problem=problem, values={}), Thresholds())
+
+
+# -- what is left -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("parts", "expected"),
+    [
+        ([("elbow", 0.6)], {"elbow": 0.6}),
+        ([("elbow", 0.6), ("wrist", 0.9)], {"elbow": 0.6, "wrist": 0.3}),
+        ([("elbow", 0.6), ("elbow", 0.9)], {"elbow": 0.9}),
+        ([("elbow", 0.6), ("wrist", 0.5), ("world", 0.7)], {"elbow": 0.6, "wrist": 0.0, "world": 0.1}),
+        ([("elbow", -0.2), ("wrist", 0.5)], {"elbow": 0.0, "wrist": 0.5}),
+    ],
+    ids=["one", "two", "at one place", "one that closes nothing more", "worse than nothing"],
+)
+def test_every_effect_closes_what_it_adds_to_those_before_it(parts, expected):
+    entries = [added(effect(f"kind@{location}"), part=closed(value)) for location, value in parts]
+    assert module._closed(entries) == pytest.approx(expected)
+
+
+@pytest.fixture
+def left(monkeypatch):
+    """Null tests and smoothers of fits: left.tests, left.places."""
+    made = SimpleNamespace(fitted=outcome(), held=outcome(), rest=SEEN, smoothed=[])
+
+    def smooth_fit(of, limits):
+        made.smoothed.append((of, limits))
+        return made.rest
+
+    monkeypatch.setattr(module, "fitted_test", lambda of, limits: made.fitted)
+    monkeypatch.setattr(module, "held_out_test", lambda of, limits: made.held)
+    monkeypatch.setattr(module, "smooth_fit", smooth_fit)
+    return made
+
+
+def after(accepted, found=SEEN, before=None):
+    held = outcome(p=1e-9, chi2=2.0)
+    return held, module._after(fit(), accepted, found, before or outcome(), held, Thresholds())
+
+
+def test_without_effects_what_is_left_is_what_there_was(left):
+    held, (remaining, where, rest) = after(())
+    assert remaining is held
+    assert where == rest
+    assert [(p.location, p.share) for p in where] == [("T1", 1.0)]
+    assert after((), found=None)[1][1:] == ((), ())
+    assert left.smoothed == []
+
+
+def test_an_effect_takes_what_it_closes_and_noise_has_no_place(left):
+    fitted = fit([FRICTION])
+    _, (remaining, where, rest) = after((added(FRICTION, fitted=fitted, part=closed(0.75)),))
+    assert remaining is left.held
+    assert rest == ()
+    assert [(p.location, p.share) for p in where] == [("elbow", 1.0), ("T1", 0.0)]
+    assert left.smoothed == []
+
+
+def test_a_gap_that_is_left_is_located_again(left):
+    left.held = outcome(p=1e-9, chi2=1.5)
+    fitted = fit([OFFSET])
+    flagged = [window(0.0, 0.5), window(0.5, 1.0), window(2.0, 2.5, flagged=False), window(3.0, 3.5)]
+    entries = (added(FRICTION, part=closed(0.5)), added(OFFSET, fitted=fitted, part=closed(0.75)))
+    _, (remaining, where, rest) = after(entries, before=outcome(windows=flagged))
+    assert remaining is left.held
+    assert left.smoothed == [(fitted, Thresholds())]
+    assert [p.location for p in rest] == ["T1"]
+    assert {p.location: p.share for p in where} == {"elbow": 0.5, "wrist": 0.25, "T1": 0.25}
+    assert where[0].windows == ((0.0, 1.0), (3.0, 3.5))
+
+
+def test_channels_above_noise_are_no_gap_without_a_candidate_or_a_sure_excess(left):
+    left.fitted = left.held = outcome(p=0.3, chi2=1.02, channels={"a": 1.3, "b": 0.9})
+    assert after((added(FRICTION),))[1][2] == ()
+    assert left.smoothed == []
+
+
+# -- all steps --------------------------------------------------------------------------------------------------------
+
+
+class Steps:
+    """A diagnosis whose steps are given; remembers which were taken, and with what."""
+
+    def __init__(self, monkeypatch, **given):
+        self.given = {
+            "before": outcome(p=1e-9, chi2=2.0, degrees=100.0),
+            "held": outcome(p=1e-9, chi2=2.0),
+            "screened": Screened((visible(FRICTION), visible(OFFSET, seen=False)), (score(FRICTION, p=1e-9),), TABLE),
+            "smoothed": SEEN,
+            "added": (added(FRICTION, fitted=fit([FRICTION], loss(1.0, 1.1), cost=50.0, values=VALUES)),),
+            "blocks": False,
+        } | given
+        self.taken, self.said = [], []
+        self.nominal = fit(lost=loss(2.0, 2.1), cost=100.0, values=VALUES)
+        object.__setattr__(self.nominal, "problem", SimpleNamespace(episodes=(), shared=("k",), system=SYSTEM))
+        monkeypatch.setattr(module, "nominal_fit", self.step("nominal", self.nominal))
+        monkeypatch.setattr(module, "largest_angles", lambda of: {"T1": 0.5})
+        monkeypatch.setattr(module, "fitted_test", lambda of, limits: self.given["before"])
+        monkeypatch.setattr(module, "held_out_test", lambda of, limits: self.given["held"])
+        monkeypatch.setattr(module, "screen", self.step("screen", self.given["screened"]))
+        monkeypatch.setattr(module, "smooth_fit", self.step("smooth", self.given["smoothed"]))
+        refits = tuple(entry.fit for entry in self.given["added"])
+        monkeypatch.setattr(module, "compose", self.step("compose", (refits, self.given["added"])))
+
+    def step(self, name, result):
+        def taken(*given):
+            self.taken.append((name, given))
+            return result
+
+        return taken
+
+    @property
+    def names(self):
+        return [name for name, _ in self.taken]
+
+    def run(self, **limits):
+        held = (SimpleNamespace(name="other"),)
+        self.effects = [Remembering("friction@elbow"), Remembering("offset@wrist")]
+        self.composed = SimpleNamespace(effects=tuple(self.effects), held_out=held, blocks=self.given["blocks"])
+        search = Search(self.composed, Thresholds(**limits), self.said.append, "store")
+        return module._diagnosed("problem", search, "solution", module._Clock())
+
+
+class Remembering:
+    """An effect that is told how far joints turn."""
+
+    def __init__(self, label):
+        self.label, self.angles = label, None
+
+    def expected(self, angles):
+        other = Remembering(self.label)
+        other.angles = angles
+        return other
+
+
+TABLE = alike([FRICTION.label], [[1.0]])
+VALUES = {"k": 1.0, "l": 1.0}
+UNIT = SimpleNamespace(unit="N m/rad")
+SYSTEM = SimpleNamespace(parameters={"k": UNIT, "l": UNIT})
+
+
+def test_a_gap_is_screened_located_and_closed(monkeypatch):
+    steps = Steps(monkeypatch)
+    found = steps.run()
+    assert steps.names == ["nominal", "screen", "smooth", "compose"]
+    assert found.verdict == "effect"
+    assert steps.taken[0][1] == ("problem", steps.composed, "solution", "store", Thresholds())
+    assert steps.taken[1][1] == (steps.composed, (), steps.nominal.values, Thresholds())
+    assert steps.taken[2][1] == (steps.nominal, Thresholds())
+    assert [e.angles for e in steps.composed.effects] == [{"T1": 0.5}] * 2
+    assert found.closure.value == pytest.approx(1 - 0.05 / 1.05)
+    assert (found.added, found.fits[0]) == (steps.given["added"], steps.given["added"][0].fit)
+    assert found.held_out == ("other",)
+    assert found.absorbed[0].before == 1.0
+    assert found.summary.startswith("The gap is real")
+    assert list(found.seconds) == ["nominal", "null_test", "screening", "localisation", "refits", "remaining"]
+    assert all(0 <= value < 5 for value in found.seconds.values())
+    assert steps.said[:3] == ["fitting the nominal model", "screening 2 candidates", "locating the gap"]
+
+
+NOISE = {"before": outcome(p=0.4, degrees=100.0), "held": outcome(p=0.5)}
+FAINT = {"before": outcome(p=0.003, chi2=1.2, degrees=100.0), "held": outcome(p=0.5)}
+LARGE = smoothed({FORCE: 9.0}, chi2=(500.0, 100.0))
+HARMLESS = Screened((visible(FRICTION),), (score(FRICTION, p=0.6),), TABLE)
+
+
+@pytest.mark.parametrize(
+    ("given", "taken", "verdict"),
+    [
+        (NOISE | {"screened": HARMLESS}, ["nominal", "screen"], "no_gap"),
+        (NOISE, ["nominal", "screen"], "no_gap"),
+        (FAINT | {"screened": HARMLESS, "smoothed": SILENT}, ["nominal", "screen", "smooth"], "no_gap"),
+        (FAINT | {"screened": HARMLESS}, ["nominal", "screen", "smooth", "compose"], "effect"),
+        ({"before": outcome(p=1e-9, chi2=2.0, degrees=5.9)}, ["nominal", "screen"], "insufficient_data"),
+        ({"before": outcome(p=1e-9, chi2=2.0, degrees=6.0)}, ["nominal", "screen", "smooth", "compose"], "effect"),
+        ({"screened": Screened((), (), TABLE)}, ["nominal", "screen", "smooth"], "insufficient_data"),
+        ({"added": ()}, ["nominal", "screen", "smooth", "compose"], "unknown"),
+        (
+            {"smoothed": smoothed({FORCE: 9.0}, chi2=(500.0, 100.0))},
+            ["nominal", "screen", "smooth", "compose"],
+            "unknown",
+        ),
+    ],
+    ids=[
+        "noise",
+        "noise along a sure candidate",
+        "chance",
+        "barely, but with a place",
+        "fewer than three samples for each of two unknowns",
+        "three samples for each",
+        "nothing could be seen",
+        "nothing was added",
+        "most is left unexplained",
+    ],
+)
+def test_what_leads_to_which_step(monkeypatch, given, taken, verdict):
+    steps = Steps(monkeypatch, **given)
+    found = steps.run()
+    assert (steps.names, found.verdict) == (taken, verdict)
+    if verdict not in ("effect", "confusable"):
+        assert found.remaining is steps.given["held"]
+        assert found.absorbed[0].after == found.absorbed[0].before == 1.0
+        assert found.effects == ()
+    if not found.added:
+        assert math.isnan(found.closure.value)
+        assert math.isnan(found.closure.low)
+        assert math.isnan(found.closure.high)
+    if "smooth" not in taken:
+        assert (found.smoothed, found.where) == (None, ())
+
+
+def test_how_many_samples_are_enough_is_a_threshold(monkeypatch):
+    steps = Steps(monkeypatch)
+    assert steps.run(samples_per_unknown=50.0).verdict == "effect"
+    found = Steps(monkeypatch).run(samples_per_unknown=50.1)
+    assert found.verdict == "insufficient_data"
+    assert found.message.startswith("100 effective samples for 2 unknowns, at least 100 are needed")
+
+
+def test_an_effect_that_is_accepted_is_where_the_gap_was(monkeypatch):
+    steps = Steps(monkeypatch, blocks=True)
+    steps.given["added"][0].fit.values.update({"k": 2.0, "l": 3.0})
+    steps.given["added"][0].fit.std.update({"k": 0.5})
+    found = steps.run()
+    assert found.where[0] == place("elbow", found.where[0].share)
+    assert (found.absorbed[0].after, found.absorbed[0].std) == (2.0, 0.5)
+    assert found.in_blocks
+    assert found.next_experiment.startswith("Repeat")

@@ -1,0 +1,165 @@
+"""Where a gap lies and when: rule by rule."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from factories import BIAS, FORCE, OFFSET, OTHER_FORCE, place, smoothed, trace
+
+from yid_ocp.diagnosis.localise import attributed, informed_map, localise, merged, units
+from yid_ocp.diagnosis.smoother_model import Source
+
+TWIST = Source("T1", "bias")
+
+
+def described(places):
+    return [(p.location, pytest.approx(p.share), p.observable) for p in places]
+
+
+@pytest.mark.parametrize(
+    ("weight", "detectable", "expected"),
+    [
+        ({FORCE: 3.0, OTHER_FORCE: 1.0}, {}, [("T1", 0.75, True), ("T2", 0.25, True)]),
+        ({FORCE: 1.0, OTHER_FORCE: 3.0}, {}, [("T2", 0.75, True), ("T1", 0.25, True)]),
+        ({FORCE: 1.0, TWIST: 2.0, OTHER_FORCE: 1.0}, {}, [("T1", 0.75, True), ("T2", 0.25, True)]),
+        ({FORCE: 0.0, OTHER_FORCE: 0.0}, {FORCE: 0.5, OTHER_FORCE: 2.0}, [("T1", 0.0, True), ("T2", 0.0, False)]),
+        ({FORCE: 0.0, OTHER_FORCE: 0.0}, {FORCE: 1.0, OTHER_FORCE: 0.9}, [("T2", 0.0, True), ("T1", 0.0, False)]),
+        ({FORCE: 0.0, TWIST: 0.0}, {FORCE: 0.5, TWIST: 2.0}, [("T1", 0.0, True)]),
+        ({FORCE: 0.0, TWIST: 0.0}, {FORCE: 2.0, TWIST: 0.5}, [("T1", 0.0, True)]),
+        ({FORCE: 2.0}, {FORCE: 5.0}, [("T1", 1.0, True)]),
+    ],
+    ids=[
+        "by evidence",
+        "largest first",
+        "unknowns of one place add",
+        "none, but one would have shown",
+        "as large as its reference does not show",
+        "one of two would have shown",
+        "the other would have shown",
+        "what is there shows",
+    ],
+)
+def test_places_share_the_gap_by_their_evidence(weight, detectable, expected):
+    found = smoothed(weight, detectable=dict.fromkeys(weight, 0.5) | detectable)
+    assert described(localise(found)) == expected
+
+
+def test_a_gap_is_there_when_an_unknown_is_surely_not_zero():
+    traces = [
+        trace([FORCE, OTHER_FORCE], [[3.1, 0.0], [-3.1, 0.0], [2.9, 9.0], [3.1, 0.0]], np.ones((4, 2))),
+        trace([OTHER_FORCE], [[0.0], [9.0]], np.ones((2, 1)), recording="second"),
+    ]
+    found = {p.location: p.windows for p in localise(smoothed({FORCE: 3.0, OTHER_FORCE: 1.0}, traces=traces))}
+    assert found == {"T1": ((0.0, 1.0), (1.5, 2.0)), "T2": ((0.5, 1.5),)}
+    strict = {p.location: p.windows for p in localise(smoothed({FORCE: 3.0, OTHER_FORCE: 1.0}, traces=traces), 5.0)}
+    assert strict == {"T1": (), "T2": ((0.5, 1.5),)}
+
+
+def test_any_unknown_of_a_place_tells_when_but_only_groups_at_work():
+    traces = [trace([FORCE, FORCE, TWIST], [[9.0, 0.0, 0.0], [0.0, 9.0, 0.0], [0.0, 0.0, 9.0]], np.ones((3, 3)))]
+    found = smoothed({FORCE: 3.0, TWIST: 1.0}, variance={FORCE: 1.0, TWIST: 0.0}, traces=traces)
+    assert localise(found)[0].windows == ((0.0, 1.0),)
+    tiny = [trace([FORCE], [[1e-13], [1e-11]], np.zeros((2, 1)))]
+    assert localise(smoothed({FORCE: 1.0}, traces=tiny))[0].windows == ((0.5, 1.0),)
+
+
+@pytest.mark.parametrize(
+    ("spans", "expected"),
+    [
+        ([], ()),
+        ([(1.0, 2.0), (0.0, 1.0)], ((0.0, 2.0),)),
+        ([(0.0, 3.0), (1.0, 2.0)], ((0.0, 3.0),)),
+        ([(0.0, 1.0), (1.0 + 1e-10, 2.0)], ((0.0, 2.0),)),
+        ([(0.0, 1.0), (1.0 + 1e-6, 2.0)], ((0.0, 1.0), (1.0 + 1e-6, 2.0))),
+        ([(2.0, 3.0), (0.0, 0.5), (2.5, 4.0)], ((0.0, 0.5), (2.0, 4.0))),
+    ],
+    ids=["none", "touching", "one in the other", "touching up to rounding", "apart", "overlapping"],
+)
+def test_touching_spans_are_one_stretch(spans, expected):
+    assert merged(spans) == expected
+
+
+# -- what effects close -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("before", "closed", "rest", "expected"),
+    [
+        ([place("T1")], {"T1": 1.0}, [], [("T1", 1.0, True)]),
+        ([place("T1")], {"T1": 0.6}, [place("T2")], [("T1", 0.6, True), ("T2", 0.4, False)]),
+        ([place("T1")], {"T1": 0.6}, [place("T1", 0.5), place("T2", 0.5)], [("T1", 0.8, True), ("T2", 0.2, False)]),
+        (
+            [place("T1")],
+            {"T1": 0.9, "T2": 0.3},
+            [place("T3")],
+            [("T1", 0.75, True), ("T2", 0.25, True), ("T3", 0, False)],
+        ),
+        ([place("T1")], {"T1": 0.5}, [], [("T1", 1.0, True)]),
+        ([place("T1", observable=False)], {"T2": 0.5}, [], [("T2", 1.0, True), ("T1", 0.0, False)]),
+        ([place("T1")], {"T2": 0.5}, [], [("T2", 1.0, True), ("T1", 0.0, True)]),
+        ([place("T1")], {"world": 0.0}, [], [("T1", 0.0, True), ("world", 0.0, True)]),
+    ],
+    ids=[
+        "all",
+        "what is left goes to its places",
+        "what is left of an effect's own place",
+        "more than all",
+        "nothing is left to be seen",
+        "a place that could not be seen",
+        "a place without an effect",
+        "nothing closed",
+    ],
+)
+def test_places_of_effects_share_by_what_they_close(before, closed, rest, expected):
+    found = described(attributed(before, closed, rest, ()))
+    assert sorted(found, key=lambda p: p[0]) == sorted(expected, key=lambda p: p[0])
+    shares = [share.expected for _, share, _ in found]
+    assert shares == sorted(shares, reverse=True)
+
+
+def test_places_keep_their_windows_and_those_without_unknowns_take_the_residuals():
+    seen, residual = ((0.0, 1.0),), ((2.0, 3.0),)
+    before = [place("T1", windows=seen), place("T2")]
+    found = {p.location: p.windows for p in attributed(before, {"T1": 0.5, "world": 0.2}, [place("T3")], residual)}
+    assert found == {"T1": seen, "world": residual, "T2": (), "T3": ()}
+    [whole] = attributed([place("T2")], {"T2": 1.0}, [], residual)
+    assert whole.windows == residual
+
+
+# -- the map ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("variance", "std", "mean", "mapped", "expected"),
+    [
+        (4.0, 1.0, 3.0, 0.5, 3.0),
+        (4.0, 1.0, 3.0, 0.75, math.nan),
+        (4.0, 1.0, 3.0, 0.74, 3.0),
+        (4.0, 0.5, 3.0, 0.5, 6.0),
+        (0.0, 1.0, 3.0, 0.5, math.nan),
+        (1.0, 0.9, 3.0, 0.5, math.nan),
+    ],
+    ids=["informed", "at the limit", "just above", "surer", "not at work", "not informed"],
+)
+def test_only_informed_values_are_on_the_map(variance, std, mean, mapped, expected):
+    found = smoothed({FORCE: 1.0}, variance={FORCE: variance}, traces=[trace([FORCE], [[mean]], [[std]])])
+    edges, names, values = informed_map(found, mapped=mapped)
+    np.testing.assert_allclose(values, [[expected]])
+    assert (list(edges), names) == ([0.0, 0.5], ("T1.0",))
+
+
+def test_the_map_is_of_one_recording():
+    traces = [trace([FORCE], [[1.0]], [[0.1]]), trace([FORCE], [[2.0]], [[0.1]])]
+    found = smoothed({FORCE: 1.0}, variance={FORCE: 1.0}, traces=traces)
+    assert informed_map(found)[2] == pytest.approx(10.0)
+    assert informed_map(found, 1)[2] == pytest.approx(20.0)
+
+
+def test_units_of_unknowns_are_those_of_their_joints_or_metres():
+    joints = (SimpleNamespace(name="slide", kind="prismatic"), SimpleNamespace(name="hinge", kind="revolute"))
+    system = SimpleNamespace(mechanism=SimpleNamespace(joints=joints, joint_names=("slide", "hinge")))
+    made = SimpleNamespace(unknowns=("hinge", "slide", "left.x", "tip.z"), sources=(FORCE, FORCE, OFFSET, BIAS))
+    assert units(system, made) == ("N m", "N", "m", "m")

@@ -1,0 +1,207 @@
+"""The null test, rule by rule, against numbers worked out by hand."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import scipy.stats
+from factories import samples, series
+
+from yid_ocp.diagnosis.null_test import noise_floor, null_test, spread
+
+CHI2 = scipy.stats.chi2
+
+
+@pytest.mark.parametrize(
+    ("colour", "expected"),
+    [((1.0,), 1.0), ((1.0, 0.5), 1.5), ((1.0, -0.5, 0.25), 1.625), ((1.0, 0.0, 1.0), 3.0)],
+    ids=["white", "one lag", "two lags", "a lag apart"],
+)
+def test_coloured_samples_count_less(colour, expected):
+    assert spread(np.array(colour)) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("count", "value", "parameters", "colour", "degrees", "ratio"),
+    [
+        (8, 2.0, 0, (1.0,), 8.0, 4.0),
+        (8, 2.0, 3, (1.0,), 5.0, 32 / 5),
+        (26, 1.0, 0, (1.0, 0.5, 0.25), 16.0, 1.0),
+        (26, 1.0, 2, (1.0, 0.5, 0.25), 14.0, 26 / 24),
+        (3, 1.0, 3, (1.0,), 1.0, 3.0),
+        (3, 1.0, 7, (1.0,), 1.0, 3.0),
+    ],
+    ids=["white", "white less parameters", "coloured", "coloured less parameters", "as many parameters", "too many"],
+)
+def test_the_whole_residual_against_chi_squared(count, value, parameters, colour, degrees, ratio):
+    found = null_test([series(range(count), colour=colour)], np.full(count, value), parameters)
+    assert found.degrees == pytest.approx(degrees)
+    assert found.chi2_per_dof == pytest.approx(ratio)
+    assert found.p_value == pytest.approx(CHI2.sf(ratio * degrees, degrees), rel=1e-12)
+
+
+def test_several_series_add_and_rows_of_no_series_do_not_count():
+    residual = np.array([1.0, 2.0, 3.0, 50.0, 4.0, 60.0])
+    parts = [series([0, 1]), series([2, 4], channel="points.other", colour=(1.0, 0.5))]
+    found = null_test(parts, residual, 1)
+    assert found.degrees == pytest.approx(2 + 2 / 1.5 - 1)
+    assert found.chi2_per_dof == pytest.approx((1 + 4 + 9 + 16) / 3)
+    assert found.channels == {"points.tip": pytest.approx(2.5), "points.other": pytest.approx(12.5)}
+
+
+# -- is it white ------------------------------------------------------------------------------------------------------
+
+
+def ljung_box(*parts: np.ndarray, lags: int = 10) -> float:
+    """The textbook's sum, term by term, about a mean of zero."""
+    total = 0.0
+    for r in parts:
+        n = len(r)
+        for lag in range(1, lags + 1):
+            rho = sum(r[i] * r[i - lag] for i in range(lag, n)) / sum(x * x for x in r)
+            total += n * (n + 2) * rho * rho / (n - lag)
+    return float(CHI2.sf(total, lags * len(parts)))
+
+
+def noise(count: int, seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).standard_normal(count)
+
+
+def test_whiteness_is_that_of_ljung_and_box():
+    r = noise(40, 1) + 0.4
+    found = null_test([series(range(40))], r, 0).whiteness
+    assert found == {"points.tip": pytest.approx(ljung_box(r), rel=1e-10)}
+
+
+def test_whiteness_adds_over_the_columns_of_a_channel():
+    r = np.concatenate([noise(40, 1), noise(31, 2)])
+    found = null_test([series(range(40)), series(range(40, 71))], r, 0).whiteness
+    assert found["points.tip"] == pytest.approx(ljung_box(r[:40], r[40:]), rel=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("parts", "judged"),
+    [([30], []), ([31], [0]), ([30, 31], [1]), ([31, 12], [0])],
+    ids=["too short", "just long enough", "first too short", "second too short"],
+)
+def test_too_short_a_column_says_nothing_of_whiteness(parts, judged):
+    r = [noise(count, 7 + i) for i, count in enumerate(parts)]
+    edges = np.cumsum([0, *parts])
+    rows = [np.arange(a, b) for a, b in itertools.pairwise(edges)]
+    found = null_test([series(own) for own in rows], np.concatenate(r), 0).whiteness["points.tip"]
+    if judged:
+        assert found == pytest.approx(ljung_box(*(r[i] for i in judged)), rel=1e-10)
+    else:
+        assert math.isnan(found)
+
+
+def test_a_column_of_zeros_and_a_coloured_channel_have_no_whiteness():
+    r = np.concatenate([np.zeros(40), noise(40, 3)])
+    parts = [series(range(40)), series(range(40, 80), channel="points.other", colour=(1.0, 0.5))]
+    found = null_test(parts, r, 0).whiteness
+    assert all(math.isnan(p) for p in found.values())
+    assert set(found) == {"points.tip", "points.other"}
+
+
+# -- windows ----------------------------------------------------------------------------------------------------------
+
+PER_WINDOW = 20
+
+
+def with_p_values(*wanted: float) -> tuple[list, np.ndarray]:
+    """A series whose windows of half a second have these p-values."""
+    residual = [math.sqrt(CHI2.isf(p, PER_WINDOW) / PER_WINDOW) for p in wanted for _ in range(PER_WINDOW)]
+    t = 0.5 * np.arange(len(residual)) / PER_WINDOW
+    return [series(range(len(residual)), t)], np.array(residual)
+
+
+@pytest.mark.parametrize(
+    ("p_values", "flagged"),
+    [
+        ((0.008, 0.5, 0.6, 0.7), ()),
+        ((0.002, 0.5, 0.6, 0.7), (0,)),
+        ((0.6, 0.7, 0.5, 0.002), (3,)),
+        ((0.5, 0.0049, 0.6, 0.004), (1, 3)),
+        ((0.0074, 0.0049, 0.5, 0.007), (0, 1, 3)),
+        ((0.0099, 0.009, 0.0095, 0.0098), (0, 1, 2, 3)),
+        ((0.0049, 0.5, 0.6, 0.7), ()),
+    ],
+    ids=[
+        "sure alone but not among four",
+        "sure among four",
+        "in whatever order",
+        "two that carry each other",
+        "three",
+        "all",
+        "second's share is not the first's",
+    ],
+)
+def test_windows_are_flagged_by_their_false_discovery_rate(p_values, flagged):
+    found = null_test(*with_p_values(*p_values), 0, level=0.01).windows
+    assert len(found) == 4
+    assert tuple(i for i, entry in enumerate(found) if entry.flagged) == flagged
+
+
+def test_the_rate_is_the_level():
+    parts = with_p_values(0.02, 0.5, 0.6, 0.7)
+    assert [w.flagged for w in null_test(*parts, 0, level=0.1).windows] == [True, False, False, False]
+    assert not any(w.flagged for w in null_test(*parts, 0, level=0.05).windows)
+
+
+def test_a_window_has_its_excess_in_standard_deviations():
+    t = [0.0, 0.2, 0.4, 0.5, 0.9, 2.1]
+    residual = np.array([1.0, 2.0, 3.0, 0.5, 0.5, 1.0])
+    found = null_test([series(range(6), t, colour=(1.0, 0.5))], residual, 0).windows
+    assert [(w.begin, w.end) for w in found] == [(0.0, 0.5), (0.5, 1.0), (2.0, 2.1)]
+    for entry, mean, count in zip(found, (14 / 3, 0.25, 1.0), (3, 2, 1), strict=True):
+        assert entry.z == pytest.approx((mean - 1) * math.sqrt(count / 1.5 / 2))
+        assert (entry.recording, entry.channel) == ("run", "points.tip")
+
+
+def test_columns_of_a_channel_share_windows_and_recordings_do_not():
+    residual = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    parts = [series([0, 1]), series([2, 3]), series([4], recording="second"), series([5], channel="points.other")]
+    found = null_test(parts, residual, 0).windows
+    assert [(w.recording, w.channel) for w in found] == [
+        ("run", "points.tip"),
+        ("second", "points.tip"),
+        ("run", "points.other"),
+    ]
+    assert found[0].z == pytest.approx((30 / 4 - 1) * math.sqrt(2))
+    assert found[1].z == pytest.approx(24 * math.sqrt(0.5))
+
+
+def test_windows_are_as_long_as_wanted_and_reach_the_last_sample():
+    t = [0.0, 0.25, 0.5, 0.75, 1.0]
+    parts = [series(range(3), t[:3]), series([3, 4], t[3:])]
+    found = null_test(parts, np.ones(5), 0, window=0.5).windows
+    assert [(w.begin, w.end) for w in found] == [(0.0, 0.5), (0.5, 1.0), (1.0, 1.0)]
+    assert len(null_test(parts, np.ones(5), 0, window=0.25).windows) == 5
+    assert [(w.begin, w.end) for w in null_test(parts, np.ones(5), 0, window=2.0).windows] == [(0.0, 1.0)]
+
+
+def test_a_coloured_window_is_less_sure():
+    residual = np.full(20, 1.3)
+    white = null_test([series(range(20))], residual, 0, level=0.05).windows[0]
+    coloured = null_test([series(range(20), colour=(1.0, 0.7))], residual, 0, level=0.05).windows[0]
+    assert white.flagged
+    assert not coloured.flagged
+    assert white.z == pytest.approx(coloured.z * math.sqrt(1 + 2 * 0.49))
+
+
+# -- noise floor ------------------------------------------------------------------------------------------------------
+
+
+def test_the_noise_floor_is_the_median_of_each_channel():
+    nan = math.nan
+    first = samples(["points.a", "points.b"], [[1.0, 9.0], [2.0, nan], [6.0, nan]])
+    second = samples(["points.a", "effort"], [[3.0, nan], [4.0, nan]], unit="N m")
+    problem = SimpleNamespace(episodes=[SimpleNamespace(samples=[first]), SimpleNamespace(samples=[second])])
+    found = {entry.channel: entry for entry in noise_floor(problem)}
+    assert set(found) == {"points.a", "points.b"}
+    assert (found["points.a"].std, found["points.a"].samples) == (3.0, 5)
+    assert (found["points.b"].std, found["points.b"].samples, found["points.b"].unit) == (9.0, 1, "m")

@@ -1,0 +1,403 @@
+"""Refits: when one is tried again, how sure its values are, and how badly held-out recordings are predicted."""
+
+from __future__ import annotations
+
+import importlib
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from factories import amplitude, costing, effect, evaluation, fit, loss, samples, series, shape
+
+from yid_ocp.diagnosis.refit import (
+    Refitted,
+    Search,
+    _half_done,
+    block_length,
+    deviations,
+    held_out_loss,
+    recalled,
+    refit,
+    refit_all,
+)
+from yid_ocp.diagnosis.screening import robust
+from yid_ocp.diagnosis.thresholds import Thresholds
+
+# the package's own name `refit` is the function
+module = importlib.import_module("yid_ocp.diagnosis.refit")
+LIMITS = Thresholds()
+FRICTION = effect("friction@elbow", amplitude(neutral=0.25), shape("s", neutral=0.5))
+A, S = "friction@elbow.a", "friction@elbow.s"
+
+
+class Problem:
+    """A problem of one nominal parameter, an initial state and an effect, whose cost is a function of named values."""
+
+    def __init__(self, cost, rows=10, names=("k", "k[run]", "start.q.k[run]", A, S)):
+        self.cost, self.rows, self.names, self.nominal = cost, rows, names, ("k",)
+        self.asked = []
+        self.freed = None
+
+    def freeing(self, effects):
+        self.freed = tuple(effects)
+        return self
+
+    def unknowns(self, values):
+        return np.array([values.get(name, 1.0) for name in self.names])
+
+    def named(self, x):
+        return dict(zip(self.names, map(float, x), strict=True))
+
+    def evaluate(self, x, derivatives=True):
+        self.asked.append(self.named(x))
+        cost = self.cost(self.named(x))
+        if cost is None:
+            return evaluation([], ok=False, message="it snaps")
+        return costing(cost, self.rows)
+
+
+class Memory(dict):
+    """A store."""
+
+    def put(self, name, refitted):
+        self[name] = refitted
+
+
+@pytest.fixture
+def solved(monkeypatch):
+    """Solvers that go nowhere, deviations of one tenth; `runs` are the solvers' starts, `losses` what was judged."""
+    made = SimpleNamespace(runs=[], losses=[])
+
+    def run(problem, x, callback):
+        made.runs.append(problem.named(x))
+        return SimpleNamespace(x=np.asarray(x), message="done")
+
+    def held_out(problem, x):
+        made.losses.append(problem.named(x))
+        return loss(1.5, 1.6)
+
+    monkeypatch.setattr(module, "SOLVER", SimpleNamespace(run=run))
+    monkeypatch.setattr(module, "held_out_loss", held_out)
+    monkeypatch.setattr(module, "deviations", lambda problem, finish: np.full(len(problem.names), 0.1))
+    return made
+
+
+# -- is a refit half done ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "half"),
+    [
+        (100.0, 60.0, True),
+        (100.0, 98.0, False),
+        (100.0, 81.0, False),
+        (100.0, 80.9, True),
+        (100.0, 5.4, False),
+        (100.0, 5.5, True),
+        (100.0, 5.6, True),
+        (None, 60.0, False),
+        (100.0, 100.0, False),
+    ],
+    ids=[
+        "much is explained",
+        "hardly anything is",
+        "a fifth of the excess",
+        "more than a fifth of the excess",
+        "all is",
+        "just not all",
+        "nearly all is",
+        "nothing to compare with",
+        "nothing is",
+    ],
+)
+def test_a_refit_that_explains_much_but_not_all_is_half_done(before, after, half):
+    """With ten residuals noise alone costs five; the excess of 100 is 95, and all is explained below 1.1 times five."""
+    problem = Problem(lambda values: before)
+    finish = costing(after, 10)
+    assert _half_done(problem, [FRICTION], {"k": 3.0, A: 9.0, S: 9.0}, finish, LIMITS) is half
+    # compared with the same model without the effect
+    assert all((asked["k"], asked[A], asked[S]) == (3.0, 0.25, 0.5) for asked in problem.asked)
+
+
+def test_what_is_much_and_what_is_all_are_thresholds():
+    problem, finish = Problem(lambda values: 100.0), costing(60.0, 10)
+    assert _half_done(problem, [FRICTION], {}, finish, LIMITS)
+    assert not _half_done(problem, [FRICTION], {}, finish, Thresholds(promising=0.5))
+    assert not _half_done(problem, [FRICTION], {}, finish, Thresholds(poor=13.0))
+
+
+# -- refits -----------------------------------------------------------------------------------------------------------
+
+START = {"k": 5.0, "k[run]": 6.0, "start.q.k[run]": 7.0, A: 0.75, S: 0.9}
+
+
+def fitting(good, bad=60.0, plain=100.0):
+    """Cost `bad` from the nominal fit's values, `good` from the nominal initial ones, `plain` without the effect."""
+
+    def cost(values):
+        return plain if values[A] == 0.25 else bad if values["k"] == 5.0 else good
+
+    return Problem(cost)
+
+
+def test_a_half_done_refit_is_tried_again_from_the_nominal_initial_values(solved):
+    problem = fitting(good=7.0)
+    found = refit(problem, [FRICTION], START)
+    assert [run["k"] for run in solved.runs] == [5.0, 1.0]
+    again = {"k": 1.0, "k[run]": 1.0, "start.q.k[run]": 1.0, A: 0.75, S: 0.9}
+    assert solved.runs[1] == again
+    assert found.values == again
+    assert found.cost == pytest.approx(7.0)
+    assert solved.losses == [again]
+    assert found.std == dict.fromkeys(problem.names, 0.1)
+    assert (found.effects, found.message, found.resumed) == ((FRICTION,), "done", False)
+
+
+@pytest.mark.parametrize(
+    ("good", "bad", "runs"),
+    [(70.0, 60.0, [5.0, 1.0]), (60.0, 60.0, [5.0, 1.0]), (None, 60.0, [5.0, 1.0]), (1.0, 5.0, [5.0])],
+    ids=["worse from there", "no better from there", "impossible from there", "not half done"],
+)
+def test_the_first_of_two_refits_stands_unless_the_second_is_better(solved, good, bad, runs):
+    found = refit(fitting(good, bad), [FRICTION], START)
+    assert [run["k"] for run in solved.runs] == runs
+    assert (found.values["k"], found.cost) == (5.0, pytest.approx(bad))
+
+
+def test_a_refit_from_the_initial_values_is_not_repeated(solved):
+    refit(fitting(good=60.0), [FRICTION], {A: 0.75, S: 0.9})
+    assert len(solved.runs) == 1
+
+
+def test_when_to_try_again_is_a_threshold(solved):
+    refit(fitting(good=7.0), [FRICTION], START, limits=Thresholds(promising=0.9))
+    assert len(solved.runs) == 1
+
+
+@pytest.mark.parametrize(("largest", "drawn"), [(2.0, 2.25), (1.3, 1.25), (0.7, 0.65), (0.4, 0.35), (0.26, 0.25)])
+def test_a_start_that_cannot_be_rolled_out_is_drawn_back_towards_the_neutral_effect(solved, largest, drawn):
+    limit = 9.0 if largest == 2.0 else largest
+    problem = Problem(lambda values: 5.0 if values[A] <= limit else None)
+    found = refit(problem, [FRICTION], {"k": 5.0, A: 2.25, S: 0.5})
+    assert found.values[A] == pytest.approx(drawn)
+    assert found.values["k"] == 5.0
+
+
+def test_a_model_that_cannot_be_rolled_out_at_all_has_no_refit(solved):
+    assert refit(Problem(lambda values: None), [FRICTION], START) is None
+    assert solved.runs == []
+
+
+def test_a_refit_that_ends_where_nothing_can_be_rolled_out_is_none(solved, monkeypatch):
+    monkeypatch.setattr(module, "SOLVER", SimpleNamespace(run=lambda p, x, _: SimpleNamespace(x=x + 9, message="")))
+    assert refit(Problem(lambda values: 5.0 if values["k"] < 9 else None), [FRICTION], START) is None
+
+
+# -- what is remembered -----------------------------------------------------------------------------------------------
+
+
+def test_a_refit_is_stored_under_its_effects_or_its_name(solved):
+    store = Memory()
+    refit(Problem(lambda values: 5.0), [FRICTION], START, store)
+    assert set(store) == {"friction@elbow"}
+    refit(Problem(lambda values: 5.0), [FRICTION], START, store, "another")
+    assert set(store) == {"friction@elbow", "another"}
+    kept = store["another"]
+    assert (kept.values, kept.message) == (START, "done")
+    assert set(kept.std.values()) == {0.1}
+
+
+def test_a_stored_refit_is_evaluated_and_not_solved(solved):
+    values, std = {**START, "k": 2.0}, dict.fromkeys(START, 0.3)
+    store = Memory({"friction@elbow": Refitted(values, std, "long ago")})
+    problem = Problem(lambda values: 5.0)
+    found = refit(problem, [FRICTION], START, store)
+    assert solved.runs == []
+    assert (found.values, found.std, found.message, found.resumed) == (values, std, "long ago", True)
+    assert found.cost == pytest.approx(5.0)
+    assert solved.losses == [values]
+    assert problem.freed == (FRICTION,)
+    assert recalled(problem, [FRICTION], store).values == values
+    assert recalled(problem, [FRICTION], store, "another") is None
+    assert recalled(problem, [FRICTION], None) is None
+
+
+@pytest.mark.parametrize(
+    ("values", "std", "cost"),
+    [
+        ({"k": 1.0}, {"k": 1.0}, 5.0),
+        (START, {"k": 1.0}, 5.0),
+        ({**START, "more": 1.0}, dict.fromkeys(START, 0.3), 5.0),
+        (START, dict.fromkeys(START, 0.3), None),
+    ],
+    ids=["other unknowns", "deviations of others", "one unknown more", "cannot be rolled out"],
+)
+def test_a_stored_refit_of_another_problem_is_no_use(solved, values, std, cost):
+    store = Memory({"friction@elbow": Refitted(values, std, "")})
+    assert recalled(Problem(lambda _: cost), [FRICTION], store) is None
+
+
+def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
+    asked, said = [], []
+    other, third = effect("offset@elbow"), effect("third@x")
+
+    def one(problem, effects, start, store, limits):
+        asked.append((problem, [e.kind for e in effects], start, store, limits))
+        made = fit(effects, loss(1.2345, 1.2345))
+        return None if effects[-1] is third else SimpleNamespace(**vars(made) | {"resumed": effects[-1] is other})
+
+    monkeypatch.setattr(module, "refit", one)
+    search = Search("problem", LIMITS, said.append, "store")
+    tried = [(FRICTION, {A: 0.7}), (other, {"k": 3.0}), (third, {})]
+    found = refit_all(search, (effect("base@x"),), tried, {"k": 2.0})
+    assert [f.effects[-1].kind for f in found] == ["friction", "offset"]
+    by_kind = {kinds[-1]: (problem, kinds, start, store, limits) for problem, kinds, start, store, limits in asked}
+    assert by_kind["friction"] == ("problem", ["base", "friction"], {"k": 2.0, A: 0.7}, "store", LIMITS)
+    assert by_kind["offset"][2] == {"k": 3.0}
+    assert sorted(said) == [
+        "refitted with friction@elbow: held-out chi2/n 1.234",
+        "resumed the refit with offset@elbow: held-out chi2/n 1.234",
+    ]
+
+
+# -- how sure ---------------------------------------------------------------------------------------------------------
+
+
+def sandwich(jacobian, residual, parts):
+    inverse = np.linalg.inv(jacobian.T @ jacobian)
+    return np.sqrt(np.diag(inverse @ robust(jacobian, residual, parts) @ inverse))
+
+
+@pytest.mark.parametrize("plain", [1e-6, 10.0], ids=["the sandwich is larger", "the plain one is larger"])
+@pytest.mark.parametrize("weak", [0, 2])
+def test_deviations_are_the_larger_of_plain_and_sandwich(monkeypatch, plain, weak):
+    """Samples of a coloured residual repeat each other, which chi2 per degree of freedom does not know."""
+    rng = np.random.default_rng(4)
+    jacobian = rng.standard_normal((40, 2))
+    residual = np.cumsum(rng.standard_normal(40))
+    parts = [series(range(40))]
+    problem = SimpleNamespace(weak_prior_rows=weak, scales=np.array([2.0, 30.0]))
+    extra = np.full((weak, 2), 5.0)
+    finish = evaluation(np.append(residual, np.full(weak, 9.0)), np.vstack([jacobian, extra]))
+    told = []
+
+    def uncertainty(which, at):
+        told.append((which, at))
+        return np.diag([plain**2, -1.0]), 1.0
+
+    monkeypatch.setattr(module, "uncertainty", uncertainty)
+    monkeypatch.setattr(module, "residual_series", lambda which: parts if which is problem else [])
+    found, expected = deviations(problem, finish), sandwich(jacobian, residual, parts)
+    assert told == [(problem, finish)]
+    assert found[0] == pytest.approx(max(plain, expected[0]), rel=1e-9)
+    assert found[1] == pytest.approx(expected[1], rel=1e-9)
+
+
+def test_a_coloured_residual_is_less_sure_than_its_size_says(monkeypatch):
+    residual, jacobian = np.repeat([1.0, -1.0, 1.0, 1.0], 25), np.ones((100, 1))
+    problem = SimpleNamespace(weak_prior_rows=0, scales=np.ones(1))
+    monkeypatch.setattr(module, "uncertainty", lambda *_: (np.array([[0.01]]), 1.0))
+    monkeypatch.setattr(module, "residual_series", lambda _: [series(range(100))])
+    assert deviations(problem, evaluation(residual, jacobian)) > 0.25
+
+
+def test_without_a_jacobian_or_unknowns_only_the_plain_deviation_is_left(monkeypatch):
+    monkeypatch.setattr(module, "uncertainty", lambda *_: (np.diag([4.0, 9.0]), 1.0))
+    problem = SimpleNamespace(weak_prior_rows=0, scales=np.ones(2))
+    np.testing.assert_array_equal(deviations(problem, evaluation([1.0])), [2.0, 3.0])
+    monkeypatch.setattr(module, "uncertainty", lambda *_: (np.zeros((0, 0)), 1.0))
+    assert deviations(problem, evaluation([1.0], np.zeros((1, 0)))).shape == (0,)
+
+
+def test_a_direction_that_nothing_informs_does_not_spoil_the_others(monkeypatch):
+    monkeypatch.setattr(module, "uncertainty", lambda *_: (np.zeros((2, 2)), 1.0))
+    monkeypatch.setattr(module, "residual_series", lambda _: [series(range(3))])
+    problem = SimpleNamespace(weak_prior_rows=0, scales=np.ones(2))
+    jacobian, residual = np.array([[1.0, 1.0], [1.0, 1.0], [0.0, 0.0]]), np.ones(3)
+    assert np.all(deviations(problem, evaluation(residual, jacobian)) < 10)
+
+
+# -- held-out recordings ----------------------------------------------------------------------------------------------
+
+
+def episode(name="other", steps=100, time_step=0.01, of=()):
+    grid = SimpleNamespace(steps=steps, time_step=time_step)
+    return SimpleNamespace(name=name, grid=grid, samples=tuple(of))
+
+
+@pytest.mark.parametrize(
+    ("seconds", "length"),
+    [((10.0,), 0.5), ((40.0,), 1.0), ((30.0, 30.0), 1.5), ((200.0,), 2.0), ((60.0,), 1.5)],
+    ids=["short", "forty seconds", "two recordings", "long", "a minute"],
+)
+def test_held_out_time_is_cut_in_some_forty_blocks(seconds, length):
+    problem = SimpleNamespace(held_out=[episode(steps=round(s / 0.01)) for s in seconds])
+    assert block_length(problem) == pytest.approx(length)
+
+
+def measured(times, value, weight, time_step=0.01):
+    t = np.asarray(times) / time_step
+    node = np.floor(t + 1e-9).astype(int)
+    value, weight = np.asarray(value, float), np.asarray(weight, float)
+    return samples(["a", "b"], np.ones(value.shape), node=node, fraction=t - node, value=value, weight=weight)
+
+
+def predicting(*pairs):
+    """A problem that predicts its held-out episodes so, or says why not."""
+    told = {}
+
+    def channel_errors(results, episodes):
+        told["episodes"] = [e.name for e in episodes]
+        return {"a": {"rmse": np.float64(0.25), "unit": "m", "n": 3}}
+
+    problem = SimpleNamespace(
+        held_out=[e for e, _ in pairs], validate=lambda x: list(pairs), channel_errors=channel_errors
+    )
+    return problem, told
+
+
+def test_a_held_out_loss_sums_whitened_squares_block_by_block():
+    nan = math.nan
+    group = measured(
+        [0.0, 0.49, 0.5, 0.99, 1.0],
+        [[1, 1], [2, nan], [3, 3], [4, 4], [5, 5]],
+        [[1, 1], [2, 0], [1, 1], [1, 1], [1, 2]],
+    )
+    more = measured([0.2], [[0, 0]], [[3, 3]])
+    predicted = np.array([[2.0, 1.0], [3.0, 9.0], [3.0, 1.0], [4.0, 5.0], [6.0, 6.0]])
+    problem, told = predicting(
+        (episode(of=[group, more]), SimpleNamespace(predicted=(predicted, np.array([[1.0, 2.0]]))))
+    )
+    found = held_out_loss(problem, np.zeros(1))
+    # blocks of half a second: [0, 0.5), [0.5, 1.0) and the last sample
+    np.testing.assert_allclose(found.squares, [1 + 4 + 9 + 36, 4 + 1, 1 + 4])
+    np.testing.assert_allclose(found.counts, [2 + 1 + 2, 4, 2])
+    assert found.channels == {"a": (0.25, "m")}
+    assert told["episodes"] == ["other"]
+
+
+def test_blocks_without_samples_do_not_count_and_recordings_follow_each_other():
+    first = measured([0.1, 1.2], [[1, 1], [1, 1]], [[1, 1], [1, 1]])
+    second = measured([0.6], [[0, 0]], [[1, 1]])
+    pairs = [
+        (episode("one", 150, of=[first]), SimpleNamespace(predicted=(np.array([[2.0, 1.0], [1.0, 4.0]]),))),
+        (episode("two", 100, of=[second]), SimpleNamespace(predicted=(np.array([[1.0, 1.0]]),))),
+    ]
+    problem, told = predicting(*pairs)
+    found = held_out_loss(problem, np.zeros(1))
+    np.testing.assert_allclose(found.squares, [1.0, 9.0, 2.0])
+    np.testing.assert_allclose(found.counts, [2.0, 2.0, 2.0])
+    assert told["episodes"] == ["one", "two"]
+
+
+def test_a_failed_prediction_is_infinitely_bad_where_it_was_measured():
+    group = measured([0.1, 0.6], [[1, 1], [1, 1]], [[1, 1], [1, 0]])
+    good = SimpleNamespace(predicted=(np.ones((2, 2)),))
+    problem, told = predicting((episode("one", of=[group]), "it snaps"), (episode("two", of=[group]), good))
+    found = held_out_loss(problem, np.zeros(1))
+    np.testing.assert_array_equal(found.squares, [math.inf, math.inf, 0.0, 0.0])
+    np.testing.assert_array_equal(found.counts, [2.0, 1.0, 2.0, 1.0])
+    assert told["episodes"] == ["two"]
+    none, _ = predicting((episode("one", of=[group]), "it snaps"))
+    assert held_out_loss(none, np.zeros(1)).channels == {}

@@ -1,0 +1,460 @@
+"""Screening, rule by rule: what could be seen, how sure a score is, what stands in for what."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import scipy.stats
+from factories import Candidates, alike, amplitude, effect, point, score, series, shape, signature, visible
+
+from yid_ocp.diagnosis import screening
+from yid_ocp.diagnosis.screening import (
+    Screened,
+    _basis,
+    _coloured,
+    confusability,
+    linearise,
+    robust,
+    scores,
+    screen,
+    shape_grid,
+    visibility,
+)
+from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.errors import SolverError
+
+CHI2 = scipy.stats.chi2
+ONE_SIDED = effect("friction@elbow", amplitude(lower=0.0, expected=(0.0, 1.0)))
+TWO_SIDED = effect("offset@elbow", amplitude(lower=-math.inf, expected=(-1.0, 1.0)))
+PAIR = effect("tilt@world", amplitude("x", lower=-9.0, upper=9.0), amplitude("y", lower=-9.0, upper=9.0))
+SHAPED = effect("branch@T1", amplitude(), shape())
+
+
+def only(of, columns, residual, noise=None, **shapes):
+    """The score of one candidate that is visible."""
+    at = point(residual, signature(of, columns, noise, **shapes))
+    [found] = scores(at, [series(range(len(residual)))], [visible(of)])
+    return found
+
+
+# -- shapes -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("expected", "count", "values"),
+    [
+        ((0.1, 100.0), 4, (0.1, 1.0, 10.0, 100.0)),
+        ((0.1, 1000.0), 3, (0.1, 10.0, 1000.0)),
+        ((0.0, 3.0), 4, (0.0, 1.0, 2.0, 3.0)),
+        ((-1.0, 1.0), 3, (-1.0, 0.0, 1.0)),
+        ((0.5, 2.0), 1, (0.5,)),
+    ],
+    ids=["logarithm", "logarithm of three", "from zero", "through zero", "one value"],
+)
+def test_shapes_are_tried_evenly_over_their_range(expected, count, values):
+    of = effect("branch@T1", amplitude(), shape("s", expected=expected))
+    found = shape_grid(of, count)
+    assert [entry["branch@T1.s"] for entry in found] == pytest.approx(values)
+    assert all(len(entry) == 1 for entry in found)
+
+
+def test_two_shapes_go_together_and_no_shape_is_one_try():
+    both = effect("branch@T1", amplitude(), shape("s", expected=(1.0, 4.0)), shape("r", expected=(0.0, 2.0)))
+    found = [tuple(entry.values()) for entry in shape_grid(both, 3)]
+    assert found == [pytest.approx(pair) for pair in ((1.0, 0.0), (2.0, 1.0), (4.0, 2.0))]
+    assert shape_grid(ONE_SIDED, 5) == [{}]
+    assert len(shape_grid(SHAPED)) == 4
+
+
+# -- projection and noise ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("matrix", "rank"),
+    [
+        ([[1.0, 0.0], [0.0, 2.0], [0.0, 0.0]], 2),
+        ([[1.0, 1e-12], [1.0, 1e-12], [0.0, 1e-12]], 2),
+        ([[1.0, 1.0 + 1e-9], [1.0, 1.0], [0.0, 0.0]], 1),
+        ([[1.0, 1.0 + 1e-5], [1.0, 1.0], [0.0, 0.0]], 2),
+        ([[1.0, 0.0], [1.0, 0.0], [0.0, 0.0]], 1),
+        ([[0.0, 0.0], [0.0, 0.0], [0.0, 0.0]], 0),
+    ],
+    ids=["plain", "whatever the size", "dependent", "nearly dependent", "one without effect", "none"],
+)
+def test_the_basis_of_what_a_fit_explains(matrix, rank):
+    matrix = np.array(matrix)
+    basis = _basis(matrix)
+    assert basis.shape == (3, rank)
+    np.testing.assert_allclose(basis.T @ basis, np.eye(rank), atol=1e-12)
+    size = np.linalg.norm(matrix, axis=0)
+    left = matrix - basis @ (basis.T @ matrix)
+    assert np.all(np.linalg.norm(left, axis=0) <= 1e-8 * size)
+
+
+def toeplitz(colour, count):
+    lags = np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
+    return np.where(lags < len(colour), np.array(colour)[np.minimum(lags, len(colour) - 1)], 0.0)
+
+
+@pytest.mark.parametrize("colour", [(1.0,), (1.0, 0.6), (1.0, 0.5, -0.3), (1.0, *[0.1] * 40)])
+def test_the_noise_of_a_signature_has_the_colour_of_its_rows(colour):
+    columns = np.random.default_rng(1).standard_normal((30, 2))
+    parts = [series(range(10, 30), colour=colour), series(range(8))]
+    expected = columns[10:].T @ toeplitz(colour, 20) @ columns[10:] + columns[:8].T @ columns[:8]
+    found = _coloured(columns, parts)
+    np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-12)
+    np.testing.assert_array_equal(found, found.T)
+
+
+def test_rows_that_hardly_move_do_not_count():
+    columns = np.array([[1e6], [1.0], [0.5]])
+    assert _coloured(columns, [series([1, 2]), series([0])]) == pytest.approx(1e12, rel=1e-14)
+    assert _coloured(1e-16 * columns, [series([1, 2])]) == pytest.approx(0.0)
+    assert _coloured(1e-16 * columns, [series([0])]) == pytest.approx(1e-20, rel=1e-9, abs=0.0)
+    assert _coloured(columns * [[1.0], [2.0], [0.0]], [series([1, 2])]) == pytest.approx(4.0)
+    assert _coloured(np.zeros((3, 1)), [series([0, 1, 2])]) == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize("count", [1, 4, 9, 17])
+def test_the_robust_covariance_is_that_of_bartlett(count):
+    rng = np.random.default_rng(count)
+    columns, residual = rng.standard_normal((count + 5, 2)), rng.standard_normal(count + 5)
+    rows = np.arange(2, count + 2)
+    u = columns[rows] * residual[rows, None]
+    length = int(math.sqrt(count)) + 1
+    expected = np.zeros((2, 2))
+    for i in range(count):
+        for j in range(count):
+            expected += max(0.0, 1 - abs(i - j) / length) * np.outer(u[i], u[j])
+    np.testing.assert_allclose(robust(columns, residual, [series(rows)]), expected, rtol=1e-10, atol=1e-12)
+
+
+def test_the_robust_covariance_adds_over_series():
+    rng = np.random.default_rng(2)
+    columns, residual = rng.standard_normal((20, 1)), rng.standard_normal(20)
+    first, second = series(range(12)), series(range(12, 20))
+    parts = robust(columns, residual, [first]) + robust(columns, residual, [second])
+    np.testing.assert_allclose(robust(columns, residual, [first, second]), parts, rtol=1e-12)
+    assert parts > 0
+
+
+# -- what could be seen -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("columns", "noise", "expected", "size", "seen"),
+    [
+        ([3.0, 4.0], None, (0.0, 1.0), 2.0 / 5.0, True),
+        ([3.0, 4.0], None, (0.0, 0.4), 2.0 / 5.0, False),
+        ([3.0, 4.0], None, (-0.5, 0.3), 2.0 / 5.0, True),
+        ([3.0, 4.0], 100.0, (0.0, 1.0), 2.0 * 10.0 / 25.0, True),
+        ([3.0, 4.0], 400.0, (0.0, 1.0), 2.0 * 20.0 / 25.0, False),
+        ([0.0, 0.0], None, (0.0, 1.0), math.inf, False),
+        ([1e-9, 0.0], None, (0.0, 1e12), math.inf, False),
+        ([1e-7, 0.0], None, (0.0, 1e12), 2.0 / 1e-7, True),
+    ],
+    ids=["seen", "as large as expected", "to either side", "noisier", "too noisy", "nothing", "hardly", "little"],
+)
+def test_an_amplitude_is_detectable_by_its_noise(columns, noise, expected, size, seen):
+    of = effect("friction@elbow", amplitude(lower=-math.inf, expected=expected))
+    [found] = visibility(point([0.0, 0.0], signature(of, columns, noise)), detection=2.0)
+    assert found.detectable == {"friction@elbow.a": pytest.approx(size)}
+    assert found.visible is seen
+
+
+def test_the_usual_detection_is_one_percent_found_nine_times_in_ten():
+    [found] = visibility(point([0.0], signature(ONE_SIDED, [1.0])))
+    normal = scipy.stats.norm
+    assert found.detectable["friction@elbow.a"] == pytest.approx(normal.isf(0.005) + normal.isf(0.1), abs=2e-3)
+
+
+def test_the_range_counts_from_the_neutral_value():
+    of = effect("factor@T1", amplitude(neutral=1.0, lower=0.0, expected=(0.7, 1.2)))
+    assert [visibility(point([0.0], signature(of, [c])), 2.0)[0].visible for c in (6.0, 8.0)] == [False, True]
+
+
+def test_amplitudes_that_do_the_same_hide_each_other_less_than_they_add():
+    [found] = visibility(point([0.0] * 2, signature(PAIR, [[1.0, 1.0], [0.0, 1.0]])), detection=2.0)
+    assert found.detectable == {"tilt@world.x": pytest.approx(2 * math.sqrt(2)), "tilt@world.y": pytest.approx(2.0)}
+    [one] = visibility(point([0.0], signature(PAIR, [[3.0, 0.0]])), detection=2.0)
+    assert one.detectable["tilt@world.y"] == math.inf
+    assert one.visible
+
+
+@pytest.mark.parametrize("order", [(0.5, 4.0, 1.0), (4.0, 0.5, 1.0), (1.0, 0.5, 4.0)])
+def test_the_best_shape_tells_what_is_detectable(order):
+    at = point([0.0], *(signature(SHAPED, [size], s=size) for size in order))
+    [found] = visibility(at, detection=2.0)
+    assert found.detectable["branch@T1.a"] == pytest.approx(0.5)
+    assert found.visible
+
+
+def test_a_shape_that_is_seen_comes_before_one_that_is_detectable_but_never_so_small():
+    of = effect("pair@x", amplitude("x", expected=(0.0, 0.05)), amplitude("y", expected=(0.0, 1.0)), shape())
+    hidden, seen = signature(of, [[20.0, 0.0]], s=0.1), signature(of, [[0.0, 4.0]], s=0.2)
+    [found] = visibility(point([0.0], hidden, seen), detection=2.0)
+    assert (found.detectable["pair@x.y"], found.visible) == (pytest.approx(0.5), True)
+    [other] = visibility(point([0.0], seen, hidden), detection=2.0)
+    assert (other.detectable["pair@x.x"], other.visible) == (pytest.approx(0.1), True)
+    weaker = signature(of, [[0.0, 3.0]], s=0.3)
+    [best] = visibility(point([0.0], seen, weaker), detection=2.0)
+    assert best.detectable["pair@x.y"] == pytest.approx(0.5)
+    larger = signature(of, [[10.0, 0.0]], s=0.4)
+    [first] = visibility(point([0.0], hidden, larger), detection=2.0)
+    assert (first.detectable["pair@x.x"], first.visible) == (pytest.approx(0.1), False)
+
+
+def test_candidates_are_judged_one_by_one():
+    at = point([0.0], signature(ONE_SIDED, [9.0]), signature(TWO_SIDED, [1.0]))
+    assert [(v.effect.label, v.visible) for v in visibility(at)] == [("friction@elbow", True), ("offset@elbow", False)]
+
+
+# -- scores -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_score_is_that_of_the_lagrange_multiplier_test():
+    x, r = np.array([1.0, 2.0, -1.0, 0.5]), np.array([-2.0, -5.0, 4.0, 1.0])
+    found = only(TWO_SIDED, x, r, noise=1e-9)
+    step = -float(x @ r) / float(x @ x)
+    left = r + x * step
+    assert found.step == {"offset@elbow.a": pytest.approx(step)}
+    assert found.decrease == pytest.approx(float(r @ r - left @ left))
+    # scattering as what would be left with the step done
+    covariance = float(robust(x[:, None], left, [series(range(4))])[0, 0])
+    assert found.statistic == pytest.approx(float(x @ r) ** 2 / covariance)
+    assert found.p_value == pytest.approx(float(CHI2.sf(found.statistic, 1)))
+
+
+def test_a_residual_below_the_noise_does_not_make_a_score_sure():
+    """What would be left scatters less than noise does, so the noise decides."""
+    x, r = np.ones(4), -1.5 * np.ones(4)
+    found = only(TWO_SIDED, x, r)
+    assert found.statistic == pytest.approx(36.0 / 4.0)
+    assert found.p_value == pytest.approx(float(CHI2.sf(9.0, 1)))
+    assert only(TWO_SIDED, x, r, noise=16.0).statistic == pytest.approx(36.0 / 16.0)
+
+
+def test_an_amplitude_of_one_sign_is_tested_on_one_side():
+    x, r = np.ones(4), -1.5 * np.ones(4)
+    two, one = only(TWO_SIDED, x, r), only(ONE_SIDED, x, r)
+    assert one.statistic == two.statistic > 0
+    assert one.p_value == pytest.approx(two.p_value / 2)
+
+
+@pytest.mark.parametrize("size", [1.5, 0.5])
+def test_an_amplitude_of_the_wrong_sign_explains_nothing(size):
+    found = only(ONE_SIDED, np.ones(4), size * np.ones(4))
+    assert found.step == {"friction@elbow.a": 0.0}
+    assert (found.decrease, found.statistic, found.p_value) == (0.0, 0.0, 1.0)
+    other = only(TWO_SIDED, np.ones(4), size * np.ones(4))
+    assert other.step == {"offset@elbow.a": pytest.approx(-size)}
+    assert other.p_value == pytest.approx(float(CHI2.sf(4 * size**2, 1)))
+
+
+def test_an_orthogonal_residual_scores_nothing():
+    found = only(ONE_SIDED, [1.0, 1.0], [1.0, -1.0])
+    assert (found.decrease, found.statistic, found.p_value) == (0.0, 0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "step", "decrease"),
+    [(1.0, 1.0, 4 * 1.0), (2.0, 1.5, 4 * (4.0 - 0.25)), (-2.0, -0.5, 4 * (4.0 - 2.25))],
+    ids=["free", "stopped above", "stopped below"],
+)
+def test_a_step_stops_at_its_bounds_and_promises_less(wanted, step, decrease):
+    of = effect("offset@elbow", amplitude(neutral=1.0, lower=0.5, upper=2.5))
+    found = only(of, np.ones(4), -wanted * np.ones(4))
+    assert found.step == {"offset@elbow.a": pytest.approx(1.0 + step)}
+    assert found.decrease == pytest.approx(decrease)
+
+
+def test_two_amplitudes_have_two_degrees_of_freedom():
+    x = np.array([[1.0, 0.0], [1.0, 1.0], [0.0, 2.0]])
+    r = np.array([-1.0, -2.0, -3.0])
+    found = only(PAIR, x, r)
+    step = np.linalg.lstsq(x, -r, rcond=None)[0]
+    assert list(found.step.values()) == pytest.approx(step)
+    statistic = float(x.T @ r @ np.linalg.solve(x.T @ x, x.T @ r))
+    assert found.statistic == pytest.approx(statistic)
+    assert found.p_value == pytest.approx(float(CHI2.sf(statistic, 2)))
+
+
+def test_amplitudes_that_do_the_same_share_the_step():
+    found = only(PAIR, [[1.0, 1.0], [1.0, 1.0]], [-1.0, -1.0])
+    assert list(found.step.values()) == pytest.approx([0.5, 0.5])
+    assert found.decrease == pytest.approx(2.0)
+    assert found.statistic == pytest.approx(2.0)
+
+
+def test_two_amplitudes_that_start_at_zero_are_not_halved():
+    of = effect("tilt@world", amplitude("x"), amplitude("y"))
+    x, r = np.eye(2), np.array([-2.0, -2.0])
+    assert only(of, x, r).p_value == pytest.approx(float(CHI2.sf(8.0, 2)))
+
+
+def test_the_best_of_many_shapes_counts_as_the_best_of_that_many_tries():
+    r = np.array([-1.5, -1.5, 0.0, 0.0])
+    columns = [np.array(c) for c in ([1.0, 0.0, 1.0, 0.0], [1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0])]
+    at = point(r, *(signature(SHAPED, c, s=0.1 * (i + 1)) for i, c in enumerate(columns)))
+    [found] = scores(at, [series(range(4))], [visible(SHAPED)])
+    alone = only(SHAPED, columns[1], r, s=0.2)
+    assert found.step == {"branch@T1.a": pytest.approx(1.5), "branch@T1.s": 0.2}
+    assert found.decrease == pytest.approx(4.5)
+    assert found.p_value == pytest.approx(3 * alone.p_value)
+    none = point(0 * r, *(signature(SHAPED, c, s=1.0) for c in columns))
+    assert scores(none, [series(range(4))], [visible(SHAPED)])[0].p_value == 1.0
+
+
+def test_scores_are_of_visible_candidates_and_the_most_promising_first():
+    others = [effect(f"offset@{name}", amplitude(lower=-math.inf)) for name in ("a", "b", "c")]
+    at = point([3.0, 2.0, 1.0], *(signature(of, np.eye(3)[i]) for i, of in zip((1, 0, 2), others, strict=True)))
+    seen = [visible(others[0]), visible(others[1]), visible(others[2], seen=False)]
+    found = scores(at, [series(range(3))], seen)
+    assert [s.effect.label for s in found] == ["offset@b", "offset@a"]
+    assert [s.decrease for s in found] == pytest.approx([9.0, 4.0])
+
+
+# -- what stands in for what ------------------------------------------------------------------------------------------
+
+
+def test_a_signature_explained_by_another():
+    a = effect("a@x", amplitude(lower=-1.0, expected=(-1.0, 1.0)))
+    b = effect("b@x", amplitude(lower=-1.0, expected=(-1.0, 1.0)))
+    angle = math.radians(30)
+    at = point([0.0] * 2, signature(a, [2.0, 0.0]), signature(b, [math.cos(angle), math.sin(angle)]))
+    found = confusability(at)
+    assert found.labels == ("a@x", "b@x")
+    np.testing.assert_allclose(found.matrix, [[1.0, 0.75], [0.75, 1.0]], atol=1e-12)
+
+
+def test_two_amplitudes_explain_more_than_one():
+    one, two = effect("one@x", amplitude(expected=(0.0, 2.0))), PAIR
+    at = point([0.0] * 2, signature(one, [1.0, 1.0]), signature(two, np.eye(2)))
+    np.testing.assert_allclose(confusability(at).matrix, [[1.0, 1.0], [0.5, 1.0]], atol=1e-12)
+
+
+def test_amplitudes_count_by_half_the_range_that_is_expected():
+    wide = effect("pair@x", amplitude("x", expected=(0.0, 4.0)), amplitude("y", expected=(-1.0, 1.0)))
+    one = effect("one@x", amplitude())
+    at = point([0.0] * 2, signature(wide, np.eye(2)), signature(one, [1.0, 0.0]))
+    np.testing.assert_allclose(confusability(at).matrix, [[1.0, 4.0 / 5.0], [1.0, 1.0]], atol=1e-12)
+
+
+def test_nothing_is_like_what_moves_nothing():
+    a, b = effect("a@x", amplitude()), effect("b@x", amplitude())
+    at = point([0.0] * 2, signature(a, [0.0, 0.0]), signature(b, [1.0, 0.0]))
+    np.testing.assert_array_equal(confusability(at).matrix, [[0.0, 0.0], [0.0, 1.0]])
+    assert confusability(point([0.0])).labels == ()
+
+
+def test_shapes_are_those_of_the_scores_or_the_middle_of_the_grid():
+    one = effect("one@x", amplitude())
+    axes = [signature(SHAPED, np.eye(4)[i], s=0.1 * (i + 1)) for i in range(4)]
+    at = point([0.0] * 4, *axes, signature(one, [0.0, 1.0, 0.0, 0.0]))
+    assert confusability(at).matrix[1, 0] == 0.0
+    chosen = score(SHAPED, step={"branch@T1.a": 1.0, "branch@T1.s": 0.2})
+    assert confusability(at, [chosen]).matrix[1, 0] == pytest.approx(1.0)
+    middle = point([0.0] * 4, *axes, signature(one, [0.0, 0.0, 1.0, 0.0]))
+    assert confusability(middle).matrix[1, 0] == pytest.approx(1.0)
+
+
+def test_candidates_alike_explain_the_signature_from_the_limit_on():
+    table = alike(["a", "b", "c", "d"], [[1.0, 0.9, 0.89, 0.95], [0.2, 1.0, 0.3, 0.1], [0, 0, 1, 0], [0, 0, 0, 1]])
+    assert table.like("a", 0.9) == ("b", "d")
+    assert table.like("a", 0.5) == ("b", "c", "d")
+    assert table.like("b", 0.9) == ()
+
+
+def test_what_was_not_seen_is_listed():
+    table = alike([], np.zeros((0, 0)))
+    screened = Screened((visible(ONE_SIDED), visible(TWO_SIDED, seen=False)), (), table)
+    assert screened.unseen == ["offset@elbow"]
+
+
+# -- one sweep for all ------------------------------------------------------------------------------------------------
+
+ROWS = 12
+
+
+@pytest.fixture
+def swept(monkeypatch):
+    """Candidates of a linear model: two plain ones, one of two amplitudes, one with a shape; a parameter of the fit."""
+    rng = np.random.default_rng(5)
+    columns = {"k": rng.standard_normal(ROWS)}
+    for of in (ONE_SIDED, TWO_SIDED, PAIR, SHAPED):
+        columns |= {name: rng.standard_normal(ROWS) for name in of.parameters.names}
+
+    def column(name, theta):
+        return columns[name] * (1 + theta["branch@T1.s"] if name == "branch@T1.a" else 1.0)
+
+    made = Candidates((ONE_SIDED, TWO_SIDED, PAIR, SHAPED), rng.standard_normal(ROWS), column, {"k": 0.3})
+    parts = [series(range(8)), series(range(8, ROWS), colour=(1.0, 0.5))]
+    monkeypatch.setattr(screening, "residual_series", lambda problem: made.told(parts, problem))
+    return made
+
+
+def projected(basis, columns):
+    q = np.linalg.qr(basis)[0]
+    return columns - q @ (q.T @ columns)
+
+
+def test_every_candidate_is_linearised_beside_what_the_fit_frees(swept):
+    found = linearise(swept, (), {"k": 0.3}, grid=3)
+    labels = [s.effect.label for s in found.signatures]
+    assert labels == ["friction@elbow", "offset@elbow", "tilt@world", *["branch@T1"] * 3]
+    assert found.values == {"k": 0.3}
+    fitted = swept.column("k", swept.theta)[:, None]
+    np.testing.assert_allclose(found.residual, projected(fitted, swept.residual_at({"k": 0.3})), atol=1e-12)
+    for entry in found.signatures:
+        theta = swept.theta | entry.shape
+        plain = np.stack([swept.column(name, theta) for name in entry.effect.amplitudes], axis=1)
+        np.testing.assert_allclose(entry.columns, projected(fitted, plain), atol=1e-12)
+        np.testing.assert_allclose(entry.noise, _coloured(entry.columns, swept.parts), atol=1e-12)
+    tried = [s.shape for s in found.signatures if s.effect is SHAPED]
+    assert tried == shape_grid(SHAPED, 3)
+    assert all(s.shape == {} for s in found.signatures if s.effect is not SHAPED)
+    assert swept.asked == ["k"]
+
+
+def test_effects_in_the_model_are_free_and_no_candidates(swept):
+    values = {"k": 0.1, "tilt@world.x": 0.5, "tilt@world.y": -0.5}
+    found = linearise(swept, (PAIR,), values, grid=1)
+    assert [s.effect.label for s in found.signatures] == ["friction@elbow", "offset@elbow", "branch@T1"]
+    names = ("k", "tilt@world.x", "tilt@world.y")
+    fitted = np.stack([swept.column(name, swept.theta) for name in names], axis=1)
+    np.testing.assert_allclose(found.residual, projected(fitted, swept.residual_at(values)), atol=1e-12)
+    plain = swept.column("friction@elbow.a", swept.theta)[:, None]
+    np.testing.assert_allclose(found.signatures[0].columns, projected(fitted, plain), atol=1e-12)
+    assert swept.asked == list(names)
+
+
+def test_weak_priors_are_no_data(swept):
+    before = linearise(swept, (), {"k": 0.3})
+    swept.weak = 2
+    after = linearise(swept, (), {"k": 0.3})
+    assert len(after.residual) == ROWS
+    np.testing.assert_allclose(after.residual, before.residual)
+    np.testing.assert_allclose(after.signatures[0].columns, before.signatures[0].columns)
+
+
+def test_without_other_candidates_nothing_is_swept(swept):
+    found = linearise(swept, (ONE_SIDED, TWO_SIDED, PAIR, SHAPED), {"k": 0.3})
+    assert found.signatures == ()
+    assert found.residual.shape == (0,)
+
+
+@pytest.mark.parametrize("fault", ["fails", "has no Jacobian"])
+def test_a_model_that_cannot_be_rolled_out_cannot_be_linearised(swept, fault):
+    swept.fault = fault
+    with pytest.raises(SolverError, match="cannot be linearised"):
+        linearise(swept, (), {"k": 0.3})
+
+
+def test_screening_goes_by_its_thresholds(swept):
+    found = screen(swept, (), {"k": 0.3}, Thresholds(shape_values=2, detection=1.5))
+    at = linearise(swept, (), {"k": 0.3}, 2)
+    assert [v.detectable for v in found.visible] == [v.detectable for v in visibility(at, 1.5)]
+    assert found.scores == scores(at, swept.parts, visibility(at, 1.5))
+    np.testing.assert_array_equal(found.alike.matrix, confusability(at, found.scores).matrix)

@@ -1,0 +1,458 @@
+"""Losses, closures and the choice among refits, rule by rule."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from factories import alike, amplitude, effect, fit, loss, score, shape
+
+from yid_ocp.diagnosis import select
+from yid_ocp.diagnosis.refit import Loss, Search
+from yid_ocp.diagnosis.screening import Screened
+from yid_ocp.diagnosis.select import closure, compose, gain, out_of_shape, oversized, shortlist, within_reach
+from yid_ocp.diagnosis.thresholds import Thresholds
+
+LIMITS = Thresholds()
+
+
+# -- losses -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("squares", "counts", "mean", "gap"),
+    [
+        ([30.0, 10.0], [10.0, 10.0], 2.0, 1.0),
+        ([30.0, 10.0], [10.0, 30.0], 1.0, 0.0),
+        ([5.0], [10.0], 0.5, 0.0),
+        ([math.inf, 1.0], [10.0, 10.0], math.inf, math.inf),
+        ([0.0], [0.0], 0.0, 0.0),
+    ],
+    ids=["above", "weighed by samples", "below noise", "failed", "empty"],
+)
+def test_a_loss_is_a_mean_over_samples_and_a_gap_what_exceeds_one(squares, counts, mean, gap):
+    found = Loss(np.array(squares), np.array(counts), {})
+    assert found.mean == pytest.approx(mean)
+    assert found.gap == pytest.approx(gap)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "closed"),
+    [
+        ((3.0, 3.0), (1.0, 1.0), 1.0),
+        ((3.0, 3.0), (2.0, 2.0), 0.5),
+        ((3.0, 3.0), (3.0, 3.0), 0.0),
+        ((2.0, 2.0), (3.0, 3.0), -1.0),
+        ((3.0, 3.0), (0.5, 0.5), 1.0),
+    ],
+    ids=["all", "half", "nothing", "worse", "below noise"],
+)
+def test_a_closure_is_the_part_of_the_gap_that_went(before, after, closed):
+    found = closure(loss(*before), loss(*after))
+    assert (found.value, found.low, found.high) == pytest.approx((closed, closed, closed))
+
+
+@pytest.mark.parametrize(
+    ("before", "after"), [((0.9, 1.0), (0.5, 0.5)), ((1.0, 1.0), (1.0, 1.0)), ((2.0, 3.0), (math.inf, 1.0))]
+)
+def test_there_is_no_closure_without_a_gap_or_a_prediction(before, after):
+    found = closure(loss(*before), loss(*after))
+    assert all(math.isnan(value) for value in (found.value, found.low, found.high))
+
+
+def bootstrapped(before: Loss, after: Loss, tails=(0.025, 0.975), paired=True, seed=0):
+    """Quantiles of the closure over resampled blocks, the same blocks for both losses unless `paired` is false."""
+    rng = np.random.default_rng(seed)
+    count = len(before.counts)
+    draws = rng.integers(0, count, (1000, count))
+    other = draws if paired else rng.integers(0, count, (1000, count))
+    ratios = []
+    for here, there in zip(draws, other, strict=True):
+        g0 = max(before.squares[here].sum() / before.counts[here].sum() - 1, 0.0)
+        g1 = max(after.squares[there].sum() / after.counts[there].sum() - 1, 0.0)
+        if g0 > 0:
+            ratios.append(1 - g1 / g0)
+    return np.quantile(ratios, tails)
+
+
+@pytest.fixture
+def noisy():
+    """Blocks in which the gap differs much, and what is left of it follows."""
+    rng = np.random.default_rng(3)
+    size = rng.uniform(0.5, 6.0, 20)
+    left = 1 + 0.4 * (size - 1) + 0.1 * rng.standard_normal(20)
+    counts = rng.integers(50, 150, 20).astype(float)
+    return Loss(size * counts, counts, {}), Loss(left * counts, counts, {})
+
+
+def test_the_interval_of_a_closure_is_that_of_95_percent_over_paired_blocks(noisy):
+    found = closure(*noisy)
+    np.testing.assert_allclose([found.low, found.high], bootstrapped(*noisy), rtol=1e-12)
+    half = bootstrapped(*noisy, tails=(0.25, 0.75))
+    assert found.low < half[0] < half[1] < found.high
+    apart = bootstrapped(*noisy, paired=False)
+    assert apart[0] < found.low - 0.1, "blocks drawn apart would widen it"
+    assert found.low < found.value < found.high
+
+
+def test_resampled_blocks_without_a_gap_do_not_count():
+    before, after = loss(0.1, 4.0, 0.2), loss(0.1, 1.5, 0.2)
+    found = closure(before, after)
+    np.testing.assert_allclose([found.low, found.high], bootstrapped(before, after), rtol=1e-12)
+    assert found.high <= 1.0
+
+
+def test_blocks_are_drawn_by_the_seed(noisy):
+    found, again = closure(*noisy, seed=1), closure(*noisy)
+    np.testing.assert_allclose([found.low, found.high], bootstrapped(*noisy, seed=1), rtol=1e-12)
+    assert found.value == again.value
+    assert found != again
+
+
+# -- gain -------------------------------------------------------------------------------------------------------------
+
+
+def test_a_gain_has_the_standard_error_of_its_sum_over_blocks():
+    before, after = loss(3.0, 4.0, 2.0, count=10.0), loss(2.0, 2.0, 2.0, count=10.0)
+    gained, error = gain(before, after)
+    assert gained == pytest.approx(1.0)
+    # blocks differ by 10, 20 and 0: their standard deviation is 10, and there are three of them
+    assert error == pytest.approx(math.sqrt(3) * 10.0 / 30.0)
+    assert gain(after, before) == pytest.approx((-gained, error))
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "expected"),
+    [
+        ((2.0,), (1.0,), (1.0, math.inf)),
+        ((2.0, 2.0), (1.0, 1.0), (1.0, 0.0)),
+        ((2.0, 2.0), (math.inf, 1.0), (-math.inf, 0.0)),
+        ((math.inf, 2.0), (1.0, 1.0), (math.inf, 0.0)),
+    ],
+    ids=["one block tells nothing", "even", "cannot be predicted", "could not be predicted"],
+)
+def test_a_gain_at_its_ends(before, after, expected):
+    assert gain(loss(*before), loss(*after)) == pytest.approx(expected)
+
+
+# -- the choice -------------------------------------------------------------------------------------------------------
+
+SMALL = effect("small@x", amplitude())
+LARGE = effect("large@x", amplitude("a"), amplitude("b"))
+WIDE = effect("wide@x", amplitude("a"), shape("s", expected=(0.1, 1.0)))
+
+
+def labels(fits):
+    return [entry.effects[-1].label for entry in fits]
+
+
+@pytest.mark.parametrize(
+    ("small", "large", "expected"),
+    [
+        # the large one is better by 0.02 with an error of 0.1
+        ((1.1, 1.3, 1.0, 1.2), (1.2, 1.0, 1.2, 1.12), ["small@x", "large@x"]),
+        # better by 0.1 in every block alike: sure, and more than a tie
+        ((1.2, 1.2, 1.2), (1.1, 1.1, 1.1), ["large@x"]),
+        # better by 0.005 in every block alike: sure, and within a hundredth
+        ((1.005, 1.005), (1.0, 1.0), ["small@x", "large@x"]),
+        ((1.0, 1.0), (1.2, 1.2), ["small@x"]),
+    ],
+    ids=["within its error", "sure", "tie", "simplest is best"],
+)
+def test_the_simplest_within_reach_of_the_best_comes_first(small, large, expected):
+    fits = [fit([LARGE], loss(*large)), fit([SMALL], loss(*small))]
+    assert labels(within_reach(fits)) == expected
+    assert labels(within_reach(fits[::-1])) == expected
+
+
+def test_a_tie_is_a_part_of_the_best_loss():
+    fits = [fit([LARGE], loss(50.0, 50.0)), fit([SMALL], loss(50.4, 50.4))]
+    assert labels(within_reach(fits)) == ["small@x", "large@x"]
+    assert labels(within_reach(fits, Thresholds(tie=0.005))) == ["large@x"]
+
+
+def test_of_equally_simple_ones_the_better_comes_first():
+    other = effect("other@x", amplitude())
+    fits = [fit([SMALL], loss(1.004, 1.004)), fit([other], loss(1.0, 1.0)), fit([LARGE], loss(0.999, 0.999))]
+    assert labels(within_reach(fits)) == ["other@x", "small@x", "large@x"]
+
+
+def test_an_amplitude_far_out_of_its_range_comes_last():
+    fits = [fit([SMALL], loss(1.0, 1.0), values={"small@x.a": 2.5}), fit([LARGE], loss(1.0, 1.0))]
+    assert labels(within_reach(fits)) == ["large@x", "small@x"]
+    assert labels(within_reach(fits, Thresholds(range_widths=2.0))) == ["small@x", "large@x"]
+
+
+@pytest.mark.parametrize(
+    ("odd", "plain", "expected"),
+    [
+        ((1.0, 1.0), (1.04, 1.04), ["small@x"]),
+        ((1.0, 1.0), (1.2, 1.2), ["wide@x"]),
+        ((10.0, 10.0), (10.4, 10.4), ["small@x"]),
+        ((1.0, 1.0), (0.9, 0.9), ["small@x"]),
+    ],
+    ids=["another comes near", "nothing comes near", "near as a part of it", "another is better"],
+)
+def test_an_unlikely_shape_counts_only_where_no_other_comes_near(odd, plain, expected):
+    fits = [fit([WIDE], loss(*odd), values={"wide@x.s": 9.0}), fit([SMALL], loss(*plain))]
+    assert labels(within_reach(fits)) == expected
+
+
+def test_how_near_another_must_come_is_a_threshold():
+    fits = [fit([WIDE], loss(1.0, 1.0), values={"wide@x.s": 9.0}), fit([SMALL], loss(1.08, 1.08))]
+    assert labels(within_reach(fits)) == ["wide@x"]
+    assert labels(within_reach(fits, Thresholds(stand_in=0.1))) == ["small@x"]
+
+
+def test_a_model_without_effects_is_the_simplest():
+    fits = [fit([SMALL], loss(1.0, 1.0)), fit((), loss(1.0, 1.0))]
+    assert [len(entry.effects) for entry in within_reach(fits)] == [0, 1]
+    assert [entry.size for entry in (fit(), fit([SMALL]), fit([SMALL, LARGE]))] == [0, 1, 3]
+
+
+@pytest.mark.parametrize(
+    ("expected", "value", "odd"),
+    [
+        ((0.1, 1.0), 0.05, False),
+        ((0.1, 1.0), 0.049, True),
+        ((0.1, 1.0), 2.0, False),
+        ((0.1, 1.0), 2.01, True),
+        ((0.0, 1.0), -1.0, False),
+        ((0.0, 1.0), -1.01, True),
+        ((0.0, 1.0), 2.0, False),
+        ((0.0, 1.0), 2.01, True),
+        ((-3.0, -1.0), 1.0, False),
+        ((-3.0, -1.0), 1.01, True),
+        ((-3.0, -1.0), -5.0, False),
+        ((-3.0, -1.0), -5.01, True),
+    ],
+)
+def test_a_shape_may_leave_its_range_by_a_factor_or_a_width(expected, value, odd):
+    of = effect("wide@x", amplitude(), shape("s", expected=expected, lower=-math.inf))
+    assert out_of_shape(of, {"wide@x.a": 99.0, "wide@x.s": value}) is odd
+
+
+@pytest.mark.parametrize(
+    ("value", "odd"), [(-1.0, False), (-1.01, True), (3.0, False), (5.0, False), (5.01, True), (0.0, False)]
+)
+def test_an_amplitude_may_leave_its_range_by_its_width(value, odd):
+    of = effect("wide@x", amplitude("b"), amplitude(lower=-9.0, expected=(1.0, 3.0)), shape("s"))
+    assert oversized(of, {"wide@x.a": value, "wide@x.b": 0.0, "wide@x.s": 99.0}) is odd
+    assert out_of_shape(of, {"wide@x.a": 99.0, "wide@x.b": 0.0, "wide@x.s": 0.5}) is False
+
+
+# -- the shortlist ----------------------------------------------------------------------------------------------------
+
+
+def ranked(**decreases):
+    return [
+        score(effect(f"{name}@x"), decrease=decrease, step={f"{name}@x.a": decrease})
+        for name, decrease in sorted(decreases.items(), key=lambda entry: -entry[1])
+    ]
+
+
+def shortlisted(scores, table, **limits):
+    return [of.kind for of, _ in shortlist(scores, table, Thresholds(**limits))]
+
+
+def test_the_best_are_refitted_and_those_that_can_stand_in_for_them():
+    scores = ranked(a=9.0, b=8.0, c=7.0, d=6.0, e=5.0)
+    matrix = np.eye(5)
+    matrix[0, 4] = matrix[1, 3] = 0.95
+    matrix[2, 0] = 0.99
+    table = alike([s.effect.label for s in scores], matrix)
+    assert shortlisted(scores, table, refits=2) == ["a", "b", "d", "e"]
+    assert shortlisted(scores, table, refits=1) == ["a", "e"]
+    assert shortlisted(scores, table, refits=2, alike=0.96) == ["a", "b"]
+    assert shortlisted(scores, table, refits=9) == ["a", "b", "c", "d", "e"]
+    assert shortlisted(scores[:4], table, refits=2) == ["a", "b", "d"]
+
+
+def test_as_many_more_as_are_refitted_and_each_once():
+    scores = ranked(a=9.0, b=8.0, c=7.0, d=6.0, e=5.0)
+    matrix = np.eye(5)
+    matrix[0, 2:] = matrix[1, 2:] = 0.95
+    table = alike([s.effect.label for s in scores], matrix)
+    assert shortlisted(scores, table, refits=2) == ["a", "b", "c", "d"]
+    [(of, step), *_] = shortlist(scores, table, LIMITS)
+    assert (of.kind, step) == ("a", {"a@x.a": 9.0})
+
+
+# -- one effect after the other ---------------------------------------------------------------------------------------
+
+A, B, C = (effect(f"{name}@x", amplitude()) for name in "abc")
+
+
+class Rounds:
+    """Refits whose held-out losses are given by the effects' kinds, screened as wanted; remembers what was asked."""
+
+    def __init__(self, monkeypatch, losses, p_values=(1e-9, 1e-9, 1e-9), fails=()):
+        self.losses, self.fails, self.refits, self.screens, self.said = losses, fails, [], [], []
+        kinds = [score(of, p=p, decrease=9.0 - i) for i, (of, p) in enumerate(zip((A, B, C), p_values, strict=True))]
+        self.scores = tuple(kinds)
+        monkeypatch.setattr(select, "refit_all", self.refit_all)
+        monkeypatch.setattr(select, "refit", self.refit)
+        monkeypatch.setattr(select, "screen", self.screen)
+
+    def fit(self, effects):
+        return fit(effects, loss(*self.losses["".join(of.kind for of in effects)]), values={"k": float(len(effects))})
+
+    def screened(self, base=()):
+        labels = {of.label for of in base}
+        left = tuple(s for s in self.scores if s.effect.label not in labels)
+        table = alike([s.effect.label for s in left], np.eye(len(left)))
+        return Screened((), left, table)
+
+    def screen(self, problem, base, values, limits):
+        self.screens.append(([of.kind for of in base], values["k"], problem, limits))
+        return self.screened(base)
+
+    def refit_all(self, search, base, tried, values):
+        self.refits.append(([of.kind for of in base], [of.kind for of, _ in tried], values["k"]))
+        return [self.fit((*base, of)) for of, _ in tried if "".join(e.kind for e in (*base, of)) in self.losses]
+
+    def refit(self, problem, effects, start, store, name, limits):
+        self.refits.append((name, [of.kind for of in effects], start["k"]))
+        kinds = "".join(of.kind for of in effects)
+        return None if kinds in self.fails else self.fit(effects)
+
+    def compose(self, **limits):
+        search = Search(SimpleNamespace(), Thresholds(**limits), self.said.append, None)
+        nominal = fit((), loss(*self.losses[""]), values={"k": 0.0})
+        first, added = compose(search, nominal, self.screened())
+        return [f.effects[0].kind for f in first], [entry.effect.kind for entry in added], added
+
+
+def test_one_effect_that_leaves_no_gap_is_enough(monkeypatch):
+    rounds = Rounds(monkeypatch, {"": (3.0, 3.2), "a": (1.0, 1.1), "b": (2.0, 2.2), "c": (1.5, 1.7)})
+    first, chosen, added = rounds.compose()
+    assert (first, chosen) == (["a", "c", "b"], ["a"])
+    assert rounds.refits == [([], ["a", "b", "c"], 0.0)]
+    assert rounds.screens == []
+    assert added[0].closure.value == pytest.approx(1 - 0.05 / 2.1)
+    assert [of.kind for of in added[0].rivals] == ["a"]
+    assert rounds.said == ["added a@x: 97.6 % of the held-out gap closed"]
+
+
+def test_rivals_are_those_within_reach(monkeypatch):
+    rounds = Rounds(monkeypatch, {"": (3.0, 3.2), "a": (1.0, 1.1), "b": (1.001, 1.101), "c": (1.5, 1.7)})
+    first, _, added = rounds.compose()
+    assert first == ["a", "b", "c"]
+    assert [of.kind for of in added[0].rivals] == ["a", "b"]
+
+
+GROWING = {
+    "": (5.0, 5.2),
+    "a": (3.0, 3.2),
+    "b": (4.0, 4.2),
+    "c": (4.5, 4.7),
+    "ab": (2.0, 2.2),
+    "ac": (2.5, 2.7),
+    "abc": (1.5, 1.7),
+    "bc": (3.5, 3.7),
+}
+
+
+def test_effects_are_added_while_the_gap_closes(monkeypatch):
+    rounds = Rounds(monkeypatch, GROWING)
+    first, chosen, added = rounds.compose()
+    assert (first, chosen) == (["a", "b", "c"], ["a", "b", "c"])
+    assert rounds.refits[:3] == [([], ["a", "b", "c"], 0.0), (["a"], ["b", "c"], 1.0), (["a", "b"], ["c"], 2.0)]
+    assert [screened[:2] for screened in rounds.screens] == [(["a"], 1.0), (["a", "b"], 2.0)]
+    assert rounds.screens[0][3] == Thresholds()
+    assert [entry.closure.value for entry in added] == pytest.approx([1 - 2.1 / 4.1, 1 - 1.1 / 4.1, 1 - 0.6 / 4.1])
+    assert [len(entry.fit.effects) for entry in added] == [1, 2, 3]
+    assert "scoring what is left beside a@x, b@x" in rounds.said
+
+
+def test_no_more_effects_than_allowed_nor_than_are_significant(monkeypatch):
+    assert Rounds(monkeypatch, GROWING).compose(effects=2)[1] == ["a", "b"]
+    assert Rounds(monkeypatch, GROWING).compose(effects=1)[1] == ["a"]
+    rounds = Rounds(monkeypatch, GROWING, p_values=(1e-9, 0.01, 0.009))
+    assert rounds.compose()[1] == ["a", "c"]
+    assert rounds.refits[0] == ([], ["a", "c"], 0.0)
+    assert Rounds(monkeypatch, GROWING, p_values=(0.02, 0.03, 0.04)).compose() == ([], [], ())
+
+
+def test_a_rest_below_the_smallest_gap_is_left(monkeypatch):
+    losses = {"": (3.0, 3.2), "a": (1.04, 1.14), "b": (2.0, 2.2), "c": (2.5, 2.7), "ab": (1.0, 1.0), "ac": (1.0, 1.0)}
+    assert Rounds(monkeypatch, losses).compose()[1] == ["a"]
+    assert Rounds(monkeypatch, losses).compose(smallest_gap=0.05)[1] == ["a", "b"]
+    # at the smallest gap another one is tried
+    assert Rounds(monkeypatch, losses).compose(smallest_gap=0.09)[1] == ["a", "b"]
+
+
+@pytest.mark.parametrize(
+    ("nominal", "best", "chosen"),
+    [
+        ((3.0, 3.0, 3.0), (2.91, 2.91, 2.91), []),
+        ((3.0, 3.0, 3.0), (2.89, 2.89, 2.89), ["a"]),
+        ((3.0, 5.0, 3.0), (4.4, 2.5, 2.9), []),
+        ((1.0, 1.0, 1.0), (0.9, 0.9, 0.9), []),
+        ((0.9, 0.9, 0.9), (0.5, 0.5, 0.5), []),
+        ((2.0, 2.0, 2.0), (2.0, 2.0, 2.0), []),
+    ],
+    ids=["too little", "enough", "not sure", "no gap", "below noise", "nothing"],
+)
+def test_an_effect_must_close_a_sure_part_of_the_gap(monkeypatch, nominal, best, chosen):
+    worse = tuple(9.0 for _ in nominal)
+    rounds = Rounds(monkeypatch, {"": nominal, "a": best, "b": worse, "c": worse})
+    first, found, _ = rounds.compose(effects=1)
+    assert (found, first[0]) == (chosen, "a")
+
+
+def test_nothing_is_added_where_no_refit_succeeds(monkeypatch):
+    assert Rounds(monkeypatch, {"": (3.0, 3.0)}).compose() == ([], [], ())
+
+
+def test_an_effect_that_others_make_superfluous_is_left_out_again(monkeypatch):
+    losses = GROWING | {"bc": (1.4, 1.6), "b": (4.0, 4.2)}
+    rounds = Rounds(monkeypatch, losses)
+    _, chosen, added = rounds.compose()
+    assert chosen == ["b", "c"]
+    assert [len(entry.fit.effects) for entry in added] == [1, 2]
+    assert added[1].fit.loss.mean == pytest.approx(1.5)
+    assert [entry.closure.value for entry in added] == pytest.approx([1 - 3.1 / 4.1, 1 - 0.5 / 4.1])
+    tried = rounds.refits[3:]
+    assert tried == [
+        ("a@x and b@x and c@x without a@x", ["b", "c"], 3.0),
+        ("b@x again", ["b"], 2.0),
+        ("b@x and c@x without b@x", ["c"], 2.0),
+    ]
+    assert [entry.effect for entry in added] == [B, C]
+    assert "left a@x out again: the others do as well" in rounds.said
+
+
+def test_the_last_of_three_may_make_both_others_superfluous(monkeypatch):
+    rounds = Rounds(monkeypatch, GROWING | {"bc": (1.4, 1.6), "c": (1.3, 1.5)}, p_values=(1e-9, 1e-9, 1e-9))
+    rounds.scores = rounds.scores[:2]
+    monkeypatch.setattr(rounds, "screened", lambda base=(), own=rounds.screened: screened_with(own, base))
+    _, chosen, added = rounds.compose()
+    assert chosen == ["c"]
+    assert added[0].closure.value == pytest.approx(1 - 0.4 / 4.1)
+
+
+def screened_with(usual, base):
+    """The third candidate shows only once two are in the model."""
+    found = usual(base)
+    if len(base) < 2:
+        return found
+    return Screened((), (score(C, p=1e-9),), alike([C.label], [[1.0]]))
+
+
+def test_an_effect_stays_where_the_others_do_worse_or_cannot_be_fitted(monkeypatch):
+    rounds = Rounds(monkeypatch, GROWING | {"bc": (1.4, 1.6), "ac": (9.0, 9.2)}, fails=("bc",))
+    assert rounds.compose()[1] == ["a", "b", "c"]
+    assert [entry[0] for entry in rounds.refits[3:]] == [
+        "a@x and b@x and c@x without a@x",
+        "a@x and b@x and c@x without b@x",
+    ]
+
+
+def test_of_two_effects_the_first_is_tried_without(monkeypatch):
+    losses = GROWING | {"ab": (2.0, 2.2), "b": (3.4, 3.5), "ac": (2.5, 2.7)}
+    rounds = Rounds(monkeypatch, losses)
+    assert rounds.compose(effects=2)[1] == ["a", "b"]
+    assert [entry[:2] for entry in rounds.refits[2:]] == [("a@x and b@x without a@x", ["b"])]

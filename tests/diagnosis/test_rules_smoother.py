@@ -1,0 +1,294 @@
+"""What the smoother adds, against dense algebra over all disturbances and parameters at once."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import threadpoolctl
+from factories import BIAS, FORCE, OTHER_FORCE
+
+from yid_ocp.diagnosis import smoother
+from yid_ocp.diagnosis.smoother_model import Interval, Linear
+from yid_ocp.diagnosis.thresholds import Thresholds
+
+SOURCES = (FORCE, OTHER_FORCE, BIAS)
+STATES, COUNT, ROWS, DECAY = 2, 8, 6, 0.7
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """The matrices are small."""
+    with threadpoolctl.threadpool_limits(1):
+        yield
+
+
+def made(seed: int, parameters=2, recording="run", size=None, loose=0.3) -> Linear:
+    """A linear model of three unknowns; with `size` its residual holds disturbances of these standard deviations."""
+    rng = np.random.default_rng(seed)
+    intervals = []
+    for _ in range(COUNT):
+        outside = rng.standard_normal((2, 1 + parameters))
+        outside[:, 0] *= 0.0 if size is None else 1.0
+        by_unknown = rng.standard_normal((ROWS, len(SOURCES)))
+        intervals.append(
+            Interval(
+                rng.standard_normal((ROWS, 1 + parameters)),
+                rng.standard_normal((ROWS, STATES)),
+                by_unknown,
+                0.5 * rng.standard_normal((STATES, STATES)),
+                rng.standard_normal((STATES, len(SOURCES))),
+                outside.T @ outside,
+                ROWS + 2,
+            )
+        )
+    at_rest = rng.standard_normal((STATES, len(SOURCES)))
+    edges = 0.1 * np.arange(COUNT + 1)
+    names = tuple(f"u{i}" for i in range(len(SOURCES)))
+    model = Linear(
+        recording, tuple(intervals), edges, names, SOURCES, np.ones(3), at_rest, np.full(STATES, loose), DECAY
+    )
+    if size is not None:
+        design, _ = dense(model)
+        scale = np.concatenate([model.loose, np.tile(size, COUNT)])
+        signal = (design @ (scale * rng.standard_normal(len(scale)))).reshape(COUNT, ROWS)
+        for interval, part in zip(intervals, signal, strict=True):
+            interval.observed[:, 0] += part
+    return model
+
+
+def dense(model: Linear) -> tuple[np.ndarray, np.ndarray]:
+    """Residual rows, and unknowns (COUNT, nd, ...), by the first state and all disturbances of unit variance."""
+    nd, width = len(model.sources), STATES + len(model.sources) * COUNT
+    unknown = np.zeros((COUNT, nd, width))
+    for j in range(COUNT):
+        if j:
+            unknown[j] = model.decay * unknown[j - 1]
+        own = slice(STATES + nd * j, STATES + nd * (j + 1))
+        unknown[j][:, own] += np.eye(nd) * (math.sqrt(1 - model.decay**2) if j else 1.0)
+    state = np.eye(STATES, width) + model.at_rest @ unknown[0]
+    rows = []
+    for j, interval in enumerate(model.intervals):
+        rows.append(interval.by_state @ state + interval.by_unknown @ unknown[j])
+        state = interval.transition @ state + interval.drive @ unknown[j]
+    return np.vstack(rows), unknown
+
+
+class Dense:
+    """Posterior and evidence of several recordings with common parameters, all at once."""
+
+    def __init__(self, models, variance):
+        self.models, blocks, observed, prior, outside = models, [], [], [], []
+        for model in models:
+            design, _ = dense(model)
+            blocks.append(design)
+            observed.append(np.vstack([i.observed for i in model.intervals]))
+            by_source = np.array([variance[s] for s in model.sources])
+            prior.append(np.concatenate([model.loose**2, np.tile(by_source, COUNT)]))
+            for interval in model.intervals:
+                values, vectors = np.linalg.eigh(interval.rest)
+                outside.append((vectors * np.sqrt(np.maximum(values, 0.0))).T)
+        rows = sum(len(b) for b in blocks)
+        self.design = np.zeros((rows + sum(map(len, outside)), sum(b.shape[1] for b in blocks)))
+        row = column = 0
+        for block in blocks:
+            self.design[row : row + len(block), column : column + block.shape[1]] = block
+            row, column = row + len(block), column + block.shape[1]
+        self.observed = np.vstack([*observed, *outside])
+        self.prior = np.concatenate(prior)
+        self.y, self.by_theta = self.observed[:, 0], self.observed[:, 1:]
+        noise = np.eye(len(self.y)) + (self.design * self.prior) @ self.design.T
+        self.conditional = noise
+        # a parameter may move by three of its sizes
+        self.total = noise + 9.0 * self.by_theta @ self.by_theta.T
+        self.inverse = np.linalg.inv(self.total)
+
+    @property
+    def evidence(self):
+        return -0.5 * (self.y @ self.inverse @ self.y + np.linalg.slogdet(self.total)[1])
+
+    @property
+    def theta(self):
+        return 9.0 * self.by_theta.T @ self.inverse @ self.y
+
+    def disturbances(self):
+        """Mean and covariance, the parameters' uncertainty in it."""
+        gain = self.prior[:, None] * self.design.T @ self.inverse
+        return gain @ self.y, np.diag(self.prior) - gain @ self.design * self.prior
+
+    def scores(self, model_index, column):
+        """|score|^2 of one unknown's disturbances and its expectation."""
+        nd, start = len(SOURCES), model_index * (STATES + len(SOURCES) * COUNT) + STATES
+        own = self.design[:, [start + nd * j + column for j in range(COUNT)]]
+        return np.sum((own.T @ self.inverse @ self.y) ** 2), np.trace(own.T @ self.inverse @ own)
+
+
+def smoothed(monkeypatch, models, **limits):
+    """The smoother on linear models as they are."""
+    told = {}
+
+    def linear_model(problem, x, evaluation, given):
+        told["limits"] = given
+        return tuple(models)
+
+    monkeypatch.setattr(smoother, "linear_model", linear_model)
+    chosen = Thresholds(**limits)
+    found = smoother.smooth(SimpleNamespace(), np.zeros(0), None, chosen)
+    assert told["limits"] == chosen
+    return found
+
+
+NOTHING = dict.fromkeys(SOURCES, 0.0)
+
+
+@pytest.mark.parametrize("smooth", [True, False])
+@pytest.mark.parametrize("variance", [(0.0, 0.0, 0.0), (0.8, 0.0, 0.0), (0.5, 1.5, 0.2)])
+def test_the_evidence_has_parameters_and_all_recordings_in_it(variance, smooth):
+    models = [made(1), made(2)]
+    at = dict(zip(SOURCES, variance, strict=True))
+    state, reference = smoother._run(models, at, smooth), Dense(models, at)
+    assert state.evidence == pytest.approx(reference.evidence, rel=1e-9)
+    np.testing.assert_allclose(state.shift, reference.theta, rtol=1e-8)
+    np.testing.assert_allclose(
+        state.spread,
+        np.linalg.inv(
+            reference.by_theta.T @ np.linalg.solve(reference.conditional, reference.by_theta) + np.eye(2) / 9.0
+        ),
+        rtol=1e-8,
+    )
+
+
+def test_scores_leave_to_parameters_what_they_explain():
+    models = [made(1), made(2)]
+    at = dict(zip(SOURCES, (0.5, 0.0, 0.2), strict=True))
+    found, reference = smoother._scores(models, smoother._run(models, at)), Dense(models, at)
+    for column, source in enumerate(SOURCES):
+        both = [reference.scores(i, column) for i in range(2)]
+        assert found[source] == pytest.approx(tuple(map(sum, zip(*both, strict=True))), rel=1e-8)
+
+
+def test_variances_so_large_that_rounding_shows_are_never_the_best():
+    assert smoother._run([made(1, loose=1e12)], NOTHING, smooth=False).evidence == -math.inf
+
+
+@pytest.mark.parametrize("column", [0, 1, 2])
+def test_variances_go_to_the_largest_evidence(column):
+    models = [made(3, size=np.eye(3)[column] * 2.0)]
+    source = SOURCES[column]
+    variance, state = smoother._refined(models, NOTHING | {source: 0.05})
+    assert {s for s, v in variance.items() if v} == {source}
+    grid = np.geomspace(0.05, 400, 60)
+    best = max(Dense(models, NOTHING | {source: v}).evidence for v in grid)
+    assert state.evidence == pytest.approx(best, abs=0.15)
+    assert state.evidence == pytest.approx(Dense(models, variance).evidence, rel=1e-9)
+
+
+def test_variances_stay_within_their_range():
+    variance, _ = smoother._refined([made(3, size=np.zeros(3))], NOTHING | {FORCE: 1e-6})
+    assert variance[FORCE] >= 1e-6
+    exploding, _ = smoother._refined([made(3, size=np.full(3, 1e9))], NOTHING | {FORCE: 1e6})
+    assert exploding[FORCE] <= 1e7
+
+
+def test_the_best_variance_of_a_group_is_searched_over_all_sizes():
+    models = [made(3, size=np.array([30.0, 0.0, 0.0]))]
+    evidence, size = smoother._largest_evidence(models, NOTHING, FORCE)
+    assert evidence == pytest.approx(Dense(models, NOTHING | {FORCE: size}).evidence, rel=1e-9)
+    assert evidence > Dense(models, NOTHING | {FORCE: 4 * size}).evidence
+    assert evidence > Dense(models, NOTHING | {FORCE: size / 4}).evidence
+    base = NOTHING | {OTHER_FORCE: 1.0}
+    more, at = smoother._largest_evidence(models, base, FORCE)
+    assert more == pytest.approx(Dense(models, base | {FORCE: at}).evidence, rel=1e-9)
+
+
+@pytest.mark.parametrize("column", [0, 1, 2])
+def test_the_group_that_explains_the_residual_is_taken_in(monkeypatch, column):
+    size = np.zeros(3)
+    size[column] = 3.0
+    models = [made(5, size=size), made(6, size=size, recording="second")]
+    found = smoothed(monkeypatch, models)
+    source = SOURCES[column]
+    at_work = {s: v for s, v in found.variance.items() if v}
+    assert set(at_work) == {source}
+    reference, nothing = Dense(models, found.variance), Dense(models, NOTHING)
+    own, other = ("sensor", "plant") if source is BIAS else ("plant", "sensor")
+    assert found.evidence[own] == found.evidence["both"] == pytest.approx(reference.evidence - nothing.evidence)
+    assert found.evidence[own] > found.evidence[other] + 5
+    assert found.evidence["none"] == 0.0
+    assert found.weight == NOTHING | {source: pytest.approx(reference.evidence - nothing.evidence)}
+    assert found.side == own
+    assert found.worth == 5.0
+
+
+def test_several_groups_are_taken_in_while_the_evidence_rises_enough(monkeypatch):
+    models = [made(7, size=np.array([3.0, 3.0, 3.0])), made(8, size=np.array([3.0, 3.0, 3.0]))]
+    found = smoothed(monkeypatch, models)
+    assert all(v > 0 for v in found.variance.values())
+    full = Dense(models, found.variance).evidence
+    for source in SOURCES:
+        less = Dense(models, found.variance | {source: 0.0}).evidence
+        assert found.weight[source] == pytest.approx(full - less, rel=1e-6)
+    assert found.side == "both"
+    assert sum(v > 0 for v in smoothed(monkeypatch, models, places=2).variance.values()) == 2
+    assert not any(smoothed(monkeypatch, models, worth=1e6).variance.values())
+
+
+def test_noise_alone_takes_nothing_in(monkeypatch):
+    models = [made(9, size=np.zeros(3), loose=0.0)]
+    found = smoothed(monkeypatch, models)
+    assert found.side == "none"
+    assert not any(found.variance.values())
+    assert found.weight == NOTHING
+    assert found.before == pytest.approx(found.after)
+    assert found.degrees_before == found.degrees_after == COUNT * (ROWS + 2) - 2
+
+
+def test_what_is_explained_is_the_fall_of_the_residual_and_the_degrees_that_it_takes(monkeypatch):
+    models = [made(5, size=np.array([3.0, 0.0, 0.0])), made(6, size=np.array([3.0, 0.0, 0.0]))]
+    found = smoothed(monkeypatch, models)
+    plain, full = Dense(models, NOTHING), Dense(models, found.variance)
+    bare = plain.y - plain.by_theta @ plain.theta
+    # the first state is loose in any case, but it is no unknown: only the residual after it counts
+    assert found.before == pytest.approx(float(bare @ bare), rel=1e-8)
+    left = np.linalg.solve(full.conditional, full.y - full.by_theta @ full.theta)
+    assert found.after == pytest.approx(float(left @ left), rel=1e-8)
+    assert found.degrees_before == 2 * COUNT * (ROWS + 2) - 2
+    start = [STATES + 3 * j for j in range(COUNT)]
+    own = [model * (STATES + 3 * COUNT) + i for model in range(2) for i in start]
+    design = full.design[:, own]
+    taken = found.variance[FORCE] * np.trace(design.T @ np.linalg.solve(full.conditional, design))
+    assert found.degrees_after == pytest.approx(found.degrees_before - taken, rel=1e-8)
+
+
+def test_degrees_never_fall_below_one(monkeypatch):
+    model = made(5, parameters=COUNT * (ROWS + 2) + 5)
+    found = smoothed(monkeypatch, [model])
+    assert found.degrees_before == found.degrees_after == 1.0
+
+
+def test_traces_hold_the_posterior_with_the_uncertainty_of_parameters(monkeypatch):
+    models = [made(5, size=np.array([3.0, 0.0, 0.0])), made(6, size=np.array([3.0, 0.0, 0.0]), recording="second")]
+    found = smoothed(monkeypatch, models)
+    mean, covariance = Dense(models, found.variance).disturbances()
+    assert [trace.recording for trace in found.traces] == ["run", "second"]
+    width = STATES + 3 * COUNT
+    for i, trace in enumerate(found.traces):
+        _, unknown = dense(models[i])
+        own = slice(i * width, (i + 1) * width)
+        np.testing.assert_allclose(trace.mean, unknown @ mean[own], rtol=1e-6, atol=1e-9)
+        variance = np.einsum("jdw,wv,jdv->jd", unknown, covariance[own, own], unknown)
+        np.testing.assert_allclose(trace.std, np.sqrt(np.maximum(variance, 0.0)), rtol=1e-5, atol=1e-7)
+        assert (trace.edges.tolist(), trace.unknowns) == (models[i].edges.tolist(), ("u0", "u1", "u2"))
+
+
+def test_what_would_be_noticed_comes_from_the_model_alone(monkeypatch):
+    models = [made(5, size=np.array([3.0, 0.0, 0.0]))]
+    found = smoothed(monkeypatch, models)
+    reference = Dense(models, NOTHING)
+    for column, source in enumerate(SOURCES):
+        expected = math.sqrt(10.0 / reference.scores(0, column)[1])
+        assert found.detectable[source] == pytest.approx(expected, rel=1e-8)
+    more = smoothed(monkeypatch, models, noticed=40.0)
+    assert more.detectable == {s: pytest.approx(2 * v) for s, v in found.detectable.items()}

@@ -1,0 +1,297 @@
+"""Is there a gap, is it chance, what is the verdict: rule by rule."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from factories import BIAS, FORCE, READ_FORCE, added, closed, effect, fit, outcome, score, smoothed, visible
+
+from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.diagnosis.verdict import decide, explained_part, has_gap, shapeless
+
+LIMITS = Thresholds()
+ONE, OTHER = effect("friction@elbow"), effect("offset@elbow")
+
+
+def scored(*p_values):
+    return [score(effect(f"kind{i}@x"), p=p) for i, p in enumerate(p_values)]
+
+
+# -- is there a gap ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("before", "held_out", "gap"),
+    [
+        ((0.004, 1.2), (0.5, 1.0), True),
+        ((0.5, 1.0), (0.004, 1.2), True),
+        ((0.006, 1.2), (0.5, 1.0), False),
+        ((0.5, 1.0), (0.006, 1.2), False),
+        ((0.005, 1.2), (0.5, 1.0), False),
+        ((0.0, 1.05), (0.0, 1.09), False),
+        ((0.0, 1.1), (0.0, 1.1), False),
+        ((0.0, 1.0), (0.5, 1.11), True),
+        ((0.5, 1.11), (0.0, 1.0), True),
+        ((0.5, 5.0), (0.5, 5.0), False),
+    ],
+    ids=[
+        "sure on the data of the fit",
+        "sure on held-out data",
+        "two tests: the smaller p counts twice",
+        "two tests, the other way",
+        "at the level",
+        "sure but small",
+        "at the smallest gap",
+        "large on the other data",
+        "large on the fit's data",
+        "large but chance",
+    ],
+)
+def test_a_gap_is_sure_and_worth_a_name(before, held_out, gap):
+    tests = [outcome(p=p, chi2=chi2, channels={"a": 1.0}) for p, chi2 in (before, held_out)]
+    assert has_gap(*tests, LIMITS) is gap
+
+
+@pytest.mark.parametrize(
+    ("p_values", "before", "held_out", "gap"),
+    [
+        ((0.004,), {"a": 1.2}, {"a": 1.0}, True),
+        ((0.004, 0.9), {"a": 1.0}, {"a": 1.0, "b": 1.2}, True),
+        ((0.006, 0.9), {"a": 1.2}, {"a": 1.0}, False),
+        ((0.9, 0.001, 0.9, 0.9), {"a": 1.2}, {"a": 1.0}, True),
+        ((0.9, 0.003, 0.9, 0.9), {"a": 1.2}, {"a": 1.0}, False),
+        ((0.01,), {"a": 1.2}, {"a": 1.2}, False),
+        ((0.001,), {"a": 1.09}, {"a": 1.05}, False),
+        ((0.001,), {"a": 1.1}, {"a": 1.1}, False),
+        ((0.001,), {}, {}, False),
+        ((), {"a": 1.2}, {"a": 1.2}, False),
+    ],
+    ids=[
+        "along one candidate",
+        "in a held-out channel",
+        "best of two tries",
+        "best of four tries",
+        "not the best of four tries",
+        "at the level",
+        "no channel above noise",
+        "channels at the smallest gap",
+        "no channel",
+        "no candidate",
+    ],
+)
+def test_a_gap_along_a_candidate_needs_a_channel_above_noise(p_values, before, held_out, gap):
+    tests = [outcome(channels=channels) for channels in (before, held_out)]
+    assert has_gap(*tests, LIMITS, scored(*p_values)) is gap
+
+
+def test_the_level_and_the_smallest_gap_are_thresholds():
+    tests = (outcome(p=0.02, chi2=1.2), outcome())
+    assert has_gap(*tests, Thresholds(level=0.05))
+    assert not has_gap(*tests, Thresholds(level=0.05, smallest_gap=0.3))
+    assert has_gap(outcome(), outcome(chi2=1.2), Thresholds(level=0.05), scored(0.03))
+    assert not has_gap(outcome(), outcome(chi2=1.2), Thresholds(level=0.05, smallest_gap=0.3), scored(0.03))
+
+
+# -- is it chance -----------------------------------------------------------------------------------------------------
+
+SILENT = smoothed({FORCE: 0.0, BIAS: 0.0})
+SPEAKING = smoothed({FORCE: 9.0, BIAS: 0.0}, evidence={"plant": 9.0, "both": 9.0})
+
+
+@pytest.mark.parametrize(
+    ("found", "p_values", "before", "held_out", "chance"),
+    [
+        (SILENT, (0.5,), 0.003, 0.5, True),
+        (SILENT, (0.5,), 0.5, 0.003, True),
+        (SILENT, (), 0.003, 0.5, True),
+        (SILENT, (0.5,), 0.00009, 0.5, False),
+        (SILENT, (0.5,), 0.5, 0.00009, False),
+        (SILENT, (0.5,), 0.0001, 0.5, False),
+        (SILENT, (0.5,), 0.00011, 0.5, True),
+        (SILENT, (0.004, 0.9), 0.003, 0.5, False),
+        (SILENT, (0.006, 0.9), 0.003, 0.5, True),
+        (SILENT, (0.005, 0.9), 0.003, 0.5, True),
+        (SPEAKING, (0.5,), 0.003, 0.5, False),
+    ],
+    ids=[
+        "barely",
+        "barely on held-out data",
+        "no candidate",
+        "sure",
+        "sure on held-out data",
+        "as sure as needed",
+        "not as sure as needed",
+        "explained by a candidate",
+        "best of two tries",
+        "at the level",
+        "explained by a force",
+    ],
+)
+def test_a_barely_significant_excess_without_shape_is_chance(found, p_values, before, held_out, chance):
+    assert shapeless(found, scored(*p_values), outcome(p=before), outcome(p=held_out), LIMITS) is chance
+
+
+def test_how_sure_an_excess_without_shape_must_be_is_a_threshold():
+    tests = outcome(p=0.003), outcome()
+    assert not shapeless(SILENT, (), *tests, Thresholds(shapeless=0.5))
+    assert shapeless(SILENT, (), *tests, Thresholds(shapeless=0.5, level=0.001))
+
+
+# -- the verdict ------------------------------------------------------------------------------------------------------
+
+SEEN = (visible(ONE),)
+CERTAIN = closed(0.9, 0.8, 0.95)
+
+
+@pytest.mark.parametrize(
+    ("changed", "verdict"),
+    [
+        ({}, "effect"),
+        ({"enough": False}, "insufficient_data"),
+        ({"visible": (visible(ONE, seen=False),)}, "insufficient_data"),
+        ({"visible": ()}, "insufficient_data"),
+        ({"visible": (visible(ONE, seen=False), visible(OTHER))}, "effect"),
+        ({"enough": False, "gap": False}, "insufficient_data"),
+        ({"gap": False}, "no_gap"),
+        ({"gap": False, "added": ()}, "no_gap"),
+        ({"added": ()}, "unknown"),
+        ({"total": closed(0.9, 0.04, 1.0)}, "unknown"),
+        ({"total": closed(0.9, 0.05, 1.0)}, "unknown"),
+        ({"total": closed(0.06, 0.051, 0.07)}, "effect"),
+        ({"total": closed(0.9, math.nan, math.nan)}, "unknown"),
+        ({"explained": 0.49}, "unknown"),
+        ({"explained": 0.5}, "effect"),
+        ({"explained": 7.0}, "effect"),
+        ({"added": (added(ONE, [OTHER]),)}, "confusable"),
+        ({"added": (added(ONE, [OTHER]), added(OTHER))}, "confusable"),
+        ({"added": (added(ONE), added(OTHER, [ONE]))}, "effect"),
+        ({"added": (added(ONE, [OTHER]),), "explained": 0.1}, "unknown"),
+    ],
+    ids=[
+        "an effect",
+        "too few samples",
+        "nothing could be seen",
+        "no candidate",
+        "one could be seen",
+        "too few samples and no gap",
+        "no gap",
+        "no gap and nothing added",
+        "nothing added",
+        "closure sure by too little, however large",
+        "lower end at the limit",
+        "lower end just above the limit",
+        "no interval",
+        "smoother explains more than twice as much",
+        "smoother explains twice as much",
+        "smoother explains less",
+        "two that do the same",
+        "two that do the same, and more",
+        "only later ones do the same",
+        "confusable but explains little",
+    ],
+)
+def test_the_verdict(changed, verdict):
+    usual = {"gap": True, "visible": SEEN, "added": (added(ONE),), "total": CERTAIN, "enough": True, "explained": 1.0}
+    said = usual | changed
+    found = decide(
+        said["gap"], said["visible"], said["added"], said["total"], LIMITS, said["enough"], said["explained"]
+    )
+    assert found == verdict
+
+
+def test_without_a_smoother_the_explained_part_is_whole():
+    assert decide(True, SEEN, (added(ONE),), CERTAIN, LIMITS, True) == "effect"
+    assert explained_part(fit(), (added(ONE),), None) == 1.0
+    assert explained_part(fit(), (), SPEAKING) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("costs", "chi2", "degrees", "part"),
+    [
+        ((100.0, 60.5), (200.0, 110.0), (90.0, 78.0), 1.0),
+        ((100.0, 80.5), (200.0, 110.0), (90.0, 78.0), 38.0 / 78.0),
+        ((100.0, 60.5), (200.0, 110.0), (90.0, 90.0), 78.0 / 90.0),
+        ((100.0, 60.5), (110.0, 100.0), (90.0, 80.0), 1.0),
+        ((100.0, 60.5), (100.0, 110.0), (90.0, 90.0), 1.0),
+        ((100.0, 100.0), (200.0, 110.0), (90.0, 78.0), -1.0 / 78.0),
+    ],
+    ids=[
+        "as much",
+        "half",
+        "smoother takes no noise",
+        "smoother explains nothing",
+        "smoother is worse",
+        "explains less",
+    ],
+)
+def test_what_effects_explain_of_what_can_be_explained(costs, chi2, degrees, part):
+    """Fall of r'r less what one parameter takes, over the smoother's fall less the degrees of freedom that it takes."""
+    nominal, last = fit(cost=costs[0]), added(ONE, fitted=fit([ONE], cost=costs[1]))
+    first = added(OTHER, fitted=fit([OTHER], cost=1e3))
+    found = smoothed({FORCE: 1.0}, chi2=chi2, degrees=degrees)
+    assert explained_part(nominal, (first, last), found) == pytest.approx(part)
+
+
+def test_two_effects_take_of_the_noise_what_all_their_parameters_take():
+    last = added(ONE, fitted=fit([ONE, OTHER], cost=60.0))
+    found = smoothed({FORCE: 1.0}, chi2=(200.0, 110.0), degrees=(90.0, 78.0))
+    assert explained_part(fit(cost=100.0), (last,), found) == pytest.approx(78.0 / 78.0)
+
+
+# -- on which side ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("weight", "evidence", "side"),
+    [
+        ({FORCE: 0.0}, {}, "none"),
+        ({FORCE: 9.0}, {"plant": -1.0, "sensor": -2.0, "both": -1.0}, "none"),
+        ({FORCE: 9.0, BIAS: 0.0}, {"plant": 9.0, "sensor": 3.0, "both": 9.0}, "plant"),
+        ({FORCE: 0.0, BIAS: 9.0}, {"plant": 3.0, "sensor": 9.0, "both": 9.0}, "sensor"),
+        ({FORCE: 9.0, BIAS: 3.0}, {"plant": 9.0, "sensor": 3.0, "both": 14.0}, "plant"),
+        ({FORCE: 9.0, BIAS: 3.0}, {"plant": 9.0, "sensor": 3.0, "both": 14.1}, "both"),
+        ({FORCE: 3.0, BIAS: 9.0}, {"plant": 3.0, "sensor": 9.0, "both": 14.1}, "both"),
+        ({FORCE: 3.0, BIAS: 9.0}, {"plant": 3.0, "sensor": 9.0, "both": 13.9}, "sensor"),
+        ({READ_FORCE: 9.0, BIAS: 3.0}, {"plant": 9.0, "sensor": 3.0, "both": 20.0}, "either"),
+        ({READ_FORCE: 3.0, FORCE: 9.0}, {"plant": 9.0, "sensor": 0.0, "both": 9.0}, "plant"),
+        ({FORCE: 0.1}, {"plant": 0.1, "both": 0.1}, "plant"),
+    ],
+    ids=[
+        "nothing",
+        "worse than nothing",
+        "plant",
+        "sensor",
+        "both by chance",
+        "both",
+        "both, mostly the sensor",
+        "mostly the sensor",
+        "an effort's bias would do the same",
+        "another force weighs more",
+        "little",
+    ],
+)
+def test_the_side_of_a_gap_by_evidence(weight, evidence, side):
+    assert smoothed(weight, evidence=evidence).side == side
+
+
+def test_how_much_more_both_must_explain_is_a_threshold():
+    evidence = {"plant": 9.0, "sensor": 3.0, "both": 12.0}
+    assert smoothed({FORCE: 9.0, BIAS: 3.0}, evidence=evidence, worth=2.0).side == "both"
+
+
+@pytest.mark.parametrize(
+    ("chi2", "degrees", "part"),
+    [
+        ((200.0, 90.0), (100.0, 90.0), 1.0),
+        ((200.0, 135.0), (100.0, 90.0), 0.5),
+        ((200.0, 200.0), (100.0, 100.0), 0.0),
+        ((200.0, 400.0), (100.0, 100.0), 0.0),
+        ((200.0, 45.0), (100.0, 90.0), 1.0),
+        ((100.0, 45.0), (100.0, 90.0), 0.0),
+        ((90.0, 45.0), (100.0, 90.0), 0.0),
+    ],
+    ids=["all", "half", "nothing", "worse", "more than all", "no gap", "below noise"],
+)
+def test_the_part_of_a_gap_that_can_be_explained_at_all(chi2, degrees, part):
+    assert smoothed({FORCE: 1.0}, chi2=chi2, degrees=degrees).explainable == pytest.approx(part)

@@ -1,0 +1,320 @@
+"""What a finding says, in sentences and as `yid-diagnosis/1`: rule by rule."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from factories import (
+    BIAS,
+    FORCE,
+    READ_FORCE,
+    absorbed,
+    added,
+    amplitude,
+    closed,
+    effect,
+    finding,
+    fit,
+    loss,
+    outcome,
+    place,
+    score,
+    smoothed,
+    visible,
+)
+
+from yid_ocp.diagnosis.finding import which
+from yid_ocp.diagnosis.words import sentences
+
+FRICTION, OFFSET = effect("friction@elbow"), effect("offset@wrist", amplitude(lower=-9.0))
+NO_EFFECT = {"added": (), "fits": ()}
+
+
+# -- is there a gap ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("verdict", "p_values", "said"),
+    [
+        ("effect", (1e-3, 0.5), "The gap is real (held-out chi2 per degree of freedom 2.35, p = 0.001)."),
+        ("effect", (0.5, 2e-3), "The gap is real (held-out chi2 per degree of freedom 2.35, p = 0.002)."),
+        ("unknown", (1e-12, 0.5), "The gap is real (held-out chi2 per degree of freedom 2.35, p < 1e-12)."),
+        ("unknown", (1.1e-12, 0.5), "The gap is real (held-out chi2 per degree of freedom 2.35, p = 1.1e-12)."),
+        (
+            "no_gap",
+            (0.4, 0.3),
+            "There is no gap to speak of (chi2 per degree of freedom 1.12, held out 2.35; p = 0.3).",
+        ),
+        (
+            "no_gap",
+            (0.2, 0.3),
+            "There is no gap to speak of (chi2 per degree of freedom 1.12, held out 2.35; p = 0.2).",
+        ),
+    ],
+)
+def test_whether_there_is_a_gap_comes_first(verdict, p_values, said):
+    before, held = outcome(p=p_values[0], chi2=1.123), outcome(p=p_values[1], chi2=2.345)
+    made = finding(verdict, before=before, held_out_before=held, **NO_EFFECT)
+    assert sentences(made).startswith(said)
+
+
+def test_insufficient_data_say_why_and_nothing_of_places():
+    said = sentences(finding("insufficient_data", message="4 samples.", next_experiment="Longer.", **NO_EFFECT))
+    assert said == "The data do not suffice: 4 samples. Next experiment: Longer."
+    none = sentences(finding("no_gap", next_experiment="None is needed.", **NO_EFFECT))
+    assert none.endswith("p = 1e-09). Next experiment: None is needed.")
+
+
+# -- where ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("shares", "said"),
+    [
+        ({"T1": 0.95, "T2": 0.05}, "It lies in T1 (95 %)."),
+        ({"T1": 0.8, "T2": 0.2}, "It lies in T1 (80 %) and T2 (20 %)."),
+        ({"T1": 0.9, "T2": 0.1}, "It lies in T1 (90 %)."),
+        ({"T1": 0.4, "T2": 0.25, "T3": 0.2, "T4": 0.15}, "It lies in T1 (40 %) and T2 (25 %) and T3 (20 %)."),
+        ({"T1": 0.06, "T2": 0.05}, "It lies in T1 (6 %)."),
+    ],
+    ids=["one", "two", "at the limit", "three at most", "none above the limit"],
+)
+def test_places_with_much_of_the_gap_are_named(shares, said):
+    made = finding("unknown", where=tuple(place(name, share) for name, share in shares.items()), **NO_EFFECT)
+    assert f"{said} No known effect explains it." in sentences(made)
+
+
+def test_without_places_nothing_is_said_of_them():
+    assert "It lies" not in sentences(finding("unknown", where=(), **NO_EFFECT))
+
+
+@pytest.mark.parametrize(
+    ("weight", "evidence", "said"),
+    [
+        ({FORCE: 9.0}, {"plant": 9.0, "both": 9.0}, " (100 %), in the mechanics rather than in what sensors read."),
+        ({BIAS: 9.0}, {"sensor": 9.0, "both": 9.0}, " (100 %), in what sensors read."),
+        (
+            {READ_FORCE: 9.0},
+            {"plant": 9.0, "both": 9.0},
+            " (100 %), in the mechanics or in what the effort sensor reads, which efforts alone do not tell apart.",
+        ),
+        ({FORCE: 9.0, BIAS: 9.0}, {"plant": 9.0, "sensor": 9.0, "both": 20.0}, "It lies in T1 (100 %)."),
+    ],
+)
+def test_the_side_is_said_where_the_evidence_tells(weight, evidence, said):
+    made = finding("unknown", smoothed=smoothed(weight, evidence=evidence), **NO_EFFECT)
+    assert said in sentences(made)
+
+
+# -- which ------------------------------------------------------------------------------------------------------------
+
+
+def with_effect(of, value, std=0.02, **changed):
+    """A finding in which this effect was added."""
+    fitted = fit(
+        [of], loss(1.0, 1.1), values=dict.fromkeys(of.amplitudes, value), std=dict.fromkeys(of.amplitudes, std)
+    )
+    return finding(**({"added": (added(of, fitted=fitted),), "fits": (fitted,)} | changed))
+
+
+@pytest.mark.parametrize(
+    ("unit", "std", "said"),
+    [
+        ("N m", 0.0234, "friction@elbow with a = 0.457 ± 0.023 N m closes"),
+        ("1", 0.0234, "friction@elbow with a = 0.457 ± 0.023 closes"),
+        ("N m", math.inf, "friction@elbow with a = 0.457 N m closes"),
+        ("N m", math.nan, "friction@elbow with a = 0.457 N m closes"),
+    ],
+)
+def test_an_effect_is_said_with_its_numbers(unit, std, said):
+    of = effect("friction@elbow", amplitude(unit=unit))
+    assert said in sentences(with_effect(of, 0.4567, std))
+
+
+def test_a_closure_is_said_with_its_interval():
+    said = sentences(with_effect(FRICTION, 0.5, closure=closed(0.9123, 0.8012, 0.9534)))
+    assert "closes 91.2 % of it on held-out motions (95 % interval 80.1 to 95.3 %)." in said
+
+
+def test_two_effects_close_together():
+    both = fit([FRICTION, OFFSET], values={"friction@elbow.a": 0.5, "offset@wrist.a": 0.25})
+    said = sentences(finding(added=(added(FRICTION), added(OFFSET, fitted=both))))
+    assert "friction@elbow with a = 0.5 ± 0.01 N m; offset@wrist with a = 0.25 ± 0.01 N m together close 90 %" in said
+
+
+def test_rivals_are_said_to_be_not_separable():
+    third = effect("third@x")
+    said = sentences(with_effect(FRICTION, 0.5, added=(added(FRICTION, [OFFSET, third]),)))
+    assert "Not separable from friction@elbow: offset@wrist, third@x." in said
+    assert "Not separable" not in sentences(with_effect(FRICTION, 0.5))
+
+
+@pytest.mark.parametrize(("value", "odd"), [(2.0, False), (2.5, False), (2.51, True), (-0.5, False), (-0.51, True)])
+def test_an_amplitude_beyond_its_range_may_stand_in_for_something_else(value, odd):
+    """By more than a quarter of the range, that is."""
+    of = effect("offset@wrist", amplitude(neutral=9.0, lower=-99.0, upper=99.0, expected=(0.0, 2.0)))
+    sentence = "Beyond what one would expect, and so perhaps standing in for something else: "
+    expected = f"{sentence}offset@wrist.a = {value:.3g} (range 0 to 2)."
+    assert (expected in sentences(with_effect(of, value))) is odd
+
+
+def test_an_amplitude_at_its_neutral_value_is_never_odd():
+    of = effect("factor@T1", amplitude(neutral=9.0, expected=(0.0, 1.0)))
+    assert "Beyond" not in sentences(with_effect(of, 9.0))
+    assert "Beyond" in sentences(with_effect(of, 8.0))
+
+
+@pytest.mark.parametrize(
+    ("chi2", "p", "places", "said"),
+    [
+        (1.23, 0.002, (place("T2"),), "What remains: held-out chi2 per degree of freedom 1.23, most of it in T2."),
+        (1.23, 0.002, (), "What remains: held-out chi2 per degree of freedom 1.23."),
+        (1.23, 0.02, (), "What remains is noise."),
+        (1.23, 0.01, (), "What remains is noise."),
+        (0.9, 0.002, (), "What remains is noise."),
+        (1.0, 0.002, (), "What remains is noise."),
+    ],
+)
+def test_what_remains(chi2, p, places, said):
+    made = with_effect(FRICTION, 0.5, remaining=outcome(p=p, chi2=chi2), remaining_where=places)
+    assert f" {said} " in sentences(made)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "said"),
+    [
+        (10.0, 11.1, True),
+        (10.0, 8.9, True),
+        (10.0, 11.0, False),
+        (-10.0, -8.9, True),
+        (0.0, 1e-9, True),
+        (0.0, 1e-11, False),
+    ],
+)
+def test_a_parameter_that_moves_much_is_said_to(before, after, said):
+    made = with_effect(FRICTION, 0.5, absorbed=(absorbed("T1.bend", before, after),))
+    assert (f"With it T1.bend goes from {before:.3g} to {after:.3g}." in sentences(made)) is said
+
+
+def test_six_parameters_at_most_are_said_to_move():
+    made = with_effect(FRICTION, 0.5, absorbed=tuple(absorbed(f"p{i}", 1.0, 2.0) for i in range(8)))
+    said = sentences(made)
+    assert "p5 goes from 1 to 2. Next" in said
+    assert "p6" not in said
+
+
+def test_an_unknown_gap_names_the_best_attempt():
+    said = sentences(finding("unknown", fits=(fit([OFFSET]), fit([FRICTION])), added=()))
+    assert "No known effect explains it (the best, offset@wrist, does not explain enough of it)." in said
+
+
+def test_blocks_and_the_next_experiment_come_last():
+    said = sentences(with_effect(FRICTION, 0.5, in_blocks=True, next_experiment="Repeat."))
+    assert said.endswith("alternate blocks of it were held out. Next experiment: Repeat.")
+    assert "blocks" not in sentences(with_effect(FRICTION, 0.5))
+
+
+# -- yid-diagnosis/1 --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("verdict", ["effect", "confusable", "unknown", "no_gap", "insufficient_data"])
+def test_effects_count_only_where_the_verdict_names_them(verdict):
+    made = finding(verdict, added=(added(FRICTION, [OFFSET]),))
+    result = made.to_dict()
+    named = verdict in ("effect", "confusable")
+    assert made.last is (made.added[-1].fit if named else made.nominal)
+    assert result["effects"] == ([{"kind": "friction", "location": "elbow"}] if named else [])
+    assert result["gap"]["closure"] == (0.9 if named else None)
+    assert result["gap"]["closure_ci"] == ([0.8, 0.95] if named else None)
+    assert len(result["confusable"]) == (1 if named else 0)
+    after = result["gap"]["after"]["rmse"]
+    assert after == result["gap"]["before"]["rmse"] == {"points.tip": 0.01}
+
+
+def test_numbers_that_are_not_finite_become_null():
+    made = finding(
+        closure=closed(0.9, math.nan, math.inf),
+        absorbed=(absorbed("T1.bend", 1.0, 2.0, math.inf),),
+        added=(added(FRICTION, part=closed(math.nan, 0.1, 0.2)),),
+    )
+    result = made.to_dict()
+    assert result["gap"]["closure_ci"] == [None, None]
+    assert result["absorption"]["T1.bend"] == {"before": 1.0, "after": 2.0, "std": None, "unit": "N m/rad"}
+    assert result["steps"][0]["closure"] is None
+    assert result["steps"][0]["closure_ci"] == [0.1, 0.2]
+
+
+def test_the_result_holds_what_was_found():
+    spoken = smoothed({FORCE: 9.0}, evidence={"plant": 9.0, "both": 9.0})
+    made = finding(
+        "confusable",
+        added=(added(FRICTION, [OFFSET]), added(OFFSET)),
+        smoothed=spoken,
+        where=(place("T1", 0.7, True, ((0.0, 1.0),)),),
+        remaining_where=(place("T2", 0.3, False),),
+        remaining=outcome(p=0.4, chi2=1.02),
+        visibility=(visible(FRICTION), visible(OFFSET, seen=False)),
+        in_blocks=True,
+    )
+    result = made.to_dict()
+    assert result["format"] == "yid-diagnosis/1"
+    assert result["gap"]["before"]["chi2_per_dof"] == made.held_out_before.chi2_per_dof
+    assert result["gap"]["after"] | {"unit": None} == {
+        "rmse": {"points.tip": 0.01},
+        "unit": None,
+        "chi2_per_dof": 1.02,
+        "p_value": 0.4,
+    }
+    assert result["gap"]["before"]["unit"] == {"points.tip": "m"}
+    assert result["where"] == [{"location": "T1", "share": 0.7, "observable": True, "windows": [[0.0, 1.0]]}]
+    assert result["remaining"] == {
+        "p_value": 0.4,
+        "where": [{"location": "T2", "share": 0.3, "observable": False, "windows": []}],
+    }
+    both = [{"kind": "friction", "location": "elbow"}, {"kind": "offset", "location": "wrist"}]
+    assert result["confusable"] == [both]
+    assert [step["added"] for step in result["steps"]] == ["friction@elbow", "offset@wrist"]
+    assert result["steps"][0]["chi2_per_dof"] == 1.0
+    assert result["steps"][0]["rmse"] == {"points.tip": 0.01}
+    assert (result["side"], result["explainable"], result["evidence"]["plant"]) == ("plant", spoken.explainable, 9.0)
+    assert result["unseen"] == ["offset@wrist"]
+    assert result["noise"] == {"points.tip": {"std": 0.001, "unit": "m", "samples": 100}}
+    assert result["held_out_in_blocks"] is True
+
+
+def test_candidates_are_listed_with_what_was_added_first():
+    third = effect("third@x")
+    alone = fit([OFFSET], loss(1.3, 1.4), values={"offset@wrist.a": 0.3})
+    best = fit([FRICTION], loss(1.0, 1.1), values={"friction@elbow.a": 0.5}, std={"friction@elbow.a": math.inf})
+    made = finding(
+        nominal=fit(lost=loss(2.0, 2.0)),
+        fits=(alone, best),
+        added=(added(FRICTION, fitted=best),),
+        scores=(
+            score(third, p=0.2, statistic=7.0, step={"third@x.a": 0.7}),
+            score(OFFSET, p=0.1, statistic=8.0),
+            score(FRICTION, p=0.05, statistic=9.0),
+        ),
+    )
+    listed = which(made)
+    assert [f"{e['kind']}@{e['location']}" for e in listed] == ["friction@elbow", "offset@wrist", "third@x"]
+    assert [entry["score"] for entry in listed] == [9.0, 8.0, 7.0]
+    assert [entry["p_value"] for entry in listed] == [0.05, 0.1, 0.2]
+    assert listed[0]["parameters"]["a"] == {"value": 0.5, "std": None, "unit": "N m"}
+    assert listed[1]["parameters"]["a"] == {"value": 0.3, "std": 0.01, "unit": "N m"}
+    assert listed[2]["parameters"]["a"] == {"value": 0.7, "std": None, "unit": "N m"}
+    assert [entry["closure"] for entry in listed] == [pytest.approx(0.95), pytest.approx(0.65), None]
+    assert listed[1]["closure_ci"] == [pytest.approx(0.6), pytest.approx(0.7)]
+    assert listed[2]["closure_ci"] is None
+
+
+def test_a_refit_without_a_score_is_listed_as_insignificant():
+    made = finding(scores=(), fits=(fit([OFFSET]),), added=())
+    [entry] = which(made)
+    assert (entry["kind"], entry["score"], entry["p_value"]) == ("offset", 0.0, 1.0)
+
+
+def test_an_unknown_gap_lists_refits_before_scores():
+    made = finding("unknown", fits=(fit([OFFSET]),), scores=(score(FRICTION), score(OFFSET)))
+    assert [entry["kind"] for entry in which(made)] == ["offset", "friction"]
