@@ -1,0 +1,207 @@
+"""Steps that are hard to solve: both kernels reach the same point, its derivatives and, where there is none, the same
+status. The kernels share nothing but the equations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from yid_ocp.integrator.discrete import ForceSplit
+from yid_ocp.integrator.step import compile_step
+from yid_ocp.integrator.step_model import Directions, StepCode
+from yid_ocp.model import Grasp, Segment, System, flexible_object
+from yid_ocp.model.system import floating_clamp
+from yid_ocp.model.urdf import read_urdf
+
+BENT = np.array([0.3, -0.2, 0.1, 0.4, 0.2, -0.1, 0.2, 0.3, 0.15])
+NEARLY_STRAIGHT = np.array([1, -1, 0.5, 0.3, 1, 0.2, -1, 0.5, 0.1])
+
+
+@dataclass(frozen=True)
+class Hard:
+    """A motion of `steps` steps from (q, p), with prescribed coordinates moved in the first step.
+
+    `damped` says that Newton's first correction is too large to be taken whole; `conditioning` by how much the
+    equations magnify rounding in the multipliers.
+    """
+
+    system: System
+    q: np.ndarray
+    time_step: float
+    p: np.ndarray | float = 0.0
+    torque: float = 0.0
+    moved: np.ndarray | float = 0.0
+    steps: int = 1
+    split: ForceSplit = "symmetric"
+    code: StepCode = StepCode.OK
+    damped: bool = False
+    conditioning: float = 1.0
+
+    def step(self, use_compiler: bool):
+        return compile_step(self.system, self.time_step, self.split, use_compiler=use_compiler)
+
+    def inputs(self):
+        n, nz = self.system.size, len(self.system.internal)
+        start = np.concatenate([self.q, np.broadcast_to(self.p, n), np.zeros(nz)])
+        torque = np.full((self.steps, len(self.system.driven)), self.torque)
+        path = np.tile(self.q[list(self.system.prescribed_indices)], (self.steps + 1, 1))
+        path[1:] += self.moved
+        return self.system.parameters.vector(), start, torque, path
+
+
+def gripped_cable(parts, shape, kind="point", grasps=1, compliance=None):
+    """The cable in a shape, its end held by a prescribed clamp, once or several times over."""
+    pose = parts.tip(parts.cable().mechanism, "w_C", shape)
+    clamp = floating_clamp("clamp")
+    grasp = Grasp("0", "clamp", "w_C", kind, rotation=ca.SX(ca.DM(pose[:3, :3])))
+    if compliance is not None:
+        grasp = replace(grasp, compliance=ca.SX(compliance))
+    segment = Segment("C", 0.6, 0.3, 0.05, links=3, bend=2.0, twist=1.0, damping=0.01)
+    system = System.build(
+        clamp,
+        objects=[(flexible_object([segment], name="cable"), None, None)],
+        grasps=[replace(grasp, name=str(i)) for i in range(grasps)],
+        prescribed=clamp.joint_names,
+    )
+    return system, np.concatenate([pose[:3, 3], np.zeros(3), shape])
+
+
+def pendulum(folder):
+    return System.build(read_urdf(folder / "double_pendulum.urdf"), driven=["elbow"])
+
+
+def in_thick_air(parts, folder):
+    robot = read_urdf(folder / "mixed_joints.urdf")
+    air = parts.thick_air("nod", 2.0, 0.2, 0.4)
+    system = System.build(robot, driven=["spin", "nod"], damping=0.2, effects=[air])
+    return system, np.array([0.1, 0.4, -0.5, 0.15, 0.3, 0.7])
+
+
+def out_of_reach(folder):
+    """The pendulum, free to turn, grasped at a point 3 m away."""
+    turn = read_urdf(folder / "turntable.urdf", joints=["turn"])
+    carrier = replace(turn, frames={"disc": turn.frames["disc"]})
+    far = Grasp("far", "ceiling", "tip", offset=ca.SX(ca.DM([0.0, 3.0, 0.0])))
+    return System.build(carrier.joined(read_urdf(folder / "double_pendulum.urdf"), "disc"), grasps=[far])
+
+
+def redundant(folder):
+    grasps = [Grasp(name, "floor", "disc") for name in ("one", "two")]
+    return System.build(read_urdf(folder / "turntable.urdf"), grasps=grasps)
+
+
+CLAMP_TURNED = np.array([-0.2, 0.1, -0.2, 0.2, 0.2, 0.2])
+PULLED_BACK = np.array([0.0, 0.0, -1e-4, 0.0, 0.0, 0.0])
+HANGING = np.array([0.3, -0.2])
+
+CASES: dict[str, Callable[..., Hard]] = {
+    "fast_pendulum": lambda parts, folder: Hard(
+        pendulum(folder), HANGING, 0.2, p=np.array([30.0, 20.0]), torque=5.0, damped=True
+    ),
+    "kicked_cable": lambda parts, folder: Hard(parts.cable(), 3 * BENT, 0.3, p=0.3 * BENT, damped=True),
+    "clamp_moved_far": lambda parts, folder: Hard(
+        *parts.clamped_cable("weld"), 0.02, moved=CLAMP_TURNED, steps=3, damped=True
+    ),
+    "closed_loop_moved_far": lambda parts, folder: Hard(
+        *parts.closed_loop(folder), 0.05, torque=60.0, moved=1.0, steps=2, damped=True
+    ),
+    "closed_force": lambda parts, folder: Hard(
+        *in_thick_air(parts, folder), 0.05, p=5.0, torque=60.0, steps=2, split="left_damping", damped=True
+    ),
+    "internal_coordinates": lambda parts, folder: Hard(
+        parts.cable(effects=[parts.maxwell_branch("C_0_x", 30.0, 0.02), parts.soft_joint("C_1_y", 0.2)]),
+        2 * BENT,
+        0.05,
+        p=0.3 * BENT,
+        steps=2,
+        damped=True,
+    ),
+    "creeping_grasp": lambda parts, folder: Hard(
+        *parts.clamped_cable("point", [parts.creeping_grasp("clamp", 0.05), parts.soft_grasp("clamp", 1e-4, 2e-3)]),
+        0.005,
+        moved=CLAMP_TURNED,
+        damped=True,
+    ),
+    "almost_at_full_stretch": lambda parts, folder: Hard(
+        *gripped_cable(parts, 1e-4 * NEARLY_STRAIGHT), 1e-3, conditioning=1e4
+    ),
+    "drawn_back_from_full_stretch": lambda parts, folder: Hard(
+        *gripped_cable(parts, 1e-4 * NEARLY_STRAIGHT, "axis"), 1e-3, moved=PULLED_BACK, damped=True, conditioning=1e4
+    ),
+    "welded_almost_at_full_stretch": lambda parts, folder: Hard(
+        *gripped_cable(parts, 1e-3 * NEARLY_STRAIGHT, "weld"), 1e-3, moved=PULLED_BACK, damped=True, conditioning=1e4
+    ),
+    "nearly_redundant_grasps": lambda parts, folder: Hard(
+        *gripped_cable(parts, BENT, grasps=2, compliance=1e-9), 1e-3, steps=5
+    ),
+    "at_full_stretch": lambda parts, folder: Hard(
+        *gripped_cable(parts, 0 * BENT), 1e-3, moved=PULLED_BACK, code=StepCode.SINGULAR
+    ),
+    "redundant_grasps": lambda parts, folder: Hard(
+        redundant(folder), np.array([0.1, 0.2, 0.3]), 0.01, code=StepCode.SINGULAR
+    ),
+    "out_of_reach": lambda parts, folder: Hard(
+        out_of_reach(folder), np.array([0.1, 0.3, 0.4]), 0.01, code=StepCode.NOT_CONVERGED
+    ),
+    "much_too_fast": lambda parts, folder: Hard(
+        pendulum(folder), HANGING, 1.0, p=np.array([10.0, -4.0]), torque=5.0, code=StepCode.NOT_CONVERGED
+    ),
+    "not_a_number": lambda parts, folder: Hard(
+        pendulum(folder), HANGING, 0.01, torque=np.nan, code=StepCode.NOT_FINITE
+    ),
+}
+
+
+@pytest.fixture(scope="module", params=list(CASES))
+def hard(request, parts, urdf_folder) -> Hard:
+    return CASES[request.param](parts, urdf_folder)
+
+
+def first_correction(hard: Hard) -> float:
+    """Newton's first correction of the coordinates, from the state before as the guess."""
+    step, (theta, start, torque, path) = hard.step(use_compiler=False), hard.inputs()
+    after = start.copy()
+    after[list(hard.system.prescribed_indices)] = path[1]
+    sizes, unknown = step.sizes, step.model.structure.unknown_row
+    pair = np.stack([start, after])
+    found = step.kernel.linearize(theta, pair, np.zeros((1, sizes["m"])), torque[:1], (), True)
+    change = np.linalg.solve(found.rows_new[0][np.ix_(unknown, unknown)], found.rows[0][unknown])
+    return float(np.max(np.abs(change[: len(unknown) - sizes["m"]])))
+
+
+def close(actual, expected, tolerance):
+    scale = max(1.0, np.max(np.abs(expected), initial=0.0))
+    assert actual.shape == expected.shape
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=tolerance * scale)
+
+
+def test_both_kernels_agree(hard):
+    if not hard.step(use_compiler=True).compiled:
+        pytest.skip("this machine has no C compiler to compare with")
+    steps = [hard.step(use_compiler) for use_compiler in (True, False)]
+    theta, start, torque, path = hard.inputs()
+    names = tuple(hard.system.parameters.names)
+    directions = Directions(names, np.random.default_rng(1).normal(size=(len(start), len(names))))
+    directions.start[list(hard.system.prescribed_indices)] = 0.0
+    one, two = (step.kernel.rollout(theta, start, torque, path, None, directions) for step in steps)
+    assert (one.status.code, two.status.code) == (hard.code, hard.code)
+    assert one.status.step == two.status.step == (hard.steps if hard.code == StepCode.OK else 0)
+    assert one.status.message.partition("(")[0] == two.status.message.partition("(")[0]
+    if hard.code != StepCode.OK:
+        assert all(np.all(np.isnan(r.by_state[1:])) and np.all(np.isnan(r.multipliers)) for r in (one, two))
+        return
+    if hard.damped:
+        assert first_correction(hard) > 0.5
+    close(one.state, two.state, 1e-10)
+    close(one.multipliers, two.multipliers, 1e-10 * hard.conditioning)
+    close(one.effort, two.effort, 1e-9 * hard.conditioning)
+    for key in ("by_state", "by_multipliers", "by_effort"):
+        close(getattr(one, key), getattr(two, key), 1e-9 * hard.conditioning)
+    by_state = np.random.default_rng(2).normal(size=one.state.shape)
+    back = [step.kernel.adjoint(theta, one, None, names, by_state, None, None) for step in steps]
+    for key in vars(back[0]):
+        close(getattr(back[0], key), getattr(back[1], key), 1e-9 * hard.conditioning)
