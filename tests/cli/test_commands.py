@@ -171,9 +171,10 @@ def test_check_refines_links_and_time_step(cli, tmp_path, monkeypatch):
         "    kind: segments\n"
         "    segments:\n"
         "      beam:\n"
-        "        {length: 0.5, mass: 0.3, radius: 0.01, bend: 0.5, twist: 0.5, rigidity: true, clamped: true}\n"
+        "        {length: 0.5, mass: 0.3, radius: 0.01, rigidity: true, clamped: true}\n"
         "  damping: 0.001\n"
         "  gravity: [0, 0, 0]\n"
+        "parameters: {beam.bend: {initial: 0.5}, beam.twist: {initial: 0.5}}\n"
     )
     done = cli("check", "beam.yaml", "--out", "c")
     assert done.code == 0, done.err
