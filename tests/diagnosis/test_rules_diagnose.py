@@ -234,8 +234,8 @@ class Steps:
         object.__setattr__(self.nominal, "problem", SimpleNamespace(episodes=(), shared=("k",), system=SYSTEM))
         monkeypatch.setattr(module, "nominal_fit", self.step("nominal", self.nominal))
         monkeypatch.setattr(module, "largest_angles", lambda of: {"T1": 0.5})
-        monkeypatch.setattr(module, "fitted_test", lambda of, limits: self.given["before"])
-        monkeypatch.setattr(module, "held_out_test", lambda of, limits: self.given["held"])
+        for name, key in (("fitted_test", "before"), ("held_out_test", "held")):
+            monkeypatch.setattr(module, name, self.tests(self.given[key]))
         monkeypatch.setattr(module, "screen", self.step("screen", self.given["screened"]))
         monkeypatch.setattr(module, "smooth_fit", self.step("smooth", self.given["smoothed"]))
         refits = tuple(entry.fit for entry in self.given["added"])
@@ -247,6 +247,9 @@ class Steps:
             return result
 
         return taken
+
+    def tests(self, before):
+        return lambda of, limits: before if of is self.nominal else outcome()
 
     @property
     def names(self):
