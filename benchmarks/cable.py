@@ -107,9 +107,9 @@ def run(folder: Path = FOLDER, iterations: int = 15) -> dict[str, Any]:
     nominal = point_errors(undeformed, undeformed.start, cable.free)
     point_errors(problem, problem.start, cable.free)
     seconds["starts"] = time.perf_counter() - clock
-    episode, (theta, deviation) = problem.episodes[0], problem.split(problem.start, 0)
+    episode, (theta, offset) = problem.episodes[0], problem.split(problem.start, 0)
     clock = time.perf_counter()
-    problem.run(episode, theta, deviation, derivatives=False)
+    problem.predictor.run(episode, theta, offset, False)
     seconds["rollout"] = time.perf_counter() - clock
     clock = time.perf_counter()
     solution = solve(problem, GaussNewton(iterations=iterations))
@@ -154,7 +154,7 @@ def medians(files: list[dict[str, Any]]) -> dict[str, float]:
 
 
 def parameters(cable: Cable, x: Any, covariance: Any, names: tuple[str, ...]) -> dict[str, dict[str, Any]]:
-    """Values, deviations, and values per unit weight (density times gravity) of rigidities and dampings."""
+    """Values, standard deviations, and values per unit weight (density times gravity) of rigidities and dampings."""
     units = {"bend": "m^3", "twist": "m^3", "damping": "m^3 s", "twist_damping": "m^3 s"}
     result: dict[str, dict[str, Any]] = {}
     for i, name in enumerate(names):
@@ -183,7 +183,7 @@ def show(result: Mapping[str, Any], console: Console) -> None:
     row("median of *", result["held_out_median"], result["held_out_median"])
     console.print(table)
     values = Table(title="per unit weight")
-    for column in ("parameter", "value", "relative deviation", "unit"):
+    for column in ("parameter", "value", "relative std", "unit"):
         values.add_column(column)
     for name, entry in result["parameters"].items():
         if "per_weight" in entry:

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 
 class YidError(Exception):
-    """A problem that its reader can mend.
+    """A problem that its reader can fix.
 
     Parameters
     ----------

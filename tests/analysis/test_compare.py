@@ -1,4 +1,4 @@
-"""Several methods on one problem: prices, agreement, and what is said of parameters that nothing informs."""
+"""Several methods on one problem: cost in time, agreement, and what is said of parameters that nothing informs."""
 
 from __future__ import annotations
 

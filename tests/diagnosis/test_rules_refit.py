@@ -15,11 +15,11 @@ from yid_ocp.diagnosis.refit import (
     Search,
     _half_done,
     block_length,
-    deviations,
     held_out_loss,
     recalled,
     refit,
     refit_all,
+    refit_std,
 )
 from yid_ocp.diagnosis.screening import robust
 from yid_ocp.diagnosis.thresholds import Thresholds
@@ -66,7 +66,7 @@ class Memory(dict):
 
 @pytest.fixture
 def solved(monkeypatch):
-    """Solvers that go nowhere, deviations of one tenth; `runs` are the solvers' starts, `losses` what was judged."""
+    """Solvers that go nowhere, standard deviations of one tenth; `runs` are the solvers' starts, `losses` what was judged."""
     made = SimpleNamespace(runs=[], losses=[])
 
     def run(problem, x, callback):
@@ -79,7 +79,7 @@ def solved(monkeypatch):
 
     monkeypatch.setattr(module, "SOLVER", SimpleNamespace(run=run))
     monkeypatch.setattr(module, "held_out_loss", held_out)
-    monkeypatch.setattr(module, "deviations", lambda problem, finish: np.full(len(problem.names), 0.1))
+    monkeypatch.setattr(module, "refit_std", lambda problem, finish: np.full(len(problem.names), 0.1))
     return made
 
 
@@ -288,7 +288,7 @@ def test_deviations_are_the_larger_of_plain_and_sandwich(monkeypatch, plain, wea
 
     monkeypatch.setattr(module, "uncertainty", uncertainty)
     monkeypatch.setattr(module, "residual_series", lambda which: parts if which is problem else [])
-    found, expected = deviations(problem, finish), sandwich(jacobian, residual, parts)
+    found, expected = refit_std(problem, finish), sandwich(jacobian, residual, parts)
     assert told == [(problem, finish)]
     assert found[0] == pytest.approx(max(plain, expected[0]), rel=1e-9)
     assert found[1] == pytest.approx(expected[1], rel=1e-9)
@@ -299,15 +299,15 @@ def test_a_coloured_residual_is_less_sure_than_its_size_says(monkeypatch):
     problem = SimpleNamespace(weak_prior_rows=0, scales=np.ones(1))
     monkeypatch.setattr(module, "uncertainty", lambda *_: (np.array([[0.01]]), 1.0))
     monkeypatch.setattr(module, "residual_series", lambda _: [series(range(100))])
-    assert deviations(problem, evaluation(residual, jacobian)) > 0.25
+    assert refit_std(problem, evaluation(residual, jacobian)) > 0.25
 
 
 def test_without_a_jacobian_or_unknowns_only_the_plain_deviation_is_left(monkeypatch):
     monkeypatch.setattr(module, "uncertainty", lambda *_: (np.diag([4.0, 9.0]), 1.0))
     problem = SimpleNamespace(weak_prior_rows=0, scales=np.ones(2))
-    np.testing.assert_array_equal(deviations(problem, evaluation([1.0])), [2.0, 3.0])
+    np.testing.assert_array_equal(refit_std(problem, evaluation([1.0])), [2.0, 3.0])
     monkeypatch.setattr(module, "uncertainty", lambda *_: (np.zeros((0, 0)), 1.0))
-    assert deviations(problem, evaluation([1.0], np.zeros((1, 0)))).shape == (0,)
+    assert refit_std(problem, evaluation([1.0], np.zeros((1, 0)))).shape == (0,)
 
 
 def test_a_direction_that_nothing_informs_does_not_spoil_the_others(monkeypatch):
@@ -315,7 +315,7 @@ def test_a_direction_that_nothing_informs_does_not_spoil_the_others(monkeypatch)
     monkeypatch.setattr(module, "residual_series", lambda _: [series(range(3))])
     problem = SimpleNamespace(weak_prior_rows=0, scales=np.ones(2))
     jacobian, residual = np.array([[1.0, 1.0], [1.0, 1.0], [0.0, 0.0]]), np.ones(3)
-    assert np.all(deviations(problem, evaluation(residual, jacobian)) < 10)
+    assert np.all(refit_std(problem, evaluation(residual, jacobian)) < 10)
 
 
 # -- held-out recordings ----------------------------------------------------------------------------------------------

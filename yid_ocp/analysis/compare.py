@@ -32,7 +32,7 @@ PUBLISHED: dict[str, dict[str, float]] = {
 SAMPLING_PERIOD = 0.02
 # Two estimates agree when they differ by less than this many of the larger standard deviation, or by this fraction of
 # the value: below that the methods' own stopping rules show.
-DEVIATIONS, FRACTION = 2.0, 0.005
+STDS, FRACTION = 2.0, 0.005
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ def _differences(run: MethodRun, best: MethodRun) -> list[str]:
             continue
         entry = run.solution.parameters[name]
         gap = abs(entry.value - reference.value)
-        if gap <= max(DEVIATIONS * max(entry.std, reference.std), FRACTION * abs(reference.value)):
+        if gap <= max(STDS * max(entry.std, reference.std), FRACTION * abs(reference.value)):
             continue
         if run.solution.status != Status.CONVERGED:
             why = f"it ended with '{run.solution.status.value}' before reaching the optimum"
@@ -170,7 +170,7 @@ def _descent_errors(run: MethodRun, best: MethodRun, truth: Mapping[str, float])
     """Which parameters a method left far from the truth, and whether these are the ones that the data do not tell."""
     known = {name: entry for name, entry in best.solution.parameters.items() if entry.free and name in truth}
     found = {name: run.solution.parameters[name].value for name in known}
-    # the same limit makes a deviation too large for an identifiable parameter
+    # the same limit makes a standard deviation too large for an identifiable parameter
     wrong = [name for name in known if abs(found[name] - truth[name]) > IDENTIFIABLE * abs(truth[name])]
     verdicts = {name: VERDICT_WORDS[entry.verdict] for name, entry in known.items()}
     hidden = [name for name in known if known[name].verdict != "identifiable"]

@@ -72,7 +72,7 @@ class Fit:
     values : dict of str to float
         Unknowns.
     std : dict of str to float
-        Their standard deviations; see `deviations`.
+        Their standard deviations; see `refit_std`.
     cost : float
     evaluation : Evaluation
     loss : Loss
@@ -196,7 +196,7 @@ def refit(
     if best is None:
         return None
     outcome, finish = best
-    std = own.named(deviations(own, finish))
+    std = own.named(refit_std(own, finish))
     loss = held_out_loss(own, outcome.x)
     values = own.named(outcome.x)
     if store is not None:
@@ -250,7 +250,7 @@ def recalled(
     return Fit(tuple(effects), own, known.values, known.std, finish.cost, finish, loss, known.message, True)
 
 
-def deviations(problem: EstimationProblem, finish: Evaluation) -> Array:
+def refit_std(problem: EstimationProblem, finish: Evaluation) -> Array:
     """Standard deviation of every unknown, shape (nx,): the larger of two.
 
     The first scales (J'J)^-1 by chi2 per degree of freedom; the second is the sandwich (J'J)^-1 S (J'J)^-1 with the

@@ -23,15 +23,15 @@ from yid_ocp.sensors import Sensor, sensor_function
 
 Array = NDArray[np.float64]
 
-# Deviation of the elastic prior: a bend of this size at a joint of mean stiffness costs as much as one standard
+# Width of the elastic prior: a bend of this size at a joint of mean stiffness costs as much as one standard
 # deviation of a measured point [rad]; other joints in proportion to their stiffness.
 BEND_STD = 0.5
 # Joints without a spring, or with one far softer than the rest, are still held a little.
 LEAST_STIFFNESS = 1e-4
-# Deviation of a coordinate's rate where the points leave it open [rad/s].
+# Standard deviation of a coordinate's rate where the points leave it open [rad/s].
 RATE_STD = 3.0
 CONSTRAINT_STD = 1e-5
-# The object is first pulled into place softly, by measurements with so many times their deviation: pulled hard at once,
+# The object is first pulled into place softly, by measurements with so many times their noise: pulled hard at once,
 # it ends in knots.
 SOFTNESS = (1000.0, 100.0, 10.0, 1.0)
 # The stage before which the best of all trials is chosen: there the object has its place and hardly its details.

@@ -74,7 +74,7 @@ class Estimate:
     initial, lower, upper : float
     free : bool
     verdict : str
-        identifiable (relative deviation up to 10 %), weak (up to 400 %), not_identifiable, or fixed.
+        identifiable (relative standard deviation up to 10 %), weak (up to 400 %), not_identifiable, or fixed.
     """
 
     value: float
@@ -336,14 +336,14 @@ def verdict(value: float, std: float) -> str:
 
 
 def estimates(problem: EstimationProblem, x: Array, covariance: Array) -> dict[str, Estimate]:
-    """Every parameter of the model with its value, deviation and verdict."""
+    """Every parameter of the model with its value, standard deviation and verdict."""
     theta, _ = problem.split(x, 0)
-    deviation = np.sqrt(np.maximum(np.diag(covariance), 0.0)) if len(covariance) else np.zeros(0)
+    spread = np.sqrt(np.maximum(np.diag(covariance), 0.0)) if len(covariance) else np.zeros(0)
     result: dict[str, Estimate] = {}
     for i, entry in enumerate(problem.system.parameters):
         free = entry.name in problem.shared
         at = problem.shared.index(entry.name) if free else -1
-        std = float(deviation[at]) if free else 0.0
+        std = float(spread[at]) if free else 0.0
         value, initial = float(theta[i]), float(problem.theta[i])
         std = std if std < 1e6 * max(abs(value), abs(initial), 1e-12) else math.inf
         result[entry.name] = Estimate(

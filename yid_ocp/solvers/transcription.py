@@ -331,8 +331,8 @@ class Transcription:
         feedback = episode.feedback
         torque = episode.torque
         if feedback is not None:
-            deviation = before[:, feedback.index] - feedback.reference
-            torque = torque - np.einsum("kuj,kj->ku", feedback.gain, deviation)
+            error = before[:, feedback.index] - feedback.reference
+            torque = torque - np.einsum("kuj,kj->ku", feedback.gain, error)
         if np.array_equal(before[1:], after[:-1]):
             chained, used, lam, held = np.vstack([before, after[-1:]]), slice(None), multipliers, torque
         else:

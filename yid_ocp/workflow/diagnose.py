@@ -133,14 +133,14 @@ def reproducing(run: Run, folder: Path) -> str:
 
 
 def in_units_of_noise(problem: EstimationProblem, run: Run) -> EstimationProblem:
-    """The same problem with the noise alone as the sensors' deviations, by `diagnosis.noise_fraction`.
+    """The same problem with the noise alone as the sensors' standard deviations, by `diagnosis.noise_fraction`.
 
     Priors and weak prior shrink alike, so that every fit stays what it is; what changes is when a gap counts as one.
 
     Raises
     ------
     ConfigError
-        A sensor without a deviation in the settings.
+        A sensor without a standard deviation in the settings.
     """
     share, options = run.diagnosis.noise_fraction, problem.options
     if share == 1:
@@ -151,7 +151,7 @@ def in_units_of_noise(problem: EstimationProblem, run: Run) -> EstimationProblem
         std = sensors[group].std if group in sensors else None
         if std is None:
             raise run.refuse(
-                f"the share of noise in the deviation of '{group}' is given, but not the deviation",
+                f"the fraction of noise in the std of '{group}' is given, but not the std",
                 "diagnosis",
                 "noise_fraction",
                 hint=f"set sensors.{group}.std",
@@ -179,14 +179,14 @@ def _times(share: float, std: float | Mapping[str, float]) -> float | Mapping[st
 def _encoder(
     run: Run, problem: EstimationProblem, sensors: Mapping[str, SensorOptions], group: str
 ) -> float | Mapping[str, float] | None:
-    """The encoders' deviation, which enters that of efforts, shrunk alike."""
+    """The encoders' standard deviation, which enters that of efforts, shrunk alike."""
     stated = sensors[group].position_std
     if stated is not None:
         return _times(run.diagnosis.noise_fraction, stated)
     recorded = [e.recording.joints.position_std for e in problem.episodes if e.recording.joints is not None]
     if group == "joints.effort" and any(std is not None and np.any(std) for std in recorded):
         raise run.refuse(
-            "the share of noise is given, but the encoders' deviation stands in the recordings alone",
+            "the fraction of noise is given, but the encoders' std is only in the recordings",
             "diagnosis",
             "noise_fraction",
             hint=f"set sensors.{group}.position_std",
