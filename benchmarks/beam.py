@@ -5,8 +5,8 @@
 A chain of equal links with twice the stiffness at its clamped first joint is a beam of some other rigidity, by a
 difference that falls with the square of the number of links: EI_n = EI + c/n^2 is fitted to the last two. From EI
 follow Young's modulus, with the second moment of area of the section, and the first frequency of a clamped beam,
-f = 1.8751^2 / (2 pi L^2) sqrt(EI L / m). Standard deviations are those of the fit with the most links; they know nothing of what
-the model misses.
+f = 1.8751^2 / (2 pi L^2) sqrt(EI L / m). Standard deviations are those of the fit with the most links;
+they know nothing of what the model misses.
 """
 
 from __future__ import annotations

@@ -66,7 +66,7 @@ class Memory(dict):
 
 @pytest.fixture
 def solved(monkeypatch):
-    """Solvers that go nowhere, standard deviations of one tenth; `runs` are the solvers' starts, `losses` what was judged."""
+    """Solvers that go nowhere, every std one tenth; `runs` are the solvers' starts, `losses` what was judged."""
     made = SimpleNamespace(runs=[], losses=[])
 
     def run(problem, x, callback):

@@ -64,7 +64,7 @@ class LowPass:
         return math.log(1e3) / decay
 
     def gains(self, step: float) -> tuple[float, float, float]:
-        """Factors from white noise's standard deviation to that of the value, its rate [1/s] and its second rate [1/s^2]."""
+        """Factors from white noise's std to that of the value, its rate [1/s] and its second rate [1/s^2]."""
         if not math.isfinite(self.cutoff):
             return 1.0, math.sqrt(0.5) / step, math.sqrt(6.0) / step**2
         length = 2 * int(5 / (self.cutoff * step)) + 101
