@@ -57,7 +57,7 @@ def edited(file, old, new):
         ("double_pendulum.urdf", "doubel_pendulum.urdf", ("no such URDF file", "double_pendulum.urdf")),
         ("estimate.h5", "estimat.h5", ("no such recording", "recordings.estimate", "did you mean 'estimate.h5'?")),
         ("recordings:", "sensors: {points: {std: 1}}\nrecordings:", ("no recording has a group 'points'",)),
-        ("  held_out:", "  held_out: [nothing.h5]\n  held_out:", ("stands twice", "held_out")),
+        ("  held_out:", "  held_out: [nothing.h5]\n  held_out:", ("is duplicated", "held_out")),
         ("recordings:", "recordings: [", ("not valid YAML",)),
         ("description: A", "description: [A", ("not valid YAML",)),
     ],
@@ -66,7 +66,7 @@ def test_configuration(cli, pendulum, left_nothing, old, new, words):
     line = edited(pendulum, old, new)
     done = cli("solve", pendulum)
     assert_refused(done, *words)
-    if "YAML" not in words[0] and "twice" not in words[0]:
+    if "YAML" not in words[0] and "duplicated" not in words[0]:
         assert f"pendulum.yaml, line {line}" in done.err
     left_nothing()
 

@@ -90,9 +90,9 @@ def _parse(text: str, origin: str) -> tuple[dict[str, Any], dict[KeyPath, str]]:
         problem = str(error.problem or error.context).split("\n")[0]
         twice = re.match(r'found duplicate key "(.*?)"', problem)
         raise ConfigError(
-            f"the key '{twice[1]}' stands twice" if twice else f"the file is not valid YAML: {problem}",
+            f"the key '{twice[1]}' is duplicated" if twice else f"the file is not valid YAML: {problem}",
             where=f"{origin}{line}",
-            hint="check indentation, brackets, colons and keys that stand twice",
+            hint="check indentation, brackets, colons and duplicated keys",
         ) from error
     except YAMLError as error:
         raise ConfigError(f"the file is not valid YAML: {str(error).splitlines()[0]}", where=origin) from error
