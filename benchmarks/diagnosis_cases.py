@@ -1,4 +1,4 @@
-"""InjectedEffect effects in data from MuJoCo: what the diagnosis says of each, failures included.
+"""Injected effects in data from MuJoCo: what the diagnosis says of each, failures included.
 
     python benchmarks/diagnosis_cases.py [CASE ...] [--seeds 1 7] [--json FILE]
 
@@ -38,7 +38,7 @@ NOISE_SEEDS = (401, 402)
 
 @dataclass(frozen=True)
 class Case:
-    """What is done in the simulator, the verdict that it deserves, and what the library is robbed of."""
+    """What is done in the simulator, the verdict that it deserves, and what is left out of the library."""
 
     withheld: tuple[InjectedEffect, ...]
     verdict: str = "effect"
@@ -158,7 +158,7 @@ def run(name: str, seeds: Sequence[int]) -> dict[str, str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Diagnose withheld effects in data from MuJoCo.")
+    parser = argparse.ArgumentParser(description="Diagnose injected effects in data from MuJoCo.")
     parser.add_argument("cases", nargs="*", default=list(CASES), help=", ".join(CASES))
     parser.add_argument("--seeds", nargs=2, type=int, default=(1, 7), help="of the two motions")
     parser.add_argument("--json", type=Path, metavar="FILE", help="store the table")

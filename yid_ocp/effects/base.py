@@ -154,12 +154,12 @@ class EffectBase(ABC):
     ) -> dict[str, Reported]:
         """The quantities as people read them, a compliance as the stiffness that it is the reciprocal of.
 
-        The deviation of 1/C is std(C)/C^2 (delta method).
+        The standard deviation of 1/C is std(C)/C^2 (delta method).
 
         Parameters
         ----------
         values : mapping of parameter name to value, optional
-            Nominal where absent; entries of other effects are passed over.
+            Nominal where absent; entries of other effects are skipped.
         stds : mapping of parameter name to standard deviation, optional
             NaN where absent.
 

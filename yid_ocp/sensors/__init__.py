@@ -2,6 +2,5 @@
 
 from yid_ocp.sensors.base import Sensor as Sensor
 from yid_ocp.sensors.base import sensor_function as sensor_function
-from yid_ocp.sensors.joints import AngleSensor as AngleSensor
 from yid_ocp.sensors.joints import EffortSensor as EffortSensor
 from yid_ocp.sensors.points import PointSensor as PointSensor

@@ -1,4 +1,4 @@
-"""Sensors of the robot's joints: encoders and effort."""
+"""Sensors of the robot's joints."""
 
 from __future__ import annotations
 
@@ -8,43 +8,6 @@ import casadi as ca
 
 from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import NodeState
-
-
-@dataclass(frozen=True)
-class AngleSensor:
-    """Encoders of the named joints."""
-
-    joints: tuple[str, ...]
-    group: str = "joints.position"
-
-    @property
-    def channels(self) -> tuple[str, ...]:
-        """`joints.position.JOINT` for every joint."""
-        return tuple(f"{self.group}.{joint}" for joint in self.joints)
-
-    @property
-    def unit(self) -> str:
-        """Radians."""
-        return "rad"
-
-    @property
-    def width(self) -> int:
-        """One output a joint."""
-        return 1
-
-    @property
-    def frames(self) -> tuple[str, ...]:
-        """No points."""
-        return ()
-
-    @property
-    def camera(self) -> Placement | None:
-        """No camera."""
-        return None
-
-    def output(self, state: NodeState) -> ca.SX:
-        """Coordinates of the joints, shape (nj, 1)."""
-        return ca.vertcat(*(state.q[state.system.mechanism.joint_index(joint)] for joint in self.joints))
 
 
 @dataclass(frozen=True)
