@@ -25,7 +25,8 @@ from yid_ocp.diagnosis.smoother_model import Source
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects.base import EffectBase, Quantity
 from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.problem.problem import Evaluation
+from yid_ocp.problem.measurements import Measurements
+from yid_ocp.problem.problem import Evaluation, ResidualRows
 
 WHITE = (1.0,)
 
@@ -231,16 +232,6 @@ def finding(verdict="effect", **changed) -> Finding:
     return Finding(**(usual | changed))
 
 
-# -- recordings on nodes ----------------------------------------------------------------------------------------------
-
-
-def samples(channels: Sequence[str], std, unit="m", width=1, **more):
-    """What one sensor measured, as far as rules look at it."""
-    sensor = SimpleNamespace(channels=tuple(channels), unit=unit, width=width, group="points")
-    columns = tuple(channel for channel in channels for _ in range(width))
-    return SimpleNamespace(sensor=sensor, channel_of_column=columns, std=np.asarray(std, float), **more)
-
-
 # -- problems ---------------------------------------------------------------------------------------------------------
 
 
@@ -262,7 +253,11 @@ class Candidates:
         self.nominal = tuple(nominal)
         self.theta = dict(nominal) | {n: v for of in effects for n, v in of.neutral.items()}
         self.names: tuple[str, ...] = self.nominal
-        self.weak, self.fault, self.asked, self.parts = 0, "", [], []
+        self.weak, self.fault, self.asked, self.parts, self.warmed = 0, "", [], [], []
+
+    @property
+    def problem(self):
+        return self
 
     def told(self, parts, problem):
         """Keep what `residual_series` was asked of."""
@@ -274,25 +269,25 @@ class Candidates:
         vars(other).update(changed)
         return other
 
-    def freeing(self, effects, names=None):
-        extra = [n for of in effects for n in of.parameters.names] if names is None else names
-        return self._like(names=(*self.nominal, *extra))
+    def freeing(self, names):
+        return self._like(names=tuple(names))
 
     def at(self, values):
         return self._like(theta=self.theta | dict(values))
 
-    def unknowns(self, values):
+    def vector(self, values):
         return np.array([values.get(name, self.theta[name]) for name in self.names])
 
     def residual_at(self, values):
         """The data's residual at some values of the unknowns."""
         return self.y + sum(value * self.column(name, self.theta) for name, value in values.items())
 
-    @property
-    def weak_prior_rows(self):
-        return self.weak
+    def informing(self, at):
+        count = len(self.y)
+        return at.residual[:count], at.jacobian[:count]
 
-    def evaluate(self, x, derivatives=True):
+    def evaluate(self, x, derivatives=True, warm=None):
+        self.warmed.append(warm)
         values = dict(zip(self.names, x, strict=True))
         if self.fault == "fails":
             return evaluation([], ok=False, message="it snaps")
@@ -306,33 +301,50 @@ class Recorded:
     """One output of one held-out recording, measured at some times (a node every tenth of a second)."""
 
     def __init__(self, times, value, weight):
-        value = np.asarray(value, float)
+        value, weight = np.asarray(value, float), np.asarray(weight, float)
         node = np.rint(np.asarray(times) / 0.1).astype(int)
-        self._samples = samples(
-            ["a"],
-            np.ones(value.shape),
-            node=node,
-            fraction=np.zeros(len(node)),
-            value=value,
-            weight=np.asarray(weight, float),
-        )
+        self._samples = measurements(["a"], node, np.zeros(len(node)), value, weight)
 
     def predicted(self, prediction):
         """A problem that predicts the recording so, or says why not; `asked` holds the values that it was asked at."""
         asked = []
-        episode = SimpleNamespace(
-            name="other", grid=SimpleNamespace(steps=len(self._samples.node), time_step=0.1), samples=(self._samples,)
-        )
+        grid = SimpleNamespace(steps=len(self._samples.node), time_step=0.1)
+        held = SimpleNamespace(name="other", grid=grid, samples=(self._samples,))
         result = prediction
         if not isinstance(prediction, str):
             result = SimpleNamespace(predicted=(np.asarray(prediction, float),))
-        problem = SimpleNamespace(
+        return SimpleNamespace(
             asked=asked,
-            episodes=(),
-            held_out=(episode,),
-            options=SimpleNamespace(path_cutoff=math.inf),
-            unknowns=lambda values: asked.append(dict(values)),
-            validate=lambda x: [(episode, result)],
+            held_out=(held,),
+            vector=lambda values: asked.append(dict(values)),
+            validate=lambda x: [(held, result)],
+            on=lambda episodes, held_out: SimpleNamespace(
+                episodes=episodes,
+                held_out=held_out,
+                options=SimpleNamespace(path_cutoff=math.inf),
+                rows=ResidualRows.of(episodes, 0, 0),
+            ),
         )
-        problem.freeing = lambda effects: SimpleNamespace(**vars(problem))
-        return problem
+
+
+# -- recordings on nodes ----------------------------------------------------------------------------------------------
+
+
+def samples(channels: Sequence[str], std, unit="m", width=1, **more):
+    """What one sensor measured, as far as rules look at it."""
+    columns = tuple(channel for channel in channels for _ in range(width))
+    return SimpleNamespace(
+        sensor=seeing(channels, unit, width), channel_of_column=columns, std=np.asarray(std, float), **more
+    )
+
+
+def seeing(channels: Sequence[str], unit="m", width=1, efforts=()):
+    """A sensor, as far as rules look at it."""
+    return SimpleNamespace(channels=tuple(channels), unit=unit, width=width, group="points", efforts=tuple(efforts))
+
+
+def measurements(channels, node, fraction, value, weight, span=(0, 100), **sensor) -> Measurements:
+    """Samples of unit noise on nodes."""
+    value, weight = np.asarray(value, float), np.asarray(weight, float)
+    made = seeing(channels, **sensor)
+    return Measurements(made, np.asarray(node), np.asarray(fraction, float), value, weight, np.ones(value.shape), span)

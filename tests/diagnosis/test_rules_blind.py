@@ -16,7 +16,9 @@ from yid_ocp.diagnosis.blind import Case, Ensemble, Label, answers, finer_values
 from yid_ocp.diagnosis.blind import ensemble as module
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import ConfigError, ModelError
+from yid_ocp.virtual.experiment import PointCamera
 from yid_ocp.virtual.injected import OUTSIDE, InjectedEffect
+from yid_ocp.virtual.motion import Excitation
 
 # the package's own name `score` is the function
 scoring = importlib.import_module("yid_ocp.diagnosis.blind.score")
@@ -297,8 +299,8 @@ def drawn(monkeypatch):
     """drawn(...): an ensemble whose recordings are made up; `made` remembers what was simulated."""
     made: list[dict] = []
 
-    def experiment(of, truth, injected, **settings):
-        made.append({"system": of, "truth": dict(truth), "injected": tuple(injected), **settings})
+    def experiment(of, truth, injected, settings):
+        made.append(vars(settings) | {"system": of, "truth": dict(truth), "injected": tuple(injected)})
         if len(made) <= build.failures:
             raise ModelError("it flies away")
         return Recording(points=(PointGroup("p", ("tip",), np.array([0.0]), np.zeros((1, 1, 3))),), description="told")
@@ -318,7 +320,7 @@ def drawn(monkeypatch):
         return ensemble
 
     monkeypatch.setattr(module, "injected_experiment", experiment)
-    monkeypatch.setattr(module, "Motion", SimpleNamespace(multisine=multisine))
+    monkeypatch.setattr(module, "multisine", multisine)
     build.made = made
     return build
 
@@ -364,12 +366,17 @@ def test_a_recording_says_nothing_of_what_is_in_it(drawn):
     [made] = drawn.made
     assert made["system"] is ensemble.problem.system
     assert (made["truth"], made["injected"]) == ({"T1.bend": 7.0}, (KV,))
-    assert (made["posture"], made["vision"]) == (ensemble.posture, False)
+    assert (made["posture"], made["camera"]) == (ensemble.posture, None)
     motion = made["motion"]
     assert (motion["of"], motion["truth"]) == (ensemble.problem.system, {"T1.bend": 7.0})
-    assert (motion["posture"], motion["travel"]) == (ensemble.posture, 0.15)
+    assert (motion["posture"], motion["excitation"]) == (ensemble.posture, Excitation(travel=0.15))
     rng = np.random.default_rng(1)
     assert [motion["seed"], made["seed"]] == [int(rng.integers(2**31)) for _ in range(2)]
+
+
+def test_a_camera_looks_on_where_one_did(drawn):
+    drawn(pose=np.eye(4)).record({}, (), np.random.default_rng(1), "case")
+    assert drawn.made[0]["camera"] == PointCamera()
 
 
 def test_a_finer_chain_moves_as_the_nominal_one_and_has_its_own_values(drawn, monkeypatch):

@@ -27,6 +27,7 @@ from factories import (
     window,
 )
 
+from yid_ocp.diagnosis.hypotheses import CandidateProblem
 from yid_ocp.diagnosis.refit import Search
 from yid_ocp.diagnosis.screening import Screened
 from yid_ocp.diagnosis.thresholds import Thresholds
@@ -258,7 +259,8 @@ class Steps:
     def run(self, **limits):
         held = (SimpleNamespace(name="other"),)
         self.effects = [Remembering("friction@elbow"), Remembering("offset@wrist")]
-        self.composed = SimpleNamespace(effects=tuple(self.effects), held_out=held, blocks=self.given["blocks"])
+        self.nominal.problem.held_out = held
+        self.composed = CandidateProblem("problem", tuple(self.effects), self.given["blocks"])
         search = Search(self.composed, Thresholds(**limits), self.said.append, "store")
         return module._diagnosed("problem", search, "solution", module._Clock())
 
@@ -287,9 +289,12 @@ def test_a_gap_is_screened_located_and_closed(monkeypatch):
     assert steps.names == ["nominal", "screen", "smooth", "compose"]
     assert found.verdict == "effect"
     assert steps.taken[0][1] == ("problem", steps.composed, "solution", "store", Thresholds())
-    assert steps.taken[1][1] == (steps.composed, (), steps.nominal.values, Thresholds())
+    screened, *given = steps.taken[1][1]
+    assert given == [(), steps.nominal.values, Thresholds()]
+    assert [(e.label, e.angles) for e in screened.effects] == [(e.label, {"T1": 0.5}) for e in steps.effects]
     assert steps.taken[2][1] == (steps.nominal, Thresholds())
-    assert [e.angles for e in steps.composed.effects] == [{"T1": 0.5}] * 2
+    assert steps.taken[3][1][0].problem is screened
+    assert steps.taken[3][1][1:] == (steps.nominal, steps.given["screened"])
     assert found.closure.value == pytest.approx(1 - 0.05 / 1.05)
     assert (found.added, found.fits[0]) == (steps.given["added"], steps.given["added"][0].fit)
     assert found.held_out == ("other",)

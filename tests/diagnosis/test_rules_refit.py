@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from factories import amplitude, costing, effect, evaluation, fit, loss, samples, series, shape
+from factories import amplitude, costing, effect, evaluation, fit, loss, measurements, series, shape
 
 from yid_ocp.diagnosis.refit import (
     Refitted,
@@ -23,6 +23,7 @@ from yid_ocp.diagnosis.refit import (
 )
 from yid_ocp.diagnosis.screening import robust
 from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.solvers import Status
 
 # the package's own name `refit` is the function
 module = importlib.import_module("yid_ocp.diagnosis.refit")
@@ -36,21 +37,22 @@ class Problem:
 
     def __init__(self, cost, rows=10, names=("k", "k[run]", "start.q.k[run]", A, S)):
         self.cost, self.rows, self.names, self.nominal = cost, rows, names, ("k",)
-        self.asked = []
+        self.asked, self.warmed = [], []
         self.freed = None
 
     def freeing(self, effects):
         self.freed = tuple(effects)
         return self
 
-    def unknowns(self, values):
+    def vector(self, values):
         return np.array([values.get(name, 1.0) for name in self.names])
 
     def named(self, x):
         return dict(zip(self.names, map(float, x), strict=True))
 
-    def evaluate(self, x, derivatives=True):
+    def evaluate(self, x, derivatives=True, warm=None):
         self.asked.append(self.named(x))
+        self.warmed.append(warm)
         cost = self.cost(self.named(x))
         if cost is None:
             return evaluation([], ok=False, message="it snaps")
@@ -67,11 +69,14 @@ class Memory(dict):
 @pytest.fixture
 def solved(monkeypatch):
     """Solvers that go nowhere, every std one tenth; `runs` are the solvers' starts, `losses` what was judged."""
-    made = SimpleNamespace(runs=[], losses=[])
+    made = SimpleNamespace(runs=[], failed=[], losses=[])
 
     def run(problem, x, callback):
-        made.runs.append(problem.named(x))
-        return SimpleNamespace(x=np.asarray(x), message="done")
+        values = problem.named(x)
+        failed = problem.cost(values) is None
+        (made.failed if failed else made.runs).append(values)
+        status = Status.FAILED if failed else Status.STALLED
+        return SimpleNamespace(x=np.asarray(x), message="done", status=status, warm="there")
 
     def held_out(problem, x):
         made.losses.append(problem.named(x))
@@ -152,6 +157,7 @@ def test_a_half_done_refit_is_tried_again_from_the_nominal_initial_values(solved
     assert solved.losses == [again]
     assert found.std == dict.fromkeys(problem.names, 0.1)
     assert (found.effects, found.message, found.resumed) == ((FRICTION,), "done", False)
+    assert problem.warmed == ["there", (), "there"], "the shape at rest is looked for where it was"
 
 
 @pytest.mark.parametrize(
@@ -187,10 +193,13 @@ def test_a_start_that_cannot_be_rolled_out_is_drawn_back_towards_the_neutral_eff
 def test_a_model_that_cannot_be_rolled_out_at_all_has_no_refit(solved):
     assert refit(Problem(lambda values: None), [FRICTION], START) is None
     assert solved.runs == []
+    assert [run[A] for run in solved.failed] == pytest.approx([0.75, 0.5, 0.35, 0.275, 0.25])
 
 
 def test_a_refit_that_ends_where_nothing_can_be_rolled_out_is_none(solved, monkeypatch):
-    monkeypatch.setattr(module, "SOLVER", SimpleNamespace(run=lambda p, x, _: SimpleNamespace(x=x + 9, message="")))
+    away = SimpleNamespace(message="", status=Status.CONVERGED, warm=None)
+    moving = SimpleNamespace(run=lambda p, x, _: SimpleNamespace(**vars(away), x=x + 9))
+    monkeypatch.setattr(module, "SOLVER", moving)
     assert refit(Problem(lambda values: 5.0 if values["k"] < 9 else None), [FRICTION], START) is None
 
 
@@ -264,6 +273,14 @@ def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
 # -- how sure ---------------------------------------------------------------------------------------------------------
 
 
+def informed(count, scales=None):
+    """A problem whose first rows are data."""
+    return SimpleNamespace(
+        scales=np.ones(1) if scales is None else scales,
+        informing=lambda at: (at.residual[:count], at.jacobian[:count]),
+    )
+
+
 def sandwich(jacobian, residual, parts):
     inverse = np.linalg.inv(jacobian.T @ jacobian)
     return np.sqrt(np.diag(inverse @ robust(jacobian, residual, parts) @ inverse))
@@ -277,7 +294,7 @@ def test_deviations_are_the_larger_of_plain_and_sandwich(monkeypatch, plain, wea
     jacobian = rng.standard_normal((40, 2))
     residual = np.cumsum(rng.standard_normal(40))
     parts = [series(range(40))]
-    problem = SimpleNamespace(weak_prior_rows=weak, scales=np.array([2.0, 30.0]))
+    problem = informed(40, scales=np.array([2.0, 30.0]))
     extra = np.full((weak, 2), 5.0)
     finish = evaluation(np.append(residual, np.full(weak, 9.0)), np.vstack([jacobian, extra]))
     told = []
@@ -296,7 +313,7 @@ def test_deviations_are_the_larger_of_plain_and_sandwich(monkeypatch, plain, wea
 
 def test_a_coloured_residual_is_less_sure_than_its_size_says(monkeypatch):
     residual, jacobian = np.repeat([1.0, -1.0, 1.0, 1.0], 25), np.ones((100, 1))
-    problem = SimpleNamespace(weak_prior_rows=0, scales=np.ones(1))
+    problem = informed(100)
     monkeypatch.setattr(module, "uncertainty", lambda *_: (np.array([[0.01]]), 1.0))
     monkeypatch.setattr(module, "residual_series", lambda _: [series(range(100))])
     assert refit_std(problem, evaluation(residual, jacobian)) > 0.25
@@ -304,7 +321,7 @@ def test_a_coloured_residual_is_less_sure_than_its_size_says(monkeypatch):
 
 def test_without_a_jacobian_or_unknowns_only_the_plain_deviation_is_left(monkeypatch):
     monkeypatch.setattr(module, "uncertainty", lambda *_: (np.diag([4.0, 9.0]), 1.0))
-    problem = SimpleNamespace(weak_prior_rows=0, scales=np.ones(2))
+    problem = informed(3, scales=np.ones(2))
     np.testing.assert_array_equal(refit_std(problem, evaluation([1.0])), [2.0, 3.0])
     monkeypatch.setattr(module, "uncertainty", lambda *_: (np.zeros((0, 0)), 1.0))
     assert refit_std(problem, evaluation([1.0], np.zeros((1, 0)))).shape == (0,)
@@ -313,7 +330,7 @@ def test_without_a_jacobian_or_unknowns_only_the_plain_deviation_is_left(monkeyp
 def test_a_direction_that_nothing_informs_does_not_spoil_the_others(monkeypatch):
     monkeypatch.setattr(module, "uncertainty", lambda *_: (np.zeros((2, 2)), 1.0))
     monkeypatch.setattr(module, "residual_series", lambda _: [series(range(3))])
-    problem = SimpleNamespace(weak_prior_rows=0, scales=np.ones(2))
+    problem = informed(3, scales=np.ones(2))
     jacobian, residual = np.array([[1.0, 1.0], [1.0, 1.0], [0.0, 0.0]]), np.ones(3)
     assert np.all(refit_std(problem, evaluation(residual, jacobian)) < 10)
 
@@ -332,32 +349,29 @@ def episode(name="other", steps=100, time_step=0.01, of=()):
     ids=["short", "forty seconds", "two recordings", "long", "a minute"],
 )
 def test_held_out_time_is_cut_in_some_forty_blocks(seconds, length):
-    problem = SimpleNamespace(held_out=[episode(steps=round(s / 0.01)) for s in seconds])
-    assert block_length(problem) == pytest.approx(length)
+    assert block_length([episode(steps=round(s / 0.01)) for s in seconds]) == pytest.approx(length)
 
 
 def measured(times, value, weight, time_step=0.01):
     t = np.asarray(times) / time_step
     node = np.floor(t + 1e-9).astype(int)
-    value, weight = np.asarray(value, float), np.asarray(weight, float)
-    return samples(["a", "b"], np.ones(value.shape), node=node, fraction=t - node, value=value, weight=weight)
+    return measurements(["a", "b"], node, t - node, value, weight)
 
 
-def predicting(*pairs):
-    """A problem that predicts its held-out episodes so, or says why not."""
+@pytest.fixture
+def predicting(monkeypatch):
+    """predicting(*pairs): a problem that predicts its held-out episodes so, or says why not; and what was told."""
     told = {}
 
     def channel_errors(results, episodes):
         told["episodes"] = [e.name for e in episodes]
         return {"a": {"rmse": np.float64(0.25), "unit": "m", "n": 3}}
 
-    problem = SimpleNamespace(
-        held_out=[e for e, _ in pairs], validate=lambda x: list(pairs), channel_errors=channel_errors
-    )
-    return problem, told
+    monkeypatch.setattr(module, "channel_errors", channel_errors)
+    return lambda *pairs: (SimpleNamespace(held_out=[e for e, _ in pairs], validate=lambda x: list(pairs)), told)
 
 
-def test_a_held_out_loss_sums_whitened_squares_block_by_block():
+def test_a_held_out_loss_sums_whitened_squares_block_by_block(predicting):
     nan = math.nan
     group = measured(
         [0.0, 0.49, 0.5, 0.99, 1.0],
@@ -377,7 +391,7 @@ def test_a_held_out_loss_sums_whitened_squares_block_by_block():
     assert told["episodes"] == ["other"]
 
 
-def test_blocks_without_samples_do_not_count_and_recordings_follow_each_other():
+def test_blocks_without_samples_do_not_count_and_recordings_follow_each_other(predicting):
     first = measured([0.1, 1.2], [[1, 1], [1, 1]], [[1, 1], [1, 1]])
     second = measured([0.6], [[0, 0]], [[1, 1]])
     pairs = [
@@ -391,7 +405,7 @@ def test_blocks_without_samples_do_not_count_and_recordings_follow_each_other():
     assert told["episodes"] == ["one", "two"]
 
 
-def test_a_failed_prediction_is_infinitely_bad_where_it_was_measured():
+def test_a_failed_prediction_is_infinitely_bad_where_it_was_measured(predicting):
     group = measured([0.1, 0.6], [[1, 1], [1, 1]], [[1, 1], [1, 0]])
     good = SimpleNamespace(predicted=(np.ones((2, 2)),))
     problem, told = predicting((episode("one", of=[group]), "it snaps"), (episode("two", of=[group]), good))

@@ -427,7 +427,7 @@ def test_effects_in_the_model_are_free_and_no_candidates(swept):
     np.testing.assert_allclose(found.residual, projected(fitted, swept.residual_at(values)), atol=1e-12)
     plain = swept.column("friction@elbow.a", swept.theta)[:, None]
     np.testing.assert_allclose(found.signatures[0].columns, projected(fitted, plain), atol=1e-12)
-    assert swept.asked == list(names)
+    assert swept.asked == ["k"]
 
 
 def test_weak_priors_are_no_data(swept):
@@ -457,4 +457,5 @@ def test_screening_goes_by_its_thresholds(swept):
     at = linearise(swept, (), {"k": 0.3}, 2)
     assert [v.detectable for v in found.visible] == [v.detectable for v in visibility(at, 1.5)]
     assert found.scores == scores(at, swept.parts, visibility(at, 1.5))
+    assert swept.warmed[:2] == [None, ()]
     np.testing.assert_array_equal(found.alike.matrix, confusability(at, found.scores).matrix)
