@@ -1,0 +1,115 @@
+"""A made-up problem for the tests of what all solvers share: nothing is rolled out for it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from types import SimpleNamespace
+
+import numpy as np
+
+from yid_ocp.model.parameters import Parameter, Parameters
+from yid_ocp.problem.problem import Evaluation, ResidualRows
+from yid_ocp.solvers.base import Iterate, Outcome, Status
+
+
+class MadeUp:
+    """A problem of shared parameters, whose residual and Jacobian are functions of them.
+
+    Parameters
+    ----------
+    rows : callable
+        From x and the horizon [s] to residual and Jacobian, or to None where the rollout fails.
+    start : sequence of float
+    stated, weak : int
+        How many rows at the end are stated and weak priors.
+    count : int, optional
+        Of all rows; needed where the start fails.
+    """
+
+    def __init__(
+        self,
+        rows: Callable[[np.ndarray, float], tuple[np.ndarray, np.ndarray] | None],
+        start: Sequence[float] = (1.0,),
+        *,
+        stated: int = 0,
+        weak: int = 0,
+        noise: float = 1.0,
+        weighting: str = "whitened",
+        lower: float = 0.0,
+        upper: float = np.inf,
+        scales: Sequence[float] | None = None,
+        fixed: Sequence[float] = (),
+        duration: float = 10.0,
+        count: int | None = None,
+    ) -> None:
+        self._rows, self._stated, self._weak, self.noise, self.duration = rows, stated, weak, noise, duration
+        self.start = np.array(start, float)
+        size = len(self.start)
+        self.names = tuple(f"k{i}" for i in range(size))
+        self.shared = self.names
+        self.bounds = np.full(size, lower), np.full(size, upper)
+        self.scales = np.abs(self.start) if scales is None else np.array(scales, float)
+        self.options = SimpleNamespace(weighting=weighting)
+        values = [*self.start, *fixed]
+        entries = [Parameter(f"k{i}", v, "N m/rad", lower, upper, "made up") for i, v in enumerate(values)]
+        self.system = SimpleNamespace(parameters=Parameters(entries[::-1]))
+        self.theta = np.array(values[::-1])
+        self.step = SimpleNamespace(time_step=0.1)
+        grids = (SimpleNamespace(steps=round(duration / 0.2)), SimpleNamespace(steps=round(duration / 0.1)))
+        self.episodes = tuple(SimpleNamespace(grid=grid) for grid in grids)
+        self._count = len(rows(self.start, duration)[0]) if count is None else count
+        self.asked: list[tuple[np.ndarray, bool, object]] = []
+
+    @property
+    def positive(self) -> np.ndarray:
+        return (self.bounds[0] >= 0) & (self.start > 0)
+
+    @property
+    def rows(self) -> ResidualRows:
+        total = self._count
+        data = total - self._stated - self._weak
+        made = ResidualRows.of((), self._stated, self._weak)
+        return ResidualRows(made.measurements, slice(0, data), slice(data, data + self._stated), slice(data, total))
+
+    def informing(self, evaluation: Evaluation) -> tuple[np.ndarray, np.ndarray]:
+        count = len(evaluation.residual) - self._weak
+        unit = np.ones(count)
+        unit[: count - self._stated] = self.noise
+        return evaluation.residual[:count] / unit, evaluation.jacobian[:count] / unit[:, None]
+
+    def split(self, x: np.ndarray, episode: int) -> tuple[np.ndarray, np.ndarray]:
+        theta = self.theta.copy()
+        theta[len(theta) - len(x) :] = x[::-1]
+        return theta, np.zeros(0)
+
+    def evaluate(self, x: np.ndarray, derivatives: bool = True, warm: object = None) -> Evaluation:
+        self.asked.append((np.array(x), derivatives, warm))
+        found = self._rows(np.asarray(x), self.duration)
+        if found is None:
+            return Evaluation(np.inf, np.zeros(0), None, False, "it snaps", ())
+        residual, jacobian = found
+        return Evaluation(0.5 * float(residual @ residual), residual, jacobian if derivatives else None, True, "", ())
+
+    def shortened(self, duration: float) -> MadeUp:
+        lower, upper = self.bounds
+        bounds = {"lower": lower[0], "upper": upper[0]}
+        return MadeUp(self._rows, self.start, **bounds, duration=duration, count=self._count)
+
+
+class Steps:
+    """A solver that goes where it is told, along a path in every run; remembers where it began, over which horizon."""
+
+    name = "made_up"
+
+    def __init__(self, *paths: Sequence[Sequence[float]], status: Status = Status.CONVERGED) -> None:
+        self._paths, self._status = list(paths), status
+        self.runs: list[tuple[list[float], float]] = []
+
+    def run(self, problem: MadeUp, start: np.ndarray, callback: Callable[[Iterate], None] | None) -> Outcome:
+        self.runs.append((start.tolist(), problem.duration))
+        path = self._paths.pop(0) if self._paths else [start]
+        history = tuple(Iterate(i, 1.0, np.array(x, float), 0.0, i + 1, 0.0) for i, x in enumerate(path))
+        for entry in history:
+            if callback is not None:
+                callback(entry)
+        return Outcome(self._status, f"run {len(self.runs)}", np.array(path[-1], float), history, len(path), "warm")

@@ -1,0 +1,378 @@
+"""What all solvers share, rule by rule: verdicts, uncertainty, restarts, horizons."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from made_problems import MadeUp, Steps
+
+from yid_ocp.solvers.base import (
+    Recorder,
+    Solution,
+    Status,
+    estimates,
+    projected_gradient,
+    solve,
+    uncertainty,
+    verdict,
+)
+
+# -- verdicts ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "said"),
+    [
+        (10.0, 0.5, "identifiable"),
+        (10.0, 1.0, "identifiable"),
+        (10.0, 1.01, "weak"),
+        (10.0, 3.0, "weak"),
+        (10.0, 40.0, "weak"),
+        (10.0, 40.1, "not_identifiable"),
+        (-10.0, 0.5, "identifiable"),
+        (-10.0, 3.0, "weak"),
+        (10.0, math.inf, "not_identifiable"),
+        (10.0, math.nan, "not_identifiable"),
+        (0.0, 0.0, "identifiable"),
+        (0.0, 1e-14, "identifiable"),
+        (0.0, 1e-3, "not_identifiable"),
+    ],
+)
+def test_a_verdict_goes_by_the_relative_standard_deviation(value, std, said):
+    assert verdict(value, std) == said
+
+
+# -- uncertainty ------------------------------------------------------------------------------------------------------
+
+
+def linear(matrix, residual=None):
+    """Rows of a linear model about zero."""
+    matrix = np.array(matrix, float)
+    offset = np.zeros(len(matrix)) if residual is None else np.array(residual, float)
+    return lambda x, duration: (offset + matrix @ x, matrix)
+
+
+def judged(problem, at=None):
+    return uncertainty(problem, problem.evaluate(np.zeros(len(problem.start)) if at is None else np.array(at)))
+
+
+def test_the_covariance_is_the_inverse_of_the_information():
+    matrix = np.array([[3.0, 1.0], [0.0, 2.0], [1.0, 1.0], [2.0, -1.0]])
+    covariance, chi2 = judged(MadeUp(linear(matrix, [0.1, 0.2, 0.3, 0.4]), (5.0, 70.0)))
+    np.testing.assert_allclose(covariance, np.linalg.inv(matrix.T @ matrix), rtol=1e-9)
+    assert chi2 == pytest.approx(0.3 / 2)
+
+
+def test_a_misfit_beyond_the_noise_widens_the_covariance():
+    matrix = np.eye(2)[[0, 1, 0, 1]]
+    covariance, chi2 = judged(MadeUp(linear(matrix, [3.0, 4.0, 3.0, 4.0]), (1.0, 1.0)))
+    assert chi2 == pytest.approx(25.0)
+    np.testing.assert_allclose(covariance, 25.0 * np.eye(2) / 2)
+
+
+def test_stated_priors_inform_and_weak_ones_do_not():
+    matrix = np.array([[1.0], [1.0], [2.0], [9.0]])
+    rows = linear(matrix, [1.0, 2.0, 5.0, 7.0])
+    covariance, chi2 = judged(MadeUp(rows, stated=1, weak=1))
+    # two measurements and a prior, which counts as an observation but whose misfit says nothing of the noise
+    assert chi2 == pytest.approx((1.0 + 4.0) / (3 - 1))
+    assert covariance == pytest.approx(2.5 / (1 + 1 + 4))
+    _, without = judged(MadeUp(rows, stated=0, weak=1))
+    assert without == pytest.approx((1.0 + 4.0 + 25.0) / 2)
+
+
+def test_residuals_that_are_not_whitened_count_in_units_of_their_noise():
+    matrix = np.array([[1.0], [2.0], [2.0]])
+    covariance, chi2 = judged(MadeUp(linear(matrix, [0.02, 0.02, 0.5]), stated=1, noise=0.01, weighting="paper"))
+    assert chi2 == pytest.approx((4.0 + 4.0) / 2)
+    assert covariance == pytest.approx(4.0 / (1e4 + 4e4 + 4))
+
+
+@pytest.mark.parametrize(("rows", "degrees"), [(5, 4), (2, 1), (1, 1)])
+def test_degrees_of_freedom_are_at_least_one(rows, degrees):
+    _, chi2 = judged(MadeUp(linear(np.ones((rows, 1)), np.full(rows, 2.0))))
+    assert chi2 == pytest.approx(4.0 * rows / degrees)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "known"),
+    [
+        ([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]], (1.0, 1.0)),
+        ([[1.0, 0.0], [1.0, 0.0], [0.0, 0.0]], (0.5, None)),
+        ([[2.0, 0.0]], (0.25, None)),
+        ([[0.0, 2.0]], (None, 0.25)),
+        (np.zeros((0, 2)), (None, None)),
+    ],
+    ids=["both", "one", "fewer rows than unknowns", "fewer rows, the other one", "no rows"],
+)
+def test_what_the_data_do_not_inform_gets_a_huge_variance_in_units_of_its_size(matrix, known):
+    problem = MadeUp(linear(matrix), (3.0, 50.0))
+    covariance, _ = judged(problem)
+    for i, (variance, size) in enumerate(zip(known, (3.0, 50.0), strict=True)):
+        assert covariance[i, i] == pytest.approx(variance if variance is not None else (1e8 * size) ** 2, rel=1e-9)
+    assert covariance[0, 1] == pytest.approx(0.0, abs=1e-6 * np.sqrt(covariance[0, 0] * covariance[1, 1]))
+
+
+def test_a_direction_between_two_unknowns_is_known_though_neither_is():
+    covariance, _ = judged(MadeUp(linear([[1.0, 1.0]]), (1.0, 1.0)))
+    assert covariance[0, 0] > 1e15
+    assert covariance[0, 1] / covariance[0, 0] == pytest.approx(-1.0)
+
+
+@pytest.mark.parametrize("ok", [True, False])
+def test_without_a_jacobian_nothing_is_known(ok):
+    problem = MadeUp(linear(np.eye(2)) if ok else lambda x, duration: None, (1.0, 1.0), count=2)
+    covariance, chi2 = uncertainty(problem, problem.evaluate(np.zeros(2), derivatives=False))
+    assert covariance.shape == (2, 2)
+    assert np.all(np.isnan(covariance))
+    assert math.isnan(chi2)
+
+
+# -- estimates --------------------------------------------------------------------------------------------------------
+
+
+def test_every_parameter_has_its_estimate_and_fixed_ones_are_said_to_be():
+    problem = MadeUp(linear(np.eye(2)), (4.0, 50.0), fixed=(7.0,), upper=99.0)
+    found = estimates(problem, np.array([5.0, 60.0]), np.diag([0.16, 2500.0]))
+    assert list(found) == ["k2", "k1", "k0"]
+    first, second, fixed = found["k0"], found["k1"], found["k2"]
+    assert (first.value, first.std, first.initial, first.verdict) == (5.0, pytest.approx(0.4), 4.0, "identifiable")
+    assert (second.value, second.std, second.initial, second.verdict) == (60.0, pytest.approx(50.0), 50.0, "weak")
+    assert (fixed.value, fixed.std, fixed.initial, fixed.verdict) == (7.0, 0.0, 7.0, "fixed")
+    assert [entry.free for entry in (first, second, fixed)] == [True, True, False]
+    assert (first.unit, first.lower, first.upper) == ("N m/rad", 0.0, 99.0)
+
+
+@pytest.mark.parametrize(
+    ("value", "initial", "std", "expected"),
+    [
+        (2.0, 1.0, 1.9e6, 1.9e6),
+        (2.0, 1.0, 2.1e6, math.inf),
+        (1.0, 2.0, 1.9e6, 1.9e6),
+        (0.0, 0.0, 0.9e-6, 0.9e-6),
+        (0.0, 0.0, 1.1e-6, math.inf),
+    ],
+)
+def test_a_standard_deviation_of_a_million_times_the_value_is_infinite(value, initial, std, expected):
+    problem = MadeUp(linear([[1.0]]), (initial,))
+    found = estimates(problem, np.array([value]), np.array([[std**2]]))["k0"]
+    assert found.std == pytest.approx(expected)
+    assert (found.verdict == "not_identifiable") or math.isfinite(expected)
+
+
+def test_rounding_below_zero_is_no_variance_and_no_unknowns_need_none():
+    problem = MadeUp(linear([[1.0]]), (1.0,))
+    assert estimates(problem, np.array([1.0]), np.array([[-1e-20]]))["k0"].std == 0.0
+    none = MadeUp(linear(np.zeros((1, 0))), (), fixed=(3.0,))
+    assert estimates(none, np.zeros(0), np.zeros((0, 0)))["k0"].verdict == "fixed"
+
+
+def test_a_solution_has_the_deviations_of_free_parameters():
+    problem = MadeUp(linear(np.eye(2), [-1.0, -2.0]), (4.0, 50.0), fixed=(7.0,))
+    solution = solve(problem, Steps([[1.0, 2.0]]))
+    assert solution.std == {"k1": pytest.approx(1.0), "k0": pytest.approx(1.0)}
+
+
+# -- gradients and histories ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("x", "gradient", "expected"),
+    [
+        ((1.0, 1.0), (3.0, -4.0), 8.0),
+        ((1.0, 1.0), (5.0, -1.0), 5.0),
+        ((0.0, 1.0), (5.0, -1.0), 2.0),
+        ((0.0, 1.0), (-5.0, -1.0), 5.0),
+        ((1.0, 2.0), (1.0, -9.0), 1.0),
+        ((1.0, 2.0), (1.0, 9.0), 18.0),
+        ((0.0, 2.0), (5.0, -9.0), 0.0),
+        ((-0.1, 2.1), (5.0, -9.0), 0.0),
+    ],
+)
+def test_a_gradient_that_pushes_against_a_bound_does_not_count(x, gradient, expected):
+    found = projected_gradient(np.array(x), np.array(gradient), np.zeros(2), np.full(2, 2.0), np.array([1.0, 2.0]))
+    assert found == expected
+
+
+def test_a_recorder_keeps_points_as_they_were_and_tells_them():
+    told = []
+    recorder = Recorder(told.append)
+    x = np.array([1.0])
+    recorder.evaluations = 3
+    recorder.accept(9.0, x, 0.5, "first")
+    x[0] = 2.0
+    recorder.accept(8.0, x, 0.25)
+    first, second = recorder.history
+    assert told == [first, second]
+    assert (first.iteration, first.cost, first.x[0], first.gradient, first.evaluations) == (0, 9.0, 1.0, 0.5, 3)
+    assert (first.note, second.note, second.iteration) == ("first", "", 1)
+    assert 0 <= first.seconds <= second.seconds < 5
+    Recorder(None).accept(1.0, x, 0.0)
+
+
+# -- restarts ---------------------------------------------------------------------------------------------------------
+
+
+def misfit(cost_at):
+    """Rows whose chi2 per degree of freedom at x is that of a function of x; ten of them, one unknown."""
+
+    def rows(x, duration):
+        chi2 = cost_at(float(x[0]))
+        return None if chi2 is None else (np.full(10, math.sqrt(0.9 * chi2)), np.full((10, 1), 1.0))
+
+    return rows
+
+
+def test_a_good_fit_is_not_started_again():
+    solver = Steps([[1.0], [2.0]])
+    solution = solve(MadeUp(misfit(lambda x: 4.9)), solver)
+    assert solver.runs == [([1.0], 10.0)]
+    assert solution.message == "run 1"
+    assert (solution.status, solution.method, solution.iterations, solution.evaluations) == (
+        Status.CONVERGED,
+        "made_up",
+        1,
+        2,
+    )
+    assert solution.chi2_per_dof == pytest.approx(4.9)
+    assert solution.cost == pytest.approx(0.5 * 9 * 4.9)
+
+
+def test_a_poor_fit_is_started_again_from_multiples_of_the_start_and_the_best_is_kept():
+    at = {1.0: 9.0, 4.0: 7.0, 2.0: 6.0, 10.0: 8.0}
+    solver, told = Steps(), []
+    solution = solve(MadeUp(misfit(at.__getitem__)), solver, callback=told.append)
+    assert [start for start, _ in solver.runs] == [[1.0], [4.0], [2.0], [10.0]]
+    assert solution.x.tolist() == [2.0]
+    assert solution.message == "run 3 (best of 4 starts)"
+    assert [entry.note for entry in solution.history] == ["", "start x 4", "start x 2", "start x 10"]
+    assert (solution.evaluations, solution.iterations) == (4, 3)
+    assert len(told) == 4
+
+
+def test_starting_again_ends_with_the_first_good_fit():
+    at = {1.0: 9.0, 4.0: 4.0}
+    solver = Steps()
+    assert solve(MadeUp(misfit(at.__getitem__)), solver).message == "run 2 (best of 2 starts)"
+    assert [start for start, _ in solver.runs] == [[1.0], [4.0]]
+    same = dict.fromkeys((1.0, 4.0, 2.0, 10.0), 5.5)
+    kept = solve(MadeUp(misfit(same.__getitem__)), Steps())
+    assert (kept.x.tolist(), kept.message) == ([1.0], "run 1 (best of 4 starts)")
+
+
+def test_a_failed_fit_is_started_again_and_loses():
+    at = {1.0: None, 4.0: 3.0}
+    solver = Steps()
+    solver.needs_rollout = False
+    solution = solve(MadeUp(misfit(at.get), count=10), solver)
+    assert solution.x.tolist() == [4.0]
+    assert solution.evaluation is not None
+
+
+def test_new_starts_stay_within_bounds_and_move_positive_unknowns_only():
+    problem = MadeUp(misfit(lambda x: 9.0), (1.0,), upper=3.0)
+    solver = Steps()
+    solve(problem, solver)
+    assert [start for start, _ in solver.runs] == [[1.0], [3.0], [2.0], [3.0]]
+    either = MadeUp(misfit(lambda x: 9.0), (1.0,), lower=-5.0)
+    solver = Steps()
+    solve(either, solver)
+    assert [start for start, _ in solver.runs] == [[1.0]] * 4
+    given = Steps()
+    solve(problem, given, [0.5])
+    assert [start for start, _ in given.runs] == [[0.5], [2.0], [1.0], [3.0]]
+    beyond = Steps()
+    solve(MadeUp(misfit(lambda x: 1.0), upper=3.0), beyond, [7.0])
+    assert beyond.runs[0][0] == [3.0]
+
+
+def test_the_papers_cost_says_nothing_of_noise_and_is_not_started_again():
+    solver = Steps()
+    assert solve(MadeUp(misfit(lambda x: 99.0), weighting="paper", noise=1.0), solver).message == "run 1"
+    assert len(solver.runs) == 1
+
+
+def test_a_fit_that_cannot_be_evaluated_has_failed():
+    at = {1.0: 2.0}
+    problem = MadeUp(misfit(at.get))
+    solution = solve(problem, Steps([[9.0]], [[9.0]], [[9.0]], [[9.0]]))
+    assert (solution.status, solution.message, solution.evaluation) == (Status.FAILED, "it snaps", None)
+    assert solution.cost == math.inf
+    assert math.isnan(solution.chi2_per_dof)
+    paper = MadeUp(misfit({1.0: 2.0, 4.0: 2.0}.get), weighting="paper")
+    solver = Steps([[9.0]])
+    assert solve(paper, solver).status == Status.CONVERGED
+    assert len(solver.runs) == 2, "the paper's cost is started again as well where it failed"
+
+
+def test_the_end_is_evaluated_where_the_solver_found_its_equilibria():
+    problem = MadeUp(misfit(lambda x: 1.0))
+    solve(problem, Steps([[2.0]]))
+    x, derivatives, warm = problem.asked[-1]
+    assert (x.tolist(), derivatives, warm) == ([2.0], True, "warm")
+
+
+# -- shorter horizons -------------------------------------------------------------------------------------------------
+
+
+def reaching(limit):
+    """Rows that can be worked out up to so many seconds for a value; the longest recording has ten."""
+
+    def rows(x, duration):
+        if duration > limit(float(x[0])) + 1e-9:
+            return None
+        return np.full(10, 0.1), np.ones((10, 1))
+
+    return rows
+
+
+def test_a_start_that_can_be_rolled_out_needs_no_shorter_horizon():
+    solver = Steps([[1.0], [2.0]])
+    solution = solve(MadeUp(reaching(lambda x: 10.0)), solver)
+    assert solver.runs == [([1.0], 10.0)]
+    assert [entry.note for entry in solution.history] == ["", ""]
+
+
+def test_a_start_that_fails_is_approached_over_longer_and_longer_horizons():
+    # every run takes the value further, by which the rollout holds longer
+    limits = {1.0: 1.3, 2.0: 1.3, 3.0: 4.9, 4.0: 6.0, 5.0: 10.0}
+    solver = Steps([[1.5], [2.0]], [[3.0]], [[4.0]], [[5.0]], [[5.0]])
+    told = []
+    problem = MadeUp(reaching(lambda x: limits.get(x, 0.0)), count=10)
+    solution = solve(problem, solver, callback=told.append)
+    assert [(start, pytest.approx(duration)) for start, duration in solver.runs] == [
+        ([1.0], 0.6),
+        ([2.0], 1.2),
+        ([3.0], 2.5),
+        ([4.0], 5.0),
+        ([5.0], 10.0),
+    ]
+    assert [entry.note for entry in solution.history] == [
+        "first 0.6 s",
+        "first 0.6 s",
+        "first 1.2 s",
+        "first 2.5 s",
+        "first 5 s",
+        "",
+    ]
+    assert (solution.evaluations, len(told)) == (6, 6)
+
+
+def test_horizons_that_fail_are_skipped_and_the_rest_is_left_out_once_the_whole_holds():
+    limits = {1.0: 1.0, 2.0: 10.0}
+    solver = Steps([[2.0]], [[2.0]])
+    solve(MadeUp(reaching(lambda x: limits.get(x, 10.0)), count=10), solver)
+    assert [(start, pytest.approx(duration)) for start, duration in solver.runs] == [([1.0], 0.6), ([2.0], 10.0)]
+
+
+@pytest.mark.parametrize("needs", [True, False])
+def test_a_solver_that_needs_no_rollout_is_not_given_shorter_horizons(needs):
+    solver = Steps([[1.0]], [[1.0]], [[1.0]], [[1.0]], [[1.0]])
+    solver.needs_rollout = needs
+    solution = solve(MadeUp(reaching(lambda x: 0.7), weighting="paper", count=10), solver)
+    whole = [duration for _, duration in solver.runs if duration == 10.0]
+    assert len(whole) == 4
+    assert (len(solver.runs) > 4) is needs
+    assert isinstance(solution, Solution)
