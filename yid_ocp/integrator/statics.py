@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -108,6 +109,7 @@ class Statics:
         self._residual = ca.Function("rest", inputs, [residual, ca.jacobian(residual, w)])
         self._outcome = ca.Function("outcome", inputs, [state, u, potential, give])
         self._symbols = (inputs, residual, state)
+        self._lock = threading.Lock()
         self._derivatives: dict[tuple[str, ...], ca.Function] = {}
 
     def solve(
@@ -195,12 +197,14 @@ class Statics:
         return starts
 
     def _differentiate(self, w: Array, arguments: list, names: tuple[str, ...]) -> tuple[Array, Array]:
-        if names not in self._derivatives:
-            inputs, residual, state = self._symbols
-            other = ca.vertcat(*(self.step.system.parameters[name].symbol for name in names), inputs[1])
-            outputs = [ca.jacobian(f, x) for f in (residual, state) for x in (inputs[0], other)]
-            self._derivatives[names] = ca.Function("by", inputs, outputs)
-        r_w, r_o, s_w, s_o = (np.array(ca.densify(x)) for x in self._derivatives[names](w, *arguments))
+        with self._lock:
+            if names not in self._derivatives:
+                inputs, residual, state = self._symbols
+                other = ca.vertcat(*(self.step.system.parameters[name].symbol for name in names), inputs[1])
+                outputs = [ca.jacobian(f, x) for f in (residual, state) for x in (inputs[0], other)]
+                self._derivatives[names] = ca.Function("by", inputs, outputs)
+            function = self._derivatives[names]
+        r_w, r_o, s_w, s_o = (np.array(ca.densify(x)) for x in function(w, *arguments))
         change = -np.linalg.lstsq(r_w, r_o, rcond=None)[0] if len(w) else np.zeros((0, r_o.shape[1]))
         total = s_w @ change + s_o
         return total[:, : len(names)], total[:, len(names) :]
