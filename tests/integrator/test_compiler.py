@@ -75,6 +75,29 @@ def test_the_second_compilation_reads_the_cache(cache, runs):
 
 
 @needs_compiler
+@pytest.mark.parametrize("change", ["compiler", "processor", "flags", "level", "casadi"])
+def test_what_a_library_was_made_with_is_part_of_its_key(cache, tmp_path, monkeypatch, change):
+    """A cache that moves to another machine, or meets another compiler, is not trusted."""
+    compiler.compile_library(SOURCE % 42)
+    if change == "compiler":
+        other = tmp_path / "other_cc"
+        other.write_text(f'#!/bin/sh\n[ "$1" = --version ] && echo other && exit\nexec {compiler.compiler()} "$@"\n')
+        other.chmod(0o755)
+        monkeypatch.setenv("CC", str(other))
+        compiler.compiler.cache_clear()
+    elif change == "processor":
+        monkeypatch.setattr(compiler.platform, "machine", lambda: "another")
+        monkeypatch.setattr(compiler.platform, "processor", lambda: "another")
+    elif change == "flags":
+        monkeypatch.setattr(compiler, "FLAGS", (*compiler.FLAGS, "-g"))
+    elif change == "casadi":
+        monkeypatch.setattr(compiler.ca.CasadiMeta, "version", lambda: "another")
+    compiler._machine.cache_clear()
+    assert compiler.compile_library(SOURCE % 42, straight_line=change == "level").yid_answer() == 42
+    assert len(list(cache.iterdir())) == 2
+
+
+@needs_compiler
 def test_a_step_compiled_again_runs_no_compiler(cache, runs, pendulum):
     theta = pendulum.parameters.vector()
     arguments = ([0.3, 0.1], [0.0, 0.0], [], theta)
