@@ -66,11 +66,11 @@ def test_rollouts_adjoints_and_linearizations(parts, urdf_folder, monkeypatch, u
 
     def everything(step):
         def run(theta):
-            swept = step.kernel.rollout(theta, case.start, case.torque, case.path, case.feedback, directions)
-            assert swept.status.ok, swept.status.message
-            back = step.kernel.adjoint(theta, swept, case.feedback, names, np.ones_like(swept.state), None, None)
-            along = step.kernel.linearize(theta, swept.state, swept.multipliers, swept.torque, names, True)
-            found = (swept.state, swept.multipliers, swept.effort, swept.by_state, swept.by_multipliers)
+            rollout = step.kernel.rollout(theta, case.start, case.torque, case.path, case.feedback, directions)
+            assert rollout.status.ok, rollout.status.message
+            back = step.kernel.adjoint(theta, rollout, case.feedback, names, np.ones_like(rollout.state), None, None)
+            along = step.kernel.linearize(theta, rollout.state, rollout.multipliers, rollout.torque, names, True)
+            found = (rollout.state, rollout.multipliers, rollout.effort, rollout.by_state, rollout.by_multipliers)
             return *found, *vars(back).values(), *vars(along).values()
 
         return run

@@ -57,10 +57,7 @@ class Rest:
 # encoder noise stretches the object by a hair beyond its reach. With a measured torque the spring is as soft as the
 # ratio of torque error to encoder error; without one it is stiff enough to give less than an encoder's noise.
 HOLD_STIFFNESS = 1e5
-
-
 HOLD_STIFFNESS_WITH_TORQUE = 1e3
-
 
 # A holding spring that gives by more than this means that the posture does not fit the grasp [rad].
 HOLD_LIMIT = 0.02
