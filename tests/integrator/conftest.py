@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
@@ -9,6 +10,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from yid_ocp.errors import ResourceError
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.integrator.step_model import Feedback
 from yid_ocp.model import (
@@ -314,3 +316,53 @@ def parts():
         tip = staticmethod(tip)
 
     return Parts
+
+
+# An allocator that gives out `yid_grants` pieces of memory and then none, and counts those that were not given back.
+POOR = """
+#include <stdlib.h>
+long yid_grants = 0, yid_held = 0;
+static void *poor_allocate(size_t count, size_t size) {
+    if (yid_grants <= 0) return NULL;
+    yid_grants--;
+    yid_held++;
+    return calloc(count, size);
+}
+static void poor_free(void *memory) {
+    if (memory) yid_held--;
+    free(memory);
+}
+#define YID_ALLOCATE poor_allocate
+#define YID_FREE poor_free
+"""
+
+
+class Poor:
+    """That allocator, in the library that is watched."""
+
+    source = POOR
+
+    def watch(self, library):
+        self.grants, self.held = (ctypes.c_long.in_dll(library, name) for name in ("yid_grants", "yid_held"))
+
+    def grants_needed(self, action) -> int:
+        """How many pieces an action asks for; every smaller number must end in an error and leave nothing behind."""
+        messages = []
+        for grants in range(20):
+            self.grants.value = grants
+            try:
+                action()
+            except ResourceError as error:
+                messages.append(str(error))
+            else:
+                assert all("not enough memory for" in m and " MB" in m and "fewer parameters" in m for m in messages)
+                return grants
+            finally:
+                assert self.held.value == 0
+        raise AssertionError("never enough")
+
+
+@pytest.fixture
+def poor() -> Poor:
+    """An allocator that runs out of memory."""
+    return Poor()

@@ -222,7 +222,7 @@ class CompiledKernel:
         along = [_doubles(a) for a in (state, multipliers, None, torque)]
         matrices = [getattr(out, name) if derivatives else None for name in MATRICES]
         outcome = _Outcome()
-        directions = self._directions(names, len(names))
+        directions = self._directions(names, len(names)) if derivatives else None
         code = self._library.yid_linearize(
             ctypes.byref(self._motion(len(torque), theta, None, None, None, directions)),
             ctypes.byref(_filled(_Trajectory, *along)),

@@ -122,10 +122,9 @@ class InterpretedKernel:
         wanted: Directions | None,
     ) -> Rollout:
         """See `Kernel.rollout`."""
-        n, lam = self._model.sizes["n"], np.zeros(self._model.sizes["m"])
-        value, slope, slopes = self._evaluators()
+        (value, slope, slopes), n, lam = self._evaluators(), self._model.sizes["n"], np.zeros(self._model.sizes["m"])
         out = empty_rollout(self._model.sizes, len(torque), None if wanted is None else wanted.count)
-        state, by = out.state, [vars(out)[f"by_{name}"] for name in ("state", "multipliers", "effort")]
+        state, by = out.state, [getattr(out, f"by_{name}") for name in ("state", "multipliers", "effort")]
         state[0] = start
         if wanted is not None:
             by[0][0] = wanted.start
@@ -173,10 +172,11 @@ class InterpretedKernel:
         if wanted.path is not None:
             moved[self._fixed] = wanted.path[k + 1]
         change = slopes @ moved
-        factors = _factorised(slopes[np.ix_(self._residual, self._unknown)])
-        if factors is None:
+        try:
+            solution = np.linalg.solve(slopes[np.ix_(self._residual, self._unknown)], change[self._residual])
+        except np.linalg.LinAlgError:
             return None
-        moved[self._unknown] = -_solved(factors, change[self._residual])
+        moved[self._unknown] = -solution
         change += slopes[:, self._unknown] @ moved[self._unknown]
         after = np.concatenate([moved[at["q1"]], change[self._p1], moved[at["z1"]]])
         return after, moved[at["lam"]], change[self._effort]
@@ -206,10 +206,11 @@ class InterpretedKernel:
             by_point[at["q1"]] += costate[:n]
             by_point[at["z1"]] += costate[2 * n :]
             by_point[at["lam"]] += 0.0 if by_multipliers is None else by_multipliers[k]
-            factors = _factorised(jacobian[np.ix_(self._residual, self._unknown)].T)
-            if factors is None:
+            square = jacobian[np.ix_(self._residual, self._unknown)]
+            try:
+                by_point -= jacobian[self._residual].T @ np.linalg.solve(square.T, by_point[self._unknown])
+            except np.linalg.LinAlgError:
                 return Gradient(*(np.full_like(a, np.nan) for a in (by_theta, costate, by_torque, by_path)))
-            by_point -= jacobian[self._residual].T @ _solved(factors, by_point[self._unknown])
             by_theta += by_point[self._columns(names)]
             by_torque[k], by_path[k + 1] = by_point[at["u"]], by_point[self._fixed]
             costate = np.concatenate([by_point[at[name]] for name in ("q0", "p0", "z0")]) + by_state[k]
@@ -219,13 +220,7 @@ class InterpretedKernel:
         return Gradient(by_theta, costate, by_torque, by_path)
 
     def linearize(
-        self,
-        theta: Array,
-        state: Array,
-        multipliers: Array,
-        torque: Array,
-        names: tuple[str, ...],
-        derivatives: bool,
+        self, theta: Array, state: Array, multipliers: Array, torque: Array, names: tuple[str, ...], derivatives: bool
     ) -> StepLinearization:
         """See `Kernel.linearize`."""
         (value, _, slopes), at = self._evaluators(), self._at
@@ -239,8 +234,8 @@ class InterpretedKernel:
             if derivatives:
                 jacobian = slopes(point)
                 for key, index in columns.items():
-                    vars(out)[f"rows_{key}"][k] = jacobian[: self._rows, index]
-                    vars(out)[f"p1_{key}"][k] = jacobian[self._p1, index]
+                    getattr(out, f"rows_{key}")[k] = jacobian[: self._rows, index]
+                    getattr(out, f"p1_{key}")[k] = jacobian[self._p1, index]
         return out
 
 

@@ -342,8 +342,9 @@ def _arrays(what: str, shapes: Mapping[str, tuple[int, ...]], value: float) -> d
 
 def out_of_memory(what: str, size: int) -> ResourceError:
     """The error for something that needs `size` bytes."""
+    amount = f"{size / 1e9:.3g} GB" if size >= 1e9 else f"{size / 1e6:.3g} MB"
     return ResourceError(
-        f"{MESSAGES[StepCode.OUT_OF_MEMORY]} for {what}: it takes {size / 1e6:.3g} MB",
+        f"{MESSAGES[StepCode.OUT_OF_MEMORY]} for {what}: it takes {amount}",
         hint="estimate fewer parameters at once, use a shorter part of the recording, or close other programs",
     )
 
