@@ -162,7 +162,7 @@ def run(name: str, seeds: Sequence[int]) -> dict[str, str]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description="Diagnose withheld effects in data from MuJoCo.")
+    parser = argparse.ArgumentParser(description="Diagnose injected effects in data from MuJoCo.")
     parser.add_argument("cases", nargs="*", default=list(CASES), help=", ".join(CASES))
     parser.add_argument("--seeds", nargs=2, type=int, default=(1, 7), help="of the two motions")
     parser.add_argument("--json", type=Path, metavar="FILE", help="store the table")

@@ -44,6 +44,34 @@ def test_points_are_brought_back_to_where_they_may_be() -> None:
     assert fit.x == pytest.approx([1.0])
 
 
+def test_it_ends_when_steps_or_gains_are_small() -> None:
+    """On x^2 = 2 steps fall as 0.5, 0.083, 0.0025 and costs as 1, 0.0625, 5e-5."""
+
+    def square(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return x**2 - 2, np.diag(2 * x)
+
+    def ended(step_tolerance: float, cost_tolerance: float) -> tuple[int, bool]:
+        tolerances = {"step_tolerance": step_tolerance, "cost_tolerance": cost_tolerance}
+        fit = levenberg_marquardt(square, np.ones(1), iterations=50, **tolerances)
+        return fit.iterations, fit.converged
+
+    assert ended(0.1, 0.0) == (2, True)
+    assert ended(0.0, 0.99) == (1, True)
+    assert ended(0.01, 0.0) == (3, True)
+
+
+def test_it_ends_where_no_step_helps() -> None:
+    """The slope has the wrong sign, so every step is refused and damped more."""
+
+    def wrong(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.array([1.0 + x[0]]), np.array([[-1.0]])
+
+    gives_up = levenberg_marquardt(wrong, np.zeros(1), step_tolerance=0.0)
+    assert (gives_up.iterations, gives_up.converged) == (12, False)
+    tolerant = levenberg_marquardt(wrong, np.zeros(1), step_tolerance=0.2)
+    assert (tolerant.iterations, tolerant.converged) == (5, True)
+
+
 def test_a_start_at_the_minimum_stays_there() -> None:
     fit = levenberg_marquardt(lambda x: (x, np.eye(2)), np.zeros(2))
     assert fit.converged

@@ -261,7 +261,7 @@ def test_a_task_that_ends_its_process_takes_no_other_with_it(tmp_path, caplog):
 
 
 SLEEPERS = """
-import sys, time
+import signal, sys, time
 from pathlib import Path
 from yid_ocp.parallel import Task, run_tasks
 
@@ -271,6 +271,7 @@ def sleeping(seconds, mark):
     return seconds
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have had it ignored
     folder = Path(sys.argv[1])
     tasks = [Task(str(s), {"seconds": s, "mark": str(folder / str(i))}) for i, s in enumerate((0.0, 60.0, 60.0))]
     try:

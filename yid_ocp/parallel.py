@@ -60,7 +60,8 @@ def map_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> li
 
 # CasADi marks the nodes of expressions while it differentiates them: two threads at once on expressions that share
 # symbols give wrong derivatives. Evaluating finished functions is safe.
-_SYMBOLIC = threading.RLock()
+SYMBOLIC = threading.RLock()
+"""Held by whoever builds or differentiates expressions that others may hold too."""
 
 
 class Once(Generic[Key, Value]):
@@ -81,7 +82,7 @@ class Once(Generic[Key, Value]):
     def __call__(self, key: Key) -> Value:
         """The value for a key."""
         if key not in self._known:
-            with _SYMBOLIC:
+            with SYMBOLIC:
                 if key not in self._known:
                     self._known[key] = self._make(key)
         return self._known[key]

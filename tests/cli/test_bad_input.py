@@ -66,7 +66,7 @@ def test_configuration(cli, pendulum, left_nothing, old, new, words):
     line = edited(pendulum, old, new)
     done = cli("solve", pendulum)
     assert_refused(done, *words)
-    if "YAML" not in words[0] and "twice" not in words[0]:
+    if "YAML" not in words[0] and "duplicated" not in words[0]:
         assert f"pendulum.yaml, line {line}" in done.err
     left_nothing()
 

@@ -78,7 +78,8 @@ def test_an_interruption_leaves_nothing(cli, pendulum, left_nothing, monkeypatch
 @pytest.mark.skipif(os.name != "posix", reason="signals as on POSIX")
 def test_a_real_interruption(pendulum, tmp_path):
     code = (
-        "import sys, time, yid_ocp.workflow.solve as s\n"
+        "import signal, sys, time, yid_ocp.workflow.solve as s\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a shell may have had it ignored
         "def wait(*a, **k):\n"
         "    print('SOLVING', flush=True)\n"
         "    time.sleep(60)\n"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
@@ -15,7 +16,8 @@ from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Grasp, Mechanism, Segment, System, flexible_object, forward_kinematics
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement
 from yid_ocp.model.rotations import roll_pitch_yaw, transform
-from yid_ocp.sensors import AngleSensor, EffortSensor, PointSensor, sensor_function
+from yid_ocp.model.system import NodeState
+from yid_ocp.sensors import EffortSensor, PointSensor, sensor_function
 
 LENGTH, MASS, RADIUS, KAPPA = 0.5, 0.2, 0.02, 3.0
 INERTIA = MASS * (LENGTH**2 / 3 + RADIUS**2 / 4)
@@ -350,6 +352,21 @@ def read(system: System, effects, sensor, q=None, effort=None) -> np.ndarray:
     return np.array(function(*at, whole.parameters.vector())[0]).ravel()
 
 
+@dataclass(frozen=True)
+class Encoder:
+    """Measured angle of the hinge, which the library's effects change as well."""
+
+    group: str = "joints.position"
+    channels: tuple[str, ...] = ("joints.position.left_a",)
+    unit: str = "rad"
+    width: int = 1
+    frames: tuple[str, ...] = ()
+    camera: Placement | None = None
+
+    def output(self, state: NodeState) -> ca.SX:
+        return state.q
+
+
 @pytest.mark.parametrize(
     ("kind", "values", "angle", "torque"),
     [
@@ -363,7 +380,7 @@ def read(system: System, effects, sensor, q=None, effort=None) -> np.ndarray:
 def test_joint_readings_and_the_way_back(kind, values, angle, torque) -> None:
     system = hinge()
     effect = make_effect(kind, "left_a", system, values)
-    seen = [read(system, [effect], s(("left_a",)), [0.5], [3.0])[0] for s in (AngleSensor, EffortSensor)]
+    seen = [read(system, [effect], sensor, [0.5], [3.0])[0] for sensor in (Encoder(), EffortSensor(("left_a",)))]
     assert seen == pytest.approx([angle, torque])
     back = [
         effect.correct(f"joints.{quantity}.left_a", ca.SX(reading), ca.SX(3.0))

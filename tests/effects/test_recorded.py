@@ -10,8 +10,7 @@ from yid_ocp.effects import make_effect
 from yid_ocp.errors import DataError, SolverError
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.grid import Grid
-from yid_ocp.problem.inputs import held_torque, held_torque_slope, sensors_present
+from yid_ocp.problem.inputs import sensors_present
 from yid_ocp.sensors import camera_pose, sensor_function
 from yid_ocp.solvers.transcription import Transcription
 
@@ -125,20 +124,6 @@ def test_a_delay_at_a_sample_has_the_mean_slope_of_both_sides(driven, prescribed
         # a sample that would be looked for before the recording stays at its start
         numeric = (above - below) / 2e-5
         assert np.max(np.abs(exact - numeric)) <= 1e-3 * np.max(np.abs(exact))
-
-
-def test_torque_acts_late() -> None:
-    t = H * np.arange(6)
-    effort = np.array([[1.0, 2.0, 4.0, 8.0, 16.0, 32.0], [0.0, 1.0, 0.0, 1.0, 0.0, 1.0]]).T
-    joints = JointGroup(("a", "b"), t, np.zeros((6, 2)), effort=effort)
-    grid = Grid(0.0, H, 5)
-    prompt = held_torque(joints, ("a", "b"), grid, "made")
-    late = held_torque(joints, ("a", "b"), grid, "made", np.array([H, 0.25 * H]))
-    assert late[:, 0] == pytest.approx([1.0, 1, 2, 4, 8])
-    assert late[1:, 1] == pytest.approx(0.75 * prompt[1:, 1] + 0.25 * prompt[:-1, 1])
-    slope = held_torque_slope(joints, ("a", "b"), grid, "made", np.array([0.0, 0.25 * H]))
-    assert slope[:, 0] == pytest.approx(-np.array([0.5, 1.5, 3.0, 6.0, 12.0]) / H)
-    assert slope[1:, 1] == pytest.approx(-np.diff(prompt[:, 1]) / H)
 
 
 def test_a_late_camera_sees_the_past(driven, sensors) -> None:

@@ -1,4 +1,4 @@
-"""Compiled code: the private cache, the compiler's absence, index tables."""
+"""Compiled code: the private cache, its keys, the compiler's absence."""
 
 from __future__ import annotations
 
@@ -71,6 +71,29 @@ def test_the_second_compilation_reads_the_cache(cache, runs):
     assert compiler.compile_library(SOURCE % 42).yid_answer() == 42
     assert runs == []
     assert compiler.compile_library(SOURCE % 43).yid_answer() == 43
+    assert len(list(cache.iterdir())) == 2
+
+
+@needs_compiler
+@pytest.mark.parametrize("change", ["compiler", "processor", "flags", "level", "casadi"])
+def test_what_a_library_was_made_with_is_part_of_its_key(cache, tmp_path, monkeypatch, change):
+    """A cache that moves to another machine, or meets another compiler, is not trusted."""
+    compiler.compile_library(SOURCE % 42)
+    if change == "compiler":
+        other = tmp_path / "other_cc"
+        other.write_text(f'#!/bin/sh\n[ "$1" = --version ] && echo other && exit\nexec {compiler.compiler()} "$@"\n')
+        other.chmod(0o755)
+        monkeypatch.setenv("CC", str(other))
+        compiler.compiler.cache_clear()
+    elif change == "processor":
+        monkeypatch.setattr(compiler.platform, "machine", lambda: "another")
+        monkeypatch.setattr(compiler.platform, "processor", lambda: "another")
+    elif change == "flags":
+        monkeypatch.setattr(compiler, "FLAGS", (*compiler.FLAGS, "-g"))
+    elif change == "casadi":
+        monkeypatch.setattr(compiler.ca.CasadiMeta, "version", lambda: "another")
+    compiler._machine.cache_clear()
+    assert compiler.compile_library(SOURCE % 42, straight_line=change == "level").yid_answer() == 42
     assert len(list(cache.iterdir())) == 2
 
 
@@ -153,18 +176,3 @@ def test_a_damaged_library_leaves_the_interpreter(cache, monkeypatch, caplog, pe
         step = compile_step(pendulum, 0.01)
     assert not step.compiled
     assert "cannot be loaded" in caplog.text
-
-
-def test_elimination_fills_no_more_than_the_tree(single_step):
-    """Tips before roots and multipliers last: a pivot touches its ancestors, and the multipliers of grasps below it."""
-    tables, system = single_step.model.structure, single_step.system
-    size = len(tables.order)
-    names = [*system.mechanism.joint_names, *[f"lam{i}" for i in range(system.constraint_count)]]
-    ordered = [names[i] for i in tables.unknown_row[tables.order]]
-    assert ordered[0] == "T3_3_z"
-    assert ordered[-3:] == ["lam0", "lam1", "lam2"]
-    tip = [ordered[i] for i in tables.fill[0]]
-    tree = system.mechanism
-    chain = [tree.joint_names[i] for i in tree.ancestors(tree.joint_index("T3_3_z"))]
-    assert tip == chain[-2::-1]
-    assert sum(len(entries) for entries in tables.fill) < 0.75 * size * (size - 1) / 2

@@ -1,4 +1,4 @@
-"""Derivatives of steps and rollouts: forward and adjoint sweeps, finite differences; interpreter and compiled code."""
+"""Derivatives of steps and rollouts: forward, adjoint, finite differences; interpreter and compiled code."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ def sizes_of(theta):
 
 
 def after_one(case, theta=None, start=None, torque=None, path=None):
-    swept = case.rollout(theta, start, case.torque[:1] if torque is None else torque[None, :], case.path[:2])
-    assert swept.status.ok, swept.status.message
-    return swept.state[1]
+    rollout = case.rollout(theta, start, case.torque[:1] if torque is None else torque[None, :], case.path[:2])
+    assert rollout.status.ok, rollout.status.message
+    return rollout.state[1]
 
 
 def test_step_jacobians_against_differences(case):
@@ -90,8 +90,8 @@ def random_cost(case, seed=11):
         state=rng.normal(size=(steps + 1, s["nx"])),
         multipliers=0.1 * rng.normal(size=(steps, s["m"])),
         effort=0.01 * rng.normal(size=(steps, s["nc"])),
-        value=lambda weights, swept: sum(
-            np.sum(getattr(weights, name) * getattr(swept, name)) for name in ("state", "multipliers", "effort")
+        value=lambda weights, rollout: sum(
+            np.sum(getattr(weights, name) * getattr(rollout, name)) for name in ("state", "multipliers", "effort")
         ),
     )
 
@@ -106,10 +106,10 @@ def test_forward_equals_adjoint_equals_differences(case, fed_back):
     weights = random_cost(case)
     rng = np.random.default_rng(12)
 
-    swept = case.rollout(feedback=feedback)
-    assert swept.status.ok, swept.status.message
+    rollout = case.rollout(feedback=feedback)
+    assert rollout.status.ok, rollout.status.message
     gradient = case.step.kernel.adjoint(
-        theta, swept, feedback, names, weights.state, weights.multipliers, weights.effort
+        theta, rollout, feedback, names, weights.state, weights.multipliers, weights.effort
     )
 
     # columns: all of theta, then two of everything else at once
@@ -127,7 +127,7 @@ def test_forward_equals_adjoint_equals_differences(case, fed_back):
         + np.tensordot(weights.effort, forward.by_effort, 2)
     )
 
-    np.testing.assert_allclose(forward.state, swept.state, rtol=0, atol=1e-9 * scale_of(swept.state))
+    np.testing.assert_allclose(forward.state, rollout.state, rtol=0, atol=1e-9 * scale_of(rollout.state))
     scale = np.max(np.abs(slopes))
     np.testing.assert_allclose(slopes[:-2], gradient.by_theta, rtol=1e-8, atol=1e-9 * scale)
     expected = np.sum(gradient.by_start * start[:, -2]) + np.sum(gradient.by_torque * torque[..., -2])
@@ -190,33 +190,33 @@ def scale_of(array):
     return max(1.0, np.max(np.abs(array), initial=0.0))
 
 
-def test_a_sweep_is_its_steps(case):
+def test_a_rollout_is_its_steps(case):
     n, s = case.step.system.size, case.step.sizes
-    swept = case.rollout()
+    rollout = case.rollout()
     for k, u in enumerate(case.torque):
-        x = swept.state[k]
+        x = rollout.state[k]
         pair = (case.path[k], case.path[k + 1]) if s["nc"] else None
         q1, p1, lam, status = case.step(x[:n], x[n : 2 * n], u, case.theta, pair, x[2 * n :])
         assert status.ok, status.message
         after = np.concatenate([q1, p1, status.internal])
-        np.testing.assert_allclose(after, swept.state[k + 1], rtol=0, atol=1e-9 * scale_of(after))
-        np.testing.assert_allclose(lam, swept.multipliers[k], rtol=0, atol=1e-9)
-        np.testing.assert_allclose(status.effort, swept.effort[k], rtol=0, atol=1e-7 * scale_of(status.effort))
+        np.testing.assert_allclose(after, rollout.state[k + 1], rtol=0, atol=1e-9 * scale_of(after))
+        np.testing.assert_allclose(lam, rollout.multipliers[k], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(status.effort, rollout.effort[k], rtol=0, atol=1e-7 * scale_of(status.effort))
 
 
 def test_linearized_steps_are_the_equations_along_any_trajectory(case):
     s, step, names = case.step.sizes, case.step, case.step.system.parameters.names[::3]
     n, h = s["n"], step.time_step
-    swept = case.rollout()
-    exact = step.kernel.linearize(case.theta, swept.state, swept.multipliers, swept.torque, (), False)
-    assert np.max(np.abs(exact.rows[:, step.model.structure.unknown_row])) < 1e-9 * scale_of(swept.multipliers)
-    np.testing.assert_allclose(exact.p1, swept.state[1:, n : 2 * n], rtol=0, atol=1e-9)
+    rollout = case.rollout()
+    exact = step.kernel.linearize(case.theta, rollout.state, rollout.multipliers, rollout.torque, (), False)
+    assert np.max(np.abs(exact.rows[:, step.model.structure.unknown_row])) < 1e-9 * scale_of(rollout.multipliers)
+    np.testing.assert_allclose(exact.p1, rollout.state[1:, n : 2 * n], rtol=0, atol=1e-9)
     fixed = list(step.system.prescribed_indices)
-    np.testing.assert_allclose(-exact.rows[:, fixed] / h, swept.effort, rtol=0, atol=1e-7 * scale_of(swept.effort))
+    np.testing.assert_allclose(-exact.rows[:, fixed] / h, rollout.effort, rtol=0, atol=1e-7 * scale_of(rollout.effort))
 
     rng = np.random.default_rng(8)
-    state = swept.state + 0.01 * rng.normal(size=swept.state.shape)
-    lam = swept.multipliers + 0.01 * rng.normal(size=swept.multipliers.shape)
+    state = rollout.state + 0.01 * rng.normal(size=rollout.state.shape)
+    lam = rollout.multipliers + 0.01 * rng.normal(size=rollout.multipliers.shape)
     plain = compile_step(step.system, step.time_step, step.force_split, use_compiler=False)
     one, two = (k.linearize(case.theta, state, lam, case.torque, names, True) for k in (step.kernel, plain.kernel))
     for key in vars(one):

@@ -52,12 +52,12 @@ def test_effort_of_prescribed_joints_is_inverse_dynamics_to_second_order(roll, m
         step = compile_step(system, 0.5 / count)
         times = np.arange(count + 1) * step.time_step
         q, v, a = smooth(times)
-        swept = roll(step, theta, q[0], momentum(step, q[0], v[0], theta), count, path=q)
-        assert swept.status.ok, swept.status.message
+        rollout = roll(step, theta, q[0], momentum(step, q[0], v[0], theta), count, path=q)
+        assert rollout.status.ok, rollout.status.message
         needed = np.array([pin.rnea(model, data, *row) for row in zip(q, v, a, strict=True)])
-        errors.append(np.max(np.abs(swept.effort[1:] - needed[1:-1])))
+        errors.append(np.max(np.abs(rollout.effort[1:] - needed[1:-1])))
         # a start with its true momentum has felt only half a step of its effort
-        assert np.max(np.abs(2 * swept.effort[0] - needed[0])) < 60 * step.time_step
+        assert np.max(np.abs(2 * rollout.effort[0] - needed[0])) < 60 * step.time_step
     slope = np.polyfit(np.log(1 / np.array(counts)), np.log(errors), 1)[0]
     assert slope == pytest.approx(2.0, abs=0.1)
 
@@ -67,22 +67,22 @@ def test_prescribed_joints_move_what_hangs_on_them(parts, roll):
     step = compile_step(system, 1e-3)
     path = np.tile(q[:6], (41, 1))
     path[:, 0] += 0.02 * (1 - np.cos(np.linspace(0, np.pi, 41)))
-    swept = roll(step, system.parameters.vector(), q, np.zeros(system.size), 40, path=path)
-    assert swept.status.ok, swept.status.message
-    np.testing.assert_array_equal(swept.state[:, :6], path)
-    end = pose(system, "w_C", swept.state[-1, : system.size])
+    rollout = roll(step, system.parameters.vector(), q, np.zeros(system.size), 40, path=path)
+    assert rollout.status.ok, rollout.status.message
+    np.testing.assert_array_equal(rollout.state[:, :6], path)
+    end = pose(system, "w_C", rollout.state[-1, : system.size])
     np.testing.assert_allclose(end[:3, 3], path[-1, :3], atol=1e-9)
-    assert np.max(np.abs(swept.effort)) > 0.1
+    assert np.max(np.abs(rollout.effort)) > 0.1
 
 
 def test_the_effort_of_a_clamp_is_the_pull_of_its_grasp(parts, roll):
     """The clamp has no mass, so its translational effort is the multipliers over the time step."""
     system, q = parts.clamped_cable("point")
     step = compile_step(system, 1e-3)
-    swept = roll(step, system.parameters.vector(), q, np.zeros(system.size), 20)
-    assert swept.status.ok, swept.status.message
-    np.testing.assert_allclose(swept.effort[:, :3], swept.multipliers / step.time_step, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(swept.effort[:, 3:], 0.0, atol=1e-9)
+    rollout = roll(step, system.parameters.vector(), q, np.zeros(system.size), 20)
+    assert rollout.status.ok, rollout.status.message
+    np.testing.assert_allclose(rollout.effort[:, :3], rollout.multipliers / step.time_step, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(rollout.effort[:, 3:], 0.0, atol=1e-9)
 
 
 # ------------------------------------------------------------------------------------------------ internal coordinates
@@ -107,25 +107,25 @@ def test_a_maxwell_branch_relaxes_with_its_time_constant(parts, hinge, roll):
     for count in (50, 100):
         step = compile_step(system, 0.2 / count)
         assert step.sizes["nz"] == 1
-        swept = roll(step, theta, q, np.zeros(3), count)
-        assert swept.status.ok, swept.status.message
-        z = swept.state[:, -1]
+        rollout = roll(step, theta, q, np.zeros(3), count)
+        assert rollout.status.ok, rollout.status.message
+        z = rollout.state[:, -1]
         time = np.arange(count + 1) * step.time_step
         expected = angle * (1 - np.exp(-time / tau))
         errors.append(np.max(np.abs(z - expected)))
-        assert swept.status.internal == pytest.approx([z[-1]])
+        assert rollout.status.internal == pytest.approx([z[-1]])
         # torque on the held joint: the spring beside, and what is left of the branch's
         stretch = angle - expected[1:-1]
-        np.testing.assert_allclose(swept.effort[1:, 0], 2.0 * angle + k1 * stretch, rtol=5e-3)
+        np.testing.assert_allclose(rollout.effort[1:, 0], 2.0 * angle + k1 * stretch, rtol=5e-3)
     assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.05)
 
 
 def test_a_neutral_maxwell_branch_changes_nothing(parts, hinge, roll):
     q, plain, added = np.array([0.4, -0.3, 0.2]), hinge(), hinge([parts.maxwell_branch("R_0_x", 0.0, 0.1)])
-    sweeps = [
+    rollouts = [
         roll(compile_step(system, 2e-3), system.parameters.vector(), q, np.zeros(3), 100) for system in (plain, added)
     ]
-    np.testing.assert_allclose(sweeps[0].state, sweeps[1].state[:, :6], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(rollouts[0].state, rollouts[1].state[:, :6], rtol=0, atol=1e-9)
 
 
 def test_an_internal_coordinate_needs_an_equation(parts, hinge):
@@ -144,9 +144,9 @@ def test_a_compliance_equals_a_spring(parts, roll):
     states = []
     for system in (plain, soft):
         theta = system.parameters.vector({"C.damping": 0.0})
-        swept = roll(compile_step(system, 1e-3), theta, BENT, np.zeros(9), 200)
-        assert swept.status.ok, swept.status.message
-        states.append(swept.state.copy())
+        rollout = roll(compile_step(system, 1e-3), theta, BENT, np.zeros(9), 200)
+        assert rollout.status.ok, rollout.status.message
+        states.append(rollout.state.copy())
     states[1][:, 9 + index] /= 0.5
     np.testing.assert_allclose(states[1], states[0], rtol=0, atol=1e-8)
 
@@ -159,15 +159,15 @@ def test_without_compliance_a_coordinate_stays_at_zero(parts, roll):
     assert system.mechanism.joint_index("C_1_y") == index
     step = compile_step(system, 1e-3)
     theta = system.parameters.vector()
-    swept = roll(step, theta, q, np.zeros(9), 200)
-    assert swept.status.ok, swept.status.message
+    rollout = roll(step, theta, q, np.zeros(9), 200)
+    assert rollout.status.ok, rollout.status.message
     # exactly in compiled code, whose elimination does not pivot
-    assert np.max(np.abs(swept.state[:, [index, 9 + index]])) <= (0.0 if step.compiled else 1e-18)
-    assert np.ptp(swept.state[:, 3]) > 0.01
+    assert np.max(np.abs(rollout.state[:, [index, 9 + index]])) <= (0.0 if step.compiled else 1e-18)
+    assert np.ptp(rollout.state[:, 3]) > 0.01
     # the neighbours move as if there were no joint
     rigid = replace(parts.cable(prescribed=["C_1_y"]))
     other = roll(compile_step(rigid, 1e-3), rigid.parameters.vector(), q, np.zeros(9), 200)
-    np.testing.assert_allclose(swept.state[:, :9], other.state[:, :9], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(rollout.state[:, :9], other.state[:, :9], rtol=0, atol=1e-9)
 
 
 def test_the_step_is_differentiable_where_the_compliance_is_zero(parts):
@@ -189,11 +189,11 @@ def test_a_soft_grasp_gives_way_in_proportion(parts, roll, violation):
     compliance = 2e-4
     system, q = parts.clamped_cable("point", [parts.soft_grasp("clamp", compliance)])
     step, theta = compile_step(system, 1e-3), system.parameters.vector()
-    swept = roll(step, theta, q, np.zeros(system.size), 30)
-    assert swept.status.ok, swept.status.message
+    rollout = roll(step, theta, q, np.zeros(system.size), 30)
+    assert rollout.status.ok, rollout.status.message
     for k in (0, 10, 29):
-        gap = violation(step, swept.state[k + 1, : system.size], theta)
-        np.testing.assert_allclose(gap, compliance * swept.multipliers[k] / step.time_step, rtol=1e-9, atol=1e-12)
+        gap = violation(step, rollout.state[k + 1, : system.size], theta)
+        np.testing.assert_allclose(gap, compliance * rollout.multipliers[k] / step.time_step, rtol=1e-9, atol=1e-12)
         assert np.linalg.norm(gap) > 1e-5
     stiff = system.parameters.vector({"soft_grasp@clamp.compliance": 0.0})
     rigid, _ = parts.clamped_cable("point")
@@ -207,15 +207,15 @@ def test_a_soft_grasp_relaxes_with_its_time_constant(parts, roll, violation):
     compliance, relaxation = 2e-4, 5e-3
     system, q = parts.clamped_cable("point", [parts.soft_grasp("clamp", compliance, relaxation)])
     step, theta = compile_step(system, 1e-3), system.parameters.vector()
-    swept = roll(step, theta, q, np.zeros(system.size), 30)
-    assert swept.status.ok, swept.status.message
+    rollout = roll(step, theta, q, np.zeros(system.size), 30)
+    assert rollout.status.ok, rollout.status.message
     rigid, _ = parts.clamped_cable("point")
     plain = compile_step(rigid, 1e-3)
     nominal = rigid.parameters.vector()
-    gaps = [violation(plain, x[: system.size], nominal) for x in swept.state]
+    gaps = [violation(plain, x[: system.size], nominal) for x in rollout.state]
     for k in (0, 10, 29):
         rate = (gaps[k + 1] - gaps[k]) / step.time_step
-        load = swept.multipliers[k] / step.time_step
+        load = rollout.multipliers[k] / step.time_step
         np.testing.assert_allclose(gaps[k + 1] + relaxation * rate, compliance * load, rtol=1e-8, atol=1e-12)
 
 
@@ -229,9 +229,9 @@ def test_grasps_hold_what_they_should(parts, roll, violation, kind):
     path = np.tile(q[:6], (101, 1))
     # the clamp turns about its own axes
     path[:, 3:] += np.outer(1 - np.cos(np.linspace(0, np.pi, 101)), [0.05, -0.04, 0.08])
-    swept = roll(step, theta, q, np.zeros(system.size), 100, path=path)
-    assert swept.status.ok, swept.status.message
-    end = swept.state[-1, : system.size]
+    rollout = roll(step, theta, q, np.zeros(system.size), 100, path=path)
+    assert rollout.status.ok, rollout.status.message
+    end = rollout.state[-1, : system.size]
     assert np.max(np.abs(violation(step, end, theta))) < 1e-10
     grasp = system.grasps[0]
     holder = pose(system, "clamp", end)
@@ -246,9 +246,9 @@ def test_grasps_hold_what_they_should(parts, roll, violation, kind):
 def test_a_creeping_grasp_slides_along_the_object(parts, roll, violation):
     system, q = parts.clamped_cable("point", [parts.creeping_grasp("clamp", 0.05)])
     step, theta = compile_step(system, 5e-4), system.parameters.vector()
-    swept = roll(step, theta, q, np.zeros(system.size), 100)
-    assert swept.status.ok, swept.status.message
-    slip, end = swept.state[-1, -1], swept.state[-1, : system.size]
+    rollout = roll(step, theta, q, np.zeros(system.size), 100)
+    assert rollout.status.ok, rollout.status.message
+    slip, end = rollout.state[-1, -1], rollout.state[-1, : system.size]
     held, holder = pose(system, "w_C", end), pose(system, "clamp", end)
     assert abs(slip) > 1e-4
     np.testing.assert_allclose(held[:3, 3] - slip * held[:3, 2], holder[:3, 3], atol=1e-9)
@@ -268,12 +268,12 @@ class TestFailures:
         assert (status.ok, status.code, status.step) == (False, StepCode.NOT_FINITE, 0)
         torque = np.zeros((12, 1))
         torque[7] = math.nan
-        swept = roll(step, theta, [0.1, 0.2], [0.0, 0.0], 12, torque=torque)
-        assert (swept.status.code, swept.status.step) == (StepCode.NOT_FINITE, 7)
-        assert swept.status.message.startswith("step 7: the state is no longer finite")
-        assert np.all(np.isfinite(swept.state[:8]))
-        assert np.all(np.isnan(swept.state[9:]))
-        assert np.all(np.isnan(swept.multipliers[7:]))
+        rollout = roll(step, theta, [0.1, 0.2], [0.0, 0.0], 12, torque=torque)
+        assert (rollout.status.code, rollout.status.step) == (StepCode.NOT_FINITE, 7)
+        assert rollout.status.message.startswith("step 7: the state is no longer finite")
+        assert np.all(np.isfinite(rollout.state[:8]))
+        assert np.all(np.isnan(rollout.state[9:]))
+        assert np.all(np.isnan(rollout.multipliers[7:]))
 
     def test_a_grasp_out_of_reach(self, urdf_folder, use_compiler):
         robot = read_urdf(urdf_folder / "double_pendulum.urdf")

@@ -70,19 +70,19 @@ def gantry(urdf_folder):
 def test_angular_momentum_about_a_free_axis(cases, roll, momentum, seed):
     table = cases["turntable"]
     q, p = random_state(table, momentum, seed)
-    swept = roll(table.step, table.theta, q, p, 300)
-    assert swept.status.ok, swept.status.message
-    kept = swept.state[:, table.n]
+    rollout = roll(table.step, table.theta, q, p, 300)
+    assert rollout.status.ok, rollout.status.message
+    kept = rollout.state[:, table.n]
     assert np.max(np.abs(kept - kept[0])) < 1e-9 * max(1.0, abs(kept[0]))
-    assert np.ptp(swept.state[:, table.n + 1]) > 1e-3
+    assert np.ptp(rollout.state[:, table.n + 1]) > 1e-3
 
 
 @given(seed=SEEDS)
 def test_linear_momentum_along_free_rails(gantry, roll, momentum, seed):
     q, p = random_state(gantry, momentum, seed, spread=0.5)
-    swept = roll(gantry.step, gantry.theta, q, p, 200)
-    assert swept.status.ok, swept.status.message
-    kept = swept.state[:, gantry.n : gantry.n + 2]
+    rollout = roll(gantry.step, gantry.theta, q, p, 200)
+    assert rollout.status.ok, rollout.status.message
+    kept = rollout.state[:, gantry.n : gantry.n + 2]
     assert np.max(np.abs(kept - kept[0])) < 1e-9 * max(1.0, np.max(np.abs(kept[0])))
 
 
@@ -135,12 +135,12 @@ def test_symplectic(cases, momentum, name, seed):
 def test_energy_shows_no_drift_over_a_hundred_thousand_steps(cases, roll, momentum):
     one = cases["double_pendulum"]
     q0 = np.array([0.9, -0.3])
-    swept = roll(one.step, one.theta, q0, momentum(one.step, q0, np.array([0.5, 1.0]), one.theta), 100_000)
-    assert swept.status.ok, swept.status.message
+    rollout = roll(one.step, one.theta, q0, momentum(one.step, q0, np.array([0.5, 1.0]), one.theta), 100_000)
+    assert rollout.status.ok, rollout.status.message
     e, p = one.step.equations, ca.SX.sym("p", 2)
     M = mass_matrix(e.rigid, one.system.mechanism)
     energy = ca.substitute([0.5 * ca.dot(p, ca.solve(M, p)) + e.rigid.potential], [e.q1], [e.q0])
-    every = swept.state[::10]
+    every = rollout.state[::10]
     function = ca.Function("energy", [e.q0, p, e.theta, e.time_step], energy)
     values = np.array(function(every[:, :2].T, every[:, 2:4].T, one.theta, one.step.time_step)).ravel()
     error = np.abs(values - values[0])
@@ -156,7 +156,7 @@ def test_constraints_do_not_drift(golden, theta_golden, paper_systems, single_st
     trep, theta = golden(name), theta_golden(name)
     left = {"single": single_step, "dual": dual_step}[name]
     for step, steps in ((left, 300), (compile_step(paper_systems[name], 0.01), 100)):
-        swept = roll(step, theta, trep.q[0], trep.p[0], steps, torque=trep.u[:steps])
-        assert swept.status.ok, swept.status.message
-        worst = max(np.max(np.abs(violation(step, x[: trep.q.shape[1]], theta))) for x in swept.state[1::7])
+        rollout = roll(step, theta, trep.q[0], trep.p[0], steps, torque=trep.u[:steps])
+        assert rollout.status.ok, rollout.status.message
+        worst = max(np.max(np.abs(violation(step, x[: trep.q.shape[1]], theta))) for x in rollout.state[1::7])
         assert worst < 1e-10

@@ -40,10 +40,10 @@ class Motion:
         times = (np.arange(count) + 0.5) * step.time_step
         torque = np.sin(2 * np.pi * times / self.duration + 0.3)[:, None] * self.amplitude
         p = momentum(step, self.q, self.v, theta)
-        swept = roll(step, theta, self.q, p, count, torque=torque)
-        assert swept.status.ok, swept.status.message
+        rollout = roll(step, theta, self.q, p, count, torque=torque)
+        assert rollout.status.ok, rollout.status.message
         n = self.system.size
-        return swept.state[-1, :n], swept.state[-1, n : 2 * n]
+        return rollout.state[-1, :n], rollout.state[-1, n : 2 * n]
 
     def slopes(self, split, roll, momentum):
         """Slope of log error over log time step, of q and of p, against a run with many more steps."""

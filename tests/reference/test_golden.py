@@ -58,9 +58,9 @@ def test_first_derivatives(case, k):
 
 def test_start_of_the_rollout(case, roll):
     trep, _, step, theta = case
-    swept = roll(step, theta, trep.q[0], trep.p[0], 50, torque=trep.u[:50])
-    assert swept.status.ok, swept.status.message
-    np.testing.assert_allclose(swept.state[:, : trep.q.shape[1]], trep.q[:51], rtol=0, atol=1e-8)
+    rollout = roll(step, theta, trep.q[0], trep.p[0], 50, torque=trep.u[:50])
+    assert rollout.status.ok, rollout.status.message
+    np.testing.assert_allclose(rollout.state[:, : trep.q.shape[1]], trep.q[:51], rtol=0, atol=1e-8)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -45,7 +45,7 @@ def found(tmp_path_factory, urdf_folder):
         for problem_episodes in (nominal.episodes, nominal.held_out):
             for episode in problem_episodes:
                 theta = nominal.theta
-                swept = nominal.run(episode, theta, np.zeros(0), derivatives=False)
+                swept = nominal.predictor.run(episode, theta, np.zeros(0), False)
                 effort = np.vstack([swept.rollout.effort, swept.rollout.effort[-1:]])[:151]
                 joints = recordings[episode.name].joints
                 effort = effort + rub * np.sign(np.gradient(joints.position, axis=0)) * [0, 1]

@@ -108,7 +108,7 @@ def test_wrong_points_hardly_matter(alone):
     assert fit.inliers == pytest.approx(0.85, abs=0.06)
 
 
-def test_foreign_parts_do_not_count_against_the_fit(alone):
+def test_unconnected_parts_do_not_count_against_the_fit(alone):
     shape = ShapeFit(alone)
     clean = seen(shape, np.zeros(alone.size))
     heap = np.random.default_rng(0).normal([1.3, 0.5, -0.5], 0.02, (200, 3))

@@ -122,6 +122,17 @@ def test_a_recording_that_solve_reads(tmp_path, clean, recording, system):
     assert "clock offset" in again.description
 
 
+def test_positions_of_a_straight_object_stay_with_their_points(clean, recording):
+    groups = {name: PointGroup(name, ("w_T1",), [0.0], np.zeros((1, 1, 3))) for name in ("points_arm", "points_camera")}
+    straight = np.ones((1, 3))
+    for name, kept in (("points_arm", True), ("points_camera", False)):
+        before = replace(recording, points=(groups[name],), straight=straight)
+        assert (clean.track.recording(before).straight is not None) is kept
+    assert clean.track.recording(recording).straight is None
+    mocap = replace(groups["points_arm"], name="points_mocap")
+    assert clean.track.recording(replace(recording, points=(mocap,), straight=straight)).straight is None
+
+
 def test_the_points_are_those_that_no_arm_holds(system, small):
     found = track(Scene(system), small.recording, small.sequence)
     assert found.names == ("w_T1", "w_T3")

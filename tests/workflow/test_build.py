@@ -170,6 +170,8 @@ def test_more_links_scale_what_is_said_of_a_stiffness_per_joint(written):
     assert [finer[name].value for name in ("a.bend", "a.twist", "b.bend", "b.damping")] == [15, 6, 5, 0.3]
     assert (finer["a.bend"].lower, finer["a.bend"].upper) == (3, 24)
     assert (finer["b.bend"].lower, finer["b.bend"].upper) == (1, 8)
+    finer = build_system(load_config(written(SEGMENTED.split("parameters:")[0])), links=6).parameters
+    assert [finer[name].value for name in ("a.bend", "a.twist", "b.bend")] == [9, 9, 3]
     foam = load_config(written("model: {object: {kind: y}}\nparameters: {T1.bend: {initial: 10}}\n"))
     finer = build_system(foam, links=8).parameters
     assert [finer[name].value for name in ("T1.bend", "T2.bend")] == [20, 6]

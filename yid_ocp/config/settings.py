@@ -16,7 +16,7 @@ from annotated_types import Ge, Gt, Le, Len, Lt
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedSeq
 
-from yid_ocp.diagnosis.verdict import Thresholds
+from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import ConfigError
 from yid_ocp.integrator.discrete import ForceSplit
 from yid_ocp.model.cable import CableOptions

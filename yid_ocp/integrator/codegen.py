@@ -50,44 +50,12 @@ def step_functions(equations: DiscreteEquations) -> StepFunctions:
     (`RigidBody`), everything else as sparse nonzeros from automatic differentiation.
     """
     e = equations
-    h, rigid = e.h, e.rigid
-    bodies, bodies_p = (e.row_scale * (h / 2 * rigid.by_q + sign * rigid.by_v) for sign in (-1, 1))
-    balance = e.balance_rest + e.p0 + bodies
+    bodies = [e.row_scale * (e.h / 2 * e.rigid.by_q + sign * e.rigid.by_v) for sign in (-1, 1)]
+    balance = e.balance_rest + e.p0 + bodies[0]
     if e.closed_impulses is not None:
         balance += e.closed_impulses[0]
-        bodies, bodies_p = (part + push for part, push in zip((bodies, bodies_p), e.closed_impulses, strict=True))
-    plus, minus = rigid.S + h / 2 * rigid.D, rigid.S - h / 2 * rigid.D
-    lower, upper = rigid.B / 2 - rigid.F / h, rigid.B / 2 + rigid.F / h
-    parts = [plus, minus, lower, upper, rigid.S[:3, :], h / 4 * rigid.G]
-    if e.closed is not None:
-        parts += [e.closed.A, h / 2 * e.closed.T]
-    pairs = ca.vertcat(*(ca.vec(ca.densify(part).T) for part in parts))
-
-    unknown = ca.vertcat(e.q1, e.z1, e.lam)
-    old = ca.vertcat(e.q0, e.z0)
-    inputs = ca.vertcat(unknown, old, e.u)
-
-    def by_internal(expression: ca.SX) -> ca.SX:
-        """What the closed form leaves out: placements and masses may depend on internal coordinates."""
-        rows, n = expression.numel(), e.q0.numel()
-        blocks = [ca.jacobian(expression, z) for z in (e.z1, e.z0)]
-        gaps = [ca.SX(rows, count) for count in (n, e.lam.numel() + n, e.u.numel())]
-        return ca.horzcat(gaps[0], blocks[0], gaps[1], blocks[1], gaps[2])
-
-    m = e.lam.numel()
-    rest = ca.jacobian(ca.vertcat(e.balance_rest, e.internal, ca.SX(m, 1)), inputs)
-    rest += by_internal(ca.vertcat(bodies, ca.SX(e.z0.numel() + m, 1)))
-    rest_p = ca.jacobian(e.p1_rest, inputs) + by_internal(bodies_p)
-    by_q1 = ca.substitute(e.constraint_matrix, old, ca.vertcat(e.q1, e.z1))
-    if e.constraint_gain is not None:
-        # the rows of a relaxing grasp depend on where it was before as well
-        by_q1 = e.constraint_gain * by_q1
-        at, n = unknown.numel(), e.q0.numel()
-        rest[-m:, at : at + n] = (1 - e.constraint_gain) * e.constraint_matrix
-        rest[-m:, at + n : at + old.numel()] = ca.jacobian(e.constraint, e.z0)
-    rest, rest_p = ca.sparsify(rest), ca.sparsify(rest_p)
-    by_rest = ca.jacobian(e.constraint, ca.vertcat(e.z1, e.lam))
-    by_unknown = ca.sparsify(ca.horzcat(by_q1, by_rest))
+        bodies = [part + push for part, push in zip(bodies, e.closed_impulses, strict=True)]
+    rest, rest_p, by_unknown = _rest_jacobians(e, *bodies)
     by_z = ca.jacobian(e.constraint_matrix.T @ e.lam, e.z0)
     pull = ca.sparsify(ca.horzcat(e.pull_by_q, by_z))
 
@@ -101,10 +69,10 @@ def step_functions(equations: DiscreteEquations) -> StepFunctions:
     return StepFunctions(
         e,
         function("residual", balance, e.internal, e.constraint, e.p1),
-        function("linear", pairs, nonzeros(rest), nonzeros(rest_p), nonzeros(by_unknown)),
+        function("linear", _pairs(e), nonzeros(rest), nonzeros(rest_p), nonzeros(by_unknown)),
         function("matrix", nonzeros(e.constraint_matrix)),
         function("pull", nonzeros(pull)),
-        function("scales", e.row_scale, h),
+        function("scales", e.row_scale, e.h),
         {
             "rest": rest.sparsity(),
             "rest_p": rest_p.sparsity(),
@@ -113,6 +81,46 @@ def step_functions(equations: DiscreteEquations) -> StepFunctions:
             "pull": pull.sparsity(),
         },
     )
+
+
+def _pairs(e: DiscreteEquations) -> ca.SX:
+    """Vectors per joint from which the kernel forms the bodies' part of the Jacobians, joint by joint."""
+    h, rigid = e.h, e.rigid
+    plus, minus = rigid.S + h / 2 * rigid.D, rigid.S - h / 2 * rigid.D
+    lower, upper = rigid.B / 2 - rigid.F / h, rigid.B / 2 + rigid.F / h
+    parts = [plus, minus, lower, upper, rigid.S[:3, :], h / 4 * rigid.G]
+    if e.closed is not None:
+        parts += [e.closed.A, h / 2 * e.closed.T]
+    return ca.vertcat(*(ca.vec(ca.densify(part).T) for part in parts))
+
+
+def _rest_jacobians(e: DiscreteEquations, bodies: ca.SX, bodies_p: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
+    """What the pairs leave out, sparse: of the rows and of p1 by (unknowns, old, input), of the constraint by unknowns.
+
+    `bodies` and `bodies_p` are the bodies' part of the balance and of p1.
+    """
+    unknown, old = ca.vertcat(e.q1, e.z1, e.lam), ca.vertcat(e.q0, e.z0)
+    inputs = ca.vertcat(unknown, old, e.u)
+    m, n = e.lam.numel(), e.q0.numel()
+
+    def by_internal(expression: ca.SX) -> ca.SX:
+        """What the closed form leaves out: placements and masses may depend on internal coordinates."""
+        blocks = [ca.jacobian(expression, z) for z in (e.z1, e.z0)]
+        gaps = [ca.SX(expression.numel(), count) for count in (n, m + n, e.u.numel())]
+        return ca.horzcat(gaps[0], blocks[0], gaps[1], blocks[1], gaps[2])
+
+    rest = ca.jacobian(ca.vertcat(e.balance_rest, e.internal, ca.SX(m, 1)), inputs)
+    rest += by_internal(ca.vertcat(bodies, ca.SX(e.z0.numel() + m, 1)))
+    rest_p = ca.jacobian(e.p1_rest, inputs) + by_internal(bodies_p)
+    by_q1 = ca.substitute(e.constraint_matrix, old, ca.vertcat(e.q1, e.z1))
+    if e.constraint_gain is not None:
+        # the rows of a relaxing grasp depend on where it was before as well
+        by_q1 = e.constraint_gain * by_q1
+        at = unknown.numel()
+        rest[-m:, at : at + n] = (1 - e.constraint_gain) * e.constraint_matrix
+        rest[-m:, at + n : at + old.numel()] = ca.jacobian(e.constraint, e.z0)
+    by_rest = ca.jacobian(e.constraint, ca.vertcat(e.z1, e.lam))
+    return ca.sparsify(rest), ca.sparsify(rest_p), ca.sparsify(ca.horzcat(by_q1, by_rest))
 
 
 def theta_function(equations: DiscreteEquations, names: Sequence[str]) -> ca.Function:

@@ -21,12 +21,8 @@ from yid_ocp.errors import OutputError
 
 log = logging.getLogger(__name__)
 
-
 FLAGS = ("-ftree-vectorize", "-ffp-contract=fast", "-fopenmp-simd", "-fPIC", "-shared")
-
-
 NATIVE = ("-march=native",)
-
 
 # -O2 takes minutes on single functions of tens of thousands of lines, for a gain of some 10 %.
 SHORT, LONG, LONG_FROM = "-O2", "-O1", 45_000
@@ -90,10 +86,10 @@ def compile_library(source: str, straight_line: bool = False) -> ctypes.CDLL | N
 
     Parameters
     ----------
-    straight_line : bool
-        Whether the text is one long function without loops, on which the compiler should not dwell.
     source : str
         C text. The cache key is the hash of this text, the flags, the compiler, the processor and CasADi's version.
+    straight_line : bool
+        Whether the text is one long function without loops, on which the compiler should not dwell.
     """
     path = compiler()
     if path is None:

@@ -72,7 +72,7 @@ def lqr_filter(
         Measured torques [N m].
     theta : array_like, shape (ntheta,)
     angle_std, rate_std, torque_std : float or array_like
-        Errors that weigh the same [rad], [rad/s], [N m].
+        Standard deviations that weigh the same [rad], [rad/s], [N m].
 
     References
     ----------

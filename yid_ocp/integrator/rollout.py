@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from yid_ocp.errors import ModelError
 from yid_ocp.integrator.step import Step, check_shape
 from yid_ocp.integrator.step_model import Directions, Feedback, Gradient, Rollout
+from yid_ocp.parallel import SYMBOLIC
 
 Array = NDArray[np.float64]
 
@@ -134,7 +135,8 @@ def momentum_of(step: Step, q: ArrayLike, v: ArrayLike, theta: ArrayLike) -> Arr
     e, s = step.equations, step.sizes
     half = np.atleast_2d(np.asarray(v, float)) * step.time_step / 2
     middle = np.atleast_2d(np.asarray(q, float))
-    function = ca.Function("momentum", e.arguments, [e.row_scale * e.rigid.by_v])
+    with SYMBOLIC:
+        function = ca.Function("momentum", e.arguments, [e.row_scale * e.rigid.by_v])
     none = [np.zeros(s[key]) for key in ("n", "nz", "nz", "m", "nu")]
     values = np.asarray(theta, float)
     rows = [

@@ -13,7 +13,7 @@ import scipy.linalg.lapack
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.integrator.step import Step, check_shape
-from yid_ocp.parallel import Once
+from yid_ocp.parallel import SYMBOLIC, Once
 
 Array = NDArray[np.float64]
 
@@ -57,10 +57,7 @@ class Rest:
 # encoder noise stretches the object by a hair beyond its reach. With a measured torque the spring is as soft as the
 # ratio of torque error to encoder error; without one it is stiff enough to give less than an encoder's noise.
 HOLD_STIFFNESS = 1e5
-
-
 HOLD_STIFFNESS_WITH_TORQUE = 1e3
-
 
 # A holding spring that gives by more than this means that the posture does not fit the grasp [rad].
 HOLD_LIMIT = 0.02
@@ -213,7 +210,8 @@ class Statics:
         e, n = step.equations, system.size
         if not system.grasps or not np.all(np.isfinite(state)):
             return text
-        phi = ca.Function("phi", [e.q1, e.z1, e.lam, e.theta, e.time_step], [e.closure])
+        with SYMBOLIC:
+            phi = ca.Function("phi", [e.q1, e.z1, e.lam, e.theta, e.time_step], [e.closure])
         gap = np.array(phi(state[:n], state[2 * n :], 0, theta, step.time_step)).ravel()
         row = 0
         for grasp in system.grasps:
@@ -272,11 +270,11 @@ def relaxed(step: Step, q: ArrayLike, theta: ArrayLike) -> Array:
     nz = e.z0.numel()
     if nz == 0:
         return np.zeros(0)
-    z = ca.SX.sym("z", nz)
-    old = ca.vertcat(e.q0, e.q1, e.z0, e.z1, e.p0, e.lam, e.u)
-    at = ca.SX.sym("q", e.q0.numel())
-    still = ca.vertcat(at, at, z, z, ca.SX(ca.DM.zeros(e.p0.numel() + e.lam.numel() + e.u.numel())))
-    residual = ca.substitute(e.internal_at_rest, old, still)
-    function = ca.Function("relaxed", [z, at, e.theta, e.time_step], [residual, ca.jacobian(residual, z)])
+    with SYMBOLIC:
+        z, at = ca.SX.sym("z", nz), ca.SX.sym("q", e.q0.numel())
+        old = ca.vertcat(e.q0, e.q1, e.z0, e.z1, e.p0, e.lam, e.u)
+        still = ca.vertcat(at, at, z, z, ca.SX(ca.DM.zeros(e.p0.numel() + e.lam.numel() + e.u.numel())))
+        residual = ca.substitute(e.internal_at_rest, old, still)
+        function = ca.Function("relaxed", [z, at, e.theta, e.time_step], [residual, ca.jacobian(residual, z)])
     arguments = (np.asarray(q, float), np.asarray(theta, float), step.time_step)
     return _damped_newton(lambda x: function(x, *arguments), np.zeros(nz), 1e-12)[0]

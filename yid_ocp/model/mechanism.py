@@ -1,4 +1,4 @@
-"""Trees of rigid bodies: read from URDF, locked, merged, joined and written back."""
+"""Trees of rigid bodies: placements, inertias, joints, frames, and how trees are joined."""
 
 from __future__ import annotations
 
@@ -263,7 +263,7 @@ class Mechanism:
         return replace(self, joints=joints, frames=frames)
 
     def inserted(self, index: int, chain: Sequence[Joint]) -> Mechanism:
-        """Put a chain of joints into the tree at a place in its order; what shall hang on it is then yet to be told.
+        """Put a chain of joints into the tree at a place in its order; nothing hangs on it yet.
 
         Parameters
         ----------

@@ -215,7 +215,11 @@ class Track:
         """A recording with these points in place of any `points_camera` that it had; `DataError` as `validate`."""
         others = tuple(group for group in recording.points if group.name != GROUP)
         text = f"{recording.description} Points of {len(self.t)} of {len(self.frames)} frames; {self.clock.message}."
-        return validate(replace(recording, points=(*others, self.group()), description=text.strip(), sha256=None))
+        made = replace(recording, points=(*others, self.group()), description=text.strip(), sha256=None)
+        # the positions of a straight object belong to the group that a file lists first
+        if not others or others[0] is not recording.points[0] or others[0].name > GROUP:
+            made = replace(made, straight=None)
+        return validate(made)
 
 
 def track(

@@ -166,7 +166,7 @@ def _ensemble(run: Run, seed: int) -> Ensemble:
     problem = build_problem(run)
     links = len(problem.system.segments[0].links) if problem.system.segments else 0
     finer = (lambda times: build_system(run, links * times)) if links else None
-    return Ensemble(problem, seed, finer, run.diagnosis.candidates)
+    return Ensemble(problem, seed, finer, run.diagnosis.candidates, run.diagnosis)
 
 
 # -- tasks: each builds the problem again, which takes a twentieth of the time of a diagnosis -------------------------

@@ -88,7 +88,7 @@ def run_track(run: Run, out: str | Path | None = None, progress: Progress = SILE
         made: VirtualFrames | None = None
         if settings.frames is None:
             progress.stage("simulating a virtual experiment in MuJoCo")
-            recording, made = virtual_film(run, system, settings.virtual)
+            recording, made = simulated_frames(run, system, settings.virtual)
             seen = made.sequence
             if settings.keep_frames:
                 write_frames(seen, folder.path / "frames")
@@ -166,7 +166,7 @@ def truth_errors(system: System, found: Track, made: VirtualFrames) -> Mapping[s
     }
 
 
-def virtual_film(run: Run, system: System, settings: VirtualFramesSettings) -> tuple[Recording, VirtualFrames]:
+def simulated_frames(run: Run, system: System, settings: VirtualFramesSettings) -> tuple[Recording, VirtualFrames]:
     """A virtual experiment with the parameters' initial values as the truth, and its frames by a virtual camera.
 
     Raises

@@ -1,0 +1,114 @@
+"""Equilibria: which one is found, its derivatives, and what is said where there is none."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from yid_ocp.integrator.rollout import simulate
+from yid_ocp.integrator.statics import HOLD_STIFFNESS, Statics, relaxed
+from yid_ocp.integrator.step import compile_step
+from yid_ocp.model import Grasp, Segment, System, flexible_object, forward_kinematics
+from yid_ocp.model.rotations import roll_pitch_yaw
+from yid_ocp.model.system import Spring, floating_clamp
+from yid_ocp.model.urdf import read_urdf
+
+
+def hung_cable(span: float, **options):
+    """A cable of 0.6 m that starts level along x, its end held at a fraction of its length; statics and clamp pose."""
+    turn = roll_pitch_yaw(0.0, np.pi / 2, 0.0)
+    segment = Segment("C", 0.6, 0.3, 0.01, links=4, bend=0.05, twist=1.0, damping=0.01, rotation=turn)
+    clamp = floating_clamp("clamp")
+    system = System.build(
+        clamp,
+        objects=[(flexible_object([segment], name="cable"), None, None)],
+        grasps=[Grasp("end", "clamp", "w_C")],
+        prescribed=clamp.joint_names,
+        **options,
+    )
+    return Statics(compile_step(system, 0.01, use_compiler=False)), np.array([0.6 * span, 0, 0, 0, 0, 0])
+
+
+def height(system, frame, q) -> float:
+    kinematics = forward_kinematics(system.mechanism.numeric(), ca.SX(ca.DM(q)))
+    return float(kinematics.position(frame)[2])
+
+
+def test_of_several_equilibria_the_one_of_least_energy():
+    """The cable could also stand as an arch, and the search comes across that with the smaller imbalance."""
+    statics, posture = hung_cable(0.95)
+    system, theta = statics.step.system, statics.step.system.parameters.vector()
+    rest = statics.solve(posture, theta)
+    assert rest.converged, rest.message
+    assert height(system, "C_1_tip", rest.state[: system.size]) < -0.05
+
+
+@pytest.fixture(scope="module")
+def arm(urdf_folder):
+    """The double pendulum, its elbow driven, with a spring on each joint."""
+    robot = read_urdf(urdf_folder / "double_pendulum.urdf")
+    springs = {name: Spring(4.0, 0.1) for name in robot.joint_names}
+    return Statics(compile_step(System.build(robot, driven=["elbow"], springs=springs), 0.01, use_compiler=False))
+
+
+def test_a_system_at_rest_stays_there(arm):
+    theta = arm.step.system.parameters.vector()
+    rest = arm.solve([0.4], theta)
+    assert rest.converged, rest.message
+    stayed = simulate(arm.step, theta, rest.state, 20, torque=np.tile(rest.torque, (20, 1)))
+    np.testing.assert_allclose(stayed.state, np.tile(rest.state, (21, 1)), rtol=0, atol=1e-9)
+
+
+def test_derivatives_of_an_equilibrium(arm):
+    names = ("shoulder.stiffness", "elbow.mass", "shoulder.rest")
+    parameters = arm.step.system.parameters
+    theta, posture, torque = parameters.vector(), np.array([0.4]), np.array([0.3])
+    rest = arm.solve(posture, theta, torque, names=names)
+    assert rest.converged, rest.message
+
+    def slope(change, size=1e-5):
+        plus, minus = (arm.solve(*change(sign * size), guess=rest.state[:2]).state for sign in (1, -1))
+        return (plus - minus) / (2 * size)
+
+    for column, name in enumerate(names):
+        unit = np.eye(len(theta))[parameters.index(name)]
+        expected = slope(lambda e, unit=unit: (posture, theta + e * unit, torque))
+        np.testing.assert_allclose(rest.by_theta[:, column], expected, rtol=1e-6, atol=1e-8)
+        assert np.max(np.abs(expected)) > 1e-3
+    np.testing.assert_allclose(rest.by_posture[:, 0], slope(lambda e: (posture + e, theta, torque)), atol=1e-8)
+    np.testing.assert_allclose(rest.by_torque[:, 0], slope(lambda e: (posture, theta, torque + e)), atol=1e-8)
+
+
+def test_a_measured_torque_that_fits_takes_the_load_off_the_holding_spring(arm):
+    theta = arm.step.system.parameters.vector()
+    elbow = arm.step.system.mechanism.joint_index("elbow")
+    rest = arm.solve([0.4], theta)
+    given = rest.torque[0] / HOLD_STIFFNESS
+    assert abs(given) > 1e-6
+    assert rest.state[elbow] == pytest.approx(0.4 - given, abs=1e-12)
+    again = arm.solve([0.4], theta, torque=rest.torque)
+    assert again.converged, again.message
+    assert abs(again.state[elbow] - 0.4) < 0.05 * abs(given)
+
+
+def test_a_torque_that_does_not_fit_the_posture_is_said(arm):
+    rest = arm.solve([0.4], arm.step.system.parameters.vector(), torque=[100.0])
+    assert not rest.converged
+    assert "elbow would have to move by" in rest.message
+
+
+def test_a_grasp_out_of_reach_is_said():
+    statics, posture = hung_cable(1.5)
+    rest = statics.solve(posture, statics.step.system.parameters.vector())
+    assert not rest.converged
+    assert "grasp 'end' is out of reach by" in rest.message
+
+
+def test_internal_coordinates_of_an_object_that_has_long_been_there(parts):
+    system = parts.cable(effects=[parts.maxwell_branch("C_0_x", 3.0, 0.02)])
+    step = compile_step(system, 1e-3, use_compiler=False)
+    q = np.linspace(0.1, 0.5, 9)
+    np.testing.assert_allclose(relaxed(step, q, system.parameters.vector()), [q[0]], rtol=1e-12)
+    plain = compile_step(parts.cable(), 1e-3, use_compiler=False)
+    assert relaxed(plain, q, plain.system.parameters.vector()).shape == (0,)
