@@ -112,7 +112,7 @@ class Measurements:
         weight = factor * self.weight
         jacobian = None
         if slopes is not None:
-            jacobian = (weight[:, :, None] * slopes).reshape(-1, slopes.shape[2])[keep]
+            jacobian = (weight[:, :, None] * slopes).reshape(raw.size, slopes.shape[2])[keep]
         return Rows(cost, (factor * raw).ravel()[keep], jacobian, weight.ravel()[keep])
 
     def late(self, steps: Array) -> Measurements:

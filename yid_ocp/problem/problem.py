@@ -452,9 +452,7 @@ class EstimationProblem:
         fitted to points at these parameters.
         """
         x = np.asarray(x, float)
-        theta, _ = self.split(x, 0)
-        for name in self.local:
-            theta[self.system.parameters.index(name)] = self.theta[self.system.parameters.index(name)]
+        theta = self._held_out_theta(x)
 
         def one(held: Episode) -> tuple[Episode, EpisodeResult | str]:
             episode = self._held_out_episode(held, theta)
@@ -469,8 +467,16 @@ class EstimationProblem:
 
     def held_out_offset(self, i: int, x: ArrayLike) -> Array:
         """Offset of a held-out recording's start from rest at unknowns `x`, shape (number of estimated rows,)."""
+        x = np.asarray(x, float)
+        theta = self._held_out_theta(x)
+        return self._held_out_offset(self._held_out_episode(self.held_out[i], theta), theta, x)
+
+    def _held_out_theta(self, x: Array) -> Array:
+        """theta with the shared parameters of `x`, local ones at their initial value."""
         theta, _ = self.split(x, 0)
-        return self._held_out_offset(self._held_out_episode(self.held_out[i], theta), theta, np.asarray(x, float))
+        for name in self.local:
+            theta[self.system.parameters.index(name)] = self.theta[self.system.parameters.index(name)]
+        return theta
 
     def _held_out_offset(self, episode: Episode, theta: Array, x: Array) -> Array:
         if episode.shares_start_of is not None:

@@ -1,0 +1,85 @@
+"""Made-up pieces of small problems: recordings, measurements on nodes, sensors."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.effects import make_effect
+from yid_ocp.integrator.step import compile_step
+from yid_ocp.model import System
+from yid_ocp.model.system import Spring
+from yid_ocp.model.urdf import read_urdf
+from yid_ocp.problem.measurements import Measurements
+from yid_ocp.sensors.joints import EffortSensor
+from yid_ocp.sensors.points import PointSensor
+
+
+def efforts(*joints: str) -> EffortSensor:
+    """A sensor of one output a joint."""
+    return EffortSensor(joints)
+
+
+def points(*names: str, pose=None, group="points") -> PointSensor:
+    """A sensor of three outputs a point, each its own frame."""
+    return PointSensor(group, names, names, pose)
+
+
+def measured(sensor, node, fraction, value, weight=None, std=None, span=(0, 100)) -> Measurements:
+    """Samples on nodes; whitened by unit noise unless weights are given."""
+    value = np.asarray(value, float)
+    seen = np.isfinite(value)
+    weight = np.where(seen, 1.0, 0.0) if weight is None else np.asarray(weight, float)
+    std = np.where(seen, 1.0, np.nan) if std is None else np.asarray(std, float)
+    return Measurements(sensor, np.asarray(node), np.asarray(fraction, float), value, weight, std, span)
+
+
+def joints(names, t, position, **more) -> JointGroup:
+    return JointGroup(tuple(names), np.asarray(t, float), np.asarray(position, float), **more)
+
+
+def seen(names, t, position, name="points", **more) -> PointGroup:
+    return PointGroup(name, tuple(names), np.asarray(t, float), np.asarray(position, float), **more)
+
+
+def recording(group=None, *groups, name="made") -> Recording:
+    return Recording(group, groups, name=name)
+
+
+H, STEPS = 0.01, 24
+PENDULUM = ("shoulder", "elbow")
+
+
+def pendulum_step(folder, effects=(), **how):
+    """A double pendulum with springs and dampers; effects as (kind, location, values)."""
+    robot = read_urdf(folder / "double_pendulum.urdf")
+    springs = {joint: Spring(stiffness, 0.1) for joint, stiffness in zip(PENDULUM, (6.0, 3.0), strict=True)}
+    loose = {joint: spring for joint, spring in springs.items() if joint not in how.get("driven", ())}
+    loose = {joint: spring for joint, spring in loose.items() if joint not in how.get("prescribed", ())}
+    system = System.build(robot, springs=loose, damping=dict.fromkeys(PENDULUM, 0.2), points=["tip", "lower"], **how)
+    made = [make_effect(kind, place, system, values) for kind, place, values in effects]
+    return compile_step(system.with_effects(made), H, use_compiler=False)
+
+
+def taken(step, seed, *, efforts=True, camera=True, name=None, steps=STEPS):
+    """A recording of something like a motion of the pendulum: smooth angles and efforts, points somewhere near."""
+    rng = np.random.default_rng(seed)
+    t = 1.0 + H * np.arange(steps + 1)
+    names = (*step.system.driven, *step.system.prescribed)
+    group = None
+    if names:
+        phase = rng.uniform(0, 6, (2, len(names)))
+        angle = 0.2 + 0.1 * np.sin(9.0 * t[:, None] + phase[0])
+        effort = 1.0 + 0.5 * np.sin(7.0 * t[:, None] + phase[1])
+        group = joints(names, t, angle, effort=effort if efforts else None, effort_std=0.3, position_std=1e-3)
+    place = np.array([0.0, 0.1, 0.35]) + 0.05 * rng.standard_normal((steps + 1, 1, 3))
+    groups = [seen(["tip"], t, place, "points_arm", std=np.full(place.shape, 0.02))]
+    if camera:
+        at = np.sort(rng.uniform(t[0], t[-1], 7))
+        pose = np.eye(4)
+        pose[:3, 3] = [0.0, 2.0, 0.5]
+        shot = np.array([0.0, 0.1, 0.7]) + 0.05 * rng.standard_normal((7, 2, 3))
+        shot[2, 1] = np.nan
+        more = {"std": np.full(shot.shape, 0.05), "sensor": "camera", "pose": pose}
+        groups.append(seen(["lower", "tip"], at, shot, "points_camera", **more))
+    return Recording(group, tuple(groups), name=name or f"run_{seed}")

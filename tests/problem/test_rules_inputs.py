@@ -1,0 +1,304 @@
+"""From a recording to what drives the model: torques, loads, paths, clamps, filters; rule by rule."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import scipy.signal
+from scipy.spatial.transform import Rotation
+from small_problems import joints, recording, seen
+
+from yid_ocp.errors import DataError
+from yid_ocp.model.cable import ClampPath
+from yid_ocp.problem.grid import Grid
+from yid_ocp.problem.inputs import (
+    held_torque,
+    held_torque_slope,
+    joint_loads,
+    point_course,
+    prescribed_path,
+    sensors_present,
+)
+from yid_ocp.problem.low_pass import LowPass
+
+PLAIN = LowPass(math.inf)
+
+
+# -- torques ----------------------------------------------------------------------------------------------------------
+
+
+def driven(effort, t=None):
+    effort = np.asarray(effort, float).reshape(-1, 1)
+    t = 0.1 * np.arange(len(effort)) if t is None else np.asarray(t, float)
+    return joints(["other", "a"], t, np.zeros((len(t), 2)), effort=np.hstack([99 + effort, effort]))
+
+
+@pytest.mark.parametrize(
+    ("grid", "expected"),
+    [
+        (Grid(0.0, 0.1, 3), [1.0, 2.0, 4.0]),
+        (Grid(0.0, 0.2, 2), [1.5, 6.0]),
+        (Grid(0.05, 0.1, 2), [1.5, 3.0]),
+        (Grid(0.0, 0.05, 4), [1.0, 1.0, 2.0, 2.0]),
+        (Grid(0.2, 0.1, 4), [4.0, 8.0, 8.0, 8.0]),
+        (Grid(-0.2, 0.1, 3), [1.0, 1.0, 1.0]),
+    ],
+    ids=[
+        "step by step",
+        "two samples a step",
+        "in between",
+        "two steps a sample",
+        "beyond the end",
+        "before the start",
+    ],
+)
+def test_a_torque_is_held_from_sample_to_sample_and_averaged_over_a_step(grid, expected):
+    found = held_torque(driven([1.0, 2.0, 4.0, 8.0]), ("a",), grid, "run")
+    np.testing.assert_allclose(found[:, 0], expected)
+
+
+def test_an_uneven_clock_weighs_samples_by_how_long_they_are_held():
+    found = held_torque(driven([1.0, 5.0, 9.0], [0.0, 0.15, 0.2]), ("a",), Grid(0.0, 0.2, 1), "run")
+    np.testing.assert_allclose(found, [[(0.15 * 1.0 + 0.05 * 5.0) / 0.2]])
+
+
+@pytest.mark.parametrize(
+    ("delay", "expected"), [(0.0, [1, 2, 4]), (0.1, [1, 1, 2]), (0.05, [1, 1.5, 3]), (-0.1, [2, 4, 8])]
+)
+def test_a_delayed_torque_acts_later(delay, expected):
+    found = held_torque(driven([1.0, 2.0, 4.0, 8.0]), ("a",), Grid(0.0, 0.1, 3), "run", np.array([delay]))
+    np.testing.assert_allclose(found[:, 0], expected)
+
+
+@pytest.mark.parametrize("delay", [0.03, 0.17, -0.04])
+def test_the_slope_by_the_delay_is_that_of_differences(delay):
+    made, grid = driven([1.0, 2.0, 4.0, 8.0, 5.0, 1.0]), Grid(0.1, 0.1, 3)
+    ends = [held_torque(made, ("a",), grid, "run", np.array([delay + sign * 1e-6])) for sign in (1, -1)]
+    found = held_torque_slope(made, ("a",), grid, "run", np.array([delay]))
+    np.testing.assert_allclose(found, (ends[0] - ends[1]) / 2e-6, rtol=1e-6, atol=1e-6)
+
+
+def test_at_a_jump_the_slope_is_the_mean_of_both_sides():
+    made, grid = driven([1.0, 2.0, 4.0, 8.0, 5.0, 1.0]), Grid(0.1, 0.1, 3)
+    sides = [held_torque_slope(made, ("a",), grid, "run", np.array([delay])) for delay in (1e-3, -1e-3)]
+    np.testing.assert_allclose(held_torque_slope(made, ("a",), grid, "run", np.zeros(1)), np.mean(sides, axis=0))
+    # beyond the ends the torque is held, and so does not change
+    beyond = held_torque_slope(made, ("a",), Grid(0.7, 0.1, 2), "run", np.zeros(1))
+    np.testing.assert_array_equal(beyond, np.zeros((2, 1)))
+    before = held_torque_slope(made, ("a",), Grid(-0.7, 0.1, 2), "run", np.zeros(1))
+    np.testing.assert_array_equal(before, np.zeros((2, 1)))
+
+
+def test_nothing_driven_needs_no_torque_and_a_driven_joint_does():
+    silent = joints(["a"], [0.0, 0.1], np.zeros((2, 1)))
+    assert held_torque(silent, (), Grid(0.0, 0.1, 3), "run").shape == (3, 0)
+    with pytest.raises(DataError, match="no joint effort"):
+        held_torque(silent, ("a",), Grid(0.0, 0.1, 3), "run")
+    with pytest.raises(DataError, match="'b' of the model is not recorded"):
+        held_torque(driven([1.0, 2.0]), ("b",), Grid(0.0, 0.1, 3), "run")
+
+
+def test_loads_are_smoothed_and_interpolated():
+    t = 0.01 * np.arange(200)
+    effort = np.stack([np.ones(200), 3 * t + np.sin(2 * np.pi * 40 * t)], axis=1)
+    made = recording(joints(["a", "b"], t, np.zeros((200, 2)), effort=effort))
+    grid = Grid(0.5, 0.025, 20)
+    found = joint_loads(made, ("b", "a"), grid, LowPass(5.0))
+    np.testing.assert_allclose(found[:, 0], 3 * grid.times, atol=1e-3)
+    np.testing.assert_allclose(found[:, 1], 1.0, atol=1e-9)
+    for without in (
+        recording(joints(["a"], t, np.zeros((200, 1)))),
+        recording(None, seen(["p"], [0, 1], np.zeros((2, 1, 3)))),
+    ):
+        with pytest.raises(DataError, match="gears give way"):
+            joint_loads(without, ("a",), grid, PLAIN)
+
+
+# -- what is there ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("made", "expected"),
+    [
+        (recording(driven([1.0, 2.0])), {"joints.position", "joints.effort"}),
+        (recording(joints(["a"], [0.0, 0.1], np.zeros((2, 1)))), {"joints.position"}),
+        (recording(None, seen(["p"], [0, 1], np.zeros((2, 1, 3)))), set()),
+        (recording(None, seen(["p"], [0, 1], np.zeros((2, 1, 3)), pose=np.eye(4))), {"camera"}),
+        (recording(None, seen(["p"], [0, 1], np.zeros((2, 1, 3)), sensor="camera")), {"camera"}),
+        (recording(None, seen(["p"], [0, 1], np.zeros((2, 1, 3)), clock="nominal")), {"nominal_clock"}),
+    ],
+    ids=["efforts", "no efforts", "points", "camera by its pose", "camera by its name", "nominal clock"],
+)
+def test_sensors_are_known_by_what_was_recorded(made, expected):
+    assert sensors_present([made]) == expected
+    assert sensors_present([recording(driven([1.0, 2.0])), made]) == expected | {"joints.position", "joints.effort"}
+
+
+# -- prescribed paths -------------------------------------------------------------------------------------------------
+
+
+def moving(*names):
+    return SimpleNamespace(prescribed=names)
+
+
+def test_a_prescribed_joint_follows_its_recorded_positions():
+    t = 2.0 + 0.1 * np.arange(11)
+    position = np.stack([np.sin(t), t**2], axis=1)
+    made = recording(joints(["a", "b"], t, position))
+    grid = Grid(2.0, 0.025, 40)
+    found = prescribed_path(made, moving("b", "a"), grid, PLAIN)
+    np.testing.assert_allclose(found[:, 0], grid.times**2, atol=1e-9)
+    np.testing.assert_allclose(found[:, 1], np.sin(grid.times), atol=1e-4)
+    beyond = prescribed_path(made, moving("b"), Grid(1.9, 0.1, 13), PLAIN)
+    assert beyond[0, 0] == pytest.approx(4.0)
+    assert beyond[-1, 0] == pytest.approx(9.0)
+    assert prescribed_path(made, moving(), grid, PLAIN).shape == (41, 0)
+
+
+def test_a_prescribed_joint_must_be_recorded():
+    with pytest.raises(DataError, match="'a' is prescribed but the recording has no joints"):
+        prescribed_path(recording(None, seen(["p"], [0, 1], np.zeros((2, 1, 3)))), moving("a"), Grid(0, 0.1, 3), PLAIN)
+
+
+def clamped(origin, towards, t=None):
+    t = 0.1 * np.arange(len(origin)) if t is None else t
+    return recording(None, seen(["o", "d"], t, np.stack([origin, towards], axis=1)))
+
+
+AXES = tuple(f"end_{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz"))
+
+
+def test_a_clamp_stands_at_its_point_and_looks_along_its_direction():
+    origin = np.cumsum(np.full((8, 3), [0.01, 0.02, -0.01]), axis=0)
+    turned = Rotation.from_euler("XYZ", np.stack([np.linspace(0.3, 4.0, 8), np.linspace(-0.5, 0.8, 8), np.zeros(8)], 1))
+    made = clamped(origin, origin + turned.apply([0.0, 0.0, 0.25]))
+    grid = Grid(0.0, 0.1, 7)
+    path = prescribed_path(made, moving(*AXES), grid, PLAIN, (ClampPath("end", "o", "d", "zero"),))
+    np.testing.assert_allclose(path[:, :3], origin, atol=1e-12)
+    np.testing.assert_allclose(path[:, 3], np.linspace(0.3, 4.0, 8), atol=1e-9)
+    np.testing.assert_allclose(path[:, 4], np.linspace(-0.5, 0.8, 8), atol=1e-9)
+    np.testing.assert_array_equal(path[:, 5], np.zeros(8))
+
+
+def test_a_transported_clamp_does_not_turn_about_its_axis():
+    steps = 400
+    angle = np.linspace(0.0, 2 * np.pi, steps + 1)
+    direction = np.stack([0.5 * np.cos(angle), 0.5 * np.sin(angle), np.ones(steps + 1)], axis=1)
+    t = np.linspace(0.0, 1.0, steps + 1)
+    made = clamped(np.zeros((steps + 1, 3)), direction, t)
+    path = prescribed_path(
+        made, moving(*AXES), Grid(0.0, 1.0 / steps, steps), PLAIN, (ClampPath("end", "o", "d", "transported"),)
+    )
+    frames = Rotation.from_euler("XYZ", path[:, 3:])
+    turns = (frames[:-1].inv() * frames[1:]).as_rotvec()
+    assert np.abs(turns[:, 2]).max() < 1e-5
+    # carried round a cone it comes back turned by the solid angle that it enclosed
+    cone = 2 * np.pi * (1 - 1 / math.sqrt(1.25))
+    assert abs(path[-1, 5] - path[0, 5]) == pytest.approx(cone, rel=1e-3)
+
+
+def test_a_clamp_needs_two_points_apart_and_seen_often_enough():
+    origin = np.zeros((5, 3))
+    with pytest.raises(DataError, match="'o' and 'd' coincide"):
+        prescribed_path(
+            clamped(origin, origin), moving(*AXES), Grid(0, 0.1, 4), PLAIN, (ClampPath("end", "o", "d", "zero"),)
+        )
+    hidden = np.tile([0.0, 0.0, 1.0], (5, 1))
+    hidden[1, 2] = math.nan
+    made = clamped(origin, hidden)
+    np.testing.assert_allclose(point_course(made, "d", Grid(0.0, 0.1, 4), PLAIN), np.tile([0.0, 0.0, 1.0], (5, 1)))
+    hidden[2] = math.nan
+    with pytest.raises(DataError, match="'d' is seen 3 times"):
+        point_course(clamped(origin, hidden), "d", Grid(0.0, 0.1, 4), PLAIN)
+    with pytest.raises(DataError, match="'x' is not recorded"):
+        point_course(made, "x", Grid(0.0, 0.1, 4), PLAIN)
+
+
+def test_a_course_is_smoothed_and_stays_where_it_was_seen_last():
+    t = 0.01 * np.arange(300)
+    line = np.stack([t, 2 * t, 0 * t], axis=1) + 0.1 * np.sin(2 * np.pi * 45 * t)[:, None]
+    made = recording(None, seen(["o"], t, line[:, None]))
+    found = point_course(made, "o", Grid(0.5, 0.1, 20), LowPass(5.0))
+    np.testing.assert_allclose(found, np.outer(Grid(0.5, 0.1, 20).times, [1.0, 2.0, 0.0]), atol=2e-3)
+    held = point_course(made, "o", Grid(2.9, 0.1, 3), PLAIN)
+    np.testing.assert_allclose(held[2], held[3])
+
+
+# -- the low-pass filter ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("frequency", [0.5, 5.0, 10.0, 20.0])
+def test_the_filter_is_butterworths_of_order_four_forth_and_back(frequency):
+    step, cutoff = 0.002, 5.0
+    t = step * np.arange(10001)
+    found = LowPass(cutoff)(t, np.sin(2 * np.pi * frequency * t)[:, None])[:, 0]
+    # bilinear transformation: frequencies are warped
+    ratio = math.tan(math.pi * frequency * step) / math.tan(math.pi * cutoff * step)
+    middle = slice(3000, 7000)
+    np.testing.assert_allclose(found[middle], np.sin(2 * np.pi * frequency * t[middle]) / (1 + ratio**8), atol=1e-4)
+
+
+def test_without_a_cutoff_values_are_as_they_were():
+    values = np.random.default_rng(1).standard_normal((5, 2))
+    assert PLAIN(np.arange(5.0), values) is values
+    assert PLAIN.stride(0.01) == 1
+
+
+def test_an_uneven_clock_is_resampled_in_between():
+    t = np.sort(np.concatenate([0.01 * np.arange(400), [1.003, 2.5042]]))
+    line = np.stack([2 + 3 * t], axis=1)
+    np.testing.assert_allclose(LowPass(5.0)(t, line), line, atol=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("cutoff", "step", "stride"), [(5.0, 0.01, 10), (5.0, 0.02, 5), (10.0, 0.01, 5), (30.0, 0.05, 1), (7.0, 0.01, 7)]
+)
+def test_smoothed_values_tell_something_new_twice_a_period(cutoff, step, stride):
+    assert LowPass(cutoff).stride(step) == stride
+
+
+@pytest.mark.parametrize("cutoff", [2.0, 5.0])
+def test_what_lies_beyond_an_end_is_forgotten_after_settling(cutoff):
+    """The slowest poles' response has fallen to a thousandth then."""
+    step = 0.002
+    settling = LowPass(cutoff).settling
+    sections = scipy.signal.butter(4, cutoff * 2 * step, output="sos")
+    impulse = np.zeros(5000)
+    impulse[0] = 1.0
+    response = np.abs(scipy.signal.sosfilt(sections, impulse))
+    late = response[round(settling / step) :].max()
+    assert 1e-4 < late / response.max() < 1e-2
+    poles = np.log(scipy.signal.butter(4, cutoff * 2 * step, output="zpk")[1]) / step
+    assert settling == pytest.approx(math.log(1e3) / np.abs(poles.real).min(), rel=1e-2)
+
+
+@pytest.mark.parametrize("cutoff", [4.0, 8.0, math.inf])
+def test_gains_turn_white_noise_into_that_of_value_rate_and_second_rate(cutoff):
+    step = 0.01
+    low_pass = LowPass(cutoff)
+    noise = np.random.default_rng(3).standard_normal((40000, 1))
+    values = low_pass(step * np.arange(40000), noise)[200:-200, 0]
+    rates = (values[2:] - values[:-2]) / (2 * step)
+    seconds = (values[2:] - 2 * values[1:-1] + values[:-2]) / step**2
+    found = low_pass.gains(step)
+    measured = [np.std(values), np.std(rates), np.std(seconds)]
+    np.testing.assert_allclose(found, measured, rtol=0.05)
+
+
+@pytest.mark.parametrize(("cutoff", "refused"), [(0.0, True), (-1.0, True), (50.0, True), (49.9, False), (51.0, True)])
+def test_a_cutoff_lies_between_zero_and_half_the_sampling_rate(cutoff, refused):
+    t = 0.01 * np.arange(300)
+    if refused:
+        with pytest.raises(DataError, match="path_cutoff"):
+            LowPass(cutoff)(t, np.zeros((300, 1)))
+    else:
+        assert LowPass(cutoff)(t, np.ones((300, 1))) == pytest.approx(1.0)
+
+
+def test_short_records_are_padded_as_far_as_they_go():
+    for count in (5, 20, 40):
+        t = 0.01 * np.arange(count)
+        np.testing.assert_allclose(LowPass(3.0)(t, np.ones((count, 1))), 1.0, atol=1e-9)

@@ -1,0 +1,283 @@
+"""Samples beside their prediction: weights, losses, nodes in time, lateness; rule by rule."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from small_problems import efforts, joints, measured, points, recording, seen
+
+from yid_ocp.errors import DataError
+from yid_ocp.problem.grid import Grid, make_grid
+from yid_ocp.problem.measurements import huber, paper_weighting, placed
+from yid_ocp.sensors.base import SensorData
+
+NAN = math.nan
+
+
+# -- nodes in time ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("t", "node", "fraction"),
+    [
+        (5.0, 0, 0.0),
+        (5.05, 0, 0.5),
+        (5.1, 1, 0.0),
+        (5.1 + 5e-8, 1, 0.0),
+        (5.1 - 5e-8, 1, 0.0),
+        (5.1 + 5e-7, 1, 5e-6),
+        (5.275, 2, 0.75),
+        (5.3, 2, 1.0),
+        (5.4, 2, 2.0),
+        (4.9, 0, -1.0),
+    ],
+)
+def test_a_time_lies_between_two_nodes(t, node, fraction):
+    found_node, found_fraction = Grid(5.0, 0.1, 3).locate([t])
+    assert found_node.tolist() == [node]
+    assert found_fraction == pytest.approx([fraction], abs=1e-9)
+
+
+def test_nodes_are_evenly_spaced_from_the_start():
+    np.testing.assert_allclose(Grid(5.0, 0.1, 3).times, [5.0, 5.1, 5.2, 5.3])
+
+
+@pytest.mark.parametrize(
+    ("last", "duration", "steps"),
+    [
+        (1.0, None, 10),
+        (1.05, None, 10),
+        (1.0 - 1e-9, None, 10),
+        (1.0, 0.5, 5),
+        (1.0, 0.55, 5),
+        (1.0, 9.0, 10),
+        (0.2, None, 2),
+    ],
+)
+def test_a_grid_covers_the_recording_or_as_much_as_is_wanted(last, duration, steps):
+    t = 3.0 + np.array([0.0, last])
+    made = recording(joints(["a"], t, np.zeros((2, 1))), seen(["p"], [0.0, 9.0], np.zeros((2, 1, 3))))
+    found = make_grid(made, 0.1, duration)
+    assert (found.start, found.time_step, found.steps) == (3.0, 0.1, steps)
+
+
+def test_without_joints_points_drive_the_clock_and_too_little_is_refused():
+    made = recording(None, seen(["p"], [1.0, 1.4], np.zeros((2, 1, 3))))
+    assert (make_grid(made, 0.1).start, make_grid(made, 0.1).steps) == (1.0, 4)
+    with pytest.raises(DataError, match=r"0\.4 s of data are shorter than two time steps of 0\.3 s"):
+        make_grid(made, 0.3)
+
+
+# -- losses -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("residual", "scale", "cost", "factor"),
+    [
+        (1.0, 2.0, 0.5, 1.0),
+        (-1.0, 2.0, 0.5, 1.0),
+        (2.0, 2.0, 2.0, 1.0),
+        (3.0, 2.0, 2.0 * (3.0 - 1.0), math.sqrt(2 / 3)),
+        (-8.0, 2.0, 2.0 * (8.0 - 1.0), 0.5),
+        (1e6, math.inf, 0.5e12, 1.0),
+        (0.0, 2.0, 0.0, 1.0),
+        (0.5, 0.0, 0.0, 0.0),
+    ],
+)
+def test_hubers_loss_is_square_first_and_then_straight(residual, scale, cost, factor):
+    found, weight = huber(np.array([residual]), scale)
+    assert found == pytest.approx(cost)
+    assert weight == pytest.approx([factor])
+
+
+def test_losses_add():
+    cost, factor = huber(np.array([[1.0, 4.0], [0.0, -1.0]]), 2.0)
+    assert cost == pytest.approx(0.5 + 2 * 3 + 0.5)
+    np.testing.assert_allclose(factor, [[1.0, math.sqrt(0.5)], [1.0, 1.0]])
+
+
+# -- rows of a residual -----------------------------------------------------------------------------------------------
+
+TWO = measured(efforts("a", "b"), [0, 1], [0.0, 0.0], [[1.0, NAN], [3.0, 4.0]], [[2.0, 0.0], [0.5, 10.0]])
+
+
+def test_rows_are_whitened_differences_where_something_was_measured():
+    predicted = np.array([[2.0, 9.0], [1.0, 5.0]])
+    np.testing.assert_array_equal(TWO.whitened(predicted), [[2.0, 0.0], [-1.0, 10.0]])
+    found = TWO.rows(predicted)
+    np.testing.assert_array_equal(found.residual, [2.0, -1.0, 10.0])
+    np.testing.assert_array_equal(found.weight, [2.0, 0.5, 10.0])
+    assert found.cost == pytest.approx(0.5 * (4 + 1 + 100))
+    assert found.jacobian is None
+    assert TWO.count == 3
+    np.testing.assert_array_equal(TWO.seen, [[True, False], [True, True]])
+
+
+def test_rows_have_the_slopes_of_their_predictions_and_a_robust_weight():
+    slopes = np.arange(12.0).reshape(2, 2, 3)
+    found = TWO.rows(np.array([[2.0, 9.0], [1.0, 5.0]]), slopes, threshold=2.5)
+    np.testing.assert_allclose(found.residual, [2.0, -1.0, 5.0])
+    np.testing.assert_allclose(found.weight, [2.0, 0.5, 5.0])
+    np.testing.assert_allclose(found.jacobian, [[0, 2, 4], [3, 3.5, 4], [45, 50, 55]])
+    assert found.cost == pytest.approx(2.0 + 0.5 + 2.5 * (10 - 1.25))
+
+
+def test_every_output_of_a_point_has_its_channel():
+    made = measured(points("p", "r"), [0], [0.0], np.zeros((1, 6)))
+    assert made.channel_of_column == ("points.p",) * 3 + ("points.r",) * 3
+    assert TWO.channel_of_column == ("joints.effort.a", "joints.effort.b")
+
+
+# -- from a sensor ----------------------------------------------------------------------------------------------------
+
+
+def test_data_are_placed_on_nodes_and_whitened():
+    data = SensorData(efforts("a"), np.array([5.05, 5.2]), np.array([[1.0], [NAN]]), np.array([[0.5], [7.0]]))
+    found = placed(data, Grid(5.0, 0.1, 3), "run")
+    assert (found.node.tolist(), found.fraction.tolist()) == ([0, 2], [pytest.approx(0.5), 0.0])
+    np.testing.assert_array_equal(found.weight, [[2.0], [0.0]])
+    np.testing.assert_array_equal(found.std, [[0.5], [NAN]])
+    assert (found.span, found.sensor) == ((0, 3), data.sensor)
+    narrow = SensorData(efforts("a"), data.t, data.value, data.std, (1, 2))
+    assert placed(narrow, Grid(5.0, 0.1, 3), "run").span == (1, 2)
+
+
+@pytest.mark.parametrize("std", [0.0, -1.0, NAN])
+def test_a_noise_level_that_is_not_positive_is_refused_where_something_was_measured(std):
+    data = SensorData(efforts("a"), np.array([5.0, 5.1]), np.array([[1.0], [2.0]]), np.array([[0.5], [std]]))
+    with pytest.raises(DataError, match="zero or missing"):
+        placed(data, Grid(5.0, 0.1, 3), "run")
+    hidden = SensorData(efforts("a"), data.t, np.array([[1.0], [NAN]]), data.std)
+    assert placed(hidden, Grid(5.0, 0.1, 3), "run").weight.tolist() == [[2.0], [0.0]]
+
+
+@pytest.mark.parametrize(
+    ("node", "fraction", "nearest", "weight"),
+    [
+        (0, 0.0, 0, 0.0),
+        (0, 0.49, 0, 0.0),
+        (0, 0.5, 1, 1.0),
+        (1, 0.49, 1, 1.0),
+        (1, 0.5, 2, 1.0),
+        (2, 0.9, 3, math.sqrt(2)),
+        (3, 0.0, 3, math.sqrt(2)),
+    ],
+)
+def test_the_papers_cost_counts_the_end_twice_and_the_start_not_at_all(node, fraction, nearest, weight):
+    made = measured(points("p"), [node], [fraction], [[1.0, NAN, 3.0]], weight=[[1e3, 0.0, 1e3]])
+    found = paper_weighting(made, Grid(0.0, 0.1, 3))
+    assert (found.node.tolist(), found.fraction.tolist()) == ([nearest], [0.0])
+    np.testing.assert_allclose(found.weight, [[weight, 0.0, weight]])
+
+
+# -- between nodes ----------------------------------------------------------------------------------------------------
+
+
+def test_predictions_are_interpolated_between_the_nodes_that_are_needed():
+    made = measured(efforts("a", "b"), [2, 2, 5, 9], [0.0, 0.25, 0.0, 0.5], np.zeros((4, 2)))
+    assert made.nodes.tolist() == [2, 3, 5, 9, 10]
+    at_nodes = np.array([[k, k**2] for k in made.nodes], float)
+    np.testing.assert_allclose(made.interpolate(at_nodes), [[2, 4], [2.25, 5.25], [5, 25], [9.5, 90.5]])
+    deep = np.stack([at_nodes, 10 * at_nodes], axis=2)
+    np.testing.assert_allclose(made.interpolate(deep)[:, :, 1], 10 * made.interpolate(at_nodes))
+
+
+def test_a_sample_on_its_node_does_not_look_at_the_next_one():
+    made = measured(efforts("a"), [2, 3], [0.0, 0.0], np.zeros((2, 1)))
+    assert made.nodes.tolist() == [2, 3]
+    np.testing.assert_array_equal(made.interpolate(np.array([[1.0], [NAN]])), [[1.0], [NAN]])
+
+
+@pytest.mark.parametrize("late", [None, (0.0, 1.3), (0.4, 2.0)])
+def test_distributing_is_the_transpose_of_interpolating(late):
+    made = measured(efforts("a", "b"), [4, 4, 6, 9], [0.0, 0.25, 0.5, 1.0], np.zeros((4, 2)), span=(0, 10))
+    made = made if late is None else made.late(np.array(late))
+    rng = np.random.default_rng(1)
+    count = len(made.nodes)
+    at_nodes, at_samples = rng.standard_normal((count, 2)), rng.standard_normal((4, 2))
+    there, back = made.interpolate(at_nodes), made.distribute(at_samples)
+    assert back.shape == (count, 2)
+    assert np.sum(there * at_samples) == pytest.approx(np.sum(at_nodes * back), rel=1e-12)
+    deep = rng.standard_normal((4, 2, 3))
+    np.testing.assert_allclose(made.distribute(deep)[:, :, 1], made.distribute(deep[:, :, 1]), atol=1e-12)
+
+
+# -- late samples -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("node", "fraction", "steps", "late_node", "late_fraction"),
+    [
+        (5, 0.5, 0.0, 5, 0.5),
+        (5, 0.5, 0.25, 5, 0.25),
+        (5, 0.5, 0.75, 4, 0.75),
+        (5, 0.5, 0.5, 5, 0.0),
+        (5, 0.5, 0.5 + 1e-10, 5, 0.0),
+        (5, 0.0, -1.5, 6, 0.5),
+        (3, 0.0, 2.0, 2, 0.0),
+        (8, 0.5, -9.0, 7, 1.0),
+        (8, 0.0, 0.0, 7, 1.0),
+    ],
+    ids=[
+        "on time",
+        "a little",
+        "past a node",
+        "on a node",
+        "nearly",
+        "early",
+        "before the span",
+        "beyond it",
+        "its end",
+    ],
+)
+def test_a_late_sample_is_that_of_before_within_the_span(node, fraction, steps, late_node, late_fraction):
+    made = measured(efforts("a"), [node], [fraction], [[1.0]], span=(2, 8)).late(np.array([steps]))
+    assert made.node.tolist() == [[late_node]]
+    np.testing.assert_allclose(made.fraction, [[late_fraction]], atol=1e-12)
+
+
+def test_outputs_are_late_by_different_times_and_their_nodes_have_neighbours():
+    made = measured(efforts("a", "b"), [5, 6], [0.5, 0.0], np.zeros((2, 2)), span=(0, 10)).late(np.array([0.25, 2.0]))
+    assert made.node.tolist() == [[5, 3], [5, 4]]
+    np.testing.assert_allclose(made.fraction, [[0.25, 0.5], [0.75, 0.0]])
+    assert made.nodes.tolist() == [2, 3, 4, 5, 6]
+    near_start = measured(efforts("a"), [0], [0.0], [[1.0]], span=(0, 3)).late(np.zeros(1))
+    assert near_start.nodes.tolist() == [0, 1]
+    near_end = measured(efforts("a"), [3], [0.0], [[1.0]], span=(0, 3)).late(np.zeros(1))
+    assert near_end.nodes.tolist() == [1, 2, 3]
+    at_nodes = np.array([[k, 10 * k] for k in made.nodes], float)
+    np.testing.assert_allclose(made.interpolate(at_nodes), [[5.25, 35.0], [5.75, 40.0]])
+
+
+@pytest.mark.parametrize(
+    ("node", "fraction", "steps", "rate"),
+    [
+        (5, 0.5, 0.25, 36.0 - 25.0),
+        (5, 0.5, 0.5, (36.0 - 16.0) / 2),
+        (5, 0.5, 1.5, (25.0 - 9.0) / 2),
+        (5, 0.5, 0.75, 25.0 - 16.0),
+        (3, 0.0, 2.0, 0.0),
+        (3, 0.0, 1.0, (9.0 - 4.0) / 2),
+        (8, 0.0, -1.0, 0.0),
+        (8, 0.0, 0.0, (64.0 - 49.0) / 2),
+        (7, 0.5, 0.0, 64.0 - 49.0),
+    ],
+    ids=[
+        "between",
+        "on a node",
+        "on an earlier node",
+        "across",
+        "beyond",
+        "at the start",
+        "after",
+        "at the end",
+        "last",
+    ],
+)
+def test_a_late_sample_changes_by_the_slope_on_its_node_by_the_mean_of_two(node, fraction, steps, rate):
+    plain = measured(efforts("a"), [node], [fraction], [[1.0]], span=(2, 8))
+    late = plain.late(np.array([steps]))
+    at_nodes = np.array([[float(k**2)] for k in late.nodes])
+    np.testing.assert_allclose(late.slope(at_nodes, plain, np.array([steps])), [[rate]])

@@ -1,0 +1,311 @@
+"""Predictions and their derivatives: forward, adjoint and differences agree, whatever is driven, late or misread."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_problems import PENDULUM, STEPS, H, pendulum_step, taken
+
+from yid_ocp.integrator.step import Feedback
+from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
+from yid_ocp.problem.corrections import Inputs
+from yid_ocp.problem.episodes import beginning
+
+MISREAD = (("encoder_offset", "shoulder", {"offset": 0.03}), ("effort_gain", "shoulder", {"scale": 0.9}))
+LATE = (("camera_latency", "camera", {"delay": 0.0137}), ("clock_scale", "clock", {"scale": 0.97}))
+GEARS = (("series_elasticity", "shoulder", {"stiffness": 300.0}), ("backlash", "shoulder", {"width": 0.02}))
+HEAVY = (("rotor_inertia", "shoulder", {"armature": 0.03}), ("link_mass", "elbow", {"scale": 1.1}))
+DELAYED = (("effort_delay", "gripper", {"delay": 0.0137}), ("effort_offset", "shoulder", {"offset": 0.2}))
+SOFT = (("joint_coulomb", "elbow", {"tau_c": 0.05}), ("gravity_tilt", "world", {"rx": 0.03, "ry": 0.02}))
+
+TRACKED = {"feedback": "proportional", "gains": (9.0,)}
+FILTERED = {"feedback": "lqr"}
+CASES = {
+    "free": ((), {}, {}),
+    "estimated start": ((), {}, {"initial_state": "estimated"}),
+    "local": (SOFT, {}, {"local": ("elbow.stiffness",)}),
+    "robust": (LATE, {}, {"huber_threshold": 1.5}),
+    "prescribed": (MISREAD + LATE, {"prescribed": ("shoulder",)}, {}),
+    "prescribed gears": (GEARS + HEAVY, {"prescribed": ("shoulder",)}, {}),
+    "all prescribed": (MISREAD, {"prescribed": PENDULUM}, {}),
+    "driven": (DELAYED + MISREAD, {"driven": ("shoulder",)}, {"feedback": "none"}),
+    "driven, proportional": (MISREAD + GEARS, {"driven": ("shoulder",)}, TRACKED),
+    "driven, filtered": (MISREAD + HEAVY + LATE, {"driven": ("shoulder",)}, FILTERED),
+    "driven, filtered, both": (MISREAD + HEAVY, {"driven": PENDULUM}, FILTERED),
+    "driven, filtered, estimated": (MISREAD, {"driven": ("shoulder",)}, {**FILTERED, "initial_state": "estimated"}),
+    "driven and prescribed": (MISREAD, {"driven": ("elbow",), "prescribed": ("shoulder",)}, TRACKED),
+}
+
+
+def problem_of(folder, case, seeds=(1, 2), **more):
+    effects, how, options = CASES[case]
+    step = pendulum_step(folder, effects, **how)
+    names = [name for effect in step.system.effects for name in effect.parameters.names]
+    springs = [f"{joint}.stiffness" for joint in PENDULUM if f"{joint}.stiffness" in step.system.parameters.names]
+    settings = ProblemOptions(path_cutoff=math.inf, **options | more)
+    recordings = [taken(step, seed) for seed in seeds]
+    return EstimationProblem(step, recordings, ("elbow.damping", *springs, *names), settings)
+
+
+@pytest.fixture(scope="module", params=CASES)
+def problem(request, urdf_folder):
+    return problem_of(urdf_folder, request.param)
+
+
+def moved(problem):
+    """A point beside the start."""
+    x = problem.start
+    change = np.random.default_rng(3).uniform(0.9, 1.1, len(x))
+    return np.where(x == 0, 0.01 * (change - 0.9), x * change)
+
+
+def test_forward_and_adjoint_derivatives_are_those_of_differences(problem):
+    x = moved(problem)
+    evaluation = problem.evaluate(x)
+    assert evaluation.ok, evaluation.message
+    cost, gradient, _ = problem.gradient(x)
+    scale = np.maximum(np.abs(x), 1e-2)
+    forward = evaluation.jacobian.T @ evaluation.residual
+    np.testing.assert_allclose(gradient * scale, forward * scale, rtol=1e-6, atol=1e-8 * np.abs(forward * scale).max())
+    assert cost == pytest.approx(evaluation.cost, rel=1e-12)
+    rows = problem.rows.informing
+    for i in range(len(x)):
+        step = np.zeros(len(x))
+        step[i] = 1e-5 * scale[i]
+        ends = [problem.evaluate(x + sign * step, warm=evaluation.warm) for sign in (1, -1)]
+        slope = (ends[0].cost - ends[1].cost) / (2 * step[i])
+        assert slope == pytest.approx(gradient[i], rel=2e-4, abs=1e-6 * np.abs(gradient * scale).max() / scale[i])
+        if problem.options.huber_threshold == math.inf:
+            numeric = (ends[0].residual - ends[1].residual)[rows] / (2 * step[i])
+            exact = evaluation.jacobian[rows, i]
+            np.testing.assert_allclose(numeric, exact, atol=2e-4 * max(np.abs(exact).max(), 1e-6 / scale[i]))
+
+
+def test_without_derivatives_the_cost_is_the_same(problem):
+    x = moved(problem)
+    plain, full = problem.evaluate(x, derivatives=False), problem.evaluate(x)
+    np.testing.assert_array_equal(plain.residual, full.residual)
+    assert plain.jacobian is None
+    assert (plain.cost, plain.ok) == (full.cost, True)
+    warm = problem.evaluate(x, warm=full.warm)
+    np.testing.assert_allclose(warm.residual, full.residual, atol=1e-7)
+
+
+def test_what_is_freed_later_has_the_same_derivatives(urdf_folder):
+    whole = problem_of(urdf_folder, "driven, filtered")
+    x, few = moved(whole), whole.names[1:4]
+    part = whole.freeing(few).at(dict(zip(whole.names, x, strict=True)))
+    own = np.array([x[whole.names.index(name)] for name in few])
+    one, two = part.evaluate(own), whole.evaluate(x)
+    data = whole.rows.data
+    np.testing.assert_allclose(one.residual[part.rows.data], two.residual[data], atol=1e-9)
+    columns = [whole.names.index(name) for name in few]
+    np.testing.assert_allclose(one.jacobian[part.rows.data], two.jacobian[data][:, columns], atol=1e-7)
+    none = whole.freeing(()).at(dict(zip(whole.names, x, strict=True)))
+    alone = none.evaluate(np.zeros(0))
+    np.testing.assert_allclose(alone.residual, two.residual[data], atol=1e-9)
+    assert alone.jacobian.shape == (len(alone.residual), 0)
+
+
+# -- values -----------------------------------------------------------------------------------------------------------
+
+
+def predicted(problem, values, group=0):
+    return problem.evaluate(problem.vector(values), derivatives=False).episodes[0].predicted[group]
+
+
+def test_a_late_camera_sees_what_was_before(urdf_folder):
+    problem = problem_of(urdf_folder, "robust", seeds=(1,))
+    camera = problem.episodes[0].samples[1]
+    delay = "camera_latency@camera.delay"
+    neutral = {"clock_scale@clock.scale": 1.0}
+    whole = problem.evaluate(problem.vector({**neutral, delay: 0.0}), False).episodes[0].predicted[0]
+    t = H * (camera.node + camera.fraction)
+    late = predicted(problem, {**neutral, delay: 0.02}, group=1)
+    for i in range(3):
+        expected = np.interp(t - 0.02, H * np.arange(STEPS + 1), whole[:, i])
+        np.testing.assert_allclose(late[:, 3 + i], expected, atol=1e-9)
+    np.testing.assert_allclose(predicted(problem, {**neutral, delay: 0.02}), whole, atol=1e-12)
+
+
+def test_a_delay_is_in_true_time(urdf_folder):
+    problem = problem_of(urdf_folder, "robust", seeds=(1,))
+    samples, theta = problem.episodes[0].samples[1], problem.system.parameters.vector
+    values = {"camera_latency@camera.delay": 0.02, "clock_scale@clock.scale": 0.8}
+    late, _ = problem.predictor.lateness(samples, theta(values), ())
+    assert late.shape == (6,)
+    scale = float(late[0]) * H / 0.02
+    assert scale == pytest.approx(0.8) or scale == pytest.approx(1 / 0.8)
+    assert problem.predictor.lateness(problem.episodes[0].samples[0], theta(values), ()) is None
+
+
+def test_an_encoder_that_is_offset_moves_the_path(urdf_folder):
+    problem = problem_of(urdf_folder, "prescribed", seeds=(1,))
+    values = {"encoder_offset@shoulder.offset": 0.05}
+    episode = problem.episodes[0]
+    inputs = problem.predictor.inputs(episode, problem.system.parameters.vector(values), ())
+    np.testing.assert_allclose(inputs.path - episode.path, -0.05, atol=1e-12)
+    rollout = problem.evaluate(problem.vector(values), False).episodes[0].rollout
+    np.testing.assert_allclose(rollout.state[:, 0], inputs.path[:, 0], atol=1e-12)
+
+
+def test_an_elastic_gear_gives_under_the_recorded_effort(urdf_folder):
+    problem = problem_of(urdf_folder, "prescribed gears", seeds=(1,))
+    episode = problem.episodes[0]
+    theta = problem.system.parameters.vector(
+        {"series_elasticity@shoulder.compliance": 0.004, "backlash@shoulder.width": 0.0}
+    )
+    inputs = problem.predictor.inputs(episode, theta, ())
+    effort = episode.recording.joints.effort
+    np.testing.assert_allclose(episode.load, effort, atol=1e-12)
+    np.testing.assert_allclose(inputs.path, episode.path - 0.004 * effort, atol=1e-12)
+
+
+def test_a_torque_acts_as_it_was_recorded_less_what_its_sensor_adds(urdf_folder):
+    problem = problem_of(urdf_folder, "driven", seeds=(1,))
+    episode = problem.episodes[0]
+    vector = problem.system.parameters.vector
+    neutral = {
+        "effort_delay@gripper.delay": 0.0,
+        "effort_offset@shoulder.offset": 0.0,
+        "effort_gain@shoulder.scale": 1.0,
+        "encoder_offset@shoulder.offset": 0.0,
+    }
+    assert set(neutral) <= set(problem.names)
+    plain = problem.predictor.inputs(episode, vector(neutral), ())
+    np.testing.assert_allclose(plain.torque, episode.torque, atol=1e-12)
+    np.testing.assert_allclose(plain.first_torque, episode.torque[0])
+    shifted = problem.predictor.inputs(episode, vector(neutral | {"effort_delay@gripper.delay": H}), ())
+    np.testing.assert_allclose(shifted.torque[1:], episode.torque[:-1], atol=1e-9)
+    offset = problem.predictor.inputs(episode, vector(neutral | {"effort_offset@shoulder.offset": 0.5}), ())
+    np.testing.assert_allclose(offset.torque, episode.torque - 0.5, atol=1e-12)
+    np.testing.assert_allclose(offset.first_torque, episode.torque[0] - 0.5, atol=1e-12)
+
+
+def test_a_problem_is_as_recorded_unless_an_effect_may_change_it(urdf_folder):
+    plain = problem_of(urdf_folder, "free", seeds=(1,))
+    assert plain.as_recorded
+    for case in ("prescribed", "prescribed gears", "driven", "driven, filtered", "robust"):
+        assert not problem_of(urdf_folder, case, seeds=(1,)).as_recorded, case
+    neutral = {"encoder_offset@shoulder.offset": 0.0, "effort_gain@shoulder.scale": 1.0}
+    made = problem_of(urdf_folder, "all prescribed", seeds=(1,))
+    assert not made.at(neutral).as_recorded, "a free one may change it"
+    fixed = made.freeing(("elbow.damping",))
+    assert fixed.at(neutral).as_recorded
+    assert not fixed.at(neutral | {"encoder_offset@shoulder.offset": 0.01}).as_recorded
+    assert problem_of(urdf_folder, "local", seeds=(1,)).as_recorded
+
+
+def test_efforts_along_a_rollout_are_those_of_driven_and_prescribed_joints(urdf_folder):
+    problem = problem_of(urdf_folder, "driven and prescribed", seeds=(1,))
+    rollout = problem.evaluate(problem.start, False).episodes[0].rollout
+    effort = problem.predictor.efforts(rollout)
+    assert effort.shape == (STEPS + 1, 2)
+    np.testing.assert_array_equal(effort[:-1, 0], rollout.effort[:, 0])
+    np.testing.assert_array_equal(effort[:-1, 1], rollout.torque[:, 0])
+    np.testing.assert_array_equal(effort[-1], effort[-2])
+
+
+def test_readings_along_a_trajectory_are_those_of_its_rollout(urdf_folder):
+    problem = problem_of(urdf_folder, "free", seeds=(1,))
+    x = problem.start
+    evaluation = problem.evaluate(x, False)
+    state, theta = evaluation.episodes[0].rollout.state, problem.split(x, 0)[0]
+    by_state = np.zeros((STEPS + 1, 4, len(x)))
+    for k, samples in enumerate(problem.episodes[0].samples):
+        along, slopes = problem.predictor.along(samples, state, by_state, theta)
+        np.testing.assert_allclose(along, evaluation.episodes[0].predicted[k], atol=1e-12)
+        np.testing.assert_array_equal(slopes, np.zeros((*along.shape, len(x))))
+    by_state[:, 0, 1] = 1.0
+    _, slopes = problem.predictor.along(problem.episodes[0].samples[0], state, by_state, theta)
+    # turned about the shoulder as a whole, the tip moves across its lever
+    lever = evaluation.episodes[0].predicted[0] - [0.0, 0.0, 1.2]
+    np.testing.assert_allclose(slopes[:, 1, 1], -lever[:, 2], atol=1e-9)
+    np.testing.assert_allclose(slopes[:, 2, 1], lever[:, 1], atol=1e-9)
+
+
+# -- the first part of an episode -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("case", ["driven, filtered", "prescribed gears", "estimated start"])
+def test_the_beginning_of_an_episode_is_predicted_as_in_the_whole(urdf_folder, case):
+    problem = problem_of(urdf_folder, case, seeds=(1,))
+    whole = problem.episodes[0]
+    short = problem.on([beginning(whole, 10)], ())
+    x = moved(problem)
+    one, two = problem.evaluate(x, False).episodes[0], short.evaluate(x, False).episodes[0]
+    assert short.episodes[0].grid.steps == 10
+    np.testing.assert_allclose(two.rollout.state, one.rollout.state[:11], atol=1e-9)
+    for k, samples in enumerate(short.episodes[0].samples):
+        before = whole.samples[k]
+        last = 10 - (STEPS - before.span[1])
+        assert samples.span == (before.span[0], last)
+        early = before.node + before.fraction <= last + 1e-9
+        np.testing.assert_array_equal(samples.value, before.value[early])
+        np.testing.assert_allclose(two.predicted[k], one.predicted[k][early], atol=1e-9)
+    assert beginning(whole, 99).grid.steps == STEPS
+
+
+# -- filters and efforts ----------------------------------------------------------------------------------------------
+
+
+def test_filters_follow_the_true_angles_and_momenta():
+    feedback = Feedback(np.array([0, 1, 4, 5]), np.ones((3, 2, 4)), np.zeros((3, 4)))
+    arm, measured = np.full((4, 2), [1.0, 2.0]), np.zeros((4, 2))
+    momentum = np.full((3, 2), [10.0, 20.0])
+    inputs = Inputs(np.zeros((3, 2)), np.zeros(2), np.zeros((4, 0)), arm)
+    assert inputs.guided(feedback, (0, 1), measured) is feedback
+    assert inputs.guided(None, (0, 1), measured) is None
+    angles = replace(inputs, by_arm=np.zeros((4, 2, 1))).guided(feedback, (0, 1), measured)
+    np.testing.assert_array_equal(angles.reference, np.full((3, 4), [1.0, 2.0, 0.0, 0.0]))
+    momenta = replace(inputs, momentum=momentum).guided(feedback, (0, 1), measured)
+    np.testing.assert_array_equal(momenta.reference, np.full((3, 4), [0.0, 0.0, 10.0, 20.0]))
+    assert not feedback.reference.any()
+    swapped = replace(inputs, by_arm=np.zeros((4, 2, 1))).guided(feedback, (1, 0), measured)
+    np.testing.assert_array_equal(swapped.reference[:, :2], np.full((3, 2), [2.0, 1.0]))
+
+
+def test_a_moving_reference_moves_the_torque_by_the_gain():
+    gain = np.arange(24.0).reshape(3, 2, 4)
+    feedback = Feedback(np.array([0, 1, 4, 5]), gain, np.zeros((3, 4)))
+    by_arm, by_momentum = np.zeros((4, 2, 1)), np.zeros((3, 2, 1))
+    by_arm[:, 1], by_momentum[:, 0] = 1.0, 2.0
+    plain = Inputs(np.zeros((3, 2)), np.zeros(2), np.zeros((4, 0)), np.zeros((4, 2)))
+    assert plain.torque_directions(feedback, (0, 1)) is None
+    by_torque = np.full((3, 2, 1), 100.0)
+    full = replace(plain, by_torque=by_torque, by_arm=by_arm, by_momentum=by_momentum)
+    np.testing.assert_array_equal(full.torque_directions(None, (0, 1)), by_torque)
+    found = full.torque_directions(feedback, (0, 1))
+    np.testing.assert_array_equal(found[:, :, 0], 100.0 + gain[:, :, 1] + 2 * gain[:, :, 2])
+    np.testing.assert_array_equal(by_torque, np.full((3, 2, 1), 100.0))
+    alone = replace(plain, by_momentum=by_momentum).torque_directions(feedback, (0, 1))
+    np.testing.assert_array_equal(alone[:, :, 0], 2 * gain[:, :, 2])
+
+
+def test_known_coordinates_are_driven_then_prescribed():
+    inputs = Inputs(np.zeros((3, 1)), np.zeros(1), np.array([[5.0, 6.0], [0, 0]]), np.array([[4.0], [0.0]]))
+    assert inputs.posture.tolist() == [4.0, 5.0, 6.0]
+    np.testing.assert_array_equal(inputs.by_posture(2), np.zeros((3, 2)))
+    by_path = np.arange(8.0).reshape(2, 2, 2)
+    np.testing.assert_array_equal(replace(inputs, by_path=by_path).by_posture(2), [[0, 0], [0, 1], [2, 3]])
+
+
+@pytest.mark.parametrize(
+    ("position_std", "stated", "angle"), [(1e-3, None, 1e-3), (1e-3, 4e-3, 4e-3), (None, None, 0.0)]
+)
+def test_predicted_efforts_have_the_noise_of_encoders_in_them(urdf_folder, position_std, stated, angle):
+    """Accelerations come from the path: their noise times the inertia adds to that of the effort sensor."""
+    step = pendulum_step(urdf_folder, prescribed=("shoulder",))
+    made = taken(step, 1)
+    made = replace(made, joints=replace(made.joints, position_std=position_std))
+    sensors = {"joints.effort": SensorOptions(position_std=stated)}
+    options = ProblemOptions(path_cutoff=math.inf, sensors=sensors)
+    problem = EstimationProblem(step, [made], ("elbow.damping",), options)
+    effort = next(s for s in problem.episodes[0].samples if s.sensor.efforts)
+    # a second difference of white noise is larger by the root of 1 + 4 + 1
+    acceleration = angle * math.sqrt(6.0) / H**2
+    inertia = 0.0208 + 0.25**2 + 0.008 + 0.6 * 0.7**2
+    np.testing.assert_allclose(effort.std, math.hypot(0.3, inertia * acceleration), rtol=1e-9)

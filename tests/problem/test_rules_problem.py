@@ -1,0 +1,417 @@
+"""The estimation problem, rule by rule: unknowns, priors, scales, starts, what is refused."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import scipy.optimize
+from small_problems import PENDULUM, H, pendulum_step, recording, seen, taken
+
+from yid_ocp.errors import ConfigError, DataError
+from yid_ocp.model.parameters import Parameter, Parameters
+from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
+from yid_ocp.problem.episodes import apparent_inertia, beginning
+from yid_ocp.problem.problem import ResidualRows, _check_bounds
+from yid_ocp.problem.unknowns import Unknowns, replaced
+
+FREE = ("shoulder.stiffness", "elbow.stiffness", "elbow.rest")
+START = {"shoulder.stiffness": 6.0, "elbow.stiffness": 3.0, "elbow.rest": 0.1}
+
+
+@pytest.fixture(scope="module")
+def free_step(urdf_folder):
+    return pendulum_step(urdf_folder)
+
+
+@pytest.fixture(scope="module")
+def make(free_step):
+    """make(...): two recordings of a pendulum on springs."""
+
+    def build(free=FREE, held_out=(), values=None, may_free=(), seeds=(1, 2), **options):
+        recordings = [taken(free_step, seed) for seed in seeds]
+        return EstimationProblem(free_step, recordings, free, ProblemOptions(**options), values, held_out, may_free)
+
+    return build
+
+
+def tip(q):
+    """Where the tip is: rods of 0.5 and 0.4 m hang at a height of 1.2 m and turn about x."""
+    one, both = q[0], q[0] + q[1]
+    return np.array([0.0, 0.5 * np.sin(one) + 0.4 * np.sin(both), 1.2 - 0.5 * np.cos(one) - 0.4 * np.cos(both)])
+
+
+# -- the unknown vector -----------------------------------------------------------------------------------------------
+
+LAYOUT = Unknowns(("a", "b"), ("l",), ("q.x", "p.x"), ("one", "two"))
+
+
+def test_unknowns_are_shared_ones_then_those_of_every_recording():
+    assert LAYOUT.names == (
+        "a",
+        "b",
+        "l[one]",
+        "start.q.x[one]",
+        "start.p.x[one]",
+        "l[two]",
+        "start.q.x[two]",
+        "start.p.x[two]",
+    )
+    assert LAYOUT.parameters == ("a", "b", "l")
+    assert LAYOUT.columns(0).tolist() == [0, 1, 2, 3, 4]
+    assert LAYOUT.columns(1).tolist() == [0, 1, 5, 6, 7]
+
+
+def test_blocks_and_values_find_their_places():
+    block = np.arange(10.0).reshape(2, 5)
+    wide = LAYOUT.placed(block, 1)
+    np.testing.assert_array_equal(wide[1], [5, 6, 0, 0, 0, 7, 8, 9])
+    np.testing.assert_array_equal(LAYOUT.spread([1, 2], [3], [4, 5]), [1, 2, 3, 4, 5, 3, 4, 5])
+    np.testing.assert_array_equal(replaced(np.array([1.0, 2.0]), ("a", "b"), {"b": 7.0, "c": 9.0}), [1.0, 7.0])
+
+
+def test_a_recording_has_its_own_values_and_start(make):
+    problem = make(local=("elbow.rest",), initial_state="estimated")
+    x = np.arange(1.0, 1 + len(problem.names))
+    theta, offset = problem.split(x, 1)
+    names = problem.system.parameters.names
+    assert [theta[names.index(name)] for name in ("shoulder.stiffness", "elbow.stiffness", "elbow.rest")] == [1, 2, 8]
+    assert offset.tolist() == [9, 10, 11, 12]
+    assert theta[names.index("elbow.damping")] == 0.2
+    assert problem.split(x, 0)[1].tolist() == [4, 5, 6, 7]
+    assert problem.theta[names.index("elbow.rest")] == 0.1
+    assert (problem.shared, problem.local) == (FREE[:2], FREE[2:])
+
+
+def test_start_bounds_and_values_by_name(make):
+    problem = make(initial_state="estimated", seeds=(1,))
+    assert problem.named(problem.start) == {**START, **dict.fromkeys(problem.names[3:], 0.0)}
+    lower, upper = problem.bounds
+    assert lower[0] == 0.0
+    assert upper[0] == math.inf
+    np.testing.assert_array_equal(lower[3:], -np.inf)
+    np.testing.assert_array_equal(upper[3:], np.inf)
+    found = problem.vector({"elbow.stiffness": 9.0, "shoulder.stiffness": -1.0, "start.q.elbow[run_1]": 0.5})
+    assert problem.named(found) == {
+        **START,
+        "elbow.stiffness": 9.0,
+        "shoulder.stiffness": 0.0,
+        **dict.fromkeys(problem.names[3:], 0.0),
+        "start.q.elbow[run_1]": 0.5,
+    }
+
+
+# -- priors and scales ------------------------------------------------------------------------------------------------
+
+
+def test_an_estimated_start_has_a_prior_in_angles_and_momenta(make, momentum, free_step):
+    """The momentum's prior is that of a velocity times the inertia at the joint."""
+    problem = make(initial_state="estimated", configuration_std=0.07, velocity_std=0.3, seeds=(1,))
+    theta = free_step.system.parameters.vector()
+    inertia = [momentum(free_step, np.zeros(2), velocity, theta)[i] for i, velocity in enumerate(np.eye(2))]
+    # two rods: 1/3 m l^2 and more about the shoulder
+    assert inertia == pytest.approx([0.0208 + 0.25**2 + 0.008 + 0.6 * 0.7**2, 0.008 + 0.6 * 0.2**2], rel=1e-9)
+    np.testing.assert_allclose(problem.start_std, [0.07, 0.07, 0.3 * inertia[0], 0.3 * inertia[1]], rtol=1e-9)
+    np.testing.assert_allclose(apparent_inertia(free_step, theta, ("elbow", "shoulder")), inertia[::-1], rtol=1e-9)
+    assert problem.names[3:] == tuple(f"start.{kind}.{joint}[run_1]" for kind in "qp" for joint in PENDULUM)
+    assert problem.start_rows == (0, 1, 2, 3)
+
+
+def test_without_estimated_starts_there_are_none(make):
+    problem = make()
+    assert problem.start_rows == ()
+    assert problem.start_std.shape == (0,)
+    assert problem.names == FREE
+
+
+def test_stated_priors_are_gaussian_about_the_start(make):
+    problem = make(priors={"elbow.stiffness": 0.5, "elbow.rest": 0.02}, weak_prior_factor=0.0)
+    x = np.array([7.0, 4.0, 0.14])
+    residual, rows = problem.prior(x)
+    np.testing.assert_allclose(residual, [2.0, 2.0])
+    np.testing.assert_allclose(rows, [[0.0, 2.0, 0.0], [0.0, 0.0, 50.0]])
+    assert problem.rows.stated_priors.stop - problem.rows.stated_priors.start == 2
+    assert problem.rows.weak_priors.stop == problem.rows.weak_priors.start
+
+
+def test_weak_priors_are_log_normal_and_only_of_positive_unknowns_without_another(make):
+    problem = make(priors={"shoulder.stiffness": 2.0}, weak_prior_factor=10.0)
+    x = np.array([7.0, 30.0, 0.5])
+    residual, rows = problem.prior(x)
+    np.testing.assert_allclose(residual, [0.5, 1.0])
+    np.testing.assert_allclose(rows, [[0.5, 0.0, 0.0], [0.0, 1 / (math.log(10.0) * 30.0), 0.0]])
+    assert problem.positive.tolist() == [True, True, False]
+    assert (problem.rows.weak_priors, problem.rows.informing) == (
+        slice(problem.rows.data.stop + 1, problem.rows.data.stop + 2),
+        slice(0, problem.rows.data.stop + 1),
+    )
+    low, _ = problem.prior(np.array([7.0, 0.0, 0.5]))
+    assert low[1] == pytest.approx(-9.0)
+
+
+@pytest.mark.parametrize("options", [{"weak_prior_factor": 1.0}, {"weak_prior_factor": 0.0}, {"weighting": "paper"}])
+def test_some_problems_have_no_weak_prior(make, options):
+    problem = make(**options)
+    residual, rows = problem.prior(problem.start)
+    assert residual.shape == (0,)
+    assert rows.shape == (0, 3)
+    assert make(weak_prior_factor=1.1).prior(problem.start)[0].shape == (2,)
+
+
+def test_an_unknown_is_as_large_as_its_start_its_prior_or_a_tenth_of_its_range(make):
+    values = {"shoulder.stiffness": 0.0, "elbow.stiffness": 0.0, "elbow.rest": 0.0}
+    problem = make(values=values, priors={"elbow.stiffness": 0.25}, initial_state="estimated", seeds=(1,))
+    np.testing.assert_allclose(problem.scales[:2], [1.0, 0.25])
+    np.testing.assert_allclose(problem.scales[3:], problem.start_std)
+    lower, upper = problem.bounds
+    width = upper[2] - lower[2]
+    assert problem.scales[2] == pytest.approx(0.1 * width if math.isfinite(width) else 1.0)
+    np.testing.assert_allclose(make(values={"elbow.rest": -0.4}).scales, [6.0, 3.0, 0.4])
+
+
+# -- rows -------------------------------------------------------------------------------------------------------------
+
+
+def test_the_residual_is_made_of_measurements_then_priors(make):
+    problem = make(priors={"elbow.stiffness": 1.0}, weak_prior_factor=5.0)
+    evaluation = problem.evaluate(problem.start + np.array([1.0, 2.0, 0.1]))
+    rows = problem.rows
+    assert [[part.stop - part.start for part in group] for group in rows.measurements] == [[75, 39], [75, 39]]
+    assert rows.measurements[1][0] == slice(114, 189)
+    assert (rows.data, rows.stated_priors, rows.weak_priors) == (slice(0, 228), slice(228, 229), slice(229, 230))
+    np.testing.assert_allclose(evaluation.residual[228:], [2.0, math.log(7.0 / 6.0) / math.log(5.0)])
+    assert evaluation.cost == pytest.approx(0.5 * evaluation.residual @ evaluation.residual)
+    residual, jacobian = problem.informing(evaluation)
+    np.testing.assert_array_equal(residual, evaluation.residual[:229])
+    np.testing.assert_array_equal(jacobian, evaluation.jacobian[:229])
+    assert ResidualRows.of((), 2, 3) == ResidualRows((), slice(0, 0), slice(0, 2), slice(2, 5))
+
+
+def test_the_papers_rows_are_metres_and_inform_in_units_of_the_noise(make):
+    problem = make(weighting="paper", priors={"elbow.stiffness": 1.0})
+    evaluation = problem.evaluate(problem.start + np.array([0.0, 2.0, 0.0]))
+    # 75 coordinates of 2 cm and 39 of 5 cm in each recording
+    noise = math.sqrt((75 * 0.02**2 + 39 * 0.05**2) / 114)
+    assert problem.noise == pytest.approx(noise)
+    residual, jacobian = problem.informing(evaluation)
+    data = problem.rows.data
+    np.testing.assert_allclose(residual[data], evaluation.residual[data] / noise)
+    np.testing.assert_allclose(jacobian[data], evaluation.jacobian[data] / noise)
+    assert residual[-1] == 2.0
+    assert jacobian[-1].tolist() == [0.0, 1.0, 0.0]
+    assert make().noise == 1.0
+
+
+def test_predictions_are_those_of_a_rollout_from_rest(make, free_step, roll):
+    """Readings of the tip, interpolated between nodes, in the camera's frame: nothing else enters the residual."""
+    problem = make(seeds=(1,))
+    x = problem.vector({"elbow.stiffness": 4.0})
+    evaluation = problem.evaluate(x, derivatives=False)
+    assert evaluation.jacobian is None
+    result = evaluation.episodes[0]
+    theta, _ = problem.split(x, 0)
+    state = result.rest.state
+    np.testing.assert_allclose(result.rollout.state, roll(free_step, theta, state[:2], state[2:], 24).state, atol=1e-12)
+
+    places = np.stack([tip(q) for q in result.rollout.state[:, :2]])
+    episode = problem.episodes[0]
+    seen_tip = (places - episode.samples[0].value) / 0.02
+    np.testing.assert_allclose(evaluation.residual[:75], seen_tip.ravel(), atol=1e-9)
+    camera = episode.samples[1]
+    t = H * (camera.node + camera.fraction)
+    between = np.stack([np.interp(t, H * np.arange(25), places[:, i]) for i in range(3)], axis=1)
+    expected = (between - camera.value[:, 3:]) / 0.05
+    good = np.isfinite(camera.value)
+    rows = np.full(camera.value.shape, np.nan)
+    rows[good] = evaluation.residual[75:114]
+    np.testing.assert_allclose(rows[:, 3:], expected, atol=1e-9)
+
+
+@pytest.mark.filterwarnings("ignore:overflow")
+def test_a_cost_that_is_not_finite_is_a_failure(make):
+    failing = make(free=("elbow.damping",)).evaluate([1e308])
+    assert (failing.ok, failing.cost, failing.jacobian) == (False, math.inf, None)
+    assert failing.message == "the cost is not finite"
+
+
+def test_a_problem_whose_rollout_fails_says_why(make):
+    problem = make(free=("elbow.rest",))
+    failing = problem.evaluate([1e8])
+    assert not failing.ok
+    assert (failing.cost, failing.jacobian, failing.episodes, failing.warm) == (math.inf, None, (), ())
+    assert failing.message.startswith("run_1: no equilibrium found")
+    cost, gradient, same = problem.gradient([1e8])
+    assert (cost, gradient.tolist(), same.ok) == (math.inf, [0.0], False)
+
+
+# -- held-out recordings ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def held(free_step, make, roll):
+    """Two swings from near rest, the tip seen."""
+    rest = make().evaluate(list(START.values()), False).episodes[0].rest.state
+    theta = free_step.system.parameters.vector()
+    found = []
+    for seed in (8, 9):
+        rng = np.random.default_rng(seed)
+        start = rest + np.array([0.03, 0.05, 0.01, 0.005]) * rng.standard_normal(4)
+        q = roll(free_step, theta, start[:2], start[2:], 24).state[:, :2]
+        place = np.stack([tip(row) for row in q])[:, None]
+        place += 0.005 * rng.standard_normal(place.shape)
+        t = 1.0 + H * np.arange(25)
+        found.append(recording(None, seen(["tip"], t, place, std=np.full(place.shape, 0.02)), name=f"run_{seed}"))
+    return found
+
+
+@pytest.mark.parametrize(("configuration", "velocity"), [(0.05, 0.2), (0.01, 0.05), (1.0, 5.0)])
+def test_a_held_out_start_balances_its_prior_and_its_first_moments(make, held, configuration, velocity):
+    options = {"initial_state": "estimated", "configuration_std": configuration, "velocity_std": velocity}
+    problem = make(held_out=held, **options)
+    x = problem.start
+    short = beginning(problem.held_out[1], 20)
+    theta, _ = problem.split(x, 0)
+
+    def rows(offset):
+        result = problem.predictor.run(short, theta, offset, False)
+        parts = [s.whitened(y).ravel() for s, y in zip(short.samples, result.predicted, strict=True)]
+        return np.concatenate([*parts, offset / problem.start_std])
+
+    best = scipy.optimize.least_squares(rows, np.zeros(4), x_scale=problem.start_std, xtol=1e-12, ftol=1e-14)
+    found = problem.held_out_offset(1, x)
+    np.testing.assert_allclose(found / problem.start_std, best.x / problem.start_std, atol=2e-3)
+
+
+def test_held_out_recordings_are_predicted_with_shared_parameters_only(make, held):
+    problem = make(held_out=held, local=("elbow.rest",), initial_state="estimated")
+    x = problem.vector({"elbow.stiffness": 4.0, "elbow.rest[run_1]": 0.7})
+    found = problem.validate(x)
+    assert [episode.name for episode, _ in found] == ["run_8", "run_9"]
+    for i, (episode, result) in enumerate(found):
+        theta = problem.system.parameters.vector({"elbow.stiffness": 4.0, "elbow.rest": 0.1})
+        expected = problem.predictor.run(episode, theta, problem.held_out_offset(i, x), False)
+        np.testing.assert_allclose(result.predicted[0], expected.predicted[0], atol=1e-12)
+        assert np.any(problem.held_out_offset(i, x))
+
+
+def test_a_held_out_part_of_a_recording_shares_its_start(make):
+    problem = make(initial_state="estimated")
+    part = replace(problem.episodes[1], shares_start_of=1)
+    split = problem.on(problem.episodes, [part])
+    x = problem.vector({name: 0.01 * i for i, name in enumerate(problem.names[3:])})
+    assert split.held_out_offset(0, x).tolist() == problem.split(x, 1)[1].tolist()
+    np.testing.assert_array_equal(
+        split.validate(x)[0][1].predicted[0], problem.evaluate(x, False).episodes[1].predicted[0]
+    )
+
+
+def test_a_start_at_rest_needs_no_offset(make, held):
+    assert make(held_out=held).held_out_offset(0, np.array([6.0, 3.0, 0.1])).shape == (0,)
+
+
+def test_the_first_moments_are_at_least_two_steps_of_a_fifth_of_a_second(make, held):
+    problem = make(held_out=held, initial_state="estimated")
+    episode = problem.held_out[0]
+    value = episode.samples[0].value.copy()
+    for first, same in ((21, True), (20, False)):
+        changed = value.copy()
+        changed[first:] += 0.3
+        moved = replace(episode, samples=(replace(episode.samples[0], value=changed),))
+        found = problem.on(problem.episodes, [moved]).held_out_offset(0, problem.start)
+        assert np.allclose(found, problem.held_out_offset(0, problem.start), atol=1e-12) is same
+
+
+# -- other problems like it -------------------------------------------------------------------------------------------
+
+
+def test_problems_that_free_other_parameters_share_all_else(make):
+    problem = make(may_free=("elbow.damping",), local=("elbow.rest",))
+    other = problem.freeing(("elbow.damping", "shoulder.stiffness"))
+    assert other.names == ("elbow.damping", "shoulder.stiffness")
+    assert other.episodes is problem.episodes
+    assert other.functions is problem.functions
+    whole = make(free=("elbow.damping", "shoulder.stiffness"))
+    one, two = other.evaluate(other.start), whole.evaluate(whole.start)
+    np.testing.assert_allclose(one.residual, two.residual, atol=1e-9)
+    np.testing.assert_allclose(one.jacobian, two.jacobian, atol=1e-7)
+    moved = problem.at({"elbow.damping": 0.9})
+    assert moved.theta[problem.system.parameters.index("elbow.damping")] == 0.9
+    assert problem.theta[problem.system.parameters.index("elbow.damping")] == 0.2
+    assert moved.episodes is problem.episodes
+
+
+def test_problems_prepared_anew_keep_what_is_not_changed(make, held):
+    problem = make(held_out=held, values={"elbow.damping": 0.7}, priors={"elbow.rest": 0.1}, local=("elbow.rest",))
+    index = problem.system.parameters.index
+    shorter = problem.shortened(0.1)
+    assert (shorter.episodes[0].grid.steps, shorter.held_out, shorter.free) == (10, (), FREE)
+    assert shorter.theta[index("elbow.damping")] == 0.7
+    changed = problem.with_options(replace(problem.options, weak_prior_factor=3.0))
+    assert (changed.options.weak_prior_factor, len(changed.held_out), changed.free) == (3.0, 2, FREE)
+    fewer = problem.with_free(("elbow.stiffness",), {"elbow.stiffness": 5.0})
+    assert (fewer.free, fewer.options.local, fewer.options.priors) == (("elbow.stiffness",), (), {})
+    assert fewer.start.tolist() == [5.0]
+    assert fewer.theta[index("elbow.damping")] == 0.7
+    kept = problem.with_free(("elbow.rest",))
+    assert (kept.options.local, kept.options.priors) == (("elbow.rest",), {"elbow.rest": 0.1})
+    assert len(kept.held_out) == 2
+
+
+def test_a_problem_cannot_be_changed_through_its_parameters(make):
+    with pytest.raises(ValueError, match="read-only"):
+        make().theta[0] = 1.0
+
+
+# -- what is refused --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"free": ("elbow.stiffness", "elbow.stiffness")}, "named twice"),
+        ({"free": ("elbow.stiff",)}, "elbow.stiffness"),
+        ({"local": ("elbow.damping",)}, "'elbow.damping' is not free"),
+        ({"priors": {"elbow.damping": 0.1}}, "'elbow.damping' is not free"),
+        ({"values": {"elbow.stiffness": -1.0}}, "elbow.stiffness"),
+    ],
+)
+def test_what_does_not_fit_is_refused(make, given, words):
+    with pytest.raises(ConfigError, match=words):
+        make(**given)
+
+
+@pytest.mark.parametrize(
+    ("bounds", "words"),
+    [
+        ((4.0, 9.0), r"initial value 3 N m/rad of k lies outside its bounds"),
+        ((0.0, 2.0), r"initial value 3 N m/rad of k lies outside its bounds"),
+        ((3.0, 3.0), "leave no room"),
+    ],
+)
+def test_a_free_parameter_has_room_about_its_start(bounds, words):
+    lower, upper = bounds
+    system = SimpleNamespace(parameters=Parameters([Parameter("k", lower, "N m/rad", lower, upper)]))
+    with pytest.raises(ConfigError, match=words):
+        _check_bounds(system, ("k",), np.array([3.0]))
+    _check_bounds(system, (), np.array([3.0]))
+
+
+@pytest.mark.parametrize("value", [0.0, 3.0, 5.0])
+def test_a_start_may_lie_on_a_bound(value):
+    system = SimpleNamespace(parameters=Parameters([Parameter("k", 1.0, "N m/rad", 0.0, 5.0)]))
+    _check_bounds(system, ("k",), np.array([value]))
+
+
+def test_there_must_be_something_to_estimate_on(free_step):
+    with pytest.raises(DataError, match="no recording to estimate on"):
+        EstimationProblem(free_step, [], FREE)
+    t = H * np.arange(10)
+    hidden = recording(None, seen(["tip"], t, np.full((10, 1, 3), np.nan), std=np.ones((10, 1, 3))))
+    with pytest.raises(DataError, match="no measurement that the model could be compared with"):
+        EstimationProblem(free_step, [hidden], FREE)
+    unused = ProblemOptions(sensors={"points": SensorOptions(use=False)})
+    with pytest.raises(DataError, match="no measurement"):
+        EstimationProblem(free_step, [hidden], FREE, unused)

@@ -1,0 +1,314 @@
+"""Starts fitted to the first measured points, and errors of predictions; rule by rule."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import scipy.optimize
+from scipy.spatial.transform import Rotation
+from small_problems import H, efforts, measured, pendulum_step, points, taken
+
+from yid_ocp.errors import DataError
+from yid_ocp.problem import EstimationProblem, ProblemOptions
+from yid_ocp.problem.start import StartFit, _speed
+from yid_ocp.problem.validation import channel_errors, point_errors
+
+NAN = math.nan
+
+
+def tip(q):
+    one, both = q[0], q[0] + q[1]
+    return np.array([0.0, 0.5 * np.sin(one) + 0.4 * np.sin(both), 1.2 - 0.5 * np.cos(one) - 0.4 * np.cos(both)])
+
+
+def elbow(q):
+    return np.array([0.0, 0.5 * np.sin(q[0]), 1.2 - 0.5 * np.cos(q[0])])
+
+
+@pytest.fixture(scope="module")
+def step(urdf_folder):
+    return pendulum_step(urdf_folder)
+
+
+def at(node, q, std=1e-3, both=True, **more):
+    """The elbow and the tip seen at some nodes."""
+    value = np.array([np.concatenate([elbow(row), tip(row)]) if both else tip(row) for row in np.atleast_2d(q)])
+    names = ("lower", "tip") if both else ("tip",)
+    node = np.atleast_1d(node)
+    return measured(points(*names), node, np.zeros(len(node)), value, np.full(value.shape, 1 / std), **more)
+
+
+def solved(step, samples, window=0.02, posture=(), path=None, **values):
+    theta = step.system.parameters.vector(values)
+    path = np.zeros((30, len(step.system.prescribed))) if path is None else path
+    return StartFit(step).solve(np.array(posture), samples, theta, window, path)
+
+
+def momentum_at(step, momentum, q, v):
+    return momentum(step, np.asarray(q), np.asarray(v), step.system.parameters.vector())
+
+
+# -- the configuration ------------------------------------------------------------------------------------------------
+
+
+def test_a_single_frame_gives_a_configuration_at_rest(step):
+    q = np.array([0.6, -0.9])
+    found = solved(step, [at(0, q)])
+    np.testing.assert_allclose(found.state[:2], q, atol=1e-4)
+    np.testing.assert_array_equal(found.state[2:], np.zeros(2))
+    assert found.values == {}
+
+
+@pytest.mark.parametrize("std", [0.2, 1.0])
+def test_what_the_points_leave_open_has_the_least_elastic_energy(step, std):
+    """Springs of 6 and 3 N m/rad, a mean of 4.5: their prior is of half a radian at the mean stiffness."""
+    target = np.array([0.6, -0.9])
+    sample = at(0, target, std=std, both=False)
+
+    def rows(q):
+        prior = np.sqrt(np.array([6.0, 3.0]) / 4.5) / 0.5 * (q - 0.1)
+        return np.concatenate([(tip(q) - tip(target)) / std, prior])
+
+    best = scipy.optimize.least_squares(rows, [0.1, 0.1], xtol=1e-12)
+    found = solved(step, [sample])
+    np.testing.assert_allclose(found.state[:2], best.x, atol=1e-4)
+
+
+def test_known_joints_stay_where_they_are_known_to_be(urdf_folder):
+    driven = pendulum_step(urdf_folder, driven=("shoulder",))
+    found = solved(driven, [at(0, [0.5, -0.4])], posture=[0.5])
+    np.testing.assert_allclose(found.state[:2], [0.5, -0.4], atol=1e-4)
+    prescribed = pendulum_step(urdf_folder, prescribed=("shoulder",))
+    path = 0.5 + 0.1 * np.arange(30.0)[:, None]
+    later = solved(prescribed, [at(2, [0.7, -0.4])], posture=[0.5], path=path)
+    np.testing.assert_allclose(later.state[1], -0.4, atol=1e-4)
+    assert later.state[0] == 0.5, "the path's first value, whenever the points were seen"
+
+
+def test_a_joint_without_a_spring_is_held_a_little(urdf_folder):
+    loose = pendulum_step(urdf_folder, driven=("elbow",))
+    hidden = measured(points("lower"), [0], [0.0], [elbow([0.3, 0.0])], np.full((1, 3), 1e3))
+    found = solved(loose, [hidden], posture=[0.7])
+    np.testing.assert_allclose(found.state[:2], [0.3, 0.7], atol=1e-4)
+
+
+# -- the velocity -----------------------------------------------------------------------------------------------------
+
+
+def test_two_frames_give_a_velocity_and_the_start_before_the_first(step, momentum):
+    q, v = np.array([0.6, -0.9]), np.array([0.8, -1.5])
+    frames = at([1, 2], [q + v * H, q + 2 * v * H], std=1e-4)
+    found = solved(step, [frames], window=0.02)
+    np.testing.assert_allclose(found.state[:2], q, atol=2e-3)
+    np.testing.assert_allclose(found.state[2:], momentum_at(step, momentum, q, v), rtol=2e-2)
+
+
+def test_only_frames_within_the_window_count_and_only_the_first_and_last(step, momentum):
+    q, v = np.array([0.6, -0.9]), np.array([0.8, -1.5])
+    nodes = np.array([0, 1, 2, 3])
+    turned = np.array([q, q + 0.3, q + 2 * v * H, q + 0.5])
+    found = solved(step, [at(nodes, turned, std=1e-4)], window=0.02)
+    np.testing.assert_allclose(found.state[:2], q, atol=1e-4)
+    np.testing.assert_allclose(found.state[2:], momentum_at(step, momentum, q, v), rtol=2e-2)
+    one = solved(step, [at(nodes, turned, std=1e-4)], window=0.004)
+    np.testing.assert_allclose(one.state[:2], q, atol=1e-4)
+    assert np.linalg.norm(one.state[2:]) > np.linalg.norm(found.state[2:]), "at least one step"
+
+
+def test_frames_count_at_their_nearest_node_and_hidden_ones_do_not(step):
+    q = np.array([0.6, -0.9])
+    made = at([0, 1, 2], [q + 9, q, q + 0.2])
+    weight = made.weight.copy()
+    weight[0] = 0.0
+    late = replace(made, node=np.array([0, 0, 2]), fraction=np.array([0.0, 0.6, 0.0]), weight=weight)
+    found = solved(step, [late], window=0.01)
+    np.testing.assert_allclose(found.state[:2], q, atol=1e-4)
+    assert not found.state[2:].any()
+
+
+def test_a_rate_that_points_leave_open_is_small(step, momentum):
+    """Three radians a second are one standard deviation."""
+    q = np.array([0.6, -0.9])
+    vague = at([0, 2], [q, q + 0.1], std=0.05)
+    found = solved(step, [vague])
+    rows = [at(0, q, std=0.05), at(0, q + 0.1, std=0.05)]
+    first = solved(step, rows[:1]).state[:2]
+
+    def fit(x):
+        seen_there = (np.concatenate([elbow(x), tip(x)]) - rows[1].value[0]) / 0.05
+        return np.concatenate([seen_there, (x - first) / (3.0 * 2 * H)])
+
+    then = scipy.optimize.least_squares(fit, first, xtol=1e-12).x
+    np.testing.assert_allclose(found.state[2:], momentum_at(step, momentum, first, (then - first) / (2 * H)), rtol=1e-3)
+
+
+def test_other_sensors_say_nothing_of_a_start_and_some_point_must(step):
+    q = np.array([0.6, -0.9])
+    effort = measured(efforts("shoulder"), [0], [0.0], [[9.0]], [[1e6]])
+    np.testing.assert_allclose(solved(step, [effort, at(0, q)]).state[:2], q, atol=1e-4)
+    with pytest.raises(DataError, match=r"no point is seen in the first 0\.02 s"):
+        solved(step, [effort, at(3, q)])
+
+
+# -- parameters that are fitted along ---------------------------------------------------------------------------------
+
+
+TURN = "camera_rotation@camera.rx"
+
+
+def test_parameters_are_fitted_along_with_the_start(urdf_folder):
+    """The camera is turned: an arm that sees the same points tells by how much, up to the bounds."""
+    step = pendulum_step(urdf_folder, (("camera_rotation", "camera", {}),))
+    q, pose = np.array([0.6, -0.9]), tuple(map(tuple, np.eye(4).tolist()))
+    lower, upper = step.system.parameters.bounds((TURN,))
+    assert np.all(np.isfinite([*lower, *upper]))
+    sharp = np.full((1, 6), 1e3)
+    here = at(0, q)
+    for turn in (0.0, 0.03, -0.05):
+        value = np.concatenate([elbow(q), tip(q)]).reshape(2, 3)
+        turned = value @ Rotation.from_rotvec([turn, 0, 0]).as_matrix().T
+        camera = measured(points("lower", "tip", pose=pose, group="camera"), [0], [0.0], turned.reshape(1, 6), sharp)
+        found = StartFit(step, (TURN,)).solve(
+            np.zeros(0), [here, camera], step.system.parameters.vector(), 0.02, np.zeros((30, 0))
+        )
+        assert found.values[TURN] == pytest.approx(turn, abs=1e-4)
+        np.testing.assert_allclose(found.state[:2], q, atol=1e-4)
+
+
+# -- in a problem -----------------------------------------------------------------------------------------------------
+
+
+def swung(step, seed=4, std=0.02):
+    return taken(step, seed, camera=False)
+
+
+def test_a_problem_fits_its_starts_once_at_its_own_parameters(step):
+    options = ProblemOptions(initial_state="fitted_to_points", start_window=0.01)
+    problem = EstimationProblem(step, [swung(step)], ("elbow.stiffness",), options, held_out=[swung(step, 5)])
+    expected = solved(step, problem.episodes[0].samples, 0.01)
+    np.testing.assert_allclose(problem.episodes[0].start.state, expected.state)
+    moved = problem.evaluate([9.0], False)
+    np.testing.assert_allclose(moved.episodes[0].rollout.state[0], expected.state)
+    assert moved.warm == (None,)
+    assert problem.held_out[0].start is None
+    [(held, result)] = problem.validate([9.0])
+    own = solved(step, problem.held_out[0].samples, 0.01, **{"elbow.stiffness": 9.0})
+    np.testing.assert_allclose(held.start.state, own.state)
+    np.testing.assert_allclose(result.rollout.state[0], own.state)
+
+
+def test_the_points_of_a_start_may_have_a_noise_of_their_own(step):
+    usual = ProblemOptions(initial_state="fitted_to_points", start_window=0.01)
+    sharp = replace(usual, start_std=1e-4)
+    states = []
+    for options in (usual, sharp):
+        problem = EstimationProblem(step, [swung(step)], ("elbow.stiffness",), options)
+        states.append(problem.episodes[0].start.state[:2])
+        assert problem.episodes[0].samples[0].weight[0, 0] == pytest.approx(50.0)
+    misses = [np.linalg.norm(tip(q) - problem.episodes[0].samples[0].value[0]) for q in states]
+    assert misses[1] < misses[0]
+    again = EstimationProblem(step, [swung(step)], ("elbow.stiffness",), sharp)
+    weight = np.full((25, 3), 1e4)
+    exact = replace(again.episodes[0].samples[0], weight=weight)
+    np.testing.assert_allclose(states[1], solved(step, [exact], 0.01).state[:2], atol=1e-9)
+
+
+def test_known_starts_and_values_are_taken_as_they_are(step):
+    state = np.array([0.3, 0.2, 0.05, -0.02])
+    options = ProblemOptions(
+        initial_state="fitted_to_points",
+        known_start={"run_4": state},
+        recording_values={"run_4": {"elbow.rest": 0.5}},
+    )
+    problem = EstimationProblem(step, [swung(step)], ("elbow.stiffness",), options)
+    rollout = problem.evaluate([4.0], False).episodes[0].rollout
+    np.testing.assert_array_equal(rollout.state[0], state)
+    theta = problem.predictor.own_theta(problem.episodes[0], problem.theta)
+    assert theta[problem.system.parameters.index("elbow.rest")] == 0.5
+    assert problem.theta[problem.system.parameters.index("elbow.rest")] == 0.1
+    start = problem.start_state(problem.episodes[0], problem.theta)
+    np.testing.assert_array_equal(start.state, state)
+    assert (start.by_unknowns.shape, start.rest, start.message) == ((4, 1), None, "")
+    assert not start.by_unknowns.any()
+    with pytest.raises(Exception, match="known_start"):
+        EstimationProblem(step, [swung(step)], ("elbow.stiffness",), replace(options, known_start={"run_4": state[:3]}))
+
+
+def test_an_estimated_start_is_offset_from_a_known_one(step):
+    state = np.array([0.3, 0.2, 0.05, -0.02])
+    options = ProblemOptions(initial_state="estimated", known_start={"run_4": state})
+    problem = EstimationProblem(step, [swung(step)], ("elbow.stiffness",), options)
+    offset = np.array([0.01, 0.02, 0.003, 0.004])
+    rollout = problem.evaluate(np.concatenate([[3.0], offset]), False).episodes[0].rollout
+    np.testing.assert_allclose(rollout.state[0], state + offset)
+    start = problem.start_state(problem.episodes[0], problem.theta, offset)
+    np.testing.assert_allclose(start.state, state + offset)
+    np.testing.assert_array_equal(start.by_unknowns, np.hstack([np.zeros((4, 1)), np.eye(4)]))
+
+
+def test_a_start_at_rest_that_does_not_exist_is_said(step):
+    problem = EstimationProblem(step, [swung(step)], ("elbow.rest",), ProblemOptions())
+    theta = problem.system.parameters.vector() * 1.0
+    theta[problem.system.parameters.index("elbow.rest")] = 1e8
+    start = problem.start_state(problem.episodes[0], theta)
+    assert start.message.startswith("run_4: no equilibrium")
+    assert start.by_unknowns.shape == (4, 1)
+    assert not start.rest.converged
+
+
+# -- how fast it starts -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("value", "span", "speed"),
+    [
+        ([[0, 0, 0, 0, 0, 0], [3, 4, 0, 0, 0, 0]], 0.5, math.sqrt(25 / 2) / 0.5),
+        ([[0, 0, 0, 0, 0, 0], [3, 4, 0, NAN, 0, 0]], 0.5, 10.0),
+        ([[0, 0, 0, 0, 0, 0], [3, 4, 0, 0, 0, 0]], 0.0, 0.0),
+        ([[NAN] * 6, [0.0] * 6], 0.5, 0.0),
+    ],
+    ids=["two points", "one seen twice", "one frame", "none seen twice"],
+)
+def test_the_speed_of_a_start_is_that_of_points_seen_in_both_frames(value, span, speed):
+    made = measured(points("a", "b"), [0, 1], [0.0, 0.0], value)
+    other = measured(points("a", "b"), [0, 1], [0.0, 0.0], np.full((2, 6), 9.0))
+    assert _speed([(made, 0)], [(made, 1), (other, 1)], span) == pytest.approx(speed)
+    assert _speed([(made, 0)], [(other, 1)], span) == 0.0
+
+
+# -- errors of predictions --------------------------------------------------------------------------------------------
+
+
+def test_errors_are_euclidean_for_points_and_plain_for_efforts():
+    tips = measured(points("a", "b"), [0, 1], [0.0, 0.0], [[0, 0, 0, 0, 0, 0], [0, 0, 0, NAN, 0, 0]])
+    loads = measured(efforts("j"), [0, 1, 2], [0.0] * 3, [[1.0], [2.0], [NAN]])
+    result = SimpleNamespace(
+        predicted=(np.array([[3.0, 4, 0, 1, 0, 0], [0, 0, 1, 5, 5, 5]]), np.array([[4.0], [6.0], [9.0]]))
+    )
+    found = channel_errors([result, result], [SimpleNamespace(samples=(tips, loads))] * 2)
+    assert found == {
+        "points.a": {"rmse": pytest.approx(math.sqrt(13.0)), "unit": "m", "n": 4},
+        "points.b": {"rmse": 1.0, "unit": "m", "n": 2},
+        "joints.effort.j": {"rmse": pytest.approx(math.sqrt(12.5)), "unit": "N m", "n": 4},
+    }
+    hidden = measured(efforts("j"), [0], [0.0], [[NAN]])
+    assert channel_errors([SimpleNamespace(predicted=(np.zeros((1, 1)),))], [SimpleNamespace(samples=(hidden,))]) == {}
+
+
+def test_errors_of_points_in_all_recordings(step):
+    problem = EstimationProblem(
+        step, [swung(step), swung(step, 6)], ("elbow.stiffness",), ProblemOptions(), held_out=[swung(step, 5)]
+    )
+    found = point_errors(problem, [3.0], ("tip",))
+    assert set(found) == {"run_4", "run_5", "run_6"}
+    for i, episode in enumerate(problem.episodes):
+        predicted = problem.evaluate([3.0], False).episodes[i].predicted[0]
+        error = np.linalg.norm(predicted - episode.samples[0].value, axis=1)[2:]
+        assert found[episode.name] == pytest.approx(math.sqrt(np.mean(error**2)))
+    assert point_errors(problem, [3.0], ("lower",)) == {}
+    failing = EstimationProblem(step, [swung(step)], ("elbow.rest",), ProblemOptions())
+    assert math.isnan(point_errors(failing, [1e8], ("tip",))["run_4"])

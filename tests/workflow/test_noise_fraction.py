@@ -1,0 +1,101 @@
+"""A fraction of the sensors' std that is noise: the fit stays what it is, in smaller units."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.errors import ConfigError
+from yid_ocp.integrator.step import compile_step
+from yid_ocp.model import System
+from yid_ocp.model.system import Spring
+from yid_ocp.model.urdf import read_urdf
+from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
+from yid_ocp.workflow.diagnose import in_units_of_noise
+
+SHARE = 0.25
+SENSORS = {"points": SensorOptions(std=0.02), "joints.effort": SensorOptions(std={"shoulder": 0.3}, position_std=1e-3)}
+
+
+@pytest.fixture(scope="module")
+def step(urdf_folder):
+    robot = read_urdf(urdf_folder / "double_pendulum.urdf")
+    springs = {"elbow": Spring(3.0, 0.1)}
+    system = System.build(robot, prescribed=["shoulder"], springs=springs, damping=0.1, points=["tip"])
+    return compile_step(system, 0.01, use_compiler=False)
+
+
+def problem_of(step, position_std=None, **changed):
+    t = 0.01 * np.arange(21)
+    effort = 1.0 + 0.1 * np.sin(20 * t[:, None])
+    joints = JointGroup(("shoulder",), t, 0.1 * np.sin(9 * t[:, None]), effort=effort, position_std=position_std)
+    tip = np.tile([0.0, 0.1, 0.4], (21, 1, 1)) + 0.02 * np.random.default_rng(1).standard_normal((21, 1, 3))
+    options = {
+        "sensors": SENSORS,
+        "path_cutoff": float("inf"),
+        "initial_state": "estimated",
+        "priors": {"elbow.rest": 0.05},
+        "weak_prior_factor": 7.0,
+        "huber_threshold": 1.5,
+    }
+    recording = Recording(joints, (PointGroup("points", ("tip",), t, tip),), name="made")
+    free = ("elbow.stiffness", "elbow.rest")
+    return EstimationProblem(step, [recording], free, ProblemOptions(**options | changed))
+
+
+def settings(share=SHARE):
+    def refuse(what, *where, **more):
+        return ConfigError(what, where=".".join(where), **more)
+
+    return SimpleNamespace(diagnosis=SimpleNamespace(noise_fraction=share), refuse=refuse)
+
+
+def test_every_row_is_so_many_times_larger_and_the_fit_the_same(step):
+    problem = problem_of(step)
+    shrunk = in_units_of_noise(problem, settings())
+    assert shrunk.rows == problem.rows
+    rows = problem.rows
+    assert [part.stop - part.start for part in (rows.stated_priors, rows.weak_priors)] == [3, 1]
+    for seed in range(3):
+        x = problem.start + problem.scales * np.random.default_rng(seed).uniform(-0.3, 0.3, len(problem.start))
+        one, other = problem.evaluate(x), shrunk.evaluate(x)
+        np.testing.assert_allclose(other.residual, one.residual / SHARE, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(other.jacobian, one.jacobian / SHARE, rtol=1e-9, atol=1e-9)
+        assert other.cost == pytest.approx(one.cost / SHARE**2)
+
+
+def test_a_whole_fraction_and_no_weak_prior_stay_as_they_are(step):
+    problem = problem_of(step, weak_prior_factor=0.0)
+    assert in_units_of_noise(problem, settings(1.0)) is problem
+    shrunk = in_units_of_noise(problem, settings())
+    assert shrunk.options.weak_prior_factor == 0.0
+    assert shrunk.rows == problem.rows
+
+
+@pytest.mark.parametrize(
+    ("sensors", "recorded", "words"),
+    [
+        ({"joints.effort": SENSORS["joints.effort"], "points": SensorOptions()}, None, "noise in the std of 'points'"),
+        ({"points": SENSORS["points"]}, None, "noise in the std of 'joints.effort'"),
+        ({**SENSORS, "joints.effort": SensorOptions(std=0.3)}, 1e-3, "encoders' std is only in the recordings"),
+    ],
+)
+def test_a_fraction_of_what_is_not_stated_is_refused(step, sensors, recorded, words):
+    kept = {name: replace(entry, std=0.02) if entry.std is None else entry for name, entry in sensors.items()}
+    stated = {**{name: SensorOptions(std=0.3) for name in SENSORS}, **kept}
+    problem = problem_of(step, recorded, sensors=stated)
+    missing = EstimationProblem.__new__(EstimationProblem)
+    missing.__dict__.update(problem.__dict__, options=replace(problem.options, sensors=sensors))
+    with pytest.raises(ConfigError, match=words):
+        in_units_of_noise(missing, settings())
+
+
+@pytest.mark.parametrize("recorded", [None, 0.0])
+def test_encoders_without_noise_need_none(step, recorded):
+    sensors = {**SENSORS, "joints.effort": SensorOptions(std=0.3)}
+    shrunk = in_units_of_noise(problem_of(step, recorded, sensors=sensors), settings())
+    assert shrunk.options.sensors["joints.effort"] == SensorOptions(std=0.3 * SHARE)
