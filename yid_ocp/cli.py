@@ -182,7 +182,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return WRONG_INPUT
     except KeyboardInterrupt:
-        print("interrupted; no run folder was left", file=sys.stderr)
+        print("interrupted; no finished run folder was left", file=sys.stderr)
         return INTERRUPTED
     except Exception as error:  # whatever else comes up here is a mistake of ours
         with tempfile.NamedTemporaryFile("w", prefix="yid-ocp-", suffix=".log", delete=False, encoding="utf-8") as file:
