@@ -9,27 +9,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from placed_frames import numbers, positions
 
 from yid_ocp.errors import ConfigError, ModelError
-from yid_ocp.model import Segment, flexible_object, forward_kinematics
+from yid_ocp.model import Segment, flexible_object
 from yid_ocp.model.flexible import polyline_rotations
 from yid_ocp.model.rotations import roll_pitch_yaw, transform
 from yid_ocp.model.y_object import y_object
-
-
-def numbers(expression, parameters=None) -> np.ndarray:
-    if parameters is None:
-        return np.array(ca.DM(expression))
-    function = ca.Function("numbers", [parameters.symbols], [expression])
-    return np.array(ca.densify(function(parameters.vector())))
-
-
-def positions(item, frames, q=None):
-    """Where frames stand at nominal parameters, shape (len(frames), 3)."""
-    mechanism = item.mechanism.numeric()
-    q = np.zeros(len(mechanism.joints)) if q is None else q
-    kinematics = forward_kinematics(mechanism, ca.SX(ca.DM(q)))
-    return np.array([numbers(kinematics.position(frame)).ravel() for frame in frames])
 
 
 def stiffness(item, values=None):

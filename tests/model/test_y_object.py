@@ -4,29 +4,14 @@ from __future__ import annotations
 
 import math
 
-import casadi as ca
 import numpy as np
 import pytest
+from placed_frames import numbers, positions
 
 from yid_ocp.errors import OutputError
-from yid_ocp.model import flexible_object, forward_kinematics
+from yid_ocp.model import flexible_object
 from yid_ocp.model.rotations import transform
 from yid_ocp.model.y_object import write_y_urdf, y_object, y_segments
-
-
-def numbers(expression, parameters=None) -> np.ndarray:
-    if parameters is None:
-        return np.array(ca.DM(expression))
-    function = ca.Function("numbers", [parameters.symbols], [expression])
-    return np.array(ca.densify(function(parameters.vector())))
-
-
-def positions(item, frames, q=None):
-    """Where frames stand at nominal parameters, shape (len(frames), 3)."""
-    mechanism = item.mechanism.numeric()
-    q = np.zeros(len(mechanism.joints)) if q is None else q
-    kinematics = forward_kinematics(mechanism, ca.SX(ca.DM(q)))
-    return np.array([numbers(kinematics.position(frame)).ravel() for frame in frames])
 
 
 def test_the_paper_y():

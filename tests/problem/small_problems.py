@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import casadi as ca
 import numpy as np
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.effects import make_effect
+from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
+from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import Spring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem.measurements import Measurements
@@ -83,3 +86,29 @@ def taken(step, seed, *, efforts=True, camera=True, name=None, steps=STEPS):
         more = {"std": np.full(shot.shape, 0.05), "sensor": "camera", "pose": pose}
         groups.append(seen(["lower", "tip"], at, shot, "points_camera", **more))
     return Recording(group, tuple(groups), name=name or f"run_{seed}")
+
+
+def swinging_pendulum(folder):
+    """The step of a damped double pendulum, and a function that records a free swing of it, its lower points seen.
+
+    `record(seed, steps, bend, noise)` starts with angles of `bend` times a standard normal number and adds `noise`
+    metres to what is seen; the standard deviation said is 1 mm.
+    """
+    system = System.build(read_urdf(str(folder / "double_pendulum.urdf")), damping={"shoulder": 0.1, "elbow": 0.1})
+    step = compile_step(system, H, use_compiler=False)
+    frames = list(system.mechanism.frames)[-2:]
+    q = ca.SX.sym("q", system.size)
+    kinematics = forward_kinematics(system.mechanism, q)
+    place = ca.Function("place", [q], [ca.horzcat(*(kinematics.position(frame) for frame in frames))])
+
+    def record(seed, steps, bend, noise=0.0):
+        rng = np.random.default_rng(seed)
+        start = np.zeros(step.sizes["nx"])
+        start[:2], start[2:4] = bend * rng.standard_normal(2), 0.02 * rng.standard_normal(2)
+        states = simulate(step, system.parameters.vector(), start, steps).state
+        clean = np.stack([np.array(place(x[:2])).T for x in states])
+        position = clean + noise * rng.standard_normal(clean.shape)
+        group = seen(frames, H * np.arange(steps + 1), position, std=np.full(clean.shape, 1e-3))
+        return recording(None, group, name=f"swing_{seed}")
+
+    return step, record

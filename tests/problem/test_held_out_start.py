@@ -4,47 +4,23 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import casadi as ca
 import numpy as np
 import pytest
+from small_problems import swinging_pendulum
 
-from yid_ocp.data.recording import PointGroup, Recording
-from yid_ocp.integrator.rollout import simulate
-from yid_ocp.integrator.step import compile_step
-from yid_ocp.model import System
-from yid_ocp.model.kinematics import forward_kinematics
-from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.episodes import beginning
 
-TIME_STEP, NOISE = 0.01, 1e-3
+NOISE = 1e-3
 
 
 @pytest.fixture(scope="module")
 def swinging(urdf_folder):
-    tree = read_urdf(str(urdf_folder / "double_pendulum.urdf"))
-    system = System.build(tree, damping={"shoulder": 0.1, "elbow": 0.1})
-    step = compile_step(system, TIME_STEP, use_compiler=False)
-    frames = list(system.mechanism.frames)[-2:]
-    q = ca.SX.sym("q", system.size)
-    kinematics = forward_kinematics(system.mechanism, q)
-    place = ca.Function("place", [q], [ca.horzcat(*(kinematics.position(frame) for frame in frames))])
-
-    def record(seed):
-        rng = np.random.default_rng(seed)
-        start = np.zeros(step.sizes["nx"])
-        start[:2], start[2:4] = 0.05 * rng.standard_normal(2), 0.02 * rng.standard_normal(2)
-        swept = simulate(step, system.parameters.vector(), start, 150)
-        clean = np.stack([np.array(place(x[:2])).T for x in swept.state])
-        position = clean + NOISE * rng.standard_normal(clean.shape)
-        t = TIME_STEP * np.arange(151)
-        group = PointGroup("points", tuple(frames), t, position, std=np.full(clean.shape, NOISE))
-        return Recording(None, (group,), name=f"swing_{seed}")
+    step, record = swinging_pendulum(urdf_folder)
+    first, *others = (record(seed, 150, bend=0.05, noise=NOISE) for seed in (1, 2, 3))
 
     def problem(**options):
-        return EstimationProblem(
-            step, [record(1)], ("elbow.damping",), ProblemOptions(**options), held_out=[record(2), record(3)]
-        )
+        return EstimationProblem(step, [first], ("elbow.damping",), ProblemOptions(**options), held_out=others)
 
     return problem
 

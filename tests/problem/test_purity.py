@@ -5,19 +5,14 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from importlib import resources
 
-import casadi as ca
 import hypothesis.strategies as st
 import numpy as np
 import pytest
 from hypothesis import given, settings
+from small_problems import swinging_pendulum
 
 from yid_ocp.data import read_recording
-from yid_ocp.data.recording import PointGroup, Recording
-from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.model import System
-from yid_ocp.model.kinematics import forward_kinematics
-from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 
 H = 0.01
@@ -27,27 +22,13 @@ KINDS = ("equilibrium", "estimated", "fitted_to_points")
 @pytest.fixture(scope="module")
 def pendulum(urdf_folder):
     """Makes problems on three swings of a double pendulum with springs, whose start depends on what is asked."""
-    tree = read_urdf(str(urdf_folder / "double_pendulum.urdf"))
-    system = System.build(tree, damping={"shoulder": 0.1, "elbow": 0.1})
-    step = compile_step(system, H, use_compiler=False)
-    frames = list(system.mechanism.frames)[-2:]
-    q = ca.SX.sym("q", system.size)
-    kinematics = forward_kinematics(system.mechanism, q)
-    place = ca.Function("place", [q], [ca.horzcat(*(kinematics.position(frame) for frame in frames))])
-
-    def record(seed):
-        rng = np.random.default_rng(seed)
-        start = np.zeros(step.sizes["nx"])
-        start[:2], start[2:4] = 0.3 * rng.standard_normal(2), 0.02 * rng.standard_normal(2)
-        rollout = simulate(step, system.parameters.vector(), start, 40)
-        clean = np.stack([np.array(place(x[:2])).T for x in rollout.state])
-        group = PointGroup("points", tuple(frames), H * np.arange(41), clean, std=np.full(clean.shape, 1e-3))
-        return Recording(None, (group,), name=f"swing_{seed}")
+    step, record = swinging_pendulum(urdf_folder)
+    taken = {seed: record(seed, 40, bend=0.3) for seed in (1, 2, 3)}
 
     def make(kind):
         options = ProblemOptions(initial_state=kind, start_window=0.02)
         free = ("elbow.damping", "shoulder.damping")
-        return EstimationProblem(step, [record(1), record(2)], free, options, held_out=[record(3)])
+        return EstimationProblem(step, [taken[1], taken[2]], free, options, held_out=[taken[3]])
 
     return make
 

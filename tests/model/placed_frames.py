@@ -1,0 +1,24 @@
+"""Numbers of symbolic kinematics."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+from yid_ocp.model import forward_kinematics
+
+
+def numbers(expression, parameters=None) -> np.ndarray:
+    """The value of an expression, at nominal parameters where it has any."""
+    if parameters is None:
+        return np.array(ca.DM(expression))
+    function = ca.Function("numbers", [parameters.symbols], [expression])
+    return np.array(ca.densify(function(parameters.vector())))
+
+
+def positions(item, frames, q=None):
+    """Where frames stand at nominal parameters, shape (len(frames), 3)."""
+    mechanism = item.mechanism.numeric()
+    q = np.zeros(len(mechanism.joints)) if q is None else q
+    kinematics = forward_kinematics(mechanism, ca.SX(ca.DM(q)))
+    return np.array([numbers(kinematics.position(frame)).ravel() for frame in frames])
