@@ -7,8 +7,9 @@ over diagnosis/, analysis/, problem/ and solvers/base.py (see `places.py`), each
 folder that run the changed statement, tests of rules first, then file by file, the quickest first, up to the first
 failure or three times the time that they take without a change. Tests marked `slow` stay out.
 
-What was found goes to a JSON file as it is found; a second run goes on from there as long as sources and tests are the
-same. `--again` tries survivors, and only them, once more (for the time in which tests are being written).
+What was found goes to a JSON file as it is found; an interrupted run goes on from there as long as sources and tests
+are the same. `--again` is for the time in which tests are being written: what was killed counts as killed, whatever was
+changed since, and survivors are tried once more.
 Exit status 0: every named break and at least 85 % of the mutants were killed.
 """
 
@@ -63,8 +64,8 @@ class Job:
 
     @property
     def key(self) -> str:
-        """Hash of the changed text and of the tests' names."""
-        return hashlib.sha256("\0".join([self.file, self.text, *self.tests]).encode()).hexdigest()
+        """Hash of the changed text."""
+        return hashlib.sha256("\0".join([self.name, self.file, self.text]).encode()).hexdigest()
 
 
 class Worker:
@@ -96,7 +97,8 @@ class Worker:
                 "OPENBLAS_NUM_THREADS": "1",
                 "OMP_NUM_THREADS": "1",
             }
-            environment.setdefault("YID_OCP_CACHE", str(_private(ROOT / "build" / "mutation" / "compiled")))
+            if "YID_OCP_CACHE" not in environment:
+                environment["YID_OCP_CACHE"] = str(_private(ROOT / "build" / "mutation" / "compiled"))
             command = [sys.executable, str(Path(__file__).with_name("server.py")), str(self._tree), package]
             self._server = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
@@ -129,6 +131,12 @@ def _private(folder: Path) -> Path:
 
 
 # -- what to try ------------------------------------------------------------------------------------------------------
+
+
+def tree_digest() -> str:
+    """Hash of all sources and tests."""
+    files = sorted(file for folder in ("yid_ocp", "tests") for file in (ROOT / folder).rglob("*.py"))
+    return hashlib.sha256(b"\0".join([file.read_bytes() for file in files])).hexdigest()[:16]
 
 
 def breaks(chosen: Sequence[str]) -> list[Job]:
@@ -195,17 +203,24 @@ def _of_rules(test: str) -> bool:
 class Results:
     """What was found, by the job's key; written whole after each."""
 
-    def __init__(self, file: Path) -> None:
-        self._file, self._lock = file, threading.Lock()
+    def __init__(self, file: Path, tree: str) -> None:
+        self._file, self._tree, self._lock = file, tree, threading.Lock()
         self.known: dict[str, dict[str, Any]] = {}
         if file.is_file():
             self.known = json.loads(file.read_text(encoding="utf-8")).get("known", {})
         self.asked: list[tuple[str, str]] = []
 
+    def is_open(self, job: Job, again: bool) -> bool:
+        """Whether a job is still to be tried."""
+        known = self.known.get(job.key)
+        if known is None:
+            return True
+        return bool(known["status"] != "killed") if again else bool(known["tree"] != self._tree)
+
     def add(self, key: str, entry: dict[str, Any]) -> None:
         """Keep a result."""
         with self._lock:
-            self.known[key] = entry
+            self.known[key] = entry | {"tree": self._tree}
             self.write()
 
     def write(self) -> None:
@@ -230,13 +245,8 @@ class Results:
 def run(jobs: Sequence[tuple[str, Job]], workers: Sequence[Worker], results: Results, again: bool) -> None:
     """Try all jobs that have no result yet (or survivors), as many at a time as there are workers."""
     results.asked = [(kind, job.key) for kind, job in jobs]
-
-    def is_open(job: Job) -> bool:
-        known = results.known.get(job.key)
-        return known is None or (again and known["status"] != "killed")
-
     waiting: queue.SimpleQueue[Job] = queue.SimpleQueue()
-    todo = [job for _, job in jobs if is_open(job)]
+    todo = [job for _, job in jobs if results.is_open(job, again)]
     for job in sorted(todo, key=lambda job: job.package):
         waiting.put(job)
     done = [0]
@@ -265,10 +275,8 @@ def run(jobs: Sequence[tuple[str, Job]], workers: Sequence[Worker], results: Res
     results.write()
 
 
-def covering(worker: Worker, folder: str, package: str, store: Path) -> dict[str, Any]:
+def covering(worker: Worker, folder: str, package: str, store: Path, digest: str) -> dict[str, Any]:
     """Which tests of a folder run which lines; from an earlier run where sources and tests are the same."""
-    sources = sorted([*(ROOT / "yid_ocp").rglob("*.py"), *(ROOT / "tests" / folder).rglob("*.py")])
-    digest = hashlib.sha256(b"\0".join([file.read_bytes() for file in sources])).hexdigest()[:16]
     file = store / f"covered_{folder}.json"
     if file.is_file():
         known = json.loads(file.read_text(encoding="utf-8"))
@@ -294,16 +302,27 @@ def arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def jobs_of(given: argparse.Namespace, worker: Worker, store: Path) -> Iterator[tuple[str, Job]]:
+def as_they_are(worker: Worker, jobs: Sequence[Job]) -> None:
+    """Stop where tests of named breaks fail without any break."""
+    for package, tests, file in sorted({(job.package, job.tests, job.file) for job in jobs}):
+        text = (ROOT / file).read_text(encoding="utf-8")
+        found = worker.ask(package, {"file": file, "text": text, "tests": list(tests), "seconds": 600.0})
+        if found["status"] != "survived":
+            raise SystemExit(f"{', '.join(tests)} fail as they are: {found['by']}")
+
+
+def jobs_of(given: argparse.Namespace, worker: Worker, store: Path, tree: str) -> Iterator[tuple[str, Job]]:
     """All jobs, each with the part of the summary that it belongs to."""
     if not given.no_breaks:
-        yield from (("named breaks", job) for job in breaks(given.chosen))
+        named = breaks(given.chosen)
+        as_they_are(worker, named)
+        yield from (("named breaks", job) for job in named)
     if not given.mutants:
         return
     packages = {folder: package for folder, package in PACKAGES.items() if not given.chosen or folder in given.chosen}
     owner = {file: folder for folder, package in packages.items() for file in files_of(package)}
     files = [file for file in owner if not given.file or Path(file).name in given.file]
-    covered = {folder: covering(worker, folder, package, store) for folder, package in packages.items()}
+    covered = {folder: covering(worker, folder, package, store, tree) for folder, package in packages.items()}
     print(f"drawing {given.mutants} mutants", flush=True)
     for mutant in drawn(ROOT, files, given.seed, given.mutants):
         folder = owner[mutant.file]
@@ -315,11 +334,12 @@ def main() -> int:
     given = arguments()
     store = given.out.parent
     store.mkdir(parents=True, exist_ok=True)
-    results = Results(given.out)
+    tree = tree_digest()
+    results = Results(given.out, tree)
     with tempfile.TemporaryDirectory() as folder:
         workers = [Worker(Path(folder) / str(i)) for i in range(given.jobs)]
         try:
-            run(list(jobs_of(given, workers[0], store)), workers, results, given.again)
+            run(list(jobs_of(given, workers[0], store, tree)), workers, results, given.again)
         finally:
             for worker in workers:
                 worker.close()

@@ -117,7 +117,8 @@ def drawn(root: Path, files: Sequence[str], seed: int, count: int) -> list[Mutan
     for rank, file, line, options in sorted(ranked):
         if len(made) == count:
             break
-        for operator, occurrence in sorted(options, key=lambda option: _hash(rank, *option)):
+        ordered = sorted(range(len(options)), key=lambda i, rank=rank: _hash(rank, i))
+        for operator, occurrence in (options[i] for i in ordered):
             mutant = _mutant(root, file, line, operator, occurrence)
             if mutant is not None:
                 made.append(mutant)
