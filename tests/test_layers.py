@@ -14,7 +14,7 @@ import pytest
 NAME = "yid_ocp"
 PACKAGE = Path(__file__).parents[1] / NAME
 LAYERS = (
-    ("errors",),
+    ("errors", "version"),
     ("registry",),  # it raises errors, so the two cannot share a layer
     ("options", "files", "least_squares"),
     ("parallel",),

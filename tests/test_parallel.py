@@ -154,7 +154,7 @@ def test_another_version_and_another_function_do_not_count(tmp_path, threads, mo
         return result.resumed
 
     assert [resumed(slow), resumed(slow), resumed(fragile)] == [False, True, False]
-    monkeypatch.setattr("yid_ocp.__version__", "99", raising=False)
+    monkeypatch.setattr("yid_ocp.parallel.package_version", lambda: "99")
     assert [resumed(slow), resumed(slow)] == [False, True]
 
 

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, hashes of files and of plain data, plain data for JSON, the version."""
+"""Files that appear whole or not at all, hashes of files and of plain data, plain data for JSON."""
 
 from __future__ import annotations
 
@@ -9,21 +9,12 @@ import math
 import os
 import secrets
 from collections.abc import Iterator, Mapping
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from yid_ocp.errors import DataError, OutputError
-
-
-def package_version() -> str:
-    """Version of this package, `0+unknown` where it is not installed."""
-    try:
-        return metadata.version("yid-ocp")
-    except metadata.PackageNotFoundError:
-        return "0+unknown"
 
 
 @contextlib.contextmanager

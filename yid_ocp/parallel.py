@@ -32,7 +32,8 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from yid_ocp.errors import OutputError
-from yid_ocp.files import content_hash, file_sha256, package_version, reason, write_json
+from yid_ocp.files import content_hash, file_sha256, reason, write_json
+from yid_ocp.version import package_version
 
 FORMAT = "yid-task/1"
 log = logging.getLogger(__name__)

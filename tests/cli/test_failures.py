@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from yid_ocp.problem.prediction import Predictor
 from yid_ocp.workflow import solve as solve_module
 
 
@@ -29,14 +30,7 @@ def test_a_solve_that_does_not_converge(cli, pendulum, tmp_path):
 
 
 def test_a_rollout_that_fails_leaves_reason_and_best_point(cli, pendulum, tmp_path, monkeypatch):
-    original = solve_module.build_problem
-
-    def broken(run):
-        problem = original(run)
-        monkeypatch.setattr(type(problem), "run", lambda self, *a, **k: "estimate: step 3: Newton did not converge")
-        return problem
-
-    monkeypatch.setattr(solve_module, "build_problem", broken)
+    monkeypatch.setattr(Predictor, "run", lambda *a, **k: "estimate: step 3: Newton did not converge")
     done = cli("solve", pendulum, "--out", "failed")
     assert done.code == 1
     result = json.loads((tmp_path / "failed" / "result.json").read_text(), parse_constant=pytest.fail)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from importlib import import_module
 from types import SimpleNamespace
 
 import h5py
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.config.reader import DIAGNOSIS_DEFAULT, load_config
-from yid_ocp.diagnosis import select
+from yid_ocp.diagnosis.refit import SOLVER
 from yid_ocp.workflow.diagnose import reproducing, run_diagnose
 
 
@@ -32,14 +33,13 @@ def close(one, other) -> bool:
 def counted(monkeypatch):
     """How often the solver of refits is called."""
     calls = SimpleNamespace(count=0)
-    solver = select.SOLVER
 
     class Counting:
         def run(self, *arguments):
             calls.count += 1
-            return solver.run(*arguments)
+            return SOLVER.run(*arguments)
 
-    monkeypatch.setattr(select, "SOLVER", Counting())
+    monkeypatch.setattr(import_module("yid_ocp.diagnosis.refit"), "SOLVER", Counting())
     return calls
 
 
