@@ -281,3 +281,8 @@ def test_a_late_sample_changes_by_the_slope_on_its_node_by_the_mean_of_two(node,
     late = plain.late(np.array([steps]))
     at_nodes = np.array([[float(k**2)] for k in late.nodes])
     np.testing.assert_allclose(late.slope(at_nodes, plain, np.array([steps])), [[rate]])
+    # others beside it make no difference
+    several = measured(efforts("a"), [2, node, 8], [0.25, fraction, 0.0], np.ones((3, 1)), span=(2, 8))
+    all_late = several.late(np.array([steps]))
+    at_nodes = np.array([[float(k**2)] for k in all_late.nodes])
+    np.testing.assert_allclose(all_late.slope(at_nodes, several, np.array([steps]))[1], [rate])

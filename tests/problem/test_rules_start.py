@@ -63,8 +63,8 @@ def test_a_single_frame_gives_a_configuration_at_rest(step):
     assert found.values == {}
 
 
-@pytest.mark.parametrize("std", [0.2, 1.0])
-def test_what_the_points_leave_open_has_the_least_elastic_energy(step, std):
+@pytest.mark.parametrize(("std", "soft"), [(0.2, 1.0), (1.0, 1.0), (1.0, 0.1)])
+def test_what_the_points_leave_open_has_the_least_elastic_energy(step, std, soft):
     """Springs of 6 and 3 N m/rad, a mean of 4.5: their prior is of half a radian at the mean stiffness."""
     target = np.array([0.6, -0.9])
     sample = at(0, target, std=std, both=False)
@@ -74,7 +74,7 @@ def test_what_the_points_leave_open_has_the_least_elastic_energy(step, std):
         return np.concatenate([(tip(q) - tip(target)) / std, prior])
 
     best = scipy.optimize.least_squares(rows, [0.1, 0.1], xtol=1e-12)
-    found = solved(step, [sample])
+    found = solved(step, [sample], **{"shoulder.stiffness": 6.0 * soft, "elbow.stiffness": 3.0 * soft})
     np.testing.assert_allclose(found.state[:2], best.x, atol=1e-4)
 
 
