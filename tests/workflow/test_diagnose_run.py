@@ -59,7 +59,7 @@ class Interrupting:
     def advance(self, done, total, text) -> None: ...
 
 
-def test_an_interrupted_diagnosis_takes_up_its_finished_refits(rubbing, tmp_path, counted, caplog):
+def test_an_interrupted_diagnosis_resumes_its_finished_refits(rubbing, tmp_path, counted, caplog):
     run = load_config(rubbing)
     whole = run_diagnose(run, tmp_path / "whole")
     once, counted.count = counted.count, 0
@@ -74,12 +74,12 @@ def test_an_interrupted_diagnosis_takes_up_its_finished_refits(rubbing, tmp_path
     assert close(without_times(again.folder), without_times(whole.folder))
     lines = [json.loads(line) for line in (again.folder / "log.jsonl").read_text().splitlines()]
     assert {"the nominal model"} < {line["refit"] for line in lines if line["event"] == "resumed"}
-    assert any("took up the refit with" in line.get("text", "") for line in lines)
+    assert any("resumed the refit with" in line.get("text", "") for line in lines)
     assert not (tmp_path / "run.partial").exists()
     assert not list(tmp_path.glob(".*"))
 
 
-def test_a_changed_configuration_takes_nothing_up(rubbing, tmp_path, monkeypatch, caplog):
+def test_a_changed_configuration_resumes_nothing(rubbing, tmp_path, monkeypatch, caplog):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(KeyboardInterrupt):
         run_diagnose(load_config(rubbing), None, Interrupting(after=1))
