@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -112,7 +113,7 @@ def _form(first: Component, second: Component, moved: Callable[[Mapping[str, flo
     if not tried:
         return None
     least, best = min(tried, key=lambda entry: entry[0])
-    return best if least <= max(NOTHING * moved({first.name: a * STRETCH}), 1.0) else None
+    return best if math.isfinite(least) and least <= max(NOTHING * moved({first.name: a * STRETCH}), 1.0) else None
 
 
 def sparse_basis(vectors: Array) -> list[Array]:

@@ -1,0 +1,102 @@
+"""Made-up problems for the tests of analysis: a residual that is a formula of named unknowns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from types import SimpleNamespace
+
+import casadi as ca
+import numpy as np
+
+from yid_ocp.model.parameters import Parameter, Parameters
+from yid_ocp.problem.problem import Evaluation, ResidualRows
+from yid_ocp.solvers.base import Estimate, Solution, Status
+
+
+class Formula:
+    """A problem whose residual is a CasADi expression of its unknowns.
+
+    Parameters
+    ----------
+    rows : callable
+        From symbols by name to the residual's rows: data, then stated priors, then weak priors.
+    start : mapping of str to float
+    stated, weak : int
+        How many of the last rows are priors.
+    fails : callable, optional
+        From values by name to whether the rollout fails.
+    """
+
+    def __init__(
+        self,
+        rows: Callable[[Mapping[str, ca.SX]], Sequence[ca.SX]],
+        start: Mapping[str, float],
+        *,
+        bounds: Mapping[str, tuple[float, float]] | None = None,
+        scales: Mapping[str, float] | None = None,
+        units: Mapping[str, str] | None = None,
+        stated: int = 0,
+        weak: int = 0,
+        noise: float = 1.0,
+        fails: Callable[[dict[str, float]], bool] | None = None,
+    ) -> None:
+        self.names = tuple(start)
+        self.free = tuple(name for name in self.names if not name.startswith("start."))
+        self.start = np.array(list(start.values()))
+        x = ca.SX.sym("x", len(self.names))
+        residual = ca.vertcat(ca.SX(0, 1), *rows({name: x[i] for i, name in enumerate(self.names)}))
+        self._function = ca.Function("rows", [x], [residual, ca.jacobian(residual, x)])
+        limits = dict.fromkeys(self.names, (0.0, np.inf)) | dict(bounds or {})
+        self.bounds = tuple(np.array([limits[name][side] for name in self.names]) for side in (0, 1))
+        sizes = dict(zip(self.names, np.abs(self.start), strict=True)) | dict(scales or {})
+        self.scales = np.array([sizes[name] or 1.0 for name in self.names])
+        data = residual.numel() - stated - weak
+        self.rows = ResidualRows(
+            (), slice(0, data), slice(data, data + stated), slice(data + stated, data + stated + weak)
+        )
+        self.noise, self._fails = noise, fails or (lambda values: False)
+        self.options = SimpleNamespace(
+            weighting="paper" if noise != 1 else "whitened",
+            initial_state="equilibrium",
+            known_start={},
+            recording_values={},
+            priors={},
+        )
+        kinds = dict(units or {})
+        self.system = SimpleNamespace(
+            parameters=Parameters(
+                Parameter(name, 1.0, kinds.get(name, "N m/rad"))
+                for name in dict.fromkeys(name.split("[")[0] for name in self.names)
+            )
+        )
+        self.asked: list[tuple[float, ...]] = []
+
+    @property
+    def positive(self) -> np.ndarray:
+        return (self.bounds[0] >= 0) & (self.start > 0)
+
+    def evaluate(self, x: np.ndarray, derivatives: bool = True, warm: object = None) -> Evaluation:
+        x = np.asarray(x, float)
+        self.asked.append(tuple(x))
+        if self._fails(dict(zip(self.names, x, strict=True))):
+            return Evaluation(np.inf, np.zeros(0), None, False, "it snaps", ())
+        residual, jacobian = (np.array(ca.densify(part)) for part in self._function(x))
+        residual = residual.ravel()
+        return Evaluation(0.5 * float(residual @ residual), residual, jacobian if derivatives else None, True, "", ())
+
+    def informing(self, evaluation: Evaluation) -> tuple[np.ndarray, np.ndarray]:
+        rows = self.rows.informing
+        unit = np.ones(rows.stop)
+        unit[self.rows.data] = self.noise
+        return evaluation.residual[rows] / unit, evaluation.jacobian[rows] / unit[:, None]
+
+
+def estimate(value, std=0.1, verdict="identifiable", free=True, initial=1.0) -> Estimate:
+    return Estimate(value, std, "N m/rad", initial, 0.0, np.inf, free, verdict)
+
+
+def solution(method="gauss_newton", status=Status.CONVERGED, cost=1.0, **parameters: Estimate) -> Solution:
+    """What a method found; names are written with underscores for dots."""
+    named = {name.replace("_", "."): entry for name, entry in parameters.items()}
+    x = np.array([entry.value for entry in named.values()])
+    return Solution(status, "done", tuple(named), x, np.eye(len(x)), named, cost, 1.0, (), 1, 1, 0.1, None, method)

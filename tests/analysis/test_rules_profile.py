@@ -1,0 +1,260 @@
+"""Profile likelihood, rule by rule, on formulas whose intervals are known."""
+
+from __future__ import annotations
+
+import math
+
+import casadi as ca
+import numpy as np
+import pytest
+from made_models import Formula
+
+from yid_ocp.analysis.profile import LEVEL, best_fit, profile_likelihood
+
+OPEN = {"a": (-math.inf, math.inf), "b": (-math.inf, math.inf)}
+HALF = math.sqrt(LEVEL)
+
+
+def profiled(problem, name="a", std=None, at=None, **more):
+    x = problem.start if at is None else np.array(at)
+    if std is None:
+        _, jacobian = problem.informing(problem.evaluate(x))
+        std = float(np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian))[problem.names.index(name)]))
+    return profile_likelihood(problem, x, problem.names.index(name), std, **more)
+
+
+def test_the_level_is_that_of_95_percent():
+    assert pytest.approx(1.959963984540054**2, rel=1e-12) == LEVEL
+
+
+# -- linear models ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("guess", [0.5, 0.05, 5.0, math.inf])
+def test_a_linear_model_has_a_symmetric_interval_whatever_the_first_guess(guess):
+    problem = Formula(lambda x: [2 * (x["a"] - 3.0)], {"a": 3.0}, bounds=OPEN)
+    found = profiled(problem, std=guess)
+    assert (found.name, found.value, found.notes) == ("a", 3.0, ())
+    np.testing.assert_allclose([found.lower, found.upper], [3 - HALF / 2, 3 + HALF / 2], rtol=0.01)
+    np.testing.assert_allclose(found.delta_chi2, 4 * (found.values - 3.0) ** 2, atol=1e-9)
+    assert np.all(np.diff(found.values) > 0)
+
+
+def test_another_level_is_another_interval():
+    problem = Formula(lambda x: [2 * (x["a"] - 3.0)], {"a": 3.0}, bounds=OPEN)
+    found = profiled(problem, level=1.0)
+    np.testing.assert_allclose([found.lower, found.upper], [2.5, 3.5], rtol=0.01)
+
+
+def test_others_are_refitted_at_every_value():
+    rows = np.array([[1.0, 0.9], [0.3, 1.0], [0.5, 0.5]])
+    problem = Formula(
+        lambda x: [r[0] * (x["a"] - 1.0) + r[1] * (x["b"] + 2.0) for r in rows], {"a": 1.0, "b": -2.0}, bounds=OPEN
+    )
+    std = np.sqrt(np.linalg.inv(rows.T @ rows)[0, 0])
+    alone = 1 / np.linalg.norm(rows[:, 0])
+    assert std > 1.5 * alone
+    found = profiled(problem)
+    np.testing.assert_allclose([found.lower, found.upper], [1 - HALF * std, 1 + HALF * std], rtol=0.02)
+
+
+def test_a_misfit_widens_the_interval():
+    def rows(x):
+        return [2 * (x["a"] - 3.0) + 4.0, 2 * (x["a"] - 3.0) - 4.0, 2 * (x["a"] - 3.0)]
+
+    found = profiled(Formula(rows, {"a": 3.0}, bounds=OPEN))
+    # chi2 of 32 over two degrees of freedom
+    half = HALF * 4.0 / math.sqrt(12.0)
+    np.testing.assert_allclose([found.lower, found.upper], [3 - half, 3 + half], rtol=0.01)
+
+
+def test_weak_priors_do_not_count_and_stated_ones_do():
+    def rows(x):
+        return [x["a"] - 3.0, (x["a"] - 3.0) * math.sqrt(3.0), 50 * (x["a"] - 3.0)]
+
+    stated = profiled(Formula(rows, {"a": 3.0}, bounds=OPEN, stated=1, weak=1))
+    np.testing.assert_allclose([stated.lower, stated.upper], [3 - HALF / 2, 3 + HALF / 2], rtol=0.01)
+    np.testing.assert_allclose(stated.delta_chi2, 4 * (stated.values - 3.0) ** 2, atol=1e-9)
+
+
+def test_rows_in_metres_count_in_units_of_their_noise():
+    problem = Formula(
+        lambda x: [0.02 * (x["a"] - 3.0), math.sqrt(12.0) * (x["a"] - 3.0)],
+        {"a": 3.0},
+        bounds=OPEN,
+        stated=1,
+        noise=0.01,
+    )
+    found = profiled(problem)
+    np.testing.assert_allclose([found.lower, found.upper], [3 - HALF / 4, 3 + HALF / 4], rtol=0.01)
+
+
+# -- positive unknowns ------------------------------------------------------------------------------------------------
+
+
+def test_a_positive_unknown_has_the_interval_of_its_values_not_of_its_logarithm():
+    problem = Formula(lambda x: [1 * (x["a"] - 3.0)], {"a": 3.0})
+    found = profiled(problem)
+    np.testing.assert_allclose([found.lower, found.upper], [3 - HALF, 3 + HALF], rtol=0.02)
+
+
+def test_a_relative_uncertainty_is_lopsided():
+    problem = Formula(lambda x: [5 * ca.log(x["a"] / 3.0)], {"a": 3.0})
+    found = profiled(problem)
+    np.testing.assert_allclose([found.lower, found.upper], [3 * math.exp(-HALF / 5), 3 * math.exp(HALF / 5)], rtol=0.01)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_units_make_no_difference(scale):
+    problem = Formula(lambda x: [(x["a"] / scale - 3.0)], {"a": 3.0 * scale})
+    found = profiled(problem)
+    np.testing.assert_allclose([found.lower / scale, found.upper / scale], [3 - HALF, 3 + HALF], rtol=0.02)
+
+
+# -- open ends --------------------------------------------------------------------------------------------------------
+
+
+def test_what_nothing_informs_is_open_on_both_sides():
+    for bounds, std in (({}, math.inf), (OPEN, math.inf), ({}, 0.1)):
+        found = profiled(Formula(lambda x: [0 * x["a"] + 1.0], {"a": 3.0}, bounds=bounds), std=std)
+        assert (found.lower, found.upper, found.notes) == (None, None, ())
+    assert found.values[0] == pytest.approx(3e-3)
+    assert found.values[-1] == pytest.approx(3e3)
+
+
+def test_an_unknown_of_either_sign_is_followed_a_thousand_times_its_size():
+    found = profiled(Formula(lambda x: [0 * x["a"] + 1.0], {"a": 3.0}, bounds=OPEN, scales={"a": 2.0}), std=math.inf)
+    assert (found.values[0], found.values[-1]) == (3.0 - 2000.0, 3.0 + 2000.0)
+
+
+def test_an_end_may_be_open_on_one_side():
+    # twice what is lost with rising stiffness: 2 (1/a - 1/3)
+    problem = Formula(lambda x: [2 * (1 / x["a"] - 1 / 3.0)], {"a": 3.0})
+    found = profiled(problem)
+    assert found.upper is None
+    assert 1 / found.lower == pytest.approx(1 / 3 + HALF / 2, rel=0.02)
+    assert found.notes == ()
+
+
+def test_bounds_are_open_ends_unless_the_level_comes_first():
+    made = {"bounds": {"a": (2.5, 6.0)}}
+    found = profiled(Formula(lambda x: [1 * (x["a"] - 3.0)], {"a": 3.0}, **made))
+    assert found.lower is None
+    assert found.upper == pytest.approx(3 + HALF, rel=0.02)
+    assert found.values[0] == pytest.approx(2.5)
+    either = profiled(Formula(lambda x: [1 * (x["a"] - 3.0)], {"a": 3.0}, bounds={"a": (-9.0, 4.0)}))
+    assert either.lower == pytest.approx(3 - HALF, rel=0.02)
+    assert either.upper is None
+    assert either.values[-1] == pytest.approx(4.0)
+
+
+def test_others_stop_at_their_bounds():
+    problem = Formula(
+        lambda x: [x["a"] + x["b"] - 4.0, 0.1 * (x["b"] - 1.0)],
+        {"a": 3.0, "b": 1.0},
+        bounds={"b": (0.5, 1.25), "a": OPEN["a"]},
+    )
+    found = profiled(problem)
+    assert found.upper == pytest.approx(3.5 + math.sqrt(LEVEL - 0.05**2), rel=0.01)
+    assert found.lower == pytest.approx(2.75 - math.sqrt(LEVEL - 0.025**2), rel=0.01)
+
+
+def test_only_a_product_is_seen_and_either_factor_is_open():
+    problem = Formula(lambda x: [20 * (x["a"] * x["b"] - 6.0)], {"a": 2.0, "b": 3.0})
+    for name in "ab":
+        found = profiled(problem, name, std=math.inf)
+        assert (found.lower, found.upper) == (None, None)
+        assert found.delta_chi2.max() < 0.1
+
+
+def test_unknowns_that_nothing_informs_stay_put():
+    problem = Formula(lambda x: [1 * (x["a"] - 3.0), 0 * x["b"] + 1.0], {"a": 3.0, "b": 5.0})
+    problem.asked.clear()
+    profiled(problem)
+    np.testing.assert_allclose([b for _, b in problem.asked], 5.0)
+
+
+def test_series_springs_have_a_common_lower_end():
+    def rows(x):
+        return [100 * (1 / x["a"] + 1 / x["b"] - 1 / 2.0 - 1 / 2.0)]
+
+    found = profiled(Formula(rows, {"a": 2.0, "b": 2.0}), std=math.inf)
+    # neither can be softer than both together, to within the noise
+    assert found.lower == pytest.approx(1 / (1 + HALF / 100), rel=0.02)
+    assert found.upper is None
+
+
+# -- what stands in the way -------------------------------------------------------------------------------------------
+
+
+def test_where_the_rollout_fails_the_end_is_open_and_said():
+    problem = Formula(lambda x: [0.1 * (x["a"] - 3.0)], {"a": 3.0}, bounds=OPEN, fails=lambda v: v["a"] > 7.0)
+    found = profiled(problem)
+    assert found.upper is None
+    assert found.lower == pytest.approx(3 - 10 * HALF, rel=0.02)
+    [note] = found.notes
+    assert note.startswith("the model cannot be rolled out above 7")
+    below = profiled(Formula(lambda x: [0.1 * (x["a"] - 3.0)], {"a": 3.0}, bounds=OPEN, fails=lambda v: v["a"] < -7.0))
+    assert below.lower is None
+    assert below.notes[0].startswith("the model cannot be rolled out below -7")
+
+
+def test_a_failure_beyond_the_end_does_no_harm():
+    problem = Formula(lambda x: [1 * (x["a"] - 3.0)], {"a": 3.0}, bounds=OPEN, fails=lambda v: abs(v["a"] - 3.0) > 2.2)
+    found = profiled(problem, std=2.0)
+    np.testing.assert_allclose([found.lower, found.upper], [3 - HALF, 3 + HALF], rtol=0.02)
+    assert found.notes == ()
+
+
+def test_others_where_they_were_help_where_the_tangent_leads_too_far():
+    problem = Formula(
+        lambda x: [x["a"] + x["b"] - 4.0, 0.5 * (x["b"] - 1.0)],
+        {"a": 3.0, "b": 1.0},
+        bounds=OPEN,
+        fails=lambda v: v["b"] < 0.2,
+    )
+    found = profiled(problem)
+    assert found.lower == pytest.approx(3 - HALF * math.sqrt(5.0), rel=0.02)
+    assert found.upper is not None
+    assert found.upper < 3 + HALF * math.sqrt(5.0)
+
+
+def test_a_better_fit_that_is_met_on_the_way_is_said_and_counts_as_the_best():
+    def rows(x):
+        return [2 * (x["a"] - 3.0), *(0 * x["a"] for _ in range(9))]
+
+    found = profiled(Formula(rows, {"a": 3.8}, bounds=OPEN))
+    [note] = found.notes
+    assert note.startswith("a fit better by 2.")
+    assert note.endswith("in chi2 was met; the point was not the best one")
+    assert found.delta_chi2.min() == 0.0
+    assert found.lower == pytest.approx(3 - HALF / 2, rel=0.04)
+    near = profiled(Formula(rows, {"a": 3.1}, bounds=OPEN))
+    assert near.notes == ()
+
+
+def test_a_cliff_is_found_by_halving():
+    def rows(x):
+        return [0.5 * (x["a"] - 3.0), 1e4 * ca.fmax(x["a"] - 3.7, 0.0)]
+
+    found = profiled(Formula(rows, {"a": 3.0}, bounds=OPEN))
+    assert found.upper == pytest.approx(3.7, abs=2e-3)
+    assert found.lower == pytest.approx(3 - 2 * HALF, rel=0.02)
+    assert found.notes == ()
+
+
+def test_a_point_that_is_evaluated_already_is_not_evaluated_again():
+    problem = Formula(lambda x: [2 * (x["a"] - 3.0)], {"a": 3.0}, bounds=OPEN)
+    best = problem.evaluate(problem.start)
+    problem.asked.clear()
+    found = profile_likelihood(problem, problem.start, 0, 0.5, best)
+    assert (3.0,) not in problem.asked
+    assert len(problem.asked) == len(found.values) - 1 <= 6
+
+
+def test_the_best_fit_is_the_optimum_nearby():
+    problem = Formula(lambda x: [2 * (x["a"] - 3.0), x["a"] * x["b"] - 6.0], {"a": 2.0, "b": 1.0})
+    x, evaluation = best_fit(problem, problem.start)
+    np.testing.assert_allclose(x, [3.0, 2.0], rtol=1e-4)
+    assert evaluation.cost == pytest.approx(0.0, abs=1e-6)
+    assert evaluation.jacobian is not None
