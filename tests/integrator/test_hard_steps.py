@@ -40,9 +40,12 @@ class Hard:
     code: StepCode = StepCode.OK
     damped: bool = False
     conditioning: float = 1.0
+    tolerance: float | None = None
 
     def step(self, use_compiler: bool):
-        return compile_step(self.system, self.time_step, self.split, use_compiler=use_compiler)
+        return compile_step(
+            self.system, self.time_step, self.split, use_compiler=use_compiler, tolerance=self.tolerance
+        )
 
     def inputs(self):
         n, nz = self.system.size, len(self.system.internal)
@@ -137,6 +140,9 @@ CASES: dict[str, Callable[..., Hard]] = {
     ),
     "nearly_redundant_grasps": lambda parts, folder: Hard(
         *gripped_cable(parts, BENT, grasps=2, compliance=1e-9), 1e-3, steps=5
+    ),
+    "short_steps_to_the_last_digit": lambda parts, folder: Hard(
+        parts.cable(), BENT, 5e-6, p=0.1 * BENT, steps=300, tolerance=1e-17
     ),
     "at_full_stretch": lambda parts, folder: Hard(
         *gripped_cable(parts, 0 * BENT), 1e-3, moved=PULLED_BACK, code=StepCode.SINGULAR

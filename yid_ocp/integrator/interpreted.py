@@ -81,7 +81,9 @@ class InterpretedKernel:
         def largest(change: Array) -> float:
             return float(np.max(np.abs(change[: self._coordinates]), initial=0.0))
 
-        tolerance, error, previous = self._model.tolerance, 0.0, math.inf
+        # below `rounding` a correction may be noise, which no step makes smaller
+        tolerance, rounding = self._model.tolerance, 1e3 * self._model.tolerance
+        error, previous = 0.0, math.inf
         for iteration in range(1, ITERATION_LIMIT + 1):
             residual = value(point)[self._residual, 0]
             if not np.all(np.isfinite(residual)):
@@ -93,7 +95,7 @@ class InterpretedKernel:
             error = largest(change)
             if not math.isfinite(error):
                 return StepCode.NOT_FINITE, error, iteration
-            if error <= tolerance or (error < 1e3 * tolerance and error > 0.5 * previous):
+            if error <= tolerance or 0.5 * previous < error < rounding:
                 point[self._at["lam"]] += change[self._coordinates :]
                 return StepCode.OK, error, iteration
             previous, factor = error, min(1.0, 0.5 / error)
@@ -101,7 +103,7 @@ class InterpretedKernel:
                 trial = point.copy()
                 trial[self._unknown] += factor * change
                 further = _solved(factors, value(trial)[self._residual, 0])
-                if largest(further) <= (1 - 0.25 * factor) * error:
+                if largest(further) <= max((1 - 0.25 * factor) * error, rounding):
                     break
                 if factor < 1e-4:
                     return StepCode.NOT_CONVERGED, error, iteration
