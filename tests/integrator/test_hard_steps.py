@@ -130,7 +130,7 @@ CASES: dict[str, Callable[..., Hard]] = {
         damped=True,
     ),
     "almost_at_full_stretch": lambda parts, folder: Hard(
-        *gripped_cable(parts, 1e-4 * NEARLY_STRAIGHT), 1e-3, conditioning=1e4
+        *gripped_cable(parts, 1e-4 * NEARLY_STRAIGHT), 1e-3, conditioning=1e5
     ),
     "drawn_back_from_full_stretch": lambda parts, folder: Hard(
         *gripped_cable(parts, 1e-4 * NEARLY_STRAIGHT, "axis"), 1e-3, moved=PULLED_BACK, damped=True, conditioning=1e4

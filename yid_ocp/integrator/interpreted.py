@@ -81,9 +81,7 @@ class InterpretedKernel:
         def largest(change: Array) -> float:
             return float(np.max(np.abs(change[: self._coordinates]), initial=0.0))
 
-        # below `rounding` a correction may be noise, which no step makes smaller
-        tolerance, rounding = self._model.tolerance, 1e3 * self._model.tolerance
-        error, previous = 0.0, math.inf
+        tolerance, error = self._model.tolerance, 0.0
         for iteration in range(1, ITERATION_LIMIT + 1):
             residual = value(point)[self._residual, 0]
             if not np.all(np.isfinite(residual)):
@@ -95,19 +93,20 @@ class InterpretedKernel:
             error = largest(change)
             if not math.isfinite(error):
                 return StepCode.NOT_FINITE, error, iteration
-            if error <= tolerance or 0.5 * previous < error < rounding:
-                point[self._at["lam"]] += change[self._coordinates :]
-                return StepCode.OK, error, iteration
-            previous, factor = error, min(1.0, 0.5 / error)
-            while True:
+            noise, factor = error <= tolerance, min(1.0, 0.5 / error) if error else 1.0
+            while not noise:
                 trial = point.copy()
                 trial[self._unknown] += factor * change
                 further = _solved(factors, value(trial)[self._residual, 0])
-                if largest(further) <= max((1 - 0.25 * factor) * error, rounding):
+                if largest(further) <= (1 - 0.25 * factor) * error:
                     break
                 if factor < 1e-4:
                     return StepCode.NOT_CONVERGED, error, iteration
-                factor *= 0.5
+                # near the tolerance a correction that no step makes smaller is rounding
+                noise, factor = error < 1e3 * tolerance, 0.5 * factor
+            if noise:
+                point[self._at["lam"]] += change[self._coordinates :]
+                return StepCode.OK, error, iteration
             point[:] = trial
             if factor == 1.0 and largest(further) <= tolerance:
                 point[self._at["lam"]] -= further[self._coordinates :]
