@@ -122,3 +122,18 @@ def test_a_recording_in_a_table():
 def test_a_table_leaves_out_columns_without_an_entry():
     lines = terminal.table([("a", "", "long head"), ("1", "", "x"), ("22", "", "")])
     assert lines == ["a   long head", "--  ---------", "1   x", "22"]
+
+
+def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():
+    entry = {
+        "kind": "kelvin_voigt", "location": "T1", "score": 2190.0, "closure": None,
+        "parameters": {"tau": {"value": 0.05, "std": None, "unit": "s"}},
+    }  # fmt: skip
+    units = {"rmse": {}, "unit": {}}
+    result = {
+        "summary": "The gap is real.", "gap": {"before": units, "after": units}, "verdict": "unknown",
+        "seconds": {"fit": 1.0}, "which": [entry | {"p_value": 0.0}, entry | {"location": "T2", "p_value": 0.034}],
+    }  # fmt: skip
+    lines = terminal.diagnose_summary(result)
+    assert line_of(lines, "kelvin_voigt@T1").endswith(" < 1e-12")
+    assert line_of(lines, "kelvin_voigt@T2").endswith(" 0.034")

@@ -181,7 +181,8 @@ def diagnose_summary(result: Mapping[str, Any]) -> list[str]:
         values = ", ".join(f"{name} = {q['value']:.3g}{spread[name]} {q['unit']}" for name, q in known.items())
         closed = "" if entry["closure"] is None else f"{100 * entry['closure']:.3g} %"
         label = f"{entry['kind']}@{entry['location']}"
-        rows.append((label, values, closed, f"{entry['score']:.3g}", f"{entry['p_value']:.2g}"))
+        p = f"{entry['p_value']:.2g}" if entry["p_value"] > 1e-12 else "< 1e-12"
+        rows.append((label, values, closed, f"{entry['score']:.3g}", p))
     lines += [*table(rows), ""] if len(rows) > 1 else []
     return [*lines, f"verdict: {result['verdict']} ({sum(result['seconds'].values()):.1f} s)"]
 
