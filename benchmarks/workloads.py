@@ -53,7 +53,7 @@ class Bench:
     torque: Array
     path: Array
     feedback: Feedback
-    rollout: Rollout
+    trajectory: Rollout
     model: Any
     data: Any
     points: list[tuple[Array, Array, Array]]
@@ -76,8 +76,8 @@ class Bench:
         rest = Statics(step).solve(angles[0], theta)
         feedback = lqr_filter(step, angles, torque, theta)
         path = np.zeros((len(torque) + 1, 0))
-        rollout = step.kernel.rollout(theta, rest.state, torque, path, feedback, None)
-        assert rollout.status.ok, rollout.status.message
+        trajectory = step.kernel.rollout(theta, rest.state, torque, path, feedback, None)
+        assert trajectory.status.ok, trajectory.status.message
         values = dict(zip(system.parameters.names, theta, strict=True))
         tree = urdf_text(system.mechanism, {name: values[name] for name in system.mechanism.parameters.names})
         model = pin.buildModelFromXML(tree)
@@ -97,7 +97,7 @@ class Bench:
             torque,
             path,
             feedback,
-            rollout,
+            trajectory,
             model,
             model.createData(),
             points,
@@ -148,8 +148,8 @@ def step_called_from_python(bench: Bench) -> int:
     """One call of the step from Python, as a user writes it; it starts without the rollout's extrapolation."""
     n, calls = bench.size, 50
     for k in range(100, 100 + calls):
-        x = bench.rollout.state[k]
-        bench.step(x[:n], x[n : 2 * n], bench.rollout.torque[k], bench.theta)
+        x = bench.trajectory.state[k]
+        bench.step(x[:n], x[n : 2 * n], bench.trajectory.torque[k], bench.theta)
     return calls
 
 
@@ -157,8 +157,8 @@ def jacobians_called_from_python(bench: Bench) -> int:
     """One call of `jacobians` from Python: A, B_u and B_theta of the six stiffnesses."""
     n, calls = bench.size, 20
     for k in range(100, 100 + calls):
-        x = bench.rollout.state[k]
-        bench.step.jacobians(x[:n], x[n : 2 * n], bench.rollout.torque[k], bench.theta, names=STIFFNESSES)
+        x = bench.trajectory.state[k]
+        bench.step.jacobians(x[:n], x[n : 2 * n], bench.trajectory.torque[k], bench.theta, names=STIFFNESSES)
     return calls
 
 
@@ -176,7 +176,9 @@ def sensitivities_500(bench: Bench) -> int:
 
 def adjoint_500(bench: Bench) -> int:
     """The gradient by six stiffnesses from the adjoint sweep back over 500 steps (the rollout not included)."""
-    bench.step.kernel.adjoint(bench.theta, bench.rollout, bench.feedback, STIFFNESSES, bench.rollout.state, None, None)
+    bench.step.kernel.adjoint(
+        bench.theta, bench.trajectory, bench.feedback, STIFFNESSES, bench.trajectory.state, None, None
+    )
     return 1
 
 

@@ -161,13 +161,13 @@ def linearise(
     for k in range(max((len(g) for g in grids.values()), default=0)):
         chosen = [effect for effect in others if k < len(grids[effect.label])]
         shape = {name: value for effect in chosen for name, value in grids[effect.label][k].items()}
-        swept = [name for effect in chosen for name in effect.amplitudes]
-        trial = problem.problem.freeing((*problem.nominal, *own, *swept)).at(shape)
+        amplitudes = [name for effect in chosen for name in effect.amplitudes]
+        trial = problem.problem.freeing((*problem.nominal, *own, *amplitudes)).at(shape)
         evaluation = trial.evaluate(trial.vector(values), warm=warm)
         if not evaluation.ok or evaluation.jacobian is None:
             raise SolverError(f"the model cannot be linearised: {evaluation.message}", where="diagnosis")
         names, warm = list(trial.names), evaluation.warm
-        places = [names.index(name) for name in swept]
+        places = [names.index(name) for name in amplitudes]
         rest = np.setdiff1d(np.arange(len(names)), places)
         data, jacobian = trial.informing(evaluation)
         if k == 0:

@@ -337,17 +337,17 @@ class Predictor:
         for samples, pull in zip(episode.samples, pulls, strict=True):
             total += self._pull(samples, pull, rollout, theta, by_state, by_effort)
         feedback = episode.feedback
-        swept = adjoint_gradient(self.step, theta, rollout, wanted, by_state, None, by_effort, feedback)
+        by_inputs = adjoint_gradient(self.step, theta, rollout, wanted, by_state, None, by_effort, feedback)
         inputs = self.inputs(episode, theta, wanted)
         by_torque = inputs.torque_directions(feedback, self.system.driven_indices)
         if by_torque is not None:
-            total += np.einsum("ku,kuw->w", swept.by_torque, by_torque)
+            total += np.einsum("ku,kuw->w", by_inputs.by_torque, by_torque)
         if inputs.by_path is not None:
             # node 0 is part of the start state
-            total += np.einsum("kc,kcw->w", swept.by_path[1:], inputs.by_path[1:])
+            total += np.einsum("kc,kcw->w", by_inputs.by_path[1:], inputs.by_path[1:])
         by_start = self.start(episode, theta, offset, wanted, result.warm).by_unknowns
-        own = np.concatenate([total + swept.by_theta, np.zeros(len(self.unknowns.start))])
-        return np.asarray(own + swept.by_start @ by_start)
+        own = np.concatenate([total + by_inputs.by_theta, np.zeros(len(self.unknowns.start))])
+        return np.asarray(own + by_inputs.by_start @ by_start)
 
     def _pull(
         self, samples: Measurements, pull: Array, rollout: Rollout, theta: Array, by_state: Array, by_effort: Array

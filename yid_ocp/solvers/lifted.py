@@ -176,10 +176,10 @@ class Lifted:
             start = problem.start_state(episode, theta, offset, transcription.warm[i])
             if start.message:
                 return start.message
-            swept = self._condensed(transcription, i, theta, start, nodes[i])
-            if isinstance(swept, str):
-                return swept
-            trajectory, slopes, by_x, by_defect, gaps = swept
+            condensed = self._condensed(transcription, i, theta, start, nodes[i])
+            if isinstance(condensed, str):
+                return condensed
+            trajectory, slopes, by_x, by_defect, gaps = condensed
             defect = max(defect, float(np.max(np.abs(gaps), initial=0.0)))
             states.append((by_x, by_defect, gaps))
             for samples in episode.samples:
