@@ -1,0 +1,320 @@
+"""The blind proof, rule by rule: how answers are given, marked and scored."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import math
+from types import SimpleNamespace
+
+import pytest
+from factories import amplitude, effect, fit, loss
+
+from yid_ocp.diagnosis.blind import Case, Label, answers, mark, score, seal
+from yid_ocp.virtual.injected import InjectedEffect
+
+# the package's own name `score` is the function
+scoring = importlib.import_module("yid_ocp.diagnosis.blind.score")
+KV, DRY = InjectedEffect("kelvin_voigt", "T1", {"tau": 0.05}), InjectedEffect("joint_coulomb", "elbow", {"tau_c": 2.0})
+DAMPER = effect("kelvin_voigt@T1", amplitude("tau", expected=(0.0, 0.2), unit="s"))
+FRICTION = effect("joint_coulomb@elbow", amplitude("tau_c", expected=(0.0, 3.0)))
+GUST = InjectedEffect("gusts", "T3", {"size": 0.1})
+
+
+def label(category, *injected, multiple=None):
+    return Label("case_000", category, injected, multiple, {"T1.bend": 12.0})
+
+
+def pair(text):
+    kind, _, place = text.partition("@")
+    return {"kind": kind, "location": place}
+
+
+def said(verdict="effect", effects=(), which=None, where=(), confusable=(), closure=None, values=None):
+    listed = effects if which is None else which
+    return {
+        "verdict": verdict,
+        "effects": [pair(t) for t in effects],
+        "which": [pair(t) | {"parameters": (values or {}).get(t, {})} for t in listed],
+        "where": [{"location": p} for p in where],
+        "confusable": [[pair(t) for t in group] for group in confusable],
+        "gap": {"closure": closure},
+    }
+
+
+# -- marks ------------------------------------------------------------------------------------------------------------
+
+RIGHT, WRONG = "kelvin_voigt@T1", "density@T2"
+
+
+@pytest.mark.parametrize(
+    ("case", "answer", "right"),
+    [
+        (label("null"), said("no_gap"), True),
+        (label("null"), said("insufficient_data"), False),
+        (label("null"), said("unknown"), False),
+        (label("single", KV), said("effect", [RIGHT]), True),
+        (label("single", KV), said("effect", [WRONG]), False),
+        (label("single", KV), said("effect", [WRONG, RIGHT]), False),
+        (label("single", KV), said("effect", [RIGHT, WRONG]), True),
+        (label("single", KV), said("confusable", [WRONG], confusable=[[WRONG, RIGHT]]), True),
+        (label("single", KV), said("confusable", [WRONG], confusable=[[WRONG, "a@b", RIGHT]]), True),
+        (label("single", KV), said("confusable", [WRONG], confusable=[[WRONG, "a@b", "c@d", RIGHT]]), False),
+        (label("single", KV), said("confusable", [WRONG, "a@b"], confusable=[["a@b", RIGHT]]), False),
+        (label("single", KV), said("unknown", where=["T1"]), False),
+        (label("finer_chain"), said("effect", [RIGHT]), False),
+        (label("outside", GUST), said("unknown", where=["T3", "T1"]), True),
+        (label("outside", GUST), said("unknown", where=["T1", "T3"]), False),
+        (label("outside", GUST), said("unknown"), False),
+        (label("outside", GUST), said("effect", [WRONG], where=["T3"]), False),
+        (label("left_out", KV), said("unknown", where=["T1"]), True),
+        (label("left_out", KV), said("effect", [RIGHT], where=["T1"]), False),
+        (label("pair", KV, DRY), said("effect", [RIGHT, "joint_coulomb@elbow"]), True),
+        (label("pair", KV, DRY), said("effect", ["joint_coulomb@elbow", "a@b", RIGHT]), True),
+        (label("pair", KV, DRY), said("effect", [RIGHT]), False),
+        (
+            label("pair", KV, DRY),
+            said("confusable", ["joint_coulomb@elbow"], confusable=[["joint_coulomb@elbow", RIGHT]]),
+            True,
+        ),
+    ],
+)
+def test_what_is_right_depends_on_the_case(case, answer, right):
+    assert mark(case, answer).right is right
+
+
+@pytest.mark.parametrize(
+    ("listed", "where", "first", "second", "located"),
+    [
+        ([RIGHT, WRONG], ["T1", "T2"], True, True, True),
+        ([WRONG, RIGHT], ["T2", "T1"], False, True, False),
+        ([WRONG, "a@b", RIGHT], ["T1"], False, False, True),
+        ([], [], False, False, False),
+    ],
+)
+def test_a_mark_says_what_comes_first(listed, where, first, second, located):
+    found = mark(label("single", KV), said("unknown", [], which=listed, where=where))
+    assert (found.kind_first, found.kind_second, found.location_first) == (first, second, located)
+
+
+@pytest.mark.parametrize(
+    ("verdict", "gap"),
+    [("no_gap", False), ("insufficient_data", False), ("unknown", True), ("effect", True), ("confusable", True)],
+)
+def test_a_gap_is_reported_by_the_verdict(verdict, gap):
+    assert mark(label("null"), said(verdict)).gap is gap
+
+
+def test_a_clean_case_has_no_truth_to_be_first():
+    found = mark(label("null"), said("effect", [WRONG], where=["T2"]))
+    assert (found.kind_first, found.kind_second, found.location_first) == (False, False, False)
+    assert (found.truth, found.answer, found.confusable) == ("-", WRONG, ())
+    assert mark(label("null"), said("no_gap")).answer == "-"
+    assert math.isnan(found.multiple)
+
+
+def test_a_mark_keeps_case_answer_and_figures():
+    group = [WRONG, RIGHT]
+    found = mark(
+        label("pair", KV, DRY, multiple=3.0),
+        said("confusable", [WRONG, "a@b"], confusable=[["a@b", "c@d"], group], closure=0.5),
+        best=0.8,
+        seconds=7.0,
+    )
+    assert (found.case, found.category, found.verdict) == ("case_000", "pair", "confusable")
+    assert (found.truth, found.answer) == ("kelvin_voigt@T1 + joint_coulomb@elbow", f"{WRONG} + a@b")
+    assert (found.multiple, found.closure, found.best, found.seconds) == (3.0, 0.5, 0.8, 7.0)
+    assert found.confusable == tuple(group)
+    assert math.isnan(mark(label("null"), said("no_gap")).closure)
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "error", "inside"),
+    [
+        (0.06, 0.01, 0.2, True),
+        (0.06, 0.0052, 0.2, True),
+        (0.06, 0.005, 0.2, False),
+        (0.04, 0.0052, 0.2, True),
+        (0.04, 0.005, 0.2, False),
+    ],
+)
+def test_a_parameter_is_within_95_percent_or_not(value, std, error, inside):
+    values = {RIGHT: {"tau": {"value": value, "std": std, "unit": "s"}}}
+    found = mark(label("single", KV), said("effect", [WRONG, RIGHT], which=[WRONG, RIGHT], values=values))
+    assert found.errors == {f"{RIGHT}.tau": (pytest.approx(error), inside)}
+
+
+@pytest.mark.parametrize(
+    ("injected", "effects", "values"),
+    [
+        (KV, [WRONG], {}),
+        (KV, [RIGHT], {}),
+        (KV, [RIGHT], {"tau": {"value": None, "std": 0.1}}),
+        (KV, [RIGHT], {"tau": {"value": 0.05, "std": None}}),
+        (InjectedEffect("kelvin_voigt", "T1", {"tau": math.inf}), [RIGHT], {"tau": {"value": 0.05, "std": 0.1}}),
+        (GUST, ["gusts@T3"], {"size": {"value": 0.1, "std": 0.1}}),
+    ],
+    ids=["not named", "no value", "infinite", "unknown deviation", "truth is infinite", "in no library"],
+)
+def test_parameters_that_cannot_be_compared_are_left_out(injected, effects, values):
+    found = mark(label("single", injected), said("effect", effects, values=dict.fromkeys(effects, values)))
+    assert found.errors == {}
+
+
+def test_an_error_relative_to_nothing_is_large():
+    zero = InjectedEffect("kelvin_voigt", "T1", {"tau": 0.0})
+    values = {RIGHT: {"tau": {"value": 1e-3, "std": 1.0}}}
+    assert mark(label("single", zero), said("effect", [RIGHT], values=values)).errors[f"{RIGHT}.tau"][0] == 1e6
+
+
+# -- rates ------------------------------------------------------------------------------------------------------------
+
+
+def marked(category, **changed):
+    usual = {
+        "case": "c",
+        "category": category,
+        "truth": RIGHT,
+        "verdict": "effect",
+        "answer": RIGHT,
+        "multiple": 3.0,
+        "gap": True,
+        "kind_first": True,
+        "kind_second": True,
+        "location_first": True,
+        "confusable": (),
+        "right": True,
+        "closure": 0.9,
+        "best": 1.0,
+    }
+    return scoring.Mark(**(usual | changed))
+
+
+def test_rates_are_over_the_cases_that_they_speak_of():
+    found = score(
+        [
+            marked("null", gap=True),
+            marked("null", gap=False),
+            marked("null", gap=False, seconds=4.0),
+            marked("null", gap=False, seconds=8.0),
+            marked("single", kind_first=False, location_first=False, errors={"a": (0.5, True), "b": (0.1, False)}),
+            marked("single", kind_first=False, kind_second=False, closure=0.3, best=0.5, errors={"a": (0.2, True)}),
+            marked("single", confusable=(WRONG, RIGHT), closure=math.nan),
+            marked("single", confusable=(WRONG, "a@b", "c@d"), right=False, best=math.nan),
+            marked("single", gap=False, right=False, multiple=1.0, kind_first=False, best=-1.0),
+            marked("single", multiple=math.nan, best=0.0),
+            marked("outside", verdict="unknown", location_first=False),
+            marked("left_out", verdict="effect"),
+            marked("left_out", verdict="no_gap", gap=False, location_first=False),
+            marked("pair", right=False),
+            marked("finer_chain", right=False),
+        ]
+    )
+    assert found["cases"] == 15
+    assert found["false_alarms"] == 0.25
+    assert found["detection"] == {
+        "1": {"cases": 1, "gap": 0.0, "right": 0.0},
+        "3": {"cases": 4, "gap": 1.0, "right": 0.75},
+    }
+    assert found["kind_first"] == pytest.approx(3 / 5)
+    assert found["kind_in_two"] == pytest.approx(4 / 5)
+    assert found["location_first"] == pytest.approx(4 / 5)
+    assert (found["confusable_covers"], found["confusable_size"]) == (0.5, 2.5)
+    assert found["unknown_recall"] == pytest.approx(1 / 3)
+    assert found["unknown_location"] == 0.5
+    assert found["pairs_right"] == 0.0
+    assert found["closure_of_best"] == pytest.approx((0.9 + 0.6) / 2)
+    assert found["parameter_error"] == pytest.approx(0.2)
+    assert found["interval_coverage"] == pytest.approx(2 / 3)
+    assert found["seconds"] == 6.0
+    assert len(found["marks"]) == 15
+
+
+def test_no_cases_of_a_sort_have_no_rate():
+    found = score([])
+    assert found["cases"] == 0
+    assert {found[key] for key in found if key not in ("format", "cases", "detection", "marks")} == {None}
+
+
+# -- seals ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_sealed_text_is_sorted_and_holds_all():
+    text, digest = seal([label("single", KV, multiple=3.0)])
+    assert json.loads(text) == [
+        {
+            "case": "case_000",
+            "category": "single",
+            "injected": [{"kind": "kelvin_voigt", "location": "T1", "values": {"tau": 0.05}}],
+            "multiple": 3.0,
+            "truth": {"T1.bend": 12.0},
+        }
+    ]
+    assert text.index('"case"') < text.index('"injected"') < text.index('"truth"')
+    assert len(digest) == 64
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        seal([label("single", multiple=math.nan)])
+
+
+# -- answers ----------------------------------------------------------------------------------------------------------
+
+
+def case(without=("density",)):
+    return Case("case_000", "estimate", "held out", without)
+
+
+def test_an_answer_is_given_from_the_recordings_without_what_was_left_out(monkeypatch):
+    asked = {}
+    heavy = effect("density@T1")
+    monkeypatch.setattr(answers, "chosen_effects", lambda of, recordings, choice: [DAMPER, heavy, FRICTION])
+
+    def diagnose(problem, choice, held_out, **more):
+        asked.update(problem=problem, choice=choice, held_out=held_out, **more)
+        return "finding"
+
+    monkeypatch.setattr(answers, "diagnose", diagnose)
+    ensemble = SimpleNamespace(of=lambda recording: SimpleNamespace(system="system", recording=recording))
+    assert answers.answer(ensemble, case(), "all", "thresholds", "progress") == "finding"
+    assert asked["problem"].recording == "estimate"
+    assert asked["choice"] == ["kelvin_voigt@T1", "joint_coulomb@elbow"]
+    assert (asked["held_out"], asked["thresholds"], asked["progress"]) == (["held out"], "thresholds", "progress")
+
+
+@pytest.mark.parametrize(
+    ("injected", "refitted", "expected"),
+    [
+        ((KV,), True, 0.75),
+        ((KV,), False, math.nan),
+        ((KV, GUST), True, math.nan),
+        ((), True, 0.75),
+    ],
+    ids=["the true effect", "cannot be fitted", "one is in no library", "none"],
+)
+def test_the_best_that_could_be_closed_is_that_of_the_true_effects(monkeypatch, injected, refitted, expected):
+    asked = []
+    stiff = effect("kelvin_voigt@T1", amplitude("tau", unit="s"), amplitude("other"))
+    made = SimpleNamespace(of=lambda problem, effects, held_out: ("composed", effects, held_out))
+    monkeypatch.setattr(answers, "chosen_effects", lambda *_: [stiff, FRICTION])
+    monkeypatch.setattr(answers, "CandidateProblem", made)
+    monkeypatch.setattr(answers, "nominal_fit", lambda *_: fit(lost=loss(2.0, 2.0), values={"k": 3.0}))
+
+    def refit(composed, chosen, start):
+        asked.append((composed[0], [e.kind for e in chosen], dict(start)))
+        return fit(chosen, loss(1.25, 1.25)) if refitted else None
+
+    monkeypatch.setattr(answers, "refit", refit)
+    ensemble = SimpleNamespace(of=lambda recording: SimpleNamespace(system="system"))
+    found = answers.best_closure(ensemble, case(), Label("c", "single", injected, 1.0, {}))
+    assert found == pytest.approx(expected, nan_ok=True)
+    at_truth = {"kelvin_voigt@T1.tau": 0.05} if injected else {}
+    assert asked == [("composed", ["kelvin_voigt"] if injected else [], {"k": 3.0} | at_truth)]
+
+
+def test_reported_values_are_turned_back_into_parameters():
+    quantities = [
+        SimpleNamespace(name="compliance", reported=("stiffness", "N/m"), reciprocal="stiffness N/m"),
+        SimpleNamespace(name="tau", reported=("tau", "s"), reciprocal=""),
+        SimpleNamespace(name="other", reported=("other", "s"), reciprocal=""),
+    ]
+    found = answers._internal("a@b", {"stiffness": 4.0, "tau": 0.5}, quantities)
+    assert found == {"a@b.compliance": 0.25, "a@b.tau": 0.5}
