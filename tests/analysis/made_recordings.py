@@ -1,0 +1,53 @@
+"""Made-up recordings on a grid, and a pendulum that holds a rod."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import casadi as ca
+import numpy as np
+
+from yid_ocp.analysis.layouts import (
+    Setting,
+)
+from yid_ocp.data.recording import PointGroup, Recording
+from yid_ocp.model import Grasp, Segment, System, flexible_object
+from yid_ocp.model.kinematics import forward_kinematics
+from yid_ocp.model.urdf import read_urdf
+from yid_ocp.problem import ProblemOptions
+from yid_ocp.problem.grid import Grid
+
+GRID = Grid(10.0, 0.1, 20)
+
+
+def group(name="points_camera", names=("a", "b"), t=(10.0, 10.5, 11.0), std=2e-3, **more):
+    position = np.ones((len(t), len(names), 3))
+    return PointGroup(name, tuple(names), np.array(t), position, std, **more)
+
+
+def setting(*groups, sensors=None, frames=("a", "b", "tip"), **more):
+    """A setting of one made-up recording with these groups, in a model with these frames."""
+    episode = SimpleNamespace(recording=Recording(None, groups, name="run"), grid=GRID)
+    problem = SimpleNamespace(
+        episodes=(episode,),
+        options=ProblemOptions(sensors=sensors or {}),
+        system=SimpleNamespace(mechanism=SimpleNamespace(frames=dict.fromkeys(frames))),
+    )
+    return Setting(problem, np.zeros(1), **more), episode
+
+
+def places(system, frames, q):
+    """Positions of frames at a configuration."""
+    symbol = ca.SX.sym("q", system.size)
+    kinematics = forward_kinematics(system.mechanism, symbol)
+    expression = ca.horzcat(*(kinematics.position(frame) for frame in frames))
+    function = ca.Function("at", [symbol, system.parameters.symbols], [expression])
+    return np.array(function(q, system.parameters.vector())).T
+
+
+def holding_pendulum(folder):
+    """A pendulum of two motors that takes the end of a rod on the ground."""
+    robot = read_urdf(folder / "double_pendulum.urdf")
+    rod = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=3, bend=4.0, twist=3.0)])
+    grasps = [Grasp("hand", "tip", "w_T1")]
+    return System.build(robot, objects=[(rod, None, None)], grasps=grasps, driven=["shoulder", "elbow"])
