@@ -148,10 +148,10 @@ def test_travel_without_grippers_is_typical(urdf_folder):
 
 @pytest.mark.parametrize("points", [("w_T1", "w_T2", "w_T3"), ("w_T1", "w_T2")])
 def test_two_arms_hold_the_object_together_and_away(urdf_folder, points):
-    """The Y, a metre along x and 0.4 m along y: each arm's hand a bit towards the middle, both a bit outwards."""
+    """The Y, half a metre along x and 0.2 m along y: each arm's hand a bit towards the middle, both a bit outwards."""
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
     place = np.eye(4)
-    place[:2, 3] = 1.0, 0.4
+    place[:2, 3] = 0.5, 0.2
     grasps = [Grasp("left", "tip", "w_T2"), Grasp("right", "lower", "w_T3")]
     objects = [(y_object(), None, place)]
     system = System.build(robot, objects=objects, grasps=grasps, driven=["shoulder", "elbow"], points=points)

@@ -89,6 +89,89 @@ def test_rows_in_metres_count_in_units_of_their_noise():
     np.testing.assert_allclose([found.lower, found.upper], [3 - HALF / 4, 3 + HALF / 4], rtol=0.01)
 
 
+# -- how far it steps -------------------------------------------------------------------------------------------------
+
+
+def steps(problem, std, unit, name="a", **more):
+    """Values asked below and above the best fit, each in units of the interval's half-width or what is given."""
+    best = problem.evaluate(problem.start)
+    problem.asked.clear()
+    profiled(problem, name, std, evaluation=best, **more)
+    index = problem.names.index(name)
+    moved = [(x[index] - problem.start[index]) / unit for x in problem.asked]
+    return [-d for d in moved if d < 0], [d for d in moved if d > 0]
+
+
+@pytest.mark.parametrize(
+    ("guess", "asked"),
+    [
+        (1.0, [1.0]),
+        (0.995, [0.995]),
+        (0.1, [0.1, 0.4, 1.18, 1.0]),
+        (0.04, [0.04, 0.16, 0.64, 1.108, 1.0]),
+        (0.9, [0.9, 1.08, 1.0]),
+        (5.0, [5.0, 1.0]),
+        (15.0, [15.0, 7.5, 7.5 - 6.5 * 7.5 / 7.0, 1.0]),
+    ],
+)
+def test_a_line_is_followed_no_faster_than_it_is_known(guess, asked):
+    """A parabola's root is a line: the next point is a third beyond its end, no more than three times what is gone.
+
+    Of two sides, one that is kept counts half; heights of more than ten times the end's are halved.
+    """
+    problem = Formula(lambda x: [2 * (x["a"] - 3.0)], {"a": 3.0}, bounds=OPEN, scales={"a": 100.0})
+    for side in steps(problem, 0.5 * guess, 0.5 * HALF):
+        assert side == pytest.approx(asked, rel=1e-6)
+
+
+def test_the_first_step_is_no_larger_than_the_unknown_itself():
+    either = Formula(lambda x: [0 * x["a"] + 1.0], {"a": 3.0}, bounds=OPEN, scales={"a": 2.0})
+    below, above = steps(either, math.inf, HALF)
+    assert below[0] == above[0] == pytest.approx(20.0)
+    positive = Formula(lambda x: [0 * x["a"] + 1.0], {"a": 3.0})
+    below, above = steps(positive, math.inf, 3.0)
+    assert 1 + above[0] == pytest.approx(math.exp(0.5 * HALF))
+    assert 1 - below[0] == pytest.approx(math.exp(-0.5 * HALF))
+    below, above = steps(Formula(lambda x: [10 * ca.log(x["a"])], {"a": 3.0}), 0.3, 3.0)
+    assert 1 + above[0] == pytest.approx(math.exp(0.1 * HALF))
+
+
+def test_the_others_go_along_the_tangent_at_once():
+    rows = np.array([[1.0, 0.9], [0.3, 1.0], [0.5, 0.5]])
+    problem = Formula(
+        lambda x: [r[0] * (x["a"] - 1.0) + r[1] * (x["b"] + 2.0) for r in rows], {"a": 1.0, "b": -2.0}, bounds=OPEN
+    )
+    std = float(np.sqrt(np.linalg.inv(rows.T @ rows)[0, 0]))
+    below, above = steps(problem, std, std * HALF)
+    assert below == pytest.approx([1.0])
+    assert above == pytest.approx([1.0])
+
+
+def test_refits_leave_little_on_the_table():
+    """The other unknown follows the first on a curve, so that its tangent alone is not enough."""
+    problem = Formula(
+        lambda x: [x["a"] - 3.0 + x["b"], 2 * (x["b"] - 0.3 * (x["a"] - 3.0) ** 2)], {"a": 3.0, "b": 0.0}, bounds=OPEN
+    )
+    found = profiled(problem)
+    gone = found.values - 3.0
+    exact = (gone + 0.3 * gone**2) ** 2 / (1 + 1 / 4)
+    assert np.max(found.delta_chi2) > 3
+    np.testing.assert_allclose(found.delta_chi2, exact, atol=2e-3)
+    assert np.all(found.delta_chi2 >= exact - 1e-9)
+
+
+def test_edges_take_few_refits():
+    cliff = Formula(lambda x: [0.5 * (x["a"] - 3.0), 1e4 * ca.fmax(x["a"] - 3.7, 0.0)], {"a": 3.0}, bounds=OPEN)
+    below, above = steps(cliff, 2.0, 1.0)
+    assert len(below) == 1
+    assert 10 <= len(above) <= 16
+    fails = Formula(lambda x: [0.1 * (x["a"] - 3.0)], {"a": 3.0}, bounds=OPEN, fails=lambda v: v["a"] > 7.0)
+    below, above = steps(fails, 10.0, 10 * HALF)
+    assert below == pytest.approx([1.0])
+    # half the way to where it failed, time and again
+    assert above[:3] == pytest.approx([1.0, 1.0, 0.5], rel=1e-6)
+
+
 # -- positive unknowns ------------------------------------------------------------------------------------------------
 
 
