@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import ModelError
 from yid_ocp.integrator.mapped import Mapped
-from yid_ocp.integrator.step import Step, compile_step
+from yid_ocp.integrator.step import Step, compile_alike
 from yid_ocp.integrator.step_model import Feedback
 from yid_ocp.model.system import Effect, System
 
@@ -81,7 +81,7 @@ def lqr_filter(
     reference, torques = np.asarray(measured, float), np.asarray(torque, float)
     system = step.system
     arms = _arms_only(system)
-    arm_step = compile_step(arms, step.time_step, step.force_split, use_compiler=step.compiled)
+    arm_step = compile_alike(step, arms)
     values = dict(zip(system.parameters.names, np.asarray(theta, float), strict=True))
     arm_theta = arms.parameters.vector({name: values[name] for name in arms.parameters.names})
     nu = len(system.driven)
