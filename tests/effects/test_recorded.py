@@ -180,7 +180,7 @@ def test_a_cable_from_a_fitted_start(cable, all_effects) -> None:
     )
     residuals = []
     for one in (system, system.with_effects(all_effects(system))):
-        step = compile_step(one, H, "left_damping", use_compiler=False)
+        step = compile_step(one, H, use_compiler=False)
         found = EstimationProblem(step, [made], ("parent.bend",), options)
         result = found.evaluate(found.start)
         assert result.ok, result.message

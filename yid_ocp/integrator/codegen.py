@@ -116,9 +116,10 @@ def _rest_jacobians(e: DiscreteEquations, bodies: ca.SX, bodies_p: ca.SX) -> tup
     rest_p = ca.jacobian(e.p1_rest, inputs) + by_internal(bodies_p)
     by_q1, pulls = e.pulls.after, e.pulls
     if pulls.share_m:
-        moved, ended = -e.row_scale * pulls.share_m * pulls.middle_by_q / 2, e.row_scale * pulls.share_m * pulls.after_by_q
+        weight = e.row_scale * pulls.share_m
+        moved, ended = -weight * pulls.middle_by_q / 2, weight * pulls.after_by_q
         gap, none = ca.SX(n, m), ca.SX(n, e.u.numel())
-        by_z1, by_z0 = (ca.jacobian(-pulls.share_m * e.row_scale * (pulls.middle.T @ e.lam), z) for z in (e.z1, e.z0))
+        by_z1, by_z0 = (ca.jacobian(-weight * (pulls.middle.T @ e.lam), z) for z in (e.z1, e.z0))
         rest += ca.vertcat(ca.horzcat(moved, by_z1, gap, moved, by_z0, none), ca.SX(e.z0.numel() + m, inputs.numel()))
         by_z1, by_z0 = (ca.jacobian(-e.row_scale * (pulls.right.T @ e.lam), z) for z in (e.z1, e.z0))
         rest_p += ca.horzcat(moved + ended, by_z1, gap, moved, by_z0, none)

@@ -5,16 +5,17 @@ Position-momentum form, with L_d(q0, q1) = h L((q0 + q1)/2, (q1 - q0)/h) and q_m
     p_k + D1 L_d(q_k, q_{k+1}) + f- - ((1 - s) Dphi(q_k) + s Dphi(q_m))' lam_k = 0     phi(q_{k+1}) - C lam_k / h = 0
     p_{k+1} = D2 L_d(q_k, q_{k+1}) + f+ - s (Dphi(q_m) - Dphi(q_{k+1}))' lam_k
 
-with f- = f+ = (h/2) F for the symmetric split, f- = h F and f+ = 0 for the left one; s = 0 for a constraint force at the
-node, s = 1/2 for one at the midpoint. At the node the pull's own stiffness, lam times the constraint's curvature, has
-the weights (0, 1, 0) on three neighbouring configurations, and where it exceeds 4 M/h^2 (a light twist under tension)
-the motion grows with alternating sign. With s = 1/2 its weights are a spring's, (1/4, 1/2, 1/4), which no tension makes
-unstable, while lam_k is still what node k needs: a constant Dphi leaves both rules the same. The two differ by
-h/4 (d Dphi/dt)' (lam_k - lam_{k-1}) and a curvature of order h^2, so the order stays two.
-The first equation holds for
-free coordinates; at a prescribed one its left side is -h times the effort that the prescription needs at node k.
-Both equations of a compliant coordinate are multiplied by its compliance, its momentum with them: there p is the
-compliance times the momentum [rad s], which keeps the spring's force (1/compliance) finite and the rule's order two.
+with f- = f+ = (h/2) F for the symmetric split, f- = h F and f+ = 0 for the left one; s = 0 for a constraint force at
+the node, s = 1/2 for one at the midpoint. At the node the pull's own stiffness, lam times the constraint's curvature,
+has the weights (0, 1, 0) on three neighbouring configurations, and where it exceeds 4 M/h^2 (a light twist under
+tension) the motion grows with alternating sign. With s = 1/2 its weights are a spring's, (1/4, 1/2, 1/4), which no
+tension makes unstable, while lam_k is still what node k needs: with a constant Dphi the two rules are one, and in
+general they differ by h/4 (d Dphi/dt)' (lam_k - lam_{k-1}) and a curvature of order h^2, so that the order stays two.
+
+The first equation holds for free coordinates; at a prescribed one its left side is -h times the effort that the
+prescription needs at node k. Both equations of a compliant coordinate are multiplied by its compliance, its momentum
+with them: there p is the compliance times the momentum [rad s], which keeps the spring's force (1/compliance) finite
+and the rule's order two.
 """
 
 from __future__ import annotations
