@@ -130,7 +130,7 @@ CASES: dict[str, Callable[..., Hard]] = {
     "creeping_grasp": lambda parts, folder: Hard(
         *parts.clamped_cable("point", [parts.creeping_grasp("clamp", 0.05), parts.soft_grasp("clamp", 1e-4, 2e-3)]),
         0.005,
-        moved=CLAMP_TURNED,
+        moved=CLAMP_TURNED / 2,
         damped=True,
     ),
     "almost_at_full_stretch": lambda parts, folder: Hard(
