@@ -133,8 +133,9 @@ class MomentumShift:
             q = ca.SX(ca.DM.zeros(system.size))
             q[driven] = arm
             whole.append(q)
-        zero = ca.SX(ca.DM.zeros(e.z0.numel()))
-        [momentum] = ca.substitute([ca.densify(e.p1[driven])], [e.q0, e.q1, e.z0, e.z1], [*whole, zero, zero])
+        zero, free = ca.SX(ca.DM.zeros(e.z0.numel())), ca.SX(ca.DM.zeros(e.lam.numel()))
+        old, new = [e.q0, e.q1, e.z0, e.z1, e.lam], [*whole, zero, zero, free]
+        [momentum] = ca.substitute([ca.densify(e.p1[driven])], old, new)
         pattern = np.array(ca.DM(ca.jacobian_sparsity(momentum, e.theta), 1)).any(axis=0)
         neutral = {name: value for effect in system.effects for name, value in _neutral(effect).items()}
         columns = [i for i in np.flatnonzero(pattern) if system.parameters.names[i] in neutral]
