@@ -111,6 +111,12 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
         recorded = 1.0 / float(np.median(np.diff(joints.t)))
         if recorded < 0.5 * rate:
             warnings.append(f"{episode.name}: joints come at {recorded:.4g} Hz, the model steps at {rate:.4g} Hz")
+        moves = system.driven or any(samples.sensor.efforts for samples in episode.samples)
+        if moves and joints.effort is not None and joints.effort_kind is None:
+            warnings.append(
+                f"{episode.name}: nothing says whether joints/effort is a sample, a mean or a command (attribute "
+                f"effort_kind); it is taken as a {joints.effort_taken_as}"
+            )
     if problem.options.initial_state != "fitted_to_points" and (system.driven or system.prescribed or system.elastic):
         torque = episode.torque[0] if system.driven else None
         rest = problem.functions.statics.solve(
