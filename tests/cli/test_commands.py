@@ -161,6 +161,19 @@ def test_check(cli, pendulum, tmp_path):
     assert [entry["role"] for entry in result["recordings"]] == ["estimate", "held_out"]
     assert "100 Hz" in done.out
     assert "run folder: c" in done.out
+    assert not any("effort_kind" in text for text in result["warnings"])
+
+
+def test_check_says_what_kind_of_torque_is_assumed(cli, pendulum, pendulum_data, tmp_path):
+    (tmp_path / "untold.h5").write_bytes((pendulum_data.folder / "estimate.h5").read_bytes())
+    with h5py.File(tmp_path / "untold.h5", "r+") as file:
+        del file["joints"].attrs["effort_kind"]
+    done = cli("check", pendulum, "--out", "c", "--set", "recordings.estimate=[untold.h5]")
+    assert done.code == 0, done.err
+    result = json.loads((tmp_path / "c" / "result.json").read_text())
+    [said] = [text for text in result["warnings"] if "effort_kind" in text]
+    assert said.startswith("untold: ")
+    assert said.endswith("it is taken as a sample")
 
 
 def test_check_refines_links_and_time_step(cli, tmp_path, monkeypatch):
