@@ -21,19 +21,24 @@ class StepFunctions:
 
     Attributes
     ----------
-    residual : (balance, internal, constraint, p1, middle pull of the balance, pull of p1); balance and p1 without the
-        constraints' pull, whose matrices come as nonzeros of the pattern `matrix`, none where all of it is at the node
-    linear : (pair vectors, rest Jacobian, rest Jacobian of p1, constraint Jacobian), the last three as nonzeros
-    matrix : nonzeros of the share of Dphi(q_k) in the balance, which does not depend on the unknowns
-    pull : nonzeros of the derivative of its pull by (q_k, z_k)
+    residual : (balance, internal, constraint, p1, share of Dphi(q_m)), balance and p1 without the constraints' pull
+    linear : (pair vectors, rest Jacobian, rest Jacobian of p1, constraint Jacobian, curvature), the last four as
+        nonzeros; the curvature is the derivative of the midpoint's pull by q_k, which is that by q_{k+1}
+    matrix : share of Dphi(q_k) in the balance, which does not depend on the unknowns
+    ending : share of Dphi(q_{k+1}) in p1
+    pull : (derivative of the pull of `matrix` by (q_k, z_k), that of `ending` by q_{k+1})
     scales : (row scale, h)
-    patterns : sparsity of rest, rest of p1, constraint Jacobian, matrix and pull
+    patterns : sparsity of rest, rest of p1, constraint Jacobian, matrix (also of the other shares of Dphi), pull,
+        curvature and that at the end
+
+    What is at the midpoint and after it is empty where the constraints pull at the node.
     """
 
     equations: DiscreteEquations
     residual: ca.Function
     linear: ca.Function
     matrix: ca.Function
+    ending: ca.Function
     pull: ca.Function
     scales: ca.Function
     patterns: dict[str, ca.Sparsity]
@@ -41,7 +46,7 @@ class StepFunctions:
     @property
     def all(self) -> tuple[ca.Function, ...]:
         """Every function, in the order of generation."""
-        return self.residual, self.linear, self.matrix, self.pull, self.scales
+        return self.residual, self.linear, self.matrix, self.ending, self.pull, self.scales
 
 
 def step_functions(equations: DiscreteEquations) -> StepFunctions:
@@ -59,7 +64,8 @@ def step_functions(equations: DiscreteEquations) -> StepFunctions:
     pulls = e.pulls
     by_z = ca.jacobian(pulls.before.T @ e.lam, e.z0)
     pull = ca.sparsify(pulls.share_0 * ca.horzcat(pulls.before_by_q, by_z))
-    moving = [pulls.share_m * pulls.middle, pulls.right] if pulls.share_m else []
+    moving = [pulls.middle, pulls.after, pulls.middle_by_q / 2, pulls.after_by_q]
+    middle, after, curve, after_curve = (pulls.share_m * x if pulls.share_m else ca.SX(*x.shape) for x in moving)
 
     def function(name: str, *outputs: ca.SX) -> ca.Function:
         return ca.Function(name, e.arguments, ca.cse(list(outputs)))
@@ -70,10 +76,11 @@ def step_functions(equations: DiscreteEquations) -> StepFunctions:
 
     return StepFunctions(
         e,
-        function("residual", balance, e.internal, e.constraint, p1, *map(nonzeros, moving)),
-        function("linear", _pairs(e), nonzeros(rest), nonzeros(rest_p), nonzeros(by_unknown)),
+        function("residual", balance, e.internal, e.constraint, p1, nonzeros(middle)),
+        function("linear", _pairs(e), nonzeros(rest), nonzeros(rest_p), nonzeros(by_unknown), nonzeros(curve)),
         function("matrix", nonzeros(pulls.share_0 * pulls.before)),
-        function("pull", nonzeros(pull)),
+        function("ending", nonzeros(after)),
+        function("pull", nonzeros(pull), nonzeros(after_curve)),
         function("scales", e.row_scale, e.h),
         {
             "rest": rest.sparsity(),
@@ -81,6 +88,8 @@ def step_functions(equations: DiscreteEquations) -> StepFunctions:
             "constraint": by_unknown.sparsity(),
             "matrix": pulls.before.sparsity(),
             "pull": pull.sparsity(),
+            "curve": curve.sparsity(),
+            "after_curve": after_curve.sparsity(),
         },
     )
 
@@ -116,13 +125,10 @@ def _rest_jacobians(e: DiscreteEquations, bodies: ca.SX, bodies_p: ca.SX) -> tup
     rest_p = ca.jacobian(e.p1_rest, inputs) + by_internal(bodies_p)
     by_q1, pulls = e.pulls.after, e.pulls
     if pulls.share_m:
-        weight = e.row_scale * pulls.share_m
-        moved, ended = -weight * pulls.middle_by_q / 2, weight * pulls.after_by_q
-        gap, none = ca.SX(n, m), ca.SX(n, e.u.numel())
-        by_z1, by_z0 = (ca.jacobian(-weight * (pulls.middle.T @ e.lam), z) for z in (e.z1, e.z0))
-        rest += ca.vertcat(ca.horzcat(moved, by_z1, gap, moved, by_z0, none), ca.SX(e.z0.numel() + m, inputs.numel()))
-        by_z1, by_z0 = (ca.jacobian(-e.row_scale * (pulls.right.T @ e.lam), z) for z in (e.z1, e.z0))
-        rest_p += ca.horzcat(moved + ended, by_z1, gap, moved, by_z0, none)
+        # what the curvatures of `StepFunctions` leave out: grasps may depend on internal coordinates
+        middle, right = (-e.row_scale * (part.T @ e.lam) for part in (pulls.share_m * pulls.middle, pulls.right))
+        rest += by_internal(ca.vertcat(middle, ca.SX(e.z0.numel() + m, 1)))
+        rest_p += by_internal(right)
     if e.constraint_gain is not None:
         # the rows of a relaxing grasp depend on where it was before as well
         by_q1 = e.constraint_gain * by_q1
@@ -192,6 +198,11 @@ def structure(functions: StepFunctions) -> Structure:
     rows_new[column, n + nz + row] = True
     if e.pulls.share_m:
         p1_new[column, n + nz + row] = True
+    row, column = triplet(functions.patterns["curve"])
+    for matrix in (rows_new, rows_old, p1_new, p1_old):
+        matrix[row, column] = True
+    row, column = triplet(functions.patterns["after_curve"])
+    p1_new[row, column] = True
     row, column = triplet(functions.patterns["pull"])
     rows_old[row, column] = True
 
@@ -234,6 +245,8 @@ def kernel_source(functions: StepFunctions, tables: Structure) -> str:
         "NNZ_CONSTRAINT": patterns["constraint"].nnz(),
         "NNZ_MATRIX": patterns["matrix"].nnz(),
         "NNZ_PULL": patterns["pull"].nnz(),
+        "NNZ_CURVE": patterns["curve"].nnz(),
+        "NNZ_AFTER_CURVE": patterns["after_curve"].nnz(),
         "SZ_W": max(f.sz_w() for f in functions.all),
         "SZ_IW": max(f.sz_iw() for f in functions.all),
         "ROW_SCALED": int(bool(system.compliant)),
@@ -270,7 +283,7 @@ def kernel_source(functions: StepFunctions, tables: Structure) -> str:
     ragged("rows_old", tables.rows_old)
     ragged("p1_old", tables.p1_old)
     ragged("p1_new", tables.p1_new)
-    for key in ("rest", "rest_p", "constraint", "matrix", "pull"):
+    for key in ("rest", "rest_p", "constraint", "matrix", "pull", "curve", "after_curve"):
         row, column = triplet(patterns[key])
         table(f"{key}_row", row)
         table(f"{key}_col", column)

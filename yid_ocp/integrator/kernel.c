@@ -3,7 +3,7 @@
  * The generated part before this text defines the sizes N, NZ, M, NU, NC, NF, NY and NT, counts of nonzeros (NNZ_...),
  * sizes of CasADi's work arrays (SZ_W, SZ_IW), what the system needs (ROW_SCALED, MIDDLE, CLOSED, CLOSED_LEFT,
  * CLOSED_RIGHT),
- * the index tables and the CasADi functions residual, linear, matrix, pull and scales; see codegen.py.
+ * the index tables and the CasADi functions residual, linear, matrix, ending, pull and scales; see codegen.py.
  *   N coordinates, NZ internal ones, M constraints, NU inputs, NC prescribed and NF free coordinates,
  *   NT = N + NZ + M rows, NY = NF + NZ + M unknowns of a step, NX = 2 N + NZ state (q, p, z).
  * All matrices are row-major. compiled.py declares the structs of the three entry points at the end once more.
@@ -32,6 +32,7 @@ typedef struct {
     double pairs[(30 + 12 * CLOSED) * ONE(N)];
     double rest[ONE(NNZ_REST)], rest_p[ONE(NNZ_REST_P)], by_unknown[ONE(NNZ_CONSTRAINT)];
     double matrix_nz[ONE(NNZ_MATRIX)], middle_nz[ONE(NNZ_MATRIX)], right_nz[ONE(NNZ_MATRIX)], pull_nz[ONE(NNZ_PULL)];
+    double curve_nz[ONE(NNZ_CURVE)], after_curve_nz[ONE(NNZ_AFTER_CURVE)];
     double Phi[ONE(M)][ONE(N)]; /* rows of the multipliers' pull in the balance */
     double R1[ONE(NT)][ONE(NT)], R0[ONE(NT)][ONE(NQZ)], Ru[ONE(NT)][ONE(NU)];
     double P1[ONE(N)][ONE(NT)], P0[ONE(N)][ONE(NQZ)], Pu[ONE(N)][ONE(NU)];
@@ -80,20 +81,33 @@ static void constraint_matrix(Work *k, const Point *a) {
     for (int e = 0; e < NNZ_MATRIX; e++) k->Phi[matrix_row[e]][matrix_col[e]] = k->matrix_nz[e];
 }
 
-/* Take the pull of multipliers, or of a change of them, off the balance and p1. */
+/* Take the pull of multipliers, or of a change of them, off the balance. */
 static void pull_by(Work *k, const double *lam) {
     for (int e = 0; e < NNZ_MATRIX; e++) {
         const int i = matrix_col[e], c = matrix_row[e];
-        const double force = k->row_scale[i] * lam[c];
-        k->balance[i] -= k->Phi[c][i] * force;
-        if (MIDDLE) k->p1[i] -= k->right_nz[e] * force;
+        k->balance[i] -= k->row_scale[i] * k->Phi[c][i] * lam[c];
     }
 }
 
-/* Full rows of the balance (N), internal (NZ) and constraint (M) equations at the point; p1 on the way. */
+/* Take the multipliers' pull off p1, once all unknowns are known. */
+static void finish(Work *k, const Point *a) {
+    if (!MIDDLE || M == 0) return;
+    const double *args[9];
+    double *res[1] = {k->right_nz};
+    arguments(a, args);
+    ending(args, res, k->iw, k->w, 0);
+    for (int e = 0; e < NNZ_MATRIX; e++) {
+        const int i = matrix_col[e];
+        k->right_nz[e] = k->middle_nz[e] - k->right_nz[e];
+        k->p1[i] -= k->row_scale[i] * k->right_nz[e] * a->lam[matrix_row[e]];
+    }
+}
+
+/* Full rows of the balance (N), internal (NZ) and constraint (M) equations at the point; p1 on the way, but for what
+ * `finish` adds. */
 static int evaluate(Work *k, const Point *a) {
     const double *args[9];
-    double *res[6] = {k->balance, k->internal, k->constraint, k->p1, k->middle_nz, k->right_nz};
+    double *res[5] = {k->balance, k->internal, k->constraint, k->p1, k->middle_nz};
     arguments(a, args);
     residual(args, res, k->iw, k->w, 0);
     for (int e = 0; MIDDLE && e < NNZ_MATRIX; e++)
@@ -109,7 +123,7 @@ static int evaluate(Work *k, const Point *a) {
 /* Jacobians of the rows and of p1; `everything` adds those with respect to q_k, z_k and u. */
 static void linearise(Work *k, const Point *a, int everything) {
     const double *args[9];
-    double *res[4] = {k->pairs, k->rest, k->rest_p, k->by_unknown};
+    double *res[5] = {k->pairs, k->rest, k->rest_p, k->by_unknown, k->curve_nz};
     arguments(a, args);
     linear(args, res, k->iw, k->w, 0);
     const double *P = k->pairs, *D = P + 6 * N, *X = D + 6 * N, *Y = X + 6 * N, *W = Y + 6 * N, *G = W + 3 * N;
@@ -204,6 +218,15 @@ static void linearise(Work *k, const Point *a, int everything) {
     for (int e = 0; e < NNZ_CONSTRAINT; e++) k->R1[N + NZ + constraint_row[e]][constraint_col[e]] += k->by_unknown[e];
     for (int c = 0; c < M; c++)
         for (int i = 0; i < N; i++) k->R1[i][N + NZ + c] -= k->row_scale[i] * k->Phi[c][i];
+    for (int e = 0; e < NNZ_CURVE; e++) {
+        const int i = curve_row[e], j = curve_col[e];
+        const double bent = k->row_scale[i] * k->curve_nz[e];
+        k->R1[i][j] -= bent;
+        if (!everything) continue;
+        k->R0[i][j] -= bent;
+        k->P1[i][j] -= bent;
+        k->P0[i][j] -= bent;
+    }
     if (!everything) return;
     for (int e = 0; e < NNZ_REST_P; e++) {
         const int column = rest_p_col[e];
@@ -216,10 +239,12 @@ static void linearise(Work *k, const Point *a, int everything) {
         k->P1[i][N + NZ + matrix_row[e]] -= k->row_scale[i] * k->right_nz[e];
     }
     if (M > 0) {
-        double *pulls[1] = {k->pull_nz};
+        double *pulls[2] = {k->pull_nz, k->after_curve_nz};
         pull(args, pulls, k->iw, k->w, 0);
         for (int e = 0; e < NNZ_PULL; e++)
             k->R0[pull_row[e]][pull_col[e]] -= k->row_scale[pull_row[e]] * k->pull_nz[e];
+        for (int e = 0; e < NNZ_AFTER_CURVE; e++)
+            k->P1[after_curve_row[e]][after_curve_col[e]] += k->row_scale[after_curve_row[e]] * k->after_curve_nz[e];
     }
 }
 
@@ -340,11 +365,11 @@ static void advance(const Point *a, const double *delta, double factor) {
     for (int i = 0; i < M; i++) a->lam[i] += factor * delta[NF + NZ + i];
 }
 
-/* Last correction of the multipliers, and of what they pull at: p1, and the balance, which gives the effort. */
+/* Last correction of the multipliers, and of the balance, which gives the effort. */
 static void settle_multipliers(Work *k, const Point *a, const double *delta) {
     const double *change = delta + NF + NZ;
     for (int c = 0; c < M; c++) a->lam[c] += change[c];
-    if (MIDDLE || NC) pull_by(k, change);
+    if (NC) pull_by(k, change);
 }
 
 /* Simplified Newton with the factorisation at hand; refactorises where it contracts slowly. */
@@ -421,7 +446,11 @@ static int newton_damped(Work *k, const Point *a, double tolerance, int limit, d
 static int one_step(Work *k, const Point *a, double tolerance, int limit, double *error) {
     *error = 0;
     constraint_matrix(k, a);
-    if (NY == 0) return evaluate(k, a);
+    if (NY == 0) {
+        const int status = evaluate(k, a);
+        finish(k, a);
+        return status;
+    }
     double q_guess[ONE(N)], z_guess[ONE(NZ)], lam_guess[ONE(M)];
     memcpy(q_guess, a->q1, sizeof(double) * N);
     memcpy(z_guess, a->z1, sizeof(double) * NZ);
@@ -436,6 +465,7 @@ static int one_step(Work *k, const Point *a, double tolerance, int limit, double
         status = newton_damped(k, a, tolerance, limit, error);
     }
     if (status) k->factored = 0;
+    else finish(k, a);
     return status;
 }
 
@@ -759,7 +789,10 @@ int yid_adjoint(const Motion *motion, const Trajectory *rollout, const Partials 
         memcpy(lam, rollout->multipliers + (size_t)step * M, sizeof(double) * M);
         Point a = {x, x + N, x + 2 * N, u, motion->theta, &motion->time_step, q1, z1, lam};
         constraint_matrix(k, &a);
-        if (MIDDLE) evaluate(k, &a);
+        if (MIDDLE) {
+            evaluate(k, &a);
+            finish(k, &a);
+        }
         linearise(k, &a, 1);
         if (NY && (status = factorise(k))) break;
         const double *weight = costate + N, *effort = by->effort ? by->effort + (size_t)step * NC : NULL;
@@ -839,6 +872,7 @@ int yid_linearize(const Motion *motion, const Trajectory *along, const Lineariza
         Point a = {x, x + N, x + 2 * N, u, motion->theta, &motion->time_step, q1, z1, lam};
         constraint_matrix(k, &a);
         evaluate(k, &a);
+        finish(k, &a);
         double *r = out->rows + (size_t)step * NT;
         memcpy(r, k->balance, sizeof(double) * N);
         memcpy(r + N, k->internal, sizeof(double) * NZ);
