@@ -31,8 +31,8 @@ def arm(urdf_folder):
     t = 0.01 * np.arange(601)
     path = np.stack([0.6 * np.sin(2.9 * t), 0.5 * np.sin(3.7 * t + 1)], axis=1)
 
-    def build(effort: np.ndarray, cutoff: float) -> EstimationProblem:
-        joints = JointGroup(JOINTS, t, path, effort=effort, position_std=0.0, effort_std=NOISE)
+    def build(effort: np.ndarray, cutoff: float, kind: str | None = None) -> EstimationProblem:
+        joints = JointGroup(JOINTS, t, path, effort=effort, position_std=0.0, effort_std=NOISE, effort_kind=kind)
         options = ProblemOptions(path_cutoff=cutoff, weak_prior_factor=0.0)
         return EstimationProblem(step, [Recording(joints, name="arm")], tuple(TRUTH), options, TRUTH)
 
@@ -67,3 +67,12 @@ def test_neighbours_that_repeat_each_other_are_left_out(arm):
     assert LowPass(CUTOFF).stride(0.01) == 10
     assert LowPass(CUTOFF).settling == pytest.approx(0.574, abs=1e-3)
     assert LowPass(30.0).stride(0.05) == 1
+
+
+@pytest.mark.parametrize(("kind", "late"), [(None, 0.0), ("sample", 0.0), ("mean", 0.005), ("command", 0.005)])
+def test_an_effort_that_stands_for_an_interval_belongs_to_its_middle(arm, kind, late):
+    t = 0.01 * np.arange(601)
+    [samples] = arm(np.stack([t, 2 - t], axis=1), np.inf, kind).episodes[0].samples
+    at = 0.01 * (samples.node + samples.fraction)[:, None]
+    expected = np.hstack([at - late, 2 - at + late])
+    np.testing.assert_allclose(samples.value.reshape(len(at), 2), expected, atol=1e-12)
