@@ -381,3 +381,10 @@ def test_inputs_are_left_as_they_were(single_step, golden, theta_golden):
     single_step.jacobians(*arguments, names=["T1.bend"])
     for actual, expected in zip(arguments, (trep.q[3], trep.p[3], trep.u[3], theta), strict=True):
         np.testing.assert_array_equal(actual, expected)
+
+
+def test_an_unknown_constraint_force(hinge):
+    with pytest.raises(ModelError) as caught:
+        compile_step(hinge, 0.01, constraint_force="end")
+    assert "constraint_force = 'end'" in str(caught.value)
+    assert "node, midpoint" in str(caught.value)
