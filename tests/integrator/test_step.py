@@ -385,6 +385,6 @@ def test_inputs_are_left_as_they_were(single_step, golden, theta_golden):
 
 def test_an_unknown_constraint_force(hinge):
     with pytest.raises(ModelError) as caught:
-        compile_step(hinge, 0.01, constraint_force="end")
+        compile_step(hinge(), 0.01, constraint_force="end")
     assert "constraint_force = 'end'" in str(caught.value)
     assert "node, midpoint" in str(caught.value)
