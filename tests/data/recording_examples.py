@@ -28,6 +28,8 @@ def example() -> Recording:
         **{channel: generator.normal(size=(50, 2)) for channel in JOINT_CHANNELS},  # type: ignore[arg-type]
         position_std=1e-3,
         velocity_std=np.array([0.01, 0.02]),
+        effort_bias_std=np.array([0.2, 0.3]),
+        effort_kind="mean",
     )
     frames = np.array([0.0, 0.1, 0.35, 0.9])
     seen = generator.normal(size=(4, 3, 3))

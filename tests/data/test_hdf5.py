@@ -76,9 +76,16 @@ def recordings(draw: st.DrawFn) -> Recording:
         for channel in draw(st.sets(st.sampled_from(sorted(set(JOINT_CHANNELS) - {"position"})))):
             bound = 50.0 if channel == "position_command" else 1e300
             channels[channel] = draw(hnp.arrays(float, shape, elements=finite(bound)))
-        std = draw(st.none() | st.floats(0, 1e9) | hnp.arrays(float, shape[1], elements=st.floats(0, 1e9)))
+        std = st.none() | st.floats(0, 1e9) | hnp.arrays(float, shape[1], elements=st.floats(0, 1e9))
+        kinds = st.sampled_from([None, "sample", "mean", "command"])
         joints = JointGroup(
-            joint_names, t, **channels, effort_std=std, clock=draw(st.sampled_from(["recorded", "nominal"]))
+            joint_names,
+            t,
+            **channels,
+            effort_std=draw(std),
+            effort_bias_std=draw(std),
+            effort_kind=draw(kinds),
+            clock=draw(st.sampled_from(["recorded", "nominal"])),
         )
     suffixes = draw(st.sets(st.sampled_from(["", "_camera", "_arm", "_\u00e9 2"]), min_size=0 if joints else 1))
     points = []
@@ -177,6 +184,12 @@ MALFORMED: dict[str, tuple[Callable[[h5py.File], object], str, str]] = {
     "names no text": (lambda f: set_names(f, [1, 2]), "found 1", ""),
     "names empty": (lambda f: set_names(f, h5py.Empty("S1")), "cannot be used", ""),
     "clock": (lambda f: f["joints"].attrs.modify("clock", "wall"), "the clock is 'wall'", ""),
+    "kind of effort": (
+        lambda f: f["joints"].attrs.modify("effort_kind", "average"),
+        "'average'",
+        "leave the attribute",
+    ),
+    "kind no text": (lambda f: f["joints"].attrs.create("effort_kind", 2.0), "found", ""),
     "unit of position": (lambda f: f["joints/position"].attrs.modify("unit", "deg"), "'deg'", "never converted"),
     "unit of points": (
         lambda f: f["points_arm/position"].attrs.modify("unit", "mm"),

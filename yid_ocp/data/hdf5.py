@@ -31,7 +31,7 @@ FORMAT = "yid-recording/1"
 _STRAIGHT = "straight"
 _JOINT_UNITS = {"t": "s", **JOINT_CHANNELS}
 _POINT_UNITS = {"t": "s", "position": "m", "std": "m"}
-_JOINT_ATTRIBUTES = ("names", "clock", *JOINT_STD)
+_JOINT_ATTRIBUTES = ("names", "clock", "effort_kind", *JOINT_STD)
 _POINT_ATTRIBUTES = ("names", "sensor", "frame", "pose", "clock", "std")
 
 
@@ -162,7 +162,7 @@ def _read_group(
         place = f"{where}, attribute {name}"
         if name == "names":
             values[name] = tuple(_text(entry, place) for entry in np.atleast_1d(np.asarray(value, dtype=object)))
-        elif name in ("clock", "sensor", "frame"):
+        elif name in ("clock", "effort_kind", "sensor", "frame"):
             values[name] = _text(value, place)
         else:
             values[name] = read_only(value, place)

@@ -15,6 +15,7 @@ from yid_ocp.errors import DataError, nearest
 
 Array = NDArray[np.float64]
 Clock = Literal["recorded", "nominal"]
+EffortKind = Literal["sample", "mean", "command"]
 
 JOINT_CHANNELS: Mapping[str, str] = {
     "position": "rad",
@@ -26,7 +27,7 @@ JOINT_CHANNELS: Mapping[str, str] = {
 }
 """Channels of a joint group and their units."""
 
-JOINT_STD = ("position_std", "velocity_std", "effort_std")
+JOINT_STD = ("position_std", "velocity_std", "effort_std", "effort_bias_std")
 """Standard deviations that a joint group may have, in the units of their channels."""
 POINT_GROUP_NAME = re.compile(r"points(_[^/]+)?")
 """What a group of points may be called."""
@@ -57,7 +58,12 @@ class JointGroup:
     external_effort : ndarray, shape (N, nj), or None
         Effort left when the robot's own model is taken away [N m].
     position_std, velocity_std, effort_std : float or ndarray, shape (nj,), or None
-        Standard deviation of the noise, where known [rad], [rad/s], [N m].
+        Standard deviation of the noise, white from sample to sample, where known [rad], [rad/s], [N m].
+    effort_bias_std : float or ndarray, shape (nj,), or None
+        Standard deviation of what is added to a joint's effort in the whole recording alike, where known [N m].
+    effort_kind : {'sample', 'mean', 'command'} or None
+        What `effort[k]` is of the true one: its value at t_k, its mean from t_k to t_{k+1}, or the value that is held
+        from t_k to t_{k+1}; None where nobody says.
     clock : {'recorded', 'nominal'}
         Whether `t` was measured or is a sample index times a nominal period.
     """
@@ -73,6 +79,8 @@ class JointGroup:
     position_std: float | Array | None = None
     velocity_std: float | Array | None = None
     effort_std: float | Array | None = None
+    effort_bias_std: float | Array | None = None
+    effort_kind: EffortKind | None = None
     clock: Clock = "recorded"
 
     def __post_init__(self) -> None:
@@ -294,8 +302,9 @@ def validate(recording: Recording, *, allow_nan_effort: bool = False, where: str
     DataError
         If there is no group, or one is empty; names are repeated or do not match the arrays; a clock is not finite and
         strictly increasing; a joint channel has a value that is not finite; a point is infinite or seen in part; a
-        standard deviation is negative; a pose is not a rigid transform; joint positions exceed 50 rad or points 50 m,
-        which are degrees or millimetres; `straight` does not match the first group of points.
+        standard deviation is negative; the kind of effort is none that is known; a pose is not a rigid transform; joint
+        positions exceed 50 rad or points 50 m, which are degrees or millimetres; `straight` does not match the first
+        group of points.
     """
     origin = where or f"recording '{recording.name}'"
     require(bool(recording.groups), "the recording has no group", origin, "joints, points, points_<name>")
@@ -391,6 +400,10 @@ def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> 
                 _check_shape(std, (len(joints.names),), place, "one number or (nj,)")
             good = bool(np.all(np.isfinite(std) & (np.asarray(std) >= 0)))
             require(good, f"{name} is {std}", place, "finite and not negative")
+    if joints.effort_kind is not None:
+        place, kinds = f"{where}, attribute effort_kind", get_args(EffortKind)
+        hint = "leave the attribute out where it is not known"
+        require(joints.effort_kind in kinds, f"the kind is '{joints.effort_kind}'", place, ", ".join(kinds), hint)
 
 
 def _validate_points(group: PointGroup, where: str) -> None:

@@ -19,7 +19,8 @@ _AXES = ("x", "y", "z")
 def export_csv(recording: Recording, folder: str | os.PathLike[str]) -> tuple[Path, ...]:
     """Write one table per group, `<group>.csv`, with the columns that `read_csv` knows and all digits.
 
-    Standard deviations, sensor, frame, pose and clock are not in the tables; a point not seen is an empty cell.
+    Standard deviations, the kind of effort, sensor, frame, pose and clock are not in the tables; a point not seen is an
+    empty cell.
 
     Parameters
     ----------
