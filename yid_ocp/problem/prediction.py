@@ -17,6 +17,7 @@ from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.functions import ModelFunctions
 from yid_ocp.problem.inputs import held_torque, held_torque_slope
 from yid_ocp.problem.measurements import Measurements
+from yid_ocp.problem.noise import Course, Innovations, innovations
 from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.problem.unknowns import Unknowns
 
@@ -37,6 +38,10 @@ class EpisodeResult:
     sensitivities : tuple of ndarray, shape (M, k, d) each, or None
     warm : ndarray, shape (n,), or None
         Configuration at `rest`, from which that of similar parameters is found quickly.
+    correction : ndarray, shape (N, nu), or None
+        What the tracking filter added to the recorded torque [N m], where encoders are measurements.
+    by_correction : ndarray, shape (N, nu, d), or None
+        Its derivative, with `sensitivities`.
     """
 
     rollout: Rollout
@@ -44,6 +49,8 @@ class EpisodeResult:
     predicted: tuple[Array, ...]
     sensitivities: tuple[Array, ...] | None
     warm: Array | None = None
+    correction: Array | None = None
+    by_correction: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -241,10 +248,60 @@ class Predictor:
             values, by_all = self._predict(samples, rollout, theta, wanted, derivatives)
             predicted.append(values)
             sensitivities.append(by_all)
+        correction = by_correction = None
+        if episode.errors is not None and episode.errors.encoders and feedback is not None:
+            correction = rollout.torque - inputs.torque
+            if directions is not None and rollout.by_state is not None:
+                by_correction = -feedback.gain @ rollout.by_state[:-1, feedback.index]
+                for sign, given in ((1.0, directions.torque), (-1.0, inputs.by_torque)):
+                    if given is not None:
+                        by_correction[:, :, : given.shape[2]] += sign * given
         # states by all directions are the largest arrays of all, and what samples need of them has been taken
         rollout = replace(rollout, by_state=None, by_multipliers=None, by_effort=None)
-        warm = None if start.rest is None else start.rest.state[: self.system.size]
-        return EpisodeResult(rollout, start.rest, tuple(predicted), tuple(sensitivities) if derivatives else None, warm)
+        return EpisodeResult(
+            rollout,
+            start.rest,
+            tuple(predicted),
+            tuple(sensitivities) if derivatives else None,
+            None if start.rest is None else start.rest.state[: self.system.size],
+            correction,
+            by_correction,
+        )
+
+    def innovations(self, episode: Episode, theta: Array, offset: Array, guess: Array | None) -> Innovations | None:
+        """The filter that whitens an episode's residual, frozen at these unknowns; None where nothing drives it wrong.
+
+        Parameters
+        ----------
+        episode : Episode
+        theta : ndarray, shape (ntheta,)
+        offset : ndarray
+            Of an estimated start.
+        guess : ndarray, shape (n,), or None
+            Configuration near the equilibrium.
+        """
+        if episode.errors is None:
+            return None
+        result = self.run(episode, theta, offset, False, guess)
+        if isinstance(result, str):
+            return None
+        own, rollout = self.own_theta(episode, theta), result.rollout
+        late = (self.lateness(samples, own, ()) for samples in episode.samples)
+        nx, nu = self.step.sizes["nx"], self.step.sizes["nu"]
+        by_angles, by_torque = np.zeros((nx, nu)), np.zeros((nx, nu))
+        if result.rest is not None:
+            by_angles, by_torque = result.rest.by_posture[:, :nu], result.rest.by_torque
+        course = Course(
+            self.functions,
+            own,
+            rollout,
+            [s if by is None else s.late(by[0]) for s, by in zip(episode.samples, late, strict=True)],
+            episode.feedback,
+            self.efforts(rollout),
+            by_angles,
+            by_torque,
+        )
+        return innovations(course, episode.errors)
 
     def along(self, samples: Measurements, state: Array, by_state: Array, theta: Array) -> tuple[Array, Array]:
         """Readings along a given trajectory and their derivatives.

@@ -16,7 +16,8 @@ from yid_ocp.model.system import System
 from yid_ocp.parallel import map_threads
 from yid_ocp.problem.episodes import Episode, apparent_inertia, beginning, prepare_episode
 from yid_ocp.problem.functions import ModelFunctions
-from yid_ocp.problem.measurements import huber
+from yid_ocp.problem.measurements import Rows, huber
+from yid_ocp.problem.noise import Innovations
 from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.problem.prediction import EpisodeResult, Predictor, Start
 from yid_ocp.problem.unknowns import START, Unknowns, replaced
@@ -127,6 +128,8 @@ class EstimationProblem:
     episodes, held_out : tuple of Episode
     rows : ResidualRows
         How the residual is made up.
+    innovations : tuple of Innovations or None
+        What turns every recording's residual into innovations; None where the sensors' noise is all, see `weighted_at`.
 
     Raises
     ------
@@ -145,6 +148,7 @@ class EstimationProblem:
     unknowns: Unknowns
     predictor: Predictor
     rows: ResidualRows
+    innovations: tuple[Innovations | None, ...]
 
     def __init__(
         self,
@@ -180,8 +184,10 @@ class EstimationProblem:
         theta: Array,
         episodes: tuple[Episode, ...],
         held_out: tuple[Episode, ...],
+        innovations: tuple[Innovations | None, ...] = (),
     ) -> None:
         theta.setflags(write=False)
+        self.innovations = innovations or (None,) * len(episodes)
         self.functions, self.options, self.free, self.theta = functions, options, free, theta
         self.episodes, self.held_out = episodes, held_out
         self.unknowns = Unknowns(
@@ -200,7 +206,8 @@ class EstimationProblem:
     def _changed(self, **changes: Any) -> EstimationProblem:
         """Another problem that shares what is compiled and placed; nothing is prepared anew."""
         made = object.__new__(EstimationProblem)
-        same = {name: getattr(self, name) for name in ("functions", "options", "free", "theta", "episodes", "held_out")}
+        kept = ("functions", "options", "free", "theta", "episodes", "held_out", "innovations")
+        same = {name: getattr(self, name) for name in kept}
         made._set(**{**same, **changes})
         return made
 
@@ -345,14 +352,12 @@ class EstimationProblem:
         done = tuple(result for result in results if isinstance(result, EpisodeResult))
         cost, residuals, jacobians = 0.0, [], []
         for i, result in enumerate(done):
-            for k, samples in enumerate(self.episodes[i].samples):
-                slopes = None if result.sensitivities is None else result.sensitivities[k]
-                part = samples.rows(result.predicted[k], slopes, self.options.huber_threshold)
-                cost += part.cost
-                residuals.append(part.residual)
-                if part.jacobian is not None:
-                    jacobians.append(self.unknowns.placed(part.jacobian, i))
-        done = tuple(replace(result, sensitivities=None) for result in done)
+            part = self._rows(i, result)
+            cost += part.cost
+            residuals.append(part.residual)
+            if part.jacobian is not None:
+                jacobians.append(self.unknowns.placed(part.jacobian, i))
+        done = tuple(replace(result, sensitivities=None, by_correction=None) for result in done)
         prior_residual, prior_jacobian = self.prior(x)
         residual = np.concatenate([*residuals, prior_residual])
         cost += 0.5 * float(prior_residual @ prior_residual)
@@ -360,6 +365,28 @@ class EstimationProblem:
         if not np.isfinite(cost):
             return Evaluation(np.inf, residual, None, False, "the cost is not finite", done)
         return Evaluation(cost, residual, jacobian, True, "", done)
+
+    def _rows(self, i: int, result: EpisodeResult) -> Rows:
+        """One episode's part of the residual: in units of the sensors' noise, or innovations where they are frozen."""
+        parts = []
+        for k, samples in enumerate(self.episodes[i].samples):
+            parts.append(
+                samples.rows(result.predicted[k], None if result.sensitivities is None else result.sensitivities[k])
+            )
+        residual = np.concatenate([part.residual for part in parts])
+        slopes = None
+        if result.sensitivities is not None:
+            slopes = np.vstack([part.jacobian for part in parts if part.jacobian is not None])
+        whitening = self.innovations[i]
+        if whitening is not None:
+            columns = residual[:, None] if slopes is None else np.column_stack([residual, slopes])
+            push = None if result.correction is None else result.correction[:, :, None]
+            if push is not None and result.by_correction is not None:
+                push = np.concatenate([push, result.by_correction], axis=2)
+            columns, _ = whitening.whitened(columns, push)
+            residual, slopes = columns[:, 0], None if slopes is None else columns[:, 1:]
+        cost, factor = huber(residual, self.options.huber_threshold)
+        return Rows(cost, factor * residual, None if slopes is None else factor[:, None] * slopes, factor)
 
     def gradient(
         self, x: ArrayLike, evaluation: Evaluation | None = None, warm: WarmStart | None = None
@@ -514,8 +541,37 @@ class EstimationProblem:
         return self._changed(theta=theta)
 
     def on(self, episodes: Sequence[Episode], held_out: Sequence[Episode]) -> EstimationProblem:
-        """The same problem on other episodes of its model."""
-        return self._changed(episodes=tuple(episodes), held_out=tuple(held_out))
+        """The same problem on other episodes of its model, weighted by the sensors' noise alone."""
+        return self._changed(episodes=tuple(episodes), held_out=tuple(held_out), innovations=())
+
+    @property
+    def disturbed(self) -> bool:
+        """Whether errors of torques or angles drive the motion of any recording."""
+        return any(episode.errors is not None for episode in self.episodes)
+
+    def weighted_at(self, x: ArrayLike, warm: WarmStart | None = None) -> EstimationProblem:
+        """The same problem with residuals weighted by all noise, that which drives the motion too, frozen at `x`.
+
+        The problem itself where nothing is wrong with its torques and angles, or where it cannot be rolled out at `x`.
+
+        Parameters
+        ----------
+        x : array_like, shape (nx,)
+        warm : WarmStart, optional
+            As in `evaluate`.
+        """
+        x = np.asarray(x, float)
+        guesses = warm or (None,) * len(self.episodes)
+
+        def one(i: int) -> Innovations | None:
+            return self.predictor.innovations(self.episodes[i], *self.split(x, i), guesses[i])
+
+        if not self.disturbed:
+            return self
+        made = map_threads(one, range(len(self.episodes)))
+        if any(m is None and e.errors is not None for m, e in zip(made, self.episodes, strict=True)):
+            return self
+        return self._changed(innovations=tuple(made))
 
     def shortened(self, duration: float) -> EstimationProblem:
         """The same problem over the first seconds of every recording, prepared anew, without held-out ones."""
