@@ -15,7 +15,8 @@ from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import apparent_inertia, beginning
-from yid_ocp.problem.problem import ResidualRows, _check_bounds
+from yid_ocp.problem.evaluation import ResidualRows
+from yid_ocp.problem.problem import _check_bounds
 from yid_ocp.problem.unknowns import Unknowns, replaced
 
 FREE = ("shoulder.stiffness", "elbow.stiffness", "elbow.rest")

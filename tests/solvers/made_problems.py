@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.problem.problem import Evaluation, ResidualRows
+from yid_ocp.problem.evaluation import Evaluation, ResidualRows
 from yid_ocp.solvers.base import Iterate, Outcome, Status
 
 

@@ -17,7 +17,7 @@ from yid_ocp.effects import make_effect
 from yid_ocp.errors import ConfigError, SolverError, nearest
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.problem import Evaluation
+from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.solvers.base import IDENTIFIABLE, WEAK, Solution, uncertainty, verdict
 
 Array = NDArray[np.float64]

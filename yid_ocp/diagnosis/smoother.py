@@ -28,7 +28,7 @@ from yid_ocp.diagnosis.smoother_model import Linear, Source, linear_model
 from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
 from yid_ocp.parallel import map_threads
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.problem import Evaluation
+from yid_ocp.problem.evaluation import Evaluation
 
 Array = NDArray[np.float64]
 

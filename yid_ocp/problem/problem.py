@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from yid_ocp.integrator.step import Step
 from yid_ocp.model.system import System
 from yid_ocp.parallel import map_threads
 from yid_ocp.problem.episodes import Episode, apparent_inertia, beginning, prepare_episode
+from yid_ocp.problem.evaluation import Evaluation, ResidualRows, WarmStart, joined
 from yid_ocp.problem.functions import ModelFunctions
 from yid_ocp.problem.measurements import Rows, huber
 from yid_ocp.problem.noise import Innovations
@@ -23,77 +24,10 @@ from yid_ocp.problem.prediction import EpisodeResult, Predictor, Start
 from yid_ocp.problem.unknowns import START, Unknowns, replaced
 
 Array = NDArray[np.float64]
-WarmStart = tuple[Array | None, ...]
-"""Configuration near the equilibrium at which each recording starts; None where it is not known."""
-
 HELD_OUT_START = 0.2
 """Time from which the start of a held-out recording is estimated, where starts are [s]."""
 HELD_OUT_ITERATIONS = 3
 """Gauss-Newton steps of that estimate, which is nearly linear."""
-
-
-@dataclass(frozen=True)
-class ResidualRows:
-    """How the residual of a problem is made up: measurements, then stated priors, then weak priors.
-
-    Attributes
-    ----------
-    measurements : tuple of tuple of slice
-        Rows of every group of measurements of every episode, those without a measurement left out.
-    data, stated_priors, weak_priors : slice
-    informing : slice
-        Data and stated priors: all that the weak priors are not.
-    """
-
-    measurements: tuple[tuple[slice, ...], ...]
-    data: slice
-    stated_priors: slice
-    weak_priors: slice
-
-    @property
-    def informing(self) -> slice:
-        """Data and stated priors: all that the weak priors are not."""
-        return slice(0, self.stated_priors.stop)
-
-    @staticmethod
-    def of(episodes: Sequence[Episode], stated: int, weak: int) -> ResidualRows:
-        """From the numbers of measurements and priors."""
-        at, groups = 0, []
-        for episode in episodes:
-            own = []
-            for samples in episode.samples:
-                own.append(slice(at, at + samples.count))
-                at += samples.count
-            groups.append(tuple(own))
-        return ResidualRows(tuple(groups), slice(0, at), slice(at, at + stated), slice(at + stated, at + stated + weak))
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """Residual of a problem at one point.
-
-    Attributes
-    ----------
-    cost : float
-        1/2 |r|^2, or the robust loss; infinite where the rollout failed.
-    residual : ndarray, shape (nr,)
-    jacobian : ndarray, shape (nr, nx), or None
-    ok : bool
-    message : str
-    episodes : tuple of EpisodeResult
-    """
-
-    cost: float
-    residual: Array
-    jacobian: Array | None
-    ok: bool
-    message: str
-    episodes: tuple[EpisodeResult, ...]
-
-    @property
-    def warm(self) -> WarmStart:
-        """Where to look for the equilibria of a point nearby."""
-        return tuple(result.warm for result in self.episodes)
 
 
 class EstimationProblem:
@@ -130,6 +64,8 @@ class EstimationProblem:
         How the residual is made up.
     innovations : tuple of Innovations or None
         What turns every recording's residual into innovations; None where the sensors' noise is all, see `weighted_at`.
+    held_out_innovations : tuple of Innovations or None
+        The same for held-out recordings, see `held_out_weighted_at`.
 
     Raises
     ------
@@ -149,6 +85,7 @@ class EstimationProblem:
     predictor: Predictor
     rows: ResidualRows
     innovations: tuple[Innovations | None, ...]
+    held_out_innovations: tuple[Innovations | None, ...]
 
     def __init__(
         self,
@@ -185,9 +122,11 @@ class EstimationProblem:
         episodes: tuple[Episode, ...],
         held_out: tuple[Episode, ...],
         innovations: tuple[Innovations | None, ...] = (),
+        held_out_innovations: tuple[Innovations | None, ...] = (),
     ) -> None:
         theta.setflags(write=False)
         self.innovations = innovations or (None,) * len(episodes)
+        self.held_out_innovations = held_out_innovations or (None,) * len(held_out)
         self.functions, self.options, self.free, self.theta = functions, options, free, theta
         self.episodes, self.held_out = episodes, held_out
         self.unknowns = Unknowns(
@@ -206,8 +145,8 @@ class EstimationProblem:
     def _changed(self, **changes: Any) -> EstimationProblem:
         """Another problem that shares what is compiled and placed; nothing is prepared anew."""
         made = object.__new__(EstimationProblem)
-        kept = ("functions", "options", "free", "theta", "episodes", "held_out", "innovations")
-        same = {name: getattr(self, name) for name in kept}
+        kept = ("functions", "options", "free", "theta", "episodes", "held_out")
+        same = {name: getattr(self, name) for name in (*kept, "innovations", "held_out_innovations")}
         made._set(**{**same, **changes})
         return made
 
@@ -352,7 +291,7 @@ class EstimationProblem:
         done = tuple(result for result in results if isinstance(result, EpisodeResult))
         cost, residuals, jacobians = 0.0, [], []
         for i, result in enumerate(done):
-            part = self._rows(i, result)
+            part = self._rows(self.episodes[i], self.innovations[i], result)
             cost += part.cost
             residuals.append(part.residual)
             if part.jacobian is not None:
@@ -366,27 +305,38 @@ class EstimationProblem:
             return Evaluation(np.inf, residual, None, False, "the cost is not finite", done)
         return Evaluation(cost, residual, jacobian, True, "", done)
 
-    def _rows(self, i: int, result: EpisodeResult) -> Rows:
+    def _rows(self, episode: Episode, whitening: Innovations | None, result: EpisodeResult) -> Rows:
         """One episode's part of the residual: in units of the sensors' noise, or innovations where they are frozen."""
-        parts = []
-        for k, samples in enumerate(self.episodes[i].samples):
-            parts.append(
-                samples.rows(result.predicted[k], None if result.sensitivities is None else result.sensitivities[k])
-            )
-        residual = np.concatenate([part.residual for part in parts])
-        slopes = None
-        if result.sensitivities is not None:
-            slopes = np.vstack([part.jacobian for part in parts if part.jacobian is not None])
-        whitening = self.innovations[i]
-        if whitening is not None:
-            columns = residual[:, None] if slopes is None else np.column_stack([residual, slopes])
-            push = None if result.correction is None else result.correction[:, :, None]
+        if whitening is None:
+            return joined(episode.samples, result, self.options.huber_threshold)
+        plain = joined(episode.samples, result)
+        columns, push = plain.residual[:, None], result.correction
+        push = None if push is None else push[:, :, None]
+        if plain.jacobian is not None:
+            columns = np.hstack([columns, plain.jacobian])
             if push is not None and result.by_correction is not None:
                 push = np.concatenate([push, result.by_correction], axis=2)
-            columns, _ = whitening.whitened(columns, push)
-            residual, slopes = columns[:, 0], None if slopes is None else columns[:, 1:]
-        cost, factor = huber(residual, self.options.huber_threshold)
-        return Rows(cost, factor * residual, None if slopes is None else factor[:, None] * slopes, factor)
+        columns = whitening.whitened(columns, push)[0]
+        cost, factor = huber(columns[:, 0], self.options.huber_threshold)
+        columns = factor[:, None] * columns
+        return Rows(cost, columns[:, 0], None if plain.jacobian is None else columns[:, 1:], factor)
+
+    def torque_offsets(self, x: ArrayLike) -> list[tuple[Array, Array] | None]:
+        """Constant error of every driven joint's torque in every recording, at `x`: value and standard deviation [N m].
+
+        None for a recording whose torques are taken as true, and where nothing is frozen (`weighted_at`).
+        """
+        x = np.asarray(x, float)
+        found: list[tuple[Array, Array] | None] = []
+        for i, whitening in enumerate(self.innovations):
+            result = None if whitening is None else self.predictor.run(self.episodes[i], *self.split(x, i), False)
+            if whitening is None or result is None or isinstance(result, str):
+                found.append(None)
+                continue
+            push = None if result.correction is None else result.correction[:, :, None]
+            rows = joined(self.episodes[i].samples, result).residual[:, None]
+            found.append((whitening.whitened(rows, push)[1][:, 0], whitening.bias_std))
+        return found
 
     def gradient(
         self, x: ArrayLike, evaluation: Evaluation | None = None, warm: WarmStart | None = None
@@ -542,7 +492,9 @@ class EstimationProblem:
 
     def on(self, episodes: Sequence[Episode], held_out: Sequence[Episode]) -> EstimationProblem:
         """The same problem on other episodes of its model, weighted by the sensors' noise alone."""
-        return self._changed(episodes=tuple(episodes), held_out=tuple(held_out), innovations=())
+        return self._changed(
+            episodes=tuple(episodes), held_out=tuple(held_out), innovations=(), held_out_innovations=()
+        )
 
     @property
     def disturbed(self) -> bool:
@@ -571,7 +523,29 @@ class EstimationProblem:
         made = map_threads(one, range(len(self.episodes)))
         if any(m is None and e.errors is not None for m, e in zip(made, self.episodes, strict=True)):
             return self
-        return self._changed(innovations=tuple(made))
+        return self._changed(innovations=tuple(made), held_out_innovations=())
+
+    def held_out_weighted_at(self, x: ArrayLike) -> EstimationProblem:
+        """The same problem with the residuals of held-out recordings weighted like this as well, for `held_out_rows`.
+
+        One that cannot be rolled out keeps its sensors' weights.
+        """
+        x = np.asarray(x, float)
+        theta = self._held_out_theta(x)
+        made = []
+        for held in self.held_out:
+            episode = self._held_out_episode(held, theta)
+            offset = self._held_out_offset(episode, theta, x)
+            made.append(self.predictor.innovations(episode, theta, offset, None))
+        return self._changed(held_out_innovations=tuple(made))
+
+    def held_out_rows(self, i: int, episode: Episode, result: EpisodeResult) -> Rows:
+        """Residual of a held-out recording, from its place and what `validate` says of it.
+
+        Without a robust loss, in the order of its measurements; innovations where they are frozen.
+        """
+        plain = replace(self.options, huber_threshold=np.inf)
+        return self._changed(options=plain)._rows(episode, self.held_out_innovations[i], result)
 
     def shortened(self, duration: float) -> EstimationProblem:
         """The same problem over the first seconds of every recording, prepared anew, without held-out ones."""
