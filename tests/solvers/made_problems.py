@@ -49,7 +49,7 @@ class MadeUp:
         self.shared = self.names
         self.bounds = np.full(size, lower), np.full(size, upper)
         self.scales = np.abs(self.start) if scales is None else np.array(scales, float)
-        self.options = SimpleNamespace(weighting=weighting)
+        self.options, self.disturbed = SimpleNamespace(weighting=weighting), False
         values = [*self.start, *fixed]
         entries = [Parameter(f"k{i}", v, "N m/rad", lower, upper, "made up") for i, v in enumerate(values)]
         self.system = SimpleNamespace(parameters=Parameters(entries[::-1]))

@@ -316,11 +316,13 @@ def held_out_loss(problem: EstimationProblem, x: Array) -> Loss:
             block = np.minimum((sample_times(episode, samples) / length).astype(int), number - 1)
             blocks.append(np.broadcast_to(block.reshape(len(block), -1), samples.seen.shape)[samples.seen])
         of_row = np.concatenate(blocks)
-        count = np.bincount(of_row, minlength=number)
+        count = np.bincount(of_row, minlength=number).astype(float)
         if isinstance(result, str):
             total = np.full(number, np.inf)
         else:
-            total = np.bincount(of_row, problem.held_out_rows(i, episode, result).residual ** 2, number)
+            total = np.bincount(
+                of_row, weights=problem.held_out_rows(i, episode, result).residual ** 2, minlength=number
+            )
             results.append(result)
             episodes.append(episode)
         keep = count > 0

@@ -243,19 +243,25 @@ class Predictor:
         )
         if not rollout.status.ok:
             return f"{episode.name}: {rollout.status.message}"
+        by_applied = None
+        if directions is not None and rollout.by_state is not None and driven:
+            by_applied = np.zeros((*rollout.torque.shape, directions.count))
+            if directions.torque is not None:
+                by_applied += directions.torque
+            if feedback is not None:
+                by_applied -= feedback.gain @ rollout.by_state[:-1, feedback.index]
         predicted, sensitivities = [], []
         for samples in episode.samples:
-            values, by_all = self._predict(samples, rollout, theta, wanted, derivatives)
+            values, by_all = self._predict(samples, rollout, by_applied, theta, wanted)
             predicted.append(values)
             sensitivities.append(by_all)
         correction = by_correction = None
         if episode.errors is not None and episode.errors.encoders and feedback is not None:
             correction = rollout.torque - inputs.torque
-            if directions is not None and rollout.by_state is not None:
-                by_correction = -feedback.gain @ rollout.by_state[:-1, feedback.index]
-                for sign, given in ((1.0, directions.torque), (-1.0, inputs.by_torque)):
-                    if given is not None:
-                        by_correction[:, :, : given.shape[2]] += sign * given
+            by_correction = by_applied
+            if by_applied is not None and inputs.by_torque is not None:
+                by_correction = by_applied.copy()
+                by_correction[:, :, : len(wanted)] -= inputs.by_torque
         # states by all directions are the largest arrays of all, and what samples need of them has been taken
         rollout = replace(rollout, by_state=None, by_multipliers=None, by_effort=None)
         return EpisodeResult(
@@ -320,7 +326,7 @@ class Predictor:
         sensitivities : ndarray, shape (M, k, d)
         """
         effort = np.zeros((len(samples.nodes), self.system.size))
-        read = _Trajectory(state, by_state, effort, None)
+        read = _Trajectory(state, by_state, effort, None, None)
         y, total = self._read(samples, read, theta, self.unknowns.parameters)
         return samples.interpolate(y), samples.interpolate(total)
 
@@ -339,16 +345,16 @@ class Predictor:
         return None if found is None else (found[0] / self.step.time_step, found[1] / self.step.time_step)
 
     def _predict(
-        self, samples: Measurements, rollout: Rollout, theta: Array, wanted: tuple[str, ...], derivatives: bool
+        self, samples: Measurements, rollout: Rollout, by_applied: Array | None, theta: Array, wanted: tuple[str, ...]
     ) -> tuple[Array, Array]:
         unmoved, late = samples, self.lateness(samples, theta, wanted)
         if late is not None:
             samples = samples.late(late[0])
-        by_state = rollout.by_state if derivatives else None
         effort = self.efforts(rollout)[samples.nodes]
-        y, total = self._read(samples, _Trajectory(rollout.state, by_state, effort, rollout.by_effort), theta, wanted)
+        along = _Trajectory(rollout.state, rollout.by_state, effort, rollout.by_effort, by_applied)
+        y, total = self._read(samples, along, theta, wanted)
         predicted, slopes = samples.interpolate(y), samples.interpolate(total)
-        if late is not None and by_state is not None:
+        if late is not None and rollout.by_state is not None:
             slopes[:, :, : len(wanted)] -= samples.slope(y, unmoved, late[0])[:, :, None] * late[1]
         return predicted, slopes
 
@@ -364,9 +370,10 @@ class Predictor:
         total = by_q @ along.by_state[nodes, :n]
         if z.shape[1]:
             total += by_z @ along.by_state[nodes, 2 * n :]
-        fixed = list(self.system.prescribed_indices)
-        if fixed and along.by_effort is not None and np.any(by_load):
-            total += by_load[:, :, fixed] @ along.by_effort[np.minimum(nodes, len(along.by_effort) - 1)]
+        loads = ((self.system.prescribed_indices, along.by_effort), (self.system.driven_indices, along.by_torque))
+        for index, by_load_there in loads:
+            if index and by_load_there is not None and np.any(by_load[:, :, list(index)]):
+                total += by_load[:, :, list(index)] @ by_load_there[np.minimum(nodes, len(by_load_there) - 1)]
         total[:, :, : len(wanted)] += by_theta
         return y[:, :, 0], total
 
@@ -389,16 +396,18 @@ class Predictor:
         wanted, rollout = self.unknowns.parameters, result.rollout
         theta = self.own_theta(episode, theta)
         by_state = np.zeros((episode.grid.steps + 1, self.step.sizes["nx"]))
-        by_effort = np.zeros_like(rollout.effort)
+        by_effort, by_applied = np.zeros_like(rollout.effort), np.zeros_like(rollout.torque)
         total = np.zeros(len(wanted))
         for samples, pull in zip(episode.samples, pulls, strict=True):
-            total += self._pull(samples, pull, rollout, theta, by_state, by_effort)
+            total += self._pull(samples, pull, rollout, theta, _Pulls(by_state, by_effort, by_applied))
         feedback = episode.feedback
+        if feedback is not None:
+            by_state[:-1, feedback.index] -= np.einsum("kub,ku->kb", feedback.gain, by_applied)
         by_inputs = adjoint_gradient(self.step, theta, rollout, wanted, by_state, None, by_effort, feedback)
         inputs = self.inputs(episode, theta, wanted)
         by_torque = inputs.torque_directions(feedback, self.system.driven_indices)
         if by_torque is not None:
-            total += np.einsum("ku,kuw->w", by_inputs.by_torque, by_torque)
+            total += np.einsum("ku,kuw->w", by_inputs.by_torque + by_applied, by_torque)
         if inputs.by_path is not None:
             # node 0 is part of the start state
             total += np.einsum("kc,kcw->w", by_inputs.by_path[1:], inputs.by_path[1:])
@@ -406,9 +415,7 @@ class Predictor:
         own = np.concatenate([total + by_inputs.by_theta, np.zeros(len(self.unknowns.start))])
         return np.asarray(own + by_inputs.by_start @ by_start)
 
-    def _pull(
-        self, samples: Measurements, pull: Array, rollout: Rollout, theta: Array, by_state: Array, by_effort: Array
-    ) -> Array:
+    def _pull(self, samples: Measurements, pull: Array, rollout: Rollout, theta: Array, pulls: _Pulls) -> Array:
         """Spread the pull at one group's samples over states and efforts; the direct part by the parameters."""
         n, wanted = self.system.size, self.unknowns.parameters
         unmoved, late = samples, self.lateness(samples, theta, wanted)
@@ -421,20 +428,31 @@ class Predictor:
         direct = np.einsum("mk,mkq->q", at_nodes, by_theta)
         if late is not None:
             direct -= np.sum(pull * samples.slope(y[:, :, 0], unmoved, late[0]), axis=0) @ late[1]
-        by_state[nodes, :n] += np.einsum("mk,mkq->mq", at_nodes, by_q)
-        by_state[nodes, 2 * n :] += np.einsum("mk,mkq->mq", at_nodes, by_z)
-        fixed = list(self.system.prescribed_indices)
-        if fixed:
-            last = np.minimum(nodes, len(rollout.effort) - 1)
-            np.add.at(by_effort, last, np.einsum("mk,mkq->mq", at_nodes, by_load[:, :, fixed]))
+        pulls.by_state[nodes, :n] += np.einsum("mk,mkq->mq", at_nodes, by_q)
+        pulls.by_state[nodes, 2 * n :] += np.einsum("mk,mkq->mq", at_nodes, by_z)
+        last = np.minimum(nodes, len(rollout.effort) - 1)
+        loads = ((self.system.prescribed_indices, pulls.by_effort), (self.system.driven_indices, pulls.by_torque))
+        for index, by_load_there in loads:
+            if index:
+                np.add.at(by_load_there, last, np.einsum("mk,mkq->mq", at_nodes, by_load[:, :, list(index)]))
         return np.asarray(direct)
 
 
 @dataclass(frozen=True)
 class _Trajectory:
-    """States at all nodes, efforts at the nodes that are read, and their derivatives."""
+    """States at all nodes, efforts at the nodes that are read, and derivatives of states, efforts, applied torques."""
 
     state: Array
     by_state: Array | None
     effort: Array
     by_effort: Array | None
+    by_torque: Array | None
+
+
+@dataclass(frozen=True)
+class _Pulls:
+    """Derivatives of a cost by states, efforts of prescribed joints and applied torques, added up."""
+
+    by_state: Array
+    by_effort: Array
+    by_torque: Array
