@@ -96,7 +96,7 @@ def run(folder: Path = FOLDER, iterations: int = 15) -> dict[str, Any]:
     estimate, held_out = [recordings[n] for n in ESTIMATE], [recordings[n] for n in HELD_OUT]
     clock = time.perf_counter()
     system = cable_system(edge_lengths(cable.edges, estimate), cable, OPTIONS)
-    step = yid.compile_step(system, TIME_STEP, "left_damping")
+    step = yid.compile_step(system, TIME_STEP)
     seconds = {"build_and_compile": time.perf_counter() - clock}
     options = cable_options(cable, estimate + held_out, OPTIONS)
     plain = {name: 0.0 for name in system.parameters.names if name.endswith(".memory")}

@@ -32,7 +32,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--json", type=Path, metavar="FILE", help="store the ratios of CPU time")
     options = parser.parse_args(arguments)
     recording = read_recording(Path(yid_ocp.__file__).parent / "data" / "defaults" / RECORDINGS[options.arms])
-    step = compile_step(paper_system(options.arms), TIME_STEP, "left_damping")
+    step = compile_step(paper_system(options.arms), TIME_STEP)
     problem = EstimationProblem(step, [recording], STIFFNESSES)
     problem.evaluate(problem.start * 4.0)  # compiles what is compiled once
     methods = {

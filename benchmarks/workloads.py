@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 import yid_ocp
 from yid_ocp.data.hdf5 import read_recording
 from yid_ocp.data.recording import Recording
-from yid_ocp.integrator.discrete import ForceSplit
 from yid_ocp.integrator.lqr import lqr_filter
 from yid_ocp.integrator.statics import Statics
 from yid_ocp.integrator.step import Directions, Feedback, Rollout, Step, compile_step
@@ -34,7 +33,6 @@ from yid_ocp.virtual.experiment import paper_system
 Array = NDArray[np.float64]
 
 TIME_STEP = 0.01
-FORCE_SPLIT: ForceSplit = "left_damping"
 STIFFNESSES = ("T1.bend", "T1.twist", "T2.bend", "T2.twist", "T3.bend", "T3.twist")
 VALUES = dict(zip(STIFFNESSES, (22.0, 13.6, 10.7, 8.2, 11.5, 9.7), strict=True))
 # number of coordinates: arms and the shipped recording of that system
@@ -72,7 +70,7 @@ class Bench:
         assert joints.effort is not None
         assert joints.names == system.driven
         angles, torque = joints.position, np.ascontiguousarray(joints.effort[:-1])
-        step = compile_step(system, TIME_STEP, FORCE_SPLIT)
+        step = compile_step(system, TIME_STEP)
         theta = system.parameters.vector(VALUES)
         rest = Statics(step).solve(angles[0], theta)
         feedback = lqr_filter(step, angles, torque, theta)
@@ -281,7 +279,7 @@ def first_compile(bench: Bench) -> float:
         os.environ["YID_OCP_CACHE"] = folder
         try:
             start = time.perf_counter()
-            made = compile_step(bench.system, TIME_STEP, FORCE_SPLIT)
+            made = compile_step(bench.system, TIME_STEP)
             x, n = bench.start, bench.size
             made.jacobians(x[:n], x[n : 2 * n], bench.torque[0], bench.theta, names=STIFFNESSES)
             return time.perf_counter() - start

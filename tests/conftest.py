@@ -98,12 +98,12 @@ def dual_arm(paper_systems) -> System:
 
 @pytest.fixture(scope="session")
 def single_step(single_arm):
-    return compile_step(single_arm, 0.01, "left")
+    return compile_step(single_arm, 0.01, "left", "node")
 
 
 @pytest.fixture(scope="session")
 def dual_step(dual_arm):
-    return compile_step(dual_arm, 0.01, "left")
+    return compile_step(dual_arm, 0.01, "left", "node")
 
 
 @pytest.fixture(scope="session")

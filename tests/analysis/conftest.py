@@ -30,7 +30,9 @@ def golden_problem(golden, paper_systems, single_step, dual_step):
         trep, system = golden(name), paper_systems[name]
         count = len(system.driven)
         t = 0.01 * np.arange(len(trep.q))
-        joints = JointGroup(system.driven, t, trep.q[:, :count], effort=np.vstack([trep.u, trep.u[-1:]]))
+        joints = JointGroup(
+            system.driven, t, trep.q[:, :count], effort=np.vstack([trep.u, trep.u[-1:]]), effort_kind="command"
+        )
         held = [1] if name == "single" else [1, 2]
         free = [i for i in range(3) if i not in held]
         groups = [PointGroup("points_arm", [f"w_T{i + 1}" for i in held], t[1:], trep.w[:, held], 1e-3, sensor="arm")]

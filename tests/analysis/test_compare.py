@@ -18,7 +18,7 @@ from yid_ocp.solvers import GaussNewton, SingleShooting, SteepestDescent
 @pytest.fixture(scope="module")
 def problem(paper_systems):
     folder = resources.files("yid_ocp.data") / "defaults"
-    step = compile_step(paper_systems["single"], 0.01, "left_damping")
+    step = compile_step(paper_systems["single"], 0.01)
     recording = read_recording(folder / "single_arm_vision_estimate.h5")
     held_out = read_recording(folder / "single_arm_vision_held_out.h5")
     free = ("T1.bend", "T2.bend", "T3.twist")

@@ -177,7 +177,7 @@ def test_the_smallest_set_finds_all_six_in_another_engine(repository):
     experiment = VirtualExperiment(motion, posture, simulation, camera=None, seed=5, name="welded")
     recording = virtual_experiment(system, TRUTH, experiment)
     assert [group.name for group in recording.points] == ["points_arm"]
-    step = compile_step(system, 0.01, "left_damping")
+    step = compile_step(system, 0.01)
     problem = EstimationProblem(step, [recording], made.free, made.options, dict.fromkeys(TRUTH, 3.0))
     solution = solve(problem, GaussNewton())
     assert solution.chi2_per_dof < 1.1

@@ -136,7 +136,9 @@ def recorded(system: System, pushed: dict[int, tuple[float, float, float]], seed
     position = np.stack([np.array(place(x[:2])).T for x in swept.state])
     noise = np.random.default_rng(seed).standard_normal(position.shape)
     points = PointGroup("points", tuple(known), t, position + 1e-3 * noise, std=np.full(position.shape, 1e-3))
-    joints = JointGroup(("shoulder", "elbow"), t, swept.state[:, :2], effort=np.vstack([torque, torque[-1:]]))
+    joints = JointGroup(
+        ("shoulder", "elbow"), t, swept.state[:, :2], effort=np.vstack([torque, torque[-1:]]), effort_kind="command"
+    )
     return Recording(joints, (points,), name="push")
 
 

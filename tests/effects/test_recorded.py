@@ -41,7 +41,9 @@ def recording(bench, effort: bool = True, camera: bool = True) -> Recording:
     position = bench.posture + 0.02 * ramp * np.sin(14 * t[:, None] + np.arange(3))
     load = np.array([0.5, -3.0, 1.0]) if not len(bench.rest.torque) else bench.rest.torque
     torque = load + 0.4 * ramp * np.sin(11 * t[:, None] + 2 * np.arange(3))
-    joints = JointGroup(NAMES, t, position, effort=torque if effort else None, position_std=1e-4, effort_std=0.05)
+    joints = JointGroup(
+        NAMES, t, position, effort=torque if effort else None, position_std=1e-4, effort_std=0.05, effort_kind="command"
+    )
     groups = [PointGroup("points_arm", ("w_T2",), t, rng.normal(size=(len(t), 1, 3)), np.array(0.01), "arm")]
     if camera:
         seen = np.sort(rng.uniform(0.0, t[-1], 9))
@@ -180,7 +182,7 @@ def test_a_cable_from_a_fitted_start(cable, all_effects) -> None:
     )
     residuals = []
     for one in (system, system.with_effects(all_effects(system))):
-        step = compile_step(one, H, "left_damping", use_compiler=False)
+        step = compile_step(one, H, use_compiler=False)
         found = EstimationProblem(step, [made], ("parent.bend",), options)
         result = found.evaluate(found.start)
         assert result.ok, result.message

@@ -222,9 +222,11 @@ class Case:
         return (step or self.step).kernel.rollout(*values, feedback, directions)
 
 
-def make_case(system: System, q: np.ndarray, time_step=2e-3, steps=10, split="symmetric", strength=1.0) -> Case:
+def make_case(
+    system: System, q: np.ndarray, time_step=2e-3, steps=10, rule=("symmetric", "midpoint"), strength=1.0
+) -> Case:
     # finite differences magnify what Newton leaves undone
-    step = compile_step(system, time_step, split, tolerance=1e-14)
+    step = compile_step(system, time_step, *rule, tolerance=1e-14)
     sizes = step.sizes
     rng = np.random.default_rng(5)
     theta = system.parameters.vector()
@@ -255,7 +257,9 @@ def closed_loop(urdf_folder, effects=()) -> tuple[System, np.ndarray]:
 
 BUILDERS = {
     "closed_loop": lambda folder: make_case(*closed_loop(folder)),
-    "closed_loop_left": lambda folder: make_case(*closed_loop(folder), split="left"),
+    "closed_loop_node": lambda folder: make_case(*closed_loop(folder), rule=("symmetric", "node")),
+    "closed_loop_left": lambda folder: make_case(*closed_loop(folder), rule=("left", "node")),
+    "closed_loop_left_midpoint": lambda folder: make_case(*closed_loop(folder), rule=("left", "midpoint")),
     "welded_cable": lambda folder: make_case(*clamped_cable("weld"), strength=0.05),
     "aligned_cable": lambda folder: make_case(*clamped_cable("axis"), strength=0.05),
     "creeping_cable": lambda folder: make_case(
@@ -267,10 +271,15 @@ BUILDERS = {
         *clamped_cable("point", [creeping_grasp("clamp", 0.05), soft_grasp("clamp", 1e-4, relaxation=2e-3)]),
         time_step=5e-4,
         strength=0.05,
-        split="left_damping",
+    ),
+    "relaxing_cable_node": lambda folder: make_case(
+        *clamped_cable("point", [creeping_grasp("clamp", 0.05), soft_grasp("clamp", 1e-4, relaxation=2e-3)]),
+        time_step=5e-4,
+        strength=0.05,
+        rule=("left", "node"),
     ),
     "thick_air": lambda folder: make_case(
-        *closed_loop(folder, [thick_air("nod", 0.05, 0.2, 0.4)]), split="left_damping"
+        *closed_loop(folder, [thick_air("nod", 0.05, 0.2, 0.4)]), rule=("left", "node")
     ),
     "thick_air_symmetric": lambda folder: make_case(*closed_loop(folder, [thick_air("slide", 0.05, 0.2, -0.4)])),
     "soft_cable": lambda folder: make_case(

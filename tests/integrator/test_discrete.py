@@ -11,7 +11,8 @@ from yid_ocp.model import System, forward_kinematics
 from yid_ocp.model.kinematics import rigid_body
 from yid_ocp.model.urdf import read_urdf
 
-SHARES = {"symmetric": (0.5, 0.5), "left": (1.0, 1.0), "left_damping": (0.5, 1.0)}
+FORCE_LEFT = {"symmetric": 0.5, "left": 1.0}
+PULL_MIDDLE = {"node": 0.0, "midpoint": 0.5}
 
 
 def discrete_lagrangian(system: System, q0: ca.SX, q1: ca.SX, h: ca.SX) -> ca.SX:
@@ -31,25 +32,34 @@ SYSTEMS = {
 }
 
 
-@pytest.mark.parametrize("force_split", list(SHARES))
+@pytest.mark.parametrize("constraint_force", list(PULL_MIDDLE))
+@pytest.mark.parametrize("force_split", list(FORCE_LEFT))
 @pytest.mark.parametrize("name", list(SYSTEMS))
-def test_equations_are_slot_derivatives_of_the_discrete_lagrangian(parts, urdf_folder, name, force_split):
+def test_equations_are_slot_derivatives_of_the_discrete_lagrangian(
+    parts, urdf_folder, name, force_split, constraint_force
+):
     system = SYSTEMS[name](parts, urdf_folder)
-    e = discrete_equations(system, force_split)
+    e = discrete_equations(system, force_split, constraint_force)
     action = discrete_lagrangian(system, e.q0, e.q1, e.h)
-    share, viscous_share = SHARES[force_split]
-    force, viscous = system.input_force(e.u), system.viscous_force((e.q1 - e.q0) / e.h)
-    closure = [system.constraints(forward_kinematics(system.mechanism, q)) for q in (e.q0, e.q1)]
-    pull = ca.jtimes(closure[0], e.q0, e.lam, True)
-    push = e.h * (share * force + viscous_share * viscous)
+    force = system.input_force(e.u) + system.viscous_force((e.q1 - e.q0) / e.h)
+    push = FORCE_LEFT[force_split] * e.h * force
+
+    def closed(q: ca.SX) -> ca.SX:
+        return system.constraints(forward_kinematics(system.mechanism, q))
+
+    # lam times the constraint at node k, its share s moved to the mean of the ends less half of both
+    s, middle = PULL_MIDDLE[constraint_force], (e.q0 + e.q1) / 2
+    moved = s * ca.dot(e.lam, 2 * closed(middle) - closed(e.q0) - closed(e.q1))
+    pull = ca.gradient(ca.dot(e.lam, closed(e.q0)) + moved, e.q0)
+    matrix = ca.jacobian(closed(e.q1), e.q1)
     expected = {
         "momentum_balance": e.p0 + ca.gradient(action, e.q0) + push - pull,
-        "p1": ca.gradient(action, e.q1) + e.h * (force + viscous) - push,
-        "constraint": closure[1],
-        "constraint_matrix": ca.jacobian(closure[0], e.q0),
-        "pull_by_q": ca.jacobian(pull, e.q0),
+        "p1": ca.gradient(action, e.q1) + e.h * force - push - ca.gradient(moved, e.q1),
+        "constraint": closed(e.q1),
     }
     pairs = [ca.densify(x) for key, value in expected.items() for x in (getattr(e, key), value)]
+    pairs += [ca.densify(x) for x in (e.pulls.after, matrix)]
+    pairs += [ca.densify(x) for x in (e.pulls.after_by_q, ca.jacobian(matrix.T @ e.lam, e.q1))]
     function = ca.Function("pairs", e.arguments, pairs)
     rng = np.random.default_rng(4)
     theta = system.parameters.vector()

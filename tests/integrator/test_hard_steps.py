@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from yid_ocp.integrator.discrete import ForceSplit
+from yid_ocp.integrator.discrete import ConstraintForce, ForceSplit
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.integrator.step_model import Directions, StepCode
 from yid_ocp.model import Grasp, Segment, System, flexible_object
@@ -37,6 +37,7 @@ class Hard:
     moved: np.ndarray | float = 0.0
     steps: int = 1
     split: ForceSplit = "symmetric"
+    pull: ConstraintForce = "midpoint"
     code: StepCode = StepCode.OK
     damped: bool = False
     conditioning: float = 1.0
@@ -44,7 +45,7 @@ class Hard:
 
     def step(self, use_compiler: bool):
         return compile_step(
-            self.system, self.time_step, self.split, use_compiler=use_compiler, tolerance=self.tolerance
+            self.system, self.time_step, self.split, self.pull, use_compiler=use_compiler, tolerance=self.tolerance
         )
 
     def inputs(self):
@@ -107,13 +108,16 @@ CASES: dict[str, Callable[..., Hard]] = {
     ),
     "kicked_cable": lambda parts, folder: Hard(parts.cable(), 3 * BENT, 0.3, p=0.3 * BENT, damped=True),
     "clamp_moved_far": lambda parts, folder: Hard(
-        *parts.clamped_cable("weld"), 0.02, moved=CLAMP_TURNED, steps=3, damped=True
+        *parts.clamped_cable("weld"), 0.02, moved=CLAMP_TURNED, steps=3, pull="node", damped=True
+    ),
+    "clamp_moved_half_as_far": lambda parts, folder: Hard(
+        *parts.clamped_cable("weld"), 0.02, moved=CLAMP_TURNED / 2, steps=3, damped=True
     ),
     "closed_loop_moved_far": lambda parts, folder: Hard(
         *parts.closed_loop(folder), 0.05, torque=60.0, moved=1.0, steps=2, damped=True
     ),
     "closed_force": lambda parts, folder: Hard(
-        *in_thick_air(parts, folder), 0.05, p=5.0, torque=60.0, steps=2, split="left_damping", damped=True
+        *in_thick_air(parts, folder), 0.05, p=5.0, torque=60.0, steps=2, split="left", damped=True
     ),
     "internal_coordinates": lambda parts, folder: Hard(
         parts.cable(effects=[parts.maxwell_branch("C_0_x", 30.0, 0.02), parts.soft_joint("C_1_y", 0.2)]),
@@ -126,7 +130,7 @@ CASES: dict[str, Callable[..., Hard]] = {
     "creeping_grasp": lambda parts, folder: Hard(
         *parts.clamped_cable("point", [parts.creeping_grasp("clamp", 0.05), parts.soft_grasp("clamp", 1e-4, 2e-3)]),
         0.005,
-        moved=CLAMP_TURNED,
+        moved=CLAMP_TURNED / 2,
         damped=True,
     ),
     "almost_at_full_stretch": lambda parts, folder: Hard(

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from yid_ocp.integrator.step import compile_step
+from yid_ocp.integrator.step import compile_alike
 from yid_ocp.integrator.step_model import Directions
 
 EPSILON = 1e-5
@@ -158,7 +158,7 @@ def test_forward_equals_adjoint_equals_differences(case, fed_back):
 
 
 def test_interpreter_equals_compiled(case):
-    plain = compile_step(case.step.system, case.step.time_step, case.step.force_split, use_compiler=False)
+    plain = compile_alike(case.step, case.step.system, use_compiler=False)
     if not case.step.compiled:
         pytest.skip("this machine has no C compiler to compare with")
     assert not plain.compiled
@@ -217,7 +217,7 @@ def test_linearized_steps_are_the_equations_along_any_trajectory(case):
     rng = np.random.default_rng(8)
     state = rollout.state + 0.01 * rng.normal(size=rollout.state.shape)
     lam = rollout.multipliers + 0.01 * rng.normal(size=rollout.multipliers.shape)
-    plain = compile_step(step.system, step.time_step, step.force_split, use_compiler=False)
+    plain = compile_alike(step, step.system, use_compiler=False)
     one, two = (k.linearize(case.theta, state, lam, case.torque, names, True) for k in (step.kernel, plain.kernel))
     for key in vars(one):
         actual, expected = getattr(one, key), getattr(two, key)

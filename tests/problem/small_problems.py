@@ -74,7 +74,10 @@ def taken(step, seed, *, efforts=True, camera=True, name=None, steps=STEPS):
         phase = rng.uniform(0, 6, (2, len(names)))
         angle = 0.2 + 0.1 * np.sin(9.0 * t[:, None] + phase[0])
         effort = 1.0 + 0.5 * np.sin(7.0 * t[:, None] + phase[1])
-        group = joints(names, t, angle, effort=effort if efforts else None, effort_std=0.3, position_std=1e-3)
+        kind = "command" if step.system.driven else "sample"
+        group = joints(
+            names, t, angle, effort=effort if efforts else None, effort_std=0.3, effort_kind=kind, position_std=1e-3
+        )
     place = np.array([0.0, 0.1, 0.35]) + 0.05 * rng.standard_normal((steps + 1, 1, 3))
     groups = [seen(["tip"], t, place, "points_arm", std=np.full(place.shape, 0.02))]
     if camera:

@@ -92,7 +92,7 @@ def twin(cable, clamps):
     options = CableOptions(default=BranchOptions(bend=1e-3, twist=2e-3, damping=1e-4), lengths_per_recording=False)
     stub = as_recording(cable, t, held)
     system = cable_system(edge_lengths(cable.edges, [as_recording(cable, t, {})]), cable, options)
-    step = compile_step(system, PERIOD, "left_damping")
+    step = compile_step(system, PERIOD)
     path = prescribed_path(stub, system, Grid(0.0, PERIOD, len(t) - 1), LowPass(np.inf), cable.clamps)
     theta = system.parameters.vector(TRUTH)
     rest = Statics(step).solve(path[0], theta)
@@ -136,7 +136,7 @@ def test_the_undeformed_model_has_the_undeformed_shape(cable, twin):
 def test_every_row_of_the_axis_constraint_matches_its_derivatives(twin):
     e = twin[0].equations
     phi = ca.Function("phi", [e.q1, e.z1, e.lam, e.theta, e.time_step], [e.constraint, ca.jacobian(e.constraint, e.q1)])
-    closed = ca.Function("closed", e.arguments, [e.constraint_matrix, e.pull_by_q])
+    closed = ca.Function("closed", e.arguments, [e.pulls.before, e.pulls.before_by_q])
     random = np.random.default_rng(3)
     q, lam = random.normal(scale=0.4, size=e.q0.numel()), random.normal(size=5)
     theta = twin[0].system.parameters.vector()
@@ -251,7 +251,7 @@ def test_a_real_cable_is_predicted_better_than_by_carrying_it_along(repository):
     )
     recording = read_recording(folder / "bdlo1_train_021.h5")
     options = CableOptions(memory=0.75)
-    step = compile_step(cable_system(edge_lengths(cable.edges, [recording]), cable, options), PERIOD, "left_damping")
+    step = compile_step(cable_system(edge_lengths(cable.edges, [recording]), cable, options), PERIOD)
     settings = cable_options(cable, [recording], 2e-4, 0.1, options=options)
     problem = EstimationProblem(step, [recording], free_parameters(cable, options), settings)
     error = point_errors(problem, problem.start, cable.free)[recording.name]

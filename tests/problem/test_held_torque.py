@@ -15,7 +15,7 @@ H = 0.01
 def test_torque_acts_late() -> None:
     t = H * np.arange(6)
     effort = np.array([[1.0, 2.0, 4.0, 8.0, 16.0, 32.0], [0.0, 1.0, 0.0, 1.0, 0.0, 1.0]]).T
-    joints = JointGroup(("a", "b"), t, np.zeros((6, 2)), effort=effort)
+    joints = JointGroup(("a", "b"), t, np.zeros((6, 2)), effort=effort, effort_kind="command")
     grid = Grid(0.0, H, 5)
     prompt = held_torque(joints, ("a", "b"), grid, "made")
     late = held_torque(joints, ("a", "b"), grid, "made", np.array([H, 0.25 * H]))

@@ -36,7 +36,7 @@ def pendulum(urdf_folder):
 @pytest.fixture(scope="module")
 def arm(single_arm):
     """Makes problems on one arm under its tracking filter, at rest in a shape that depends on the stiffness."""
-    step = compile_step(single_arm, H, "left_damping")
+    step = compile_step(single_arm, H)
     folder = resources.files("yid_ocp.data") / "defaults"
     recordings = [read_recording(folder / f"single_arm_vision_{name}.h5") for name in ("estimate", "held_out")]
 

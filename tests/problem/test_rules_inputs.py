@@ -18,6 +18,7 @@ from yid_ocp.problem.inputs import (
     held_torque,
     held_torque_slope,
     joint_loads,
+    measured_angles,
     point_course,
     prescribed_path,
     sensors_present,
@@ -30,10 +31,10 @@ PLAIN = LowPass(math.inf)
 # -- torques ----------------------------------------------------------------------------------------------------------
 
 
-def driven(effort, t=None):
+def driven(effort, t=None, kind="command"):
     effort = np.asarray(effort, float).reshape(-1, 1)
     t = 0.1 * np.arange(len(effort)) if t is None else np.asarray(t, float)
-    return joints(["other", "a"], t, np.zeros((len(t), 2)), effort=np.hstack([99 + effort, effort]))
+    return joints(["other", "a"], t, np.zeros((len(t), 2)), effort=np.hstack([99 + effort, effort]), effort_kind=kind)
 
 
 @pytest.mark.parametrize(
@@ -73,9 +74,52 @@ def test_a_delayed_torque_acts_later(delay, expected):
     np.testing.assert_allclose(found[:, 0], expected)
 
 
+def cubic(t):
+    return 1 + 2 * t - 7 * t**2 + 5 * t**3
+
+
+def summed_cubic(t):
+    return t + t**2 - 7 / 3 * t**3 + 5 / 4 * t**4
+
+
+UNEVEN = np.array([0.0, 0.1, 0.25, 0.3, 0.45, 0.5, 0.65])
+
+
+@pytest.mark.parametrize("kind", ["sample", None])
+@pytest.mark.parametrize("delay", [0.0, 0.02])
+def test_sampled_torque_is_a_smooth_course_whose_mean_a_step_takes(kind, delay):
+    grid = Grid(0.05, 0.02, 20)
+    found = held_torque(driven(cubic(UNEVEN), UNEVEN, kind), ("a",), grid, "run", np.array([delay]))
+    expected = np.diff(summed_cubic(grid.times - delay)) / 0.02
+    np.testing.assert_allclose(found[:, 0], expected, rtol=1e-12)
+
+
+def test_mean_torque_keeps_the_mean_over_every_recorded_interval():
+    effort = np.random.default_rng(2).normal(size=12)
+    t = 0.1 * np.arange(12)
+    fine = held_torque(driven(effort, t, "mean"), ("a",), Grid(0.0, 0.025, 44), "run")[:, 0]
+    np.testing.assert_allclose(fine.reshape(11, 4).mean(axis=1), effort[:11], rtol=1e-12)
+    times = np.append(t, 1.2)
+    smooth = np.diff(times + times**2 - 7 * times**3) / 0.1
+    grid = Grid(0.0, 0.05, 22)
+    found = held_torque(driven(smooth, t, "mean"), ("a",), grid, "run")[:, 0]
+    times = grid.times
+    np.testing.assert_allclose(found, np.diff(times + times**2 - 7 * times**3) / 0.05, rtol=1e-9)
+
+
+@pytest.mark.parametrize(("kind", "first", "last"), [("command", 1, 5), ("sample", 1, 5), ("mean", 0.5, 5.5)])
+def test_beyond_the_recording_torque_is_held(kind, first, last):
+    made = driven([1.0, 2.0, 3.0, 4.0, 5.0], kind=kind)
+    before = held_torque(made, ("a",), Grid(-0.5, 0.1, 3), "run")[:, 0]
+    np.testing.assert_allclose(before, first, rtol=1e-12)
+    after = held_torque(made, ("a",), Grid(0.55, 0.1, 3), "run")[:, 0]
+    np.testing.assert_allclose(after, last, rtol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["command", "sample", "mean"])
 @pytest.mark.parametrize("delay", [0.03, 0.17, -0.04])
-def test_the_slope_by_the_delay_is_that_of_differences(delay):
-    made, grid = driven([1.0, 2.0, 4.0, 8.0, 5.0, 1.0]), Grid(0.1, 0.1, 3)
+def test_the_slope_by_the_delay_is_that_of_differences(delay, kind):
+    made, grid = driven([1.0, 2.0, 4.0, 8.0, 5.0, 1.0], kind=kind), Grid(0.1, 0.1, 3)
     ends = [held_torque(made, ("a",), grid, "run", np.array([delay + sign * 1e-6])) for sign in (1, -1)]
     found = held_torque_slope(made, ("a",), grid, "run", np.array([delay]))
     np.testing.assert_allclose(found, (ends[0] - ends[1]) / 2e-6, rtol=1e-6, atol=1e-6)
@@ -99,6 +143,14 @@ def test_nothing_driven_needs_no_torque_and_a_driven_joint_does():
         held_torque(silent, ("a",), Grid(0.0, 0.1, 3), "run")
     with pytest.raises(DataError, match="'b' of the model is not recorded"):
         held_torque(driven([1.0, 2.0]), ("b",), Grid(0.0, 0.1, 3), "run")
+
+
+def test_measured_angles_have_no_kinks_between_samples():
+    t = 0.1 * np.arange(8)
+    made = joints(["b", "a"], t, np.stack([np.zeros(8), cubic(t)], axis=1))
+    grid = Grid(0.0, 0.025, 28)
+    found = measured_angles(made, ("a",), grid, "run", LowPass(math.inf))
+    np.testing.assert_allclose(found[:, 0], cubic(grid.times), rtol=1e-12)
 
 
 def test_loads_are_smoothed_and_interpolated():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
@@ -96,14 +96,6 @@ def test_symmetric_split_has_order_two(make, urdf_folder, roll, momentum):
 def test_left_split_has_order_one(make, urdf_folder, roll, momentum):
     slopes = make(urdf_folder).slopes("left", roll, momentum)
     assert slopes == pytest.approx([1.0, 1.0], abs=0.1)
-
-
-def test_left_damping_has_order_one_because_of_the_dampers_alone(urdf_folder, roll, momentum):
-    motion = mixed_joints(urdf_folder)
-    assert motion.slopes("left_damping", roll, momentum) == pytest.approx([1.0, 1.0], abs=0.1)
-    dampers = [name for name in motion.system.parameters.names if name.endswith(".damping")]
-    undamped = replace(motion, values=dict.fromkeys(dampers, 0.0))
-    assert undamped.slopes("left_damping", roll, momentum) == pytest.approx([2.0, 2.0], abs=0.1)
 
 
 def test_coordinates_of_a_grasped_object_have_order_two(golden, single_arm, theta_golden, roll, momentum):

@@ -66,7 +66,7 @@ def test_start_of_the_rollout(case, roll):
 @pytest.mark.parametrize("name", NAMES)
 def test_interpreter(name, golden, paper_systems, theta_golden):
     trep = golden(name)
-    step = compile_step(paper_systems[name], 0.01, "left", use_compiler=False)
+    step = compile_step(paper_systems[name], 0.01, "left", "node", use_compiler=False)
     assert not step.compiled
     for k in (0, 1, 120, 299):
         compare_step(trep, step, theta_golden(name), k)

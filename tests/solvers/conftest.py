@@ -15,7 +15,7 @@ FREE = ("T1.bend", "T1.twist", "T2.bend", "T2.twist", "T3.bend", "T3.twist")
 
 @pytest.fixture(scope="session")
 def one_arm(paper_systems):
-    return compile_step(paper_systems["single"], 0.01, "left_damping")
+    return compile_step(paper_systems["single"], 0.01)
 
 
 @pytest.fixture(scope="session")

@@ -10,7 +10,7 @@ import pytest
 
 from yid_ocp.data import read_recording
 from yid_ocp.errors import SolverError
-from yid_ocp.integrator.step import compile_step
+from yid_ocp.integrator.step import compile_alike, compile_step
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import GaussNewton, Lifted, MultipleShooting, SingleShooting, Status, SteepestDescent, solve
 
@@ -81,7 +81,7 @@ def test_lifted_agrees(short, reference):
 @pytest.fixture(scope="module")
 def two_arms(paper_systems):
     """50 variables, 500 steps, six parameters from 3 N m/rad; two of the twists leave no trace in the data."""
-    step = compile_step(paper_systems["dual"], 0.01, "left_damping")
+    step = compile_step(paper_systems["dual"], 0.01)
     recording = read_recording(resources.files("yid_ocp.data") / "defaults" / "dual_arm_vision_estimate.h5")
     return EstimationProblem(step, [recording], FREE)
 
@@ -139,7 +139,7 @@ def test_bounds_are_respected(one_arm, recording, make_problem):
     problem = make_problem(free=("T1.bend", "T2.bend"), duration=1.0)
     system = problem.system
     narrow = type(system)(**{**vars(system), "parameters": system.parameters.with_bounds({"T1.bend": (0.0, 15.0)})})
-    step = compile_step(narrow, problem.step.time_step, problem.step.force_split, use_compiler=problem.step.compiled)
+    step = compile_alike(problem.step, narrow)
     problem = EstimationProblem(step, [recording], problem.free, problem.options)
     for solver in (GaussNewton(), SingleShooting(), MultipleShooting(node_interval=10)):
         solution = solve(problem, solver)

@@ -313,7 +313,7 @@ def test_solve_finds_the_truth_from_tracked_points(tracked, system, run, truth):
     camera = made.track.group()
     columns = [system.points.index(name) for name in names]
     camera = replace(camera, names=names, position=camera.position[:, columns], std=camera.std[:, columns])
-    step = yid.compile_step(system, 0.01, "left_damping")
+    step = yid.compile_step(system, 0.01)
     problem = yid.EstimationProblem(step, [Recording(joints, (arm, camera))], free=list(truth))
     solution = yid.solve(problem, yid.GaussNewton(cost_tolerance=1e-5))
     found = {name: entry for name, entry in solution.parameters.items() if entry.verdict == "identifiable"}

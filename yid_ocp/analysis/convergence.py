@@ -11,7 +11,7 @@ import numpy as np
 import scipy.optimize
 from numpy.typing import NDArray
 
-from yid_ocp.integrator.discrete import ForceSplit
+from yid_ocp.integrator.discrete import ConstraintForce, ForceSplit
 from yid_ocp.integrator.statics import Rest, Statics
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model.kinematics import forward_kinematics
@@ -53,6 +53,7 @@ def natural_frequencies(
     theta: Array,
     time_step: float,
     force_split: ForceSplit = "symmetric",
+    constraint_force: ConstraintForce = "midpoint",
     guess: Array | None = None,
 ) -> Frequencies:
     """Frequencies of the step map of a system about rest, from the eigenvalues of A_k without damping.
@@ -66,15 +67,15 @@ def natural_frequencies(
     theta : ndarray, shape (ntheta,)
     time_step : float
         h [s]; the midpoint rule lowers a frequency f to atan(pi f h)/(pi h).
-    force_split : str
-        See `compile_step`; matters for growth, not for the undamped frequencies.
+    force_split, constraint_force : str
+        See `compile_step`; the split matters for growth, not for the undamped frequencies.
     guess : ndarray, shape (n,), optional
         Configuration from which rest is sought.
     """
     still = held_still(system)
     if not still.free_indices:
         return Frequencies(np.zeros(0), message="every coordinate is prescribed, nothing can swing")
-    step = compile_step(still, time_step, force_split, use_compiler=False)
+    step = compile_step(still, time_step, force_split, constraint_force, use_compiler=False)
     known = np.array([posture[name] for name in still.prescribed])
     rest = Statics(step).solve(known, theta, guess=guess)
     if not rest.converged:

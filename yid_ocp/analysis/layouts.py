@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from yid_ocp.analysis.identifiability import StartKnowledge, carried, with_nuisances
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import DataError, SolverError, YidError
-from yid_ocp.integrator.step import Step, compile_step
+from yid_ocp.integrator.step import Step, compile_alike
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Frame, Placement
 from yid_ocp.model.system import System
@@ -304,7 +304,7 @@ class LayoutBuilder:
         if "torque" in mechanics:
             system = replace(system, driven=(), prescribed=(*system.prescribed, *system.driven))
         if mechanics - {"motion", "travel"} or system is not base.system:
-            step = compile_step(system, base.step.time_step, base.step.force_split, use_compiler=False)
+            step = compile_alike(base.step, system, use_compiler=False)
         else:
             step = base.step
         seen = sights(system)
@@ -415,7 +415,15 @@ class LayoutBuilder:
         motion = multisine(system, values, seed=seed, posture=posture, excitation=excitation)
         run = simulate_in_mujoco(system, values, motion, Simulation(duration), posture=posture)
         driven = list(system.driven_indices)
-        joints = JointGroup(system.driven, run.t, run.q[:, driven], effort=run.effort, position_std=0.0, effort_std=0.0)
+        joints = JointGroup(
+            system.driven,
+            run.t,
+            run.q[:, driven],
+            effort=run.effort,
+            position_std=0.0,
+            effort_std=0.0,
+            effort_kind="command",
+        )
         beyond: dict[str, list[str]] = {"range": [], "torque": []}
         for k, name in enumerate(system.driven):
             joint = system.mechanism.joints[driven[k]]

@@ -18,7 +18,7 @@ from ruamel.yaml.comments import CommentedSeq
 
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import ConfigError
-from yid_ocp.integrator.discrete import ForceSplit
+from yid_ocp.integrator.discrete import ConstraintForce, ForceSplit
 from yid_ocp.model.cable import CableOptions
 from yid_ocp.options import About, Among, options_of, stripped
 from yid_ocp.problem.options import ProblemOptions, SensorOptions
@@ -198,6 +198,7 @@ class ProblemSettings(ProblemOptions):
 
     time_step: Annotated[float, Gt(0), Le(0.1), About("of the integrator", "s")] = 0.01
     force_split: Annotated[ForceSplit, About("rule for forces; left is the paper's")] = "symmetric"
+    constraint_force: Annotated[ConstraintForce, About("where grasps pull; node is the paper's")] = "midpoint"
     compiler: Annotated[bool, About("whether to compile the step where a C compiler is found")] = True
 
 

@@ -98,6 +98,11 @@ class JointGroup:
         """The channels that were recorded: name to array, shape (N, nj), units in `JOINT_CHANNELS`."""
         return {name: getattr(self, name) for name in JOINT_CHANNELS if getattr(self, name) is not None}
 
+    @property
+    def effort_taken_as(self) -> EffortKind:
+        """`effort_kind`; where nobody says, `sample`, which is what drivers of robots publish."""
+        return self.effort_kind or "sample"
+
     def _rows(self, rows: NDArray[np.bool_]) -> JointGroup:
         changes: dict[str, Any] = {name: value[rows] for name, value in self.channels.items()}
         return replace(self, t=self.t[rows], **changes)

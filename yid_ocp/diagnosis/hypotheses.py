@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from yid_ocp.data.recording import Recording
 from yid_ocp.effects import EFFECTS, EffectBase, candidates, make_effect
 from yid_ocp.errors import ConfigError, DataError
-from yid_ocp.integrator.step import compile_step
+from yid_ocp.integrator.step import compile_alike
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
@@ -139,9 +139,7 @@ class CandidateProblem:
             A recording is both estimated on and held out.
         """
         step = problem.step
-        joint = compile_step(
-            step.system.with_effects(effects), step.time_step, step.force_split, use_compiler=step.compiled
-        )
+        joint = compile_alike(step, step.system.with_effects(effects))
         estimate = [episode.recording for episode in problem.episodes]
         held = [*held_out] if held_out else [episode.recording for episode in problem.held_out]
         _check_apart(estimate, held)

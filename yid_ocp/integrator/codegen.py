@@ -21,10 +21,11 @@ class StepFunctions:
 
     Attributes
     ----------
-    residual : (balance without the constraints' pull, internal, constraint, p1)
+    residual : (balance, internal, constraint, p1, middle pull of the balance, pull of p1); balance and p1 without the
+        constraints' pull, whose matrices come as nonzeros of the pattern `matrix`, none where all of it is at the node
     linear : (pair vectors, rest Jacobian, rest Jacobian of p1, constraint Jacobian), the last three as nonzeros
-    matrix : nonzeros of Dphi(q_k)
-    pull : nonzeros of d(Dphi' lam)/d(q_k, z_k)
+    matrix : nonzeros of the share of Dphi(q_k) in the balance, which does not depend on the unknowns
+    pull : nonzeros of the derivative of its pull by (q_k, z_k)
     scales : (row scale, h)
     patterns : sparsity of rest, rest of p1, constraint Jacobian, matrix and pull
     """
@@ -51,13 +52,14 @@ def step_functions(equations: DiscreteEquations) -> StepFunctions:
     """
     e = equations
     bodies = [e.row_scale * (e.h / 2 * e.rigid.by_q + sign * e.rigid.by_v) for sign in (-1, 1)]
-    balance = e.balance_rest + e.p0 + bodies[0]
     if e.closed_impulses is not None:
-        balance += e.closed_impulses[0]
         bodies = [part + push for part, push in zip(bodies, e.closed_impulses, strict=True)]
+    balance, p1 = e.balance_rest + e.p0 + bodies[0], e.p1_rest + bodies[1]
     rest, rest_p, by_unknown = _rest_jacobians(e, *bodies)
-    by_z = ca.jacobian(e.constraint_matrix.T @ e.lam, e.z0)
-    pull = ca.sparsify(ca.horzcat(e.pull_by_q, by_z))
+    pulls = e.pulls
+    by_z = ca.jacobian(pulls.before.T @ e.lam, e.z0)
+    pull = ca.sparsify(pulls.share_0 * ca.horzcat(pulls.before_by_q, by_z))
+    moving = [pulls.share_m * pulls.middle, pulls.right] if pulls.share_m else []
 
     def function(name: str, *outputs: ca.SX) -> ca.Function:
         return ca.Function(name, e.arguments, ca.cse(list(outputs)))
@@ -68,16 +70,16 @@ def step_functions(equations: DiscreteEquations) -> StepFunctions:
 
     return StepFunctions(
         e,
-        function("residual", balance, e.internal, e.constraint, e.p1),
+        function("residual", balance, e.internal, e.constraint, p1, *map(nonzeros, moving)),
         function("linear", _pairs(e), nonzeros(rest), nonzeros(rest_p), nonzeros(by_unknown)),
-        function("matrix", nonzeros(e.constraint_matrix)),
+        function("matrix", nonzeros(pulls.share_0 * pulls.before)),
         function("pull", nonzeros(pull)),
         function("scales", e.row_scale, e.h),
         {
             "rest": rest.sparsity(),
             "rest_p": rest_p.sparsity(),
             "constraint": by_unknown.sparsity(),
-            "matrix": e.constraint_matrix.sparsity(),
+            "matrix": pulls.before.sparsity(),
             "pull": pull.sparsity(),
         },
     )
@@ -112,12 +114,20 @@ def _rest_jacobians(e: DiscreteEquations, bodies: ca.SX, bodies_p: ca.SX) -> tup
     rest = ca.jacobian(ca.vertcat(e.balance_rest, e.internal, ca.SX(m, 1)), inputs)
     rest += by_internal(ca.vertcat(bodies, ca.SX(e.z0.numel() + m, 1)))
     rest_p = ca.jacobian(e.p1_rest, inputs) + by_internal(bodies_p)
-    by_q1 = ca.substitute(e.constraint_matrix, old, ca.vertcat(e.q1, e.z1))
+    by_q1, pulls = e.pulls.after, e.pulls
+    if pulls.share_m:
+        weight = e.row_scale * pulls.share_m
+        moved, ended = -weight * pulls.middle_by_q / 2, weight * pulls.after_by_q
+        gap, none = ca.SX(n, m), ca.SX(n, e.u.numel())
+        by_z1, by_z0 = (ca.jacobian(-weight * (pulls.middle.T @ e.lam), z) for z in (e.z1, e.z0))
+        rest += ca.vertcat(ca.horzcat(moved, by_z1, gap, moved, by_z0, none), ca.SX(e.z0.numel() + m, inputs.numel()))
+        by_z1, by_z0 = (ca.jacobian(-e.row_scale * (pulls.right.T @ e.lam), z) for z in (e.z1, e.z0))
+        rest_p += ca.horzcat(moved + ended, by_z1, gap, moved, by_z0, none)
     if e.constraint_gain is not None:
         # the rows of a relaxing grasp depend on where it was before as well
         by_q1 = e.constraint_gain * by_q1
         at = unknown.numel()
-        rest[-m:, at : at + n] = (1 - e.constraint_gain) * e.constraint_matrix
+        rest[-m:, at : at + n] = (1 - e.constraint_gain) * pulls.before
         rest[-m:, at + n : at + old.numel()] = ca.jacobian(e.constraint, e.z0)
     by_rest = ca.jacobian(e.constraint, ca.vertcat(e.z1, e.lam))
     return ca.sparsify(rest), ca.sparsify(rest_p), ca.sparsify(ca.horzcat(by_q1, by_rest))
@@ -180,6 +190,8 @@ def structure(functions: StepFunctions) -> Structure:
     rows_new[n + nz + row, column] = True
     row, column = triplet(functions.patterns["matrix"])
     rows_new[column, n + nz + row] = True
+    if e.pulls.share_m:
+        p1_new[column, n + nz + row] = True
     row, column = triplet(functions.patterns["pull"])
     rows_old[row, column] = True
 
@@ -225,6 +237,7 @@ def kernel_source(functions: StepFunctions, tables: Structure) -> str:
         "SZ_W": max(f.sz_w() for f in functions.all),
         "SZ_IW": max(f.sz_iw() for f in functions.all),
         "ROW_SCALED": int(bool(system.compliant)),
+        "MIDDLE": int(bool(e.pulls.share_m)),
         "CLOSED": int(e.closed is not None),
         "CLOSED_LEFT": e.closed_shares[0],
         "CLOSED_RIGHT": e.closed_shares[1],

@@ -1,17 +1,21 @@
 """The midpoint discrete Euler-Lagrange (DEL) equations of a system as symbolic expressions.
 
-Position-momentum form, with L_d(q0, q1) = h L((q0 + q1)/2, (q1 - q0)/h):
+Position-momentum form, with L_d(q0, q1) = h L((q0 + q1)/2, (q1 - q0)/h) and q_m = (q_k + q_{k+1})/2:
 
-    p_k + D1 L_d(q_k, q_{k+1}) + f- - Dphi(q_k)' lam_k = 0        phi(q_{k+1}) - C lam_k / h = 0
-    p_{k+1} = D2 L_d(q_k, q_{k+1}) + f+
+    p_k + D1 L_d(q_k, q_{k+1}) + f- - ((1 - s) Dphi(q_k) + s Dphi(q_m))' lam_k = 0     phi(q_{k+1}) - C lam_k / h = 0
+    p_{k+1} = D2 L_d(q_k, q_{k+1}) + f+ - s (Dphi(q_m) - Dphi(q_{k+1}))' lam_k
 
-with f- = f+ = (h/2) F for the symmetric split, f- = h F and f+ = 0 for the left one. The split `left_damping` is
-symmetric in all but the dampers, whose force goes left: the pull of a constraint acts at the node, and where its own
-stiffness exceeds 4 M/h^2 (a light twist under tension) only a damper on the left keeps the motion from growing with
-alternating sign. The first equation holds for
-free coordinates; at a prescribed one its left side is -h times the effort that the prescription needs at node k.
-Both equations of a compliant coordinate are multiplied by its compliance, its momentum with them: there p is the
-compliance times the momentum [rad s], which keeps the spring's force (1/compliance) finite and the rule's order two.
+with f- = f+ = (h/2) F for the symmetric split, f- = h F and f+ = 0 for the left one; s = 0 for a constraint force at
+the node, s = 1/2 for one at the midpoint. At the node the pull's own stiffness, lam times the constraint's curvature,
+has the weights (0, 1, 0) on three neighbouring configurations, and where it exceeds 4 M/h^2 (a light twist under
+tension) the motion grows with alternating sign. With s = 1/2 its weights are a spring's, (1/4, 1/2, 1/4), which no
+tension makes unstable, while lam_k is still what node k needs: with a constant Dphi the two rules are one, and in
+general they differ by h/4 (d Dphi/dt)' (lam_k - lam_{k-1}) and a curvature of order h^2, so that the order stays two.
+
+The first equation holds for free coordinates; at a prescribed one its left side is -h times the effort that the
+prescription needs at node k. Both equations of a compliant coordinate are multiplied by its compliance, its momentum
+with them: there p is the compliance times the momentum [rad s], which keeps the spring's force (1/compliance) finite
+and the rule's order two.
 """
 
 from __future__ import annotations
@@ -26,7 +30,44 @@ from yid_ocp.model.kinematics import Kinematics, RigidBody, cross, forward_kinem
 from yid_ocp.model.mechanism import Frame, Placement
 from yid_ocp.model.system import ClosedForce, Grasp, MidpointState, System
 
-ForceSplit = Literal["symmetric", "left", "left_damping"]
+ForceSplit = Literal["symmetric", "left"]
+ConstraintForce = Literal["node", "midpoint"]
+
+
+@dataclass(frozen=True)
+class ConstraintPulls:
+    """What the constraints take off the momentum in a step, with closed-form derivatives by the configuration.
+
+    The balance loses (share_0 Dphi(q_k) + share_m Dphi(q_m))' lam, p1 loses share_m (Dphi(q_m) - Dphi(q_{k+1}))' lam.
+
+    Attributes
+    ----------
+    share_0, share_m : float
+        Their sum is one.
+    before, middle, after : casadi.SX, shape (m, n)
+        Dphi at q_k, q_m and q_{k+1}, all of one sparsity.
+    before_by_q, middle_by_q, after_by_q : casadi.SX, shape (n, n)
+        d(Dphi(q)' lam)/dq there.
+    """
+
+    share_0: float
+    share_m: float
+    before: ca.SX
+    middle: ca.SX
+    after: ca.SX
+    before_by_q: ca.SX
+    middle_by_q: ca.SX
+    after_by_q: ca.SX
+
+    @property
+    def left(self) -> ca.SX:
+        """Rows of lam's pull in the balance, shape (m, n)."""
+        return self.share_0 * self.before + self.share_m * self.middle
+
+    @property
+    def right(self) -> ca.SX:
+        """Rows of lam's pull in p1, shape (m, n)."""
+        return self.share_m * (self.middle - self.after)
 
 
 @dataclass(frozen=True)
@@ -38,7 +79,8 @@ class DiscreteEquations:
     Attributes
     ----------
     system : System
-    force_split : "symmetric", "left" or "left_damping"
+    force_split : "symmetric" or "left"
+    constraint_force : "node" or "midpoint"
     q0, q1 : casadi.SX, shape (n, 1)
         q_k and q_{k+1}.
     z0, z1 : casadi.SX, shape (nz, 1)
@@ -72,16 +114,15 @@ class DiscreteEquations:
         Sum of the forces that effects give with their slopes, at the midpoint.
     closed_shares : (float, float)
         Parts of its impulse h F in `momentum_balance` and in `p1`.
-    constraint_matrix : casadi.SX, shape (m, n)
-        Dphi(q_k), so that the pull is its transpose times lam.
-    pull_by_q : casadi.SX, shape (n, n)
-        d(Dphi(q_k)' lam)/dq_k.
+    pulls : ConstraintPulls
+        The constraints' part of `momentum_balance` and of `p1`, before `row_scale`.
     row_scale : casadi.SX, shape (n, 1)
         Factor on each row of the bodies' part, in the balance and in p1 (1, or the compliance of a compliant one).
     """
 
     system: System
     force_split: ForceSplit
+    constraint_force: ConstraintForce
     q0: ca.SX
     q1: ca.SX
     z0: ca.SX
@@ -103,8 +144,7 @@ class DiscreteEquations:
     p1_rest: ca.SX
     closed: ClosedForce | None
     closed_shares: tuple[float, float]
-    constraint_matrix: ca.SX
-    pull_by_q: ca.SX
+    pulls: ConstraintPulls
     row_scale: ca.SX
 
     @property
@@ -138,14 +178,18 @@ class DiscreteEquations:
         return ca.vertcat(self.q1[list(self.system.free_indices)], self.z1, self.lam)
 
 
-def discrete_equations(system: System, force_split: ForceSplit = "symmetric") -> DiscreteEquations:
+def discrete_equations(
+    system: System, force_split: ForceSplit = "symmetric", constraint_force: ConstraintForce = "midpoint"
+) -> DiscreteEquations:
     """Build the DEL equations of one step.
 
     Parameters
     ----------
     system : System
-    force_split : "symmetric", "left" or "left_damping"
+    force_split : "symmetric" or "left"
         How the force of a step is shared between its two ends.
+    constraint_force : "node" or "midpoint"
+        Where the constraints pull.
 
     Returns
     -------
@@ -154,7 +198,7 @@ def discrete_equations(system: System, force_split: ForceSplit = "symmetric") ->
     Raises
     ------
     ModelError
-        Unknown force split, or an internal coordinate without an equation.
+        Unknown force split or constraint force, or an internal coordinate without an equation.
 
     References
     ----------
@@ -163,6 +207,8 @@ def discrete_equations(system: System, force_split: ForceSplit = "symmetric") ->
     """
     if force_split not in get_args(ForceSplit):
         raise ModelError(f"force_split = '{force_split}'", allowed=", ".join(get_args(ForceSplit)))
+    if constraint_force not in get_args(ConstraintForce):
+        raise ModelError(f"constraint_force = '{constraint_force}'", allowed=", ".join(get_args(ConstraintForce)))
     at = _Symbols.of(system)
     q0, q1, z0, z1, lam, h, qm, vm = at.q0, at.q1, at.z0, at.z1, at.lam, at.h, at.qm, at.vm
     kinematics = forward_kinematics(system.mechanism, qm)
@@ -171,22 +217,17 @@ def discrete_equations(system: System, force_split: ForceSplit = "symmetric") ->
     extra_q, extra_v = ca.gradient(terms.lagrangian, qm), ca.gradient(terms.lagrangian, vm)
 
     share = 1.0 if force_split == "left" else 0.5
-    viscous_share = 0.5 if force_split == "symmetric" else 1.0
-    push_left = h * (share * terms.force + viscous_share * terms.viscous)
-    push_right = h * ((1 - share) * terms.force + (1 - viscous_share) * terms.viscous)
+    push = h * (terms.force + terms.viscous)
     scale, spring = _row_scale(system, at)
-    matrix, pull_by_q = (
-        ca.substitute(expression, at.internal, z0)
-        for expression in _constraint_derivatives(system, forward_kinematics(system.mechanism, q0), q0, lam)
-    )
+    pulls = _constraint_pulls(system, at, kinematics, 0.0 if constraint_force == "node" else 0.5)
     constraint, gain = _constraint(system, at)
-    balance_rest = scale * (h / 2 * extra_q - extra_v + push_left) - spring
-    p1_rest = scale * (h / 2 * extra_q + extra_v + push_right) - spring
-    balance = at.p0 + scale * (h / 2 * rigid.by_q - rigid.by_v - matrix.T @ lam) + balance_rest
-    p1 = scale * (h / 2 * rigid.by_q + rigid.by_v) + p1_rest
+    balance_rest = scale * (h / 2 * extra_q - extra_v + share * push) - spring
+    p1_rest = scale * (h / 2 * extra_q + extra_v + (1 - share) * push) - spring
+    balance = at.p0 + scale * (h / 2 * rigid.by_q - rigid.by_v - pulls.left.T @ lam) + balance_rest
+    p1 = scale * (h / 2 * rigid.by_q + rigid.by_v - pulls.right.T @ lam) + p1_rest
     if terms.closed is not None:
-        balance += viscous_share * h * scale * terms.closed.force
-        p1 += (1 - viscous_share) * h * scale * terms.closed.force
+        balance += share * h * scale * terms.closed.force
+        p1 += (1 - share) * h * scale * terms.closed.force
     fields = ("by_q", "by_v", "kinetic", "potential", "S", "D", "F", "B", "G")
     closed = terms.closed
     if closed is not None:
@@ -194,6 +235,7 @@ def discrete_equations(system: System, force_split: ForceSplit = "symmetric") ->
     return DiscreteEquations(
         system=system,
         force_split=force_split,
+        constraint_force=constraint_force,
         q0=q0,
         q1=q1,
         z0=z0,
@@ -214,9 +256,8 @@ def discrete_equations(system: System, force_split: ForceSplit = "symmetric") ->
         balance_rest=at.placed(balance_rest),
         p1_rest=at.placed(p1_rest),
         closed=closed,
-        closed_shares=(viscous_share, 1 - viscous_share),
-        constraint_matrix=matrix,
-        pull_by_q=pull_by_q,
+        closed_shares=(share, 1 - share),
+        pulls=pulls,
         row_scale=ca.densify(scale),
     )
 
@@ -250,13 +291,14 @@ class _Symbols:
         own = ca.vertcat(*internal.values()) if internal else ca.SX(0, 1)
         return _Symbols(**symbols, h=symbols["time_step"] * system.time_scale, internal=own)
 
-    def placed(self, expression: ca.SX) -> ca.SX:
-        """An expression of the midpoint as one of the two nodes, dense."""
+    def placed(self, expression: ca.SX, dense: bool = True) -> ca.SX:
+        """An expression of the midpoint as one of the two nodes."""
         h, z = self.h, (self.z0 + self.z1) / 2
         midpoint = ca.vertcat(self.qm, self.vm, self.zm, self.z_rate, self.pull_rate, self.internal)
         q, v = (self.q0 + self.q1) / 2, (self.q1 - self.q0) / h
         values = ca.vertcat(q, v, z, (self.z1 - self.z0) / h, self.lam / h, z)
-        return ca.densify(ca.substitute(expression, midpoint, values))
+        placed = ca.substitute(expression, midpoint, values)
+        return ca.densify(placed) if dense else placed
 
 
 @dataclass(frozen=True)
@@ -325,6 +367,18 @@ def _constraint(system: System, at: _Symbols) -> tuple[ca.SX, ca.SX | None]:
         gain = 1 + relaxation / at.h
         closure = gain * closure + (1 - gain) * phi(at.q0, at.z0)
     return ca.densify(closure - system.constraint_compliance() * at.lam / at.h), gain
+
+
+def _constraint_pulls(system: System, at: _Symbols, middle: Kinematics, share_m: float) -> ConstraintPulls:
+    parts: dict[str, ca.SX] = {}
+    for name, q, z in (("before", at.q0, at.z0), ("after", at.q1, at.z1)):
+        found = _constraint_derivatives(system, forward_kinematics(system.mechanism, q), q, at.lam)
+        parts[name], parts[f"{name}_by_q"] = (ca.substitute(expression, at.internal, z) for expression in found)
+    found = _constraint_derivatives(system, middle, at.qm, at.lam)
+    parts["middle"], parts["middle_by_q"] = (at.placed(expression, dense=False) for expression in found)
+    shared = parts["before"].sparsity() + parts["middle"].sparsity() + parts["after"].sparsity()
+    parts |= {name: ca.project(parts[name], shared) for name in ("before", "middle", "after")}
+    return ConstraintPulls(1.0 - share_m, share_m, **parts)
 
 
 def _constraint_derivatives(system: System, kinematics: Kinematics, q: ca.SX, lam: ca.SX) -> tuple[ca.SX, ca.SX]:

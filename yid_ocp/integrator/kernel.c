@@ -1,7 +1,8 @@
 /* Time stepping of one system: Newton with a kept factorisation, rollout with forward sensitivities, adjoint.
  *
  * The generated part before this text defines the sizes N, NZ, M, NU, NC, NF, NY and NT, counts of nonzeros (NNZ_...),
- * sizes of CasADi's work arrays (SZ_W, SZ_IW), what the system needs (ROW_SCALED, CLOSED, CLOSED_LEFT, CLOSED_RIGHT),
+ * sizes of CasADi's work arrays (SZ_W, SZ_IW), what the system needs (ROW_SCALED, MIDDLE, CLOSED, CLOSED_LEFT,
+ * CLOSED_RIGHT),
  * the index tables and the CasADi functions residual, linear, matrix, pull and scales; see codegen.py.
  *   N coordinates, NZ internal ones, M constraints, NU inputs, NC prescribed and NF free coordinates,
  *   NT = N + NZ + M rows, NY = NF + NZ + M unknowns of a step, NX = 2 N + NZ state (q, p, z).
@@ -30,8 +31,8 @@ typedef struct {
     double balance[ONE(N)], internal[ONE(NZ)], constraint[ONE(M)], p1[ONE(N)];
     double pairs[(30 + 12 * CLOSED) * ONE(N)];
     double rest[ONE(NNZ_REST)], rest_p[ONE(NNZ_REST_P)], by_unknown[ONE(NNZ_CONSTRAINT)];
-    double matrix_nz[ONE(NNZ_MATRIX)], pull_nz[ONE(NNZ_PULL)];
-    double Phi[ONE(M)][ONE(N)];
+    double matrix_nz[ONE(NNZ_MATRIX)], middle_nz[ONE(NNZ_MATRIX)], right_nz[ONE(NNZ_MATRIX)], pull_nz[ONE(NNZ_PULL)];
+    double Phi[ONE(M)][ONE(N)]; /* rows of the multipliers' pull in the balance */
     double R1[ONE(NT)][ONE(NT)], R0[ONE(NT)][ONE(NQZ)], Ru[ONE(NT)][ONE(NU)];
     double P1[ONE(N)][ONE(NT)], P0[ONE(N)][ONE(NQZ)], Pu[ONE(N)][ONE(NU)];
     double A[ONE(NY)][ONE(NY)], LT[ONE(NY)][ONE(NY)], inverse[ONE(NY)];
@@ -69,7 +70,7 @@ static void arguments(const Point *a, const double *args[9]) {
     args[5] = a->lam; args[6] = a->u; args[7] = a->theta; args[8] = a->time_step;
 }
 
-/* Dphi(q_k), kept for the whole step because it does not depend on the unknowns. */
+/* What pulls at node k, kept for the whole step because it does not depend on the unknowns. */
 static void constraint_matrix(Work *k, const Point *a) {
     if (M == 0) return;
     const double *args[9];
@@ -79,16 +80,25 @@ static void constraint_matrix(Work *k, const Point *a) {
     for (int e = 0; e < NNZ_MATRIX; e++) k->Phi[matrix_row[e]][matrix_col[e]] = k->matrix_nz[e];
 }
 
+/* Take the pull of multipliers, or of a change of them, off the balance and p1. */
+static void pull_by(Work *k, const double *lam) {
+    for (int e = 0; e < NNZ_MATRIX; e++) {
+        const int i = matrix_col[e], c = matrix_row[e];
+        const double force = k->row_scale[i] * lam[c];
+        k->balance[i] -= k->Phi[c][i] * force;
+        if (MIDDLE) k->p1[i] -= k->right_nz[e] * force;
+    }
+}
+
 /* Full rows of the balance (N), internal (NZ) and constraint (M) equations at the point; p1 on the way. */
 static int evaluate(Work *k, const Point *a) {
     const double *args[9];
-    double *res[4] = {k->balance, k->internal, k->constraint, k->p1};
+    double *res[6] = {k->balance, k->internal, k->constraint, k->p1, k->middle_nz, k->right_nz};
     arguments(a, args);
     residual(args, res, k->iw, k->w, 0);
-    for (int c = 0; c < M; c++) {
-        double force = a->lam[c];
-        for (int i = 0; i < N; i++) k->balance[i] -= k->row_scale[i] * k->Phi[c][i] * force;
-    }
+    for (int e = 0; MIDDLE && e < NNZ_MATRIX; e++)
+        k->Phi[matrix_row[e]][matrix_col[e]] = k->matrix_nz[e] + k->middle_nz[e];
+    pull_by(k, a->lam);
     double sum = 0;
     for (int i = 0; i < NF; i++) sum += (k->r[i] = k->balance[free_index[i]]);
     for (int i = 0; i < NZ; i++) sum += (k->r[NF + i] = k->internal[i]);
@@ -200,6 +210,10 @@ static void linearise(Work *k, const Point *a, int everything) {
         if (column < NT) k->P1[rest_p_row[e]][column] += k->rest_p[e];
         else if (column < NT + NQZ) k->P0[rest_p_row[e]][column - NT] += k->rest_p[e];
         else k->Pu[rest_p_row[e]][column - NT - NQZ] += k->rest_p[e];
+    }
+    for (int e = 0; MIDDLE && e < NNZ_MATRIX; e++) {
+        const int i = matrix_col[e];
+        k->P1[i][N + NZ + matrix_row[e]] -= k->row_scale[i] * k->right_nz[e];
     }
     if (M > 0) {
         double *pulls[1] = {k->pull_nz};
@@ -326,16 +340,11 @@ static void advance(const Point *a, const double *delta, double factor) {
     for (int i = 0; i < M; i++) a->lam[i] += factor * delta[NF + NZ + i];
 }
 
-/* Last correction of the multipliers, and of the balance at prescribed coordinates, which gives the effort. */
+/* Last correction of the multipliers, and of what they pull at: p1, and the balance, which gives the effort. */
 static void settle_multipliers(Work *k, const Point *a, const double *delta) {
-    for (int c = 0; c < M; c++) {
-        const double change = delta[NF + NZ + c];
-        a->lam[c] += change;
-        for (int j = 0; j < NC; j++) {
-            const int at = prescribed_index[j];
-            k->balance[at] -= k->row_scale[at] * k->Phi[c][at] * change;
-        }
-    }
+    const double *change = delta + NF + NZ;
+    for (int c = 0; c < M; c++) a->lam[c] += change[c];
+    if (MIDDLE || NC) pull_by(k, change);
 }
 
 /* Simplified Newton with the factorisation at hand; refactorises where it contracts slowly. */
@@ -750,6 +759,7 @@ int yid_adjoint(const Motion *motion, const Trajectory *rollout, const Partials 
         memcpy(lam, rollout->multipliers + (size_t)step * M, sizeof(double) * M);
         Point a = {x, x + N, x + 2 * N, u, motion->theta, &motion->time_step, q1, z1, lam};
         constraint_matrix(k, &a);
+        if (MIDDLE) evaluate(k, &a);
         linearise(k, &a, 1);
         if (NY && (status = factorise(k))) break;
         const double *weight = costate + N, *effort = by->effort ? by->effort + (size_t)step * NC : NULL;

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import ModelError
 from yid_ocp.integrator.mapped import Mapped
-from yid_ocp.integrator.step import Step, compile_step
+from yid_ocp.integrator.step import Step, compile_alike
 from yid_ocp.integrator.step_model import Feedback
 from yid_ocp.model.system import Effect, System
 
@@ -81,7 +81,7 @@ def lqr_filter(
     reference, torques = np.asarray(measured, float), np.asarray(torque, float)
     system = step.system
     arms = _arms_only(system)
-    arm_step = compile_step(arms, step.time_step, step.force_split, use_compiler=step.compiled)
+    arm_step = compile_alike(step, arms)
     values = dict(zip(system.parameters.names, np.asarray(theta, float), strict=True))
     arm_theta = arms.parameters.vector({name: values[name] for name in arms.parameters.names})
     nu = len(system.driven)
@@ -133,8 +133,9 @@ class MomentumShift:
             q = ca.SX(ca.DM.zeros(system.size))
             q[driven] = arm
             whole.append(q)
-        zero = ca.SX(ca.DM.zeros(e.z0.numel()))
-        [momentum] = ca.substitute([ca.densify(e.p1[driven])], [e.q0, e.q1, e.z0, e.z1], [*whole, zero, zero])
+        zero, free = ca.SX(ca.DM.zeros(e.z0.numel())), ca.SX(ca.DM.zeros(e.lam.numel()))
+        old, new = [e.q0, e.q1, e.z0, e.z1, e.lam], [*whole, zero, zero, free]
+        [momentum] = ca.substitute([ca.densify(e.p1[driven])], old, new)
         pattern = np.array(ca.DM(ca.jacobian_sparsity(momentum, e.theta), 1)).any(axis=0)
         neutral = {name: value for effect in system.effects for name, value in _neutral(effect).items()}
         columns = [i for i in np.flatnonzero(pattern) if system.parameters.names[i] in neutral]

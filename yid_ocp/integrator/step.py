@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from yid_ocp.errors import ModelError
 from yid_ocp.integrator import codegen, compiler
 from yid_ocp.integrator.compiled import CompiledKernel
-from yid_ocp.integrator.discrete import DiscreteEquations, ForceSplit
+from yid_ocp.integrator.discrete import ConstraintForce, DiscreteEquations, ForceSplit
 from yid_ocp.integrator.interpreted import InterpretedKernel
 from yid_ocp.integrator.step_model import Directions as Directions
 from yid_ocp.integrator.step_model import Feedback as Feedback
@@ -54,6 +54,11 @@ class Step:
     def force_split(self) -> ForceSplit:
         """How the force of a step is shared between its ends."""
         return self.model.equations.force_split
+
+    @property
+    def constraint_force(self) -> ConstraintForce:
+        """Where the constraints pull."""
+        return self.model.equations.constraint_force
 
     @property
     def equations(self) -> DiscreteEquations:
@@ -172,6 +177,7 @@ def compile_step(
     system: System,
     time_step: float,
     force_split: ForceSplit = "symmetric",
+    constraint_force: ConstraintForce = "midpoint",
     *,
     use_compiler: bool = True,
     tolerance: float | None = None,
@@ -183,8 +189,11 @@ def compile_step(
     system : System
     time_step : float
         h [s], positive.
-    force_split : "symmetric", "left" or "left_damping"
-        Order two; the rule of the paper's engine; or order two but for the dampers (see `discrete_equations`).
+    force_split : "symmetric" or "left"
+        Order two, or the rule of the paper's engine.
+    constraint_force : "node" or "midpoint"
+        Where the constraints pull: as in the paper's engine, or so that no tension makes the motion grow (see
+        `discrete_equations`).
     use_compiler : bool
         Whether to generate and compile C; without a compiler on the machine the interpreter is used with one notice.
     tolerance : float, optional
@@ -197,16 +206,22 @@ def compile_step(
     Raises
     ------
     ModelError
-        Time step not positive, unknown force split.
+        Time step not positive, unknown force split or constraint force.
     """
     if not (math.isfinite(time_step) and time_step > 0):
         raise ModelError(f"time_step = {time_step}", allowed="a positive number of seconds")
-    model = step_model(system, time_step, force_split, tolerance)
+    model = step_model(system, time_step, force_split, constraint_force, tolerance)
     source = codegen.kernel_source(model.functions, model.structure) if use_compiler else None
     library = None if source is None else compiler.compile_library(source)
     if library is None:
         return Step(model, InterpretedKernel(model), compiled=False)
     return Step(model, CompiledKernel(model, library), compiled=True)
+
+
+def compile_alike(step: Step, system: System, *, use_compiler: bool | None = None) -> Step:
+    """The step of another system by the same rules, with the same kind of kernel where nothing else is said."""
+    compiled = step.compiled if use_compiler is None else use_compiler
+    return compile_step(system, step.time_step, step.force_split, step.constraint_force, use_compiler=compiled)
 
 
 def check_shape(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from yid_ocp.errors import ModelError, ResourceError
 from yid_ocp.integrator import codegen
-from yid_ocp.integrator.discrete import DiscreteEquations, ForceSplit, discrete_equations
+from yid_ocp.integrator.discrete import ConstraintForce, DiscreteEquations, ForceSplit, discrete_equations
 from yid_ocp.model.system import System
 
 Array = NDArray[np.float64]
@@ -53,9 +53,15 @@ class StepModel:
     tolerance: float
 
 
-def step_model(system: System, time_step: float, force_split: ForceSplit, tolerance: float | None = None) -> StepModel:
+def step_model(
+    system: System,
+    time_step: float,
+    force_split: ForceSplit,
+    constraint_force: ConstraintForce,
+    tolerance: float | None = None,
+) -> StepModel:
     """Equations, functions and tables of a system's step; see `compile_step`."""
-    e = discrete_equations(system, force_split)
+    e = discrete_equations(system, force_split, constraint_force)
     functions = codegen.step_functions(e)
     n, nz = system.size, e.z0.numel()
     sizes = {

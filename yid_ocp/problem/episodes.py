@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -14,13 +15,13 @@ from yid_ocp.integrator.lqr import lqr_filter, proportional_filter
 from yid_ocp.integrator.step import Feedback, Step, check_shape
 from yid_ocp.problem.functions import ModelFunctions
 from yid_ocp.problem.grid import Grid, make_grid
-from yid_ocp.problem.inputs import held_torque, joint_loads, prescribed_path
+from yid_ocp.problem.inputs import held_torque, joint_loads, measured_angles, prescribed_path
 from yid_ocp.problem.low_pass import LowPass
 from yid_ocp.problem.measurements import Measurements, paper_weighting, placed
 from yid_ocp.problem.noise import InputErrors, input_errors
 from yid_ocp.problem.options import ProblemOptions, SensorOptions
 from yid_ocp.problem.start import FittedStart
-from yid_ocp.sensors import SENSORS, Surroundings, joint_columns
+from yid_ocp.sensors import SENSORS, Surroundings
 from yid_ocp.sensors.joints import POSITION
 
 Array = NDArray[np.float64]
@@ -100,13 +101,17 @@ def prepare_episode(functions: ModelFunctions, recording: Recording, options: Pr
         raise DataError("the model's arms are driven but the recording has no joints", where=recording.name)
     low_pass = LowPass(options.path_cutoff)
     path = prescribed_path(recording, system, grid, low_pass, options.clamps)
-    torque, arm = _driving(recording, system.driven, grid)
+    arm = smooth = np.zeros((grid.steps + 1, 0))
+    torque = np.zeros((grid.steps, 0))
+    if recording.joints is not None:
+        read = (recording.joints, system.driven, grid, recording.name)
+        torque, arm = held_torque(*read), measured_angles(*read, LowPass(math.inf))
+        smooth = measured_angles(*read, low_pass) if options.feedback == "lqr" else arm
     samples = _samples(step, recording, options, theta, grid)
     known = (*system.driven, *system.prescribed)
     load = np.zeros((grid.steps + 1, len(known)))
     if functions.corrections.angles_need_effort:
         load = joint_loads(recording, known, grid, low_pass)
-    differenced = bool(system.driven) and options.feedback == "lqr"
     start = options.known_start.get(recording.name)
     episode = Episode(
         recording,
@@ -117,7 +122,7 @@ def prepare_episode(functions: ModelFunctions, recording: Recording, options: Pr
         arm,
         samples,
         load,
-        low_pass(grid.times, arm) if differenced else arm,
+        smooth,
         values=options.recording_values.get(recording.name, {}),
         errors=None
         if options.weighting == "paper"
@@ -171,16 +176,6 @@ def apparent_inertia(step: Step, theta: Array, names: tuple[str, ...]) -> Array:
     plus, _, lower, upper = (pairs[6 * n * i : 6 * n * (i + 1)].reshape(6, n) for i in range(4))
     mass = np.sum(plus * (upper - lower), axis=0) * step.time_step / 2
     return np.asarray(mass[[step.system.mechanism.joint_index(name) for name in names]])
-
-
-def _driving(recording: Recording, driven: tuple[str, ...], grid: Grid) -> tuple[Array, Array]:
-    """Torque of the driven joints over every step and their measured angles at every node."""
-    joints = recording.joints
-    if joints is None or not driven:
-        return np.zeros((grid.steps, 0)), np.zeros((grid.steps + 1, 0))
-    angles = joints.position[:, joint_columns(joints, driven, recording.name)]
-    arm = np.stack([np.interp(grid.times, joints.t, column) for column in angles.T], axis=1)
-    return held_torque(joints, driven, grid, recording.name), arm
 
 
 def _samples(

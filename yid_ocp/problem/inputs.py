@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Literal
 
 import numpy as np
 import scipy.interpolate
@@ -24,7 +23,10 @@ Array = NDArray[np.float64]
 def held_torque(
     joints: JointGroup, driven: tuple[str, ...], grid: Grid, where: str, delay: Array | None = None
 ) -> Array:
-    """Mean over every step of the effort, taken as held from sample to sample, shape (steps, nu) [N m].
+    """Mean over every step of the torque that the recorded effort stands for, shape (steps, nu) [N m].
+
+    What is held from sample to sample (`command`) jumps; through samples goes a cubic spline, and where means over the
+    recorded intervals are given, the derivative of one through their sums, which keeps every mean.
 
     Parameters
     ----------
@@ -49,35 +51,46 @@ def held_torque(
             where=f"{where}: joints/effort",
             hint="prescribe the arms' motion instead (model.arms.mode: prescribed)",
         )
-    effort = joints.effort[:, joint_columns(joints, driven, where)]
-    widths = np.diff(joints.t)
-    total = np.vstack([np.zeros((1, effort.shape[1])), np.cumsum(effort[:-1] * widths[:, None], axis=0)])
-    # the last sample is held as long as the one before it
-    t = np.append(joints.t, joints.t[-1] + widths[-1])
-    total = np.vstack([total, total[-1] + effort[-1] * widths[-1]])
     late = np.zeros(len(driven)) if delay is None else delay
-    # before the first sample and after the last one torque is held
-    parts = (
-        scipy.interpolate.interp1d(t, column, bounds_error=False, fill_value="extrapolate")(grid.times - shift)
-        for column, shift in zip(total.T, late, strict=True)
-    )
-    return np.asarray(np.diff(np.stack(list(parts), axis=1), axis=0) / grid.time_step)
+    courses = _torque_courses(joints, driven, where)
+    total = [_summed(course, grid.times - shift) for course, shift in zip(courses, late, strict=True)]
+    return np.asarray(np.diff(np.stack(total, axis=1), axis=0) / grid.time_step)
 
 
 def held_torque_slope(joints: JointGroup, driven: tuple[str, ...], grid: Grid, where: str, delay: Array) -> Array:
     """Derivative of `held_torque` by each joint's delay, shape (steps, nu) [N m/s]; at a jump the mean of two sides."""
-    assert joints.effort is not None
-    effort = joints.effort[:, joint_columns(joints, driven, where)]
-
-    def held(times: Array, column: Array, side: Literal["left", "right"]) -> Array:
-        near = 1e-9 if side == "right" else -1e-9
-        return np.asarray(column[np.clip(np.searchsorted(joints.t, times + near, side) - 1, 0, len(column) - 1)])
-
     result = []
-    for column, shift in zip(effort.T, delay, strict=True):
-        at = grid.times - shift
-        result.append(-np.diff(held(at, column, "left") + held(at, column, "right")) / 2 / grid.time_step)
+    for course, shift in zip(_torque_courses(joints, driven, where), delay, strict=True):
+        sides = (course(np.clip(grid.times - shift + near, *course.x[[0, -1]])) for near in (-1e-9, 1e-9))
+        result.append(-np.diff(sum(sides)) / 2 / grid.time_step)
     return np.stack(result, axis=1)
+
+
+def _torque_courses(joints: JointGroup, driven: tuple[str, ...], where: str) -> list[scipy.interpolate.PPoly]:
+    """Torque of each joint over time, between the first sample and the end of what the last one stands for."""
+    assert joints.effort is not None
+    effort, t = joints.effort[:, joint_columns(joints, driven, where)], joints.t
+    if joints.effort_taken_as == "sample":
+        return [scipy.interpolate.CubicSpline(t, column) for column in effort.T]
+    # the last sample stands for as long as the one before it
+    edges = np.append(t, 2 * t[-1] - t[-2])
+    if joints.effort_taken_as == "command":
+        return [scipy.interpolate.PPoly(column[None, :], edges) for column in effort.T]
+    sums = np.vstack([np.zeros((1, len(driven))), np.cumsum(effort * np.diff(edges)[:, None], axis=0)])
+    return [scipy.interpolate.CubicSpline(edges, column).derivative() for column in sums.T]
+
+
+def _summed(course: scipy.interpolate.PPoly, t: Array) -> Array:
+    """Integral of a torque up to times, shape of t; before its first moment and after its last it is held."""
+    inside = np.clip(t, *course.x[[0, -1]])
+    return np.asarray(course.antiderivative()(inside) + course(inside) * (t - inside))
+
+
+def measured_angles(joints: JointGroup, names: tuple[str, ...], grid: Grid, where: str, low_pass: LowPass) -> Array:
+    """Smoothed angles of joints at every node, without kinks between samples, shape (steps + 1, len(names)) [rad]."""
+    values = low_pass(joints.t, joints.position[:, joint_columns(joints, names, where)])
+    spline = scipy.interpolate.CubicSpline(joints.t, values, axis=0)
+    return np.asarray(spline(np.clip(grid.times, *joints.t[[0, -1]])))
 
 
 def joint_loads(recording: Recording, names: tuple[str, ...], grid: Grid, low_pass: LowPass) -> Array:
@@ -138,9 +151,7 @@ def prescribed_path(
                 f"joint '{remaining[0]}' is prescribed but the recording has no joints", where=recording.name
             )
         joints = recording.joints
-        values = low_pass(joints.t, joints.position[:, joint_columns(joints, remaining, recording.name)])
-        spline = scipy.interpolate.CubicSpline(joints.t, values, axis=0)
-        sampled = spline(np.clip(grid.times, joints.t[0], joints.t[-1]))
+        sampled = measured_angles(joints, remaining, grid, recording.name, low_pass)
         course.update({name: sampled[:, i] for i, name in enumerate(remaining)})
     return np.stack([course[name] for name in system.prescribed], axis=1)
 

@@ -112,7 +112,7 @@ class StartFit:
             for index, spring in zip(at, system.elastic, strict=True)
             if f"{spring.joint}.{PRESET[0]}" in system.parameters
         )
-        self._load = ca.Function("load", e.arguments, [e.rigid.by_q, e.constraint_matrix])
+        self._load = ca.Function("load", e.arguments, [e.rigid.by_q, e.pulls.before])
 
     def solve(
         self, posture: Array, samples: Sequence[Measurements], theta: Array, window: float, path: Array

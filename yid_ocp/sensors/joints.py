@@ -176,7 +176,9 @@ def measured_efforts(around: Surroundings) -> list[SensorData]:
         return []
     times, low_pass, where = around.times, around.low_pass, around.recording.name
     effort = low_pass(joints.t, joints.effort[:, joint_columns(joints, names, where)])
-    measured = np.stack([np.interp(times, joints.t, column) for column in effort.T], axis=1)
+    # what stands for an interval belongs to its middle
+    late = 0.0 if joints.effort_taken_as == "sample" else 0.5 * float(np.median(np.diff(joints.t)))
+    measured = np.stack([np.interp(times, joints.t + late, column) for column in effort.T], axis=1)
     std = _smoothed_effort_std(around, names, choice, float(np.median(np.diff(joints.t))))
     # Smoothed values repeat their neighbours: only as many are kept as count as independent. Both ends are left out:
     # the filter sees one side alone there, the impulse at node 0 depends on the motion before the recording and that at

@@ -84,7 +84,7 @@ class Lifted:
     Albersmeyer and Diehl (2010), SIAM J. Optim. 20(3):1655, doi:10.1137/080724885.
     """
 
-    node_interval: Annotated[int, Ge(1), About("steps between nodes")] = 10
+    node_interval: Annotated[int, Ge(1), About("steps between nodes")] = 20
     iterations: Annotated[int, Ge(1), About("limit on accepted steps")] = 80
     step_tolerance: Annotated[
         float, Gt(0), About("converged when no unknown moves by more than this fraction of its size")

@@ -219,6 +219,7 @@ def _joints(system: System, run: SimulatedRun, noise: ArmNoise, streams: Generat
         position_std=noise.position,
         velocity_std=noise.velocity,
         effort_std=noise.effort,
+        effort_kind="command",
     )
 
 

@@ -387,7 +387,7 @@ def build_step(run: Run, system: System | None = None) -> Step:
     """The compiled step of a run."""
     said = run.problem
     system = build_system(run) if system is None else system
-    return compile_step(system, said.time_step, said.force_split, use_compiler=said.compiler)
+    return compile_step(system, said.time_step, said.force_split, said.constraint_force, use_compiler=said.compiler)
 
 
 def problem_options(run: Run, parameters: Parameters, recordings: Sequence[Recording] = ()) -> ProblemOptions:

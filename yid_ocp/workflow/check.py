@@ -111,6 +111,12 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
         recorded = 1.0 / float(np.median(np.diff(joints.t)))
         if recorded < 0.5 * rate:
             warnings.append(f"{episode.name}: joints come at {recorded:.4g} Hz, the model steps at {rate:.4g} Hz")
+        moves = system.driven or any(samples.sensor.efforts for samples in episode.samples)
+        if moves and joints.effort is not None and joints.effort_kind is None:
+            warnings.append(
+                f"{episode.name}: nothing says whether joints/effort is a sample, a mean or a command (attribute "
+                f"effort_kind); it is taken as a {joints.effort_taken_as}"
+            )
     if problem.options.initial_state != "fitted_to_points" and (system.driven or system.prescribed or system.elastic):
         torque = episode.torque[0] if system.driven else None
         rest = problem.functions.statics.solve(
@@ -147,23 +153,24 @@ def refine(run: Run, problem: EstimationProblem | None, warnings: list[str]) -> 
     posture = _posture(system, problem)
     if posture is None:
         return {"links": [], "time_step": [], "message": "no posture is known: the run names no recording"}
-    theta, split, guess = system.parameters.vector(), run.problem.force_split, None
+    theta, guess = system.parameters.vector(), None
+    rule = (run.problem.force_split, run.problem.constraint_force)
     if problem is not None:
         first = problem.episodes[0]
         theta = problem.predictor.own_theta(first, theta)
         guess = None if first.start is None else first.start.state[: system.size]
-    own = natural_frequencies(system, posture, theta, h, split, guess)
+    own = natural_frequencies(system, posture, theta, h, *rule, guess)
     if own.message:
         return {"links": [], "time_step": [], "message": own.message}
     if own.growing:
-        remedy = "problem.force_split: left_damping, " if split == "symmetric" else ""
+        remedy = "problem.constraint_force: midpoint, " if rule[1] == "node" and system.grasps else ""
         warnings.append(
             f"{own.growing} modes grow from step to step about the first posture: take a shorter problem.time_step, "
             f"{remedy}or more damping"
         )
     values = dict(zip(system.parameters.names, theta, strict=True))
     steps = [_row(h, own)]
-    steps += [_row(h / k, natural_frequencies(system, posture, theta, h / k, split, guess)) for k in (2, 4)]
+    steps += [_row(h / k, natural_frequencies(system, posture, theta, h / k, *rule, guess)) for k in (2, 4)]
     _warn(warnings, "the time step goes", "s", steps, len(steps) - 1, 0)
     count = object_links(run)
     rows = []
@@ -178,7 +185,7 @@ def refine(run: Run, problem: EstimationProblem | None, warnings: list[str]) -> 
                     if name in other.parameters
                 }
             )
-            found = own if links == count else natural_frequencies(other, posture, scaled, h, split)
+            found = own if links == count else natural_frequencies(other, posture, scaled, h, *rule)
             rows.append(_row(links, found))
         _warn(warnings, "the links go", "", rows, len(rows) - 1, [row["value"] for row in rows].index(count))
     return {"links": rows, "time_step": steps, "message": ""}

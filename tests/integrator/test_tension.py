@@ -1,0 +1,76 @@
+"""A grasped object under tension: what the pull's own stiffness does to a step, and to its multipliers."""
+
+from __future__ import annotations
+
+from importlib import resources
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from yid_ocp.data import read_recording
+from yid_ocp.integrator.lqr import lqr_filter
+from yid_ocp.integrator.rollout import simulate
+from yid_ocp.integrator.statics import Statics
+from yid_ocp.integrator.step import compile_step
+
+TRUTH = {"T1.bend": 22.0, "T1.twist": 13.6, "T2.bend": 10.7, "T2.twist": 8.2, "T3.bend": 11.5, "T3.twist": 9.7}
+
+
+@pytest.fixture(scope="module")
+def two_arms(paper_systems):
+    """two_arms(time_step, constraint_force): five seconds of another engine's motion, rolled out at its parameters."""
+    system = paper_systems["dual"]
+    folder = resources.files("yid_ocp.data") / "defaults"
+    joints = read_recording(folder / "dual_arm_no_vision_estimate.h5").joints
+    theta = system.parameters.vector(TRUTH)
+
+    def roll(every, constraint_force):
+        h = 0.01 * every
+        step = compile_step(system, h, "symmetric", constraint_force)
+        arm = joints.position[::every]
+        steps = len(arm) - 1
+        torque = joints.effort[: steps * every].reshape(steps, every, -1).mean(axis=1)
+        rest = Statics(step).solve(arm[0], theta, torque[0])
+        assert rest.converged, rest.message
+        feedback = lqr_filter(step, arm, torque, theta)
+        return simulate(step, theta, rest.state, steps, torque, feedback=feedback), h
+
+    return roll
+
+
+def alternation(rollout, h):
+    """Largest second difference of the constraint forces, as a part of the largest force."""
+    force = rollout.multipliers / h
+    return np.max(np.abs(np.diff(force, 2, axis=0))) / np.max(np.abs(force))
+
+
+def test_two_arms_hold_their_object_under_tension_without_growth(two_arms):
+    at_node, h = two_arms(2, "node")
+    assert not at_node.status.ok or alternation(at_node, h) > 0.5
+    coarse, h = two_arms(2, "midpoint")
+    assert coarse.status.ok, coarse.status.message
+    fine, half = two_arms(1, "midpoint")
+    assert fine.status.ok, fine.status.message
+    # 500 steps, driven by torque that jumps from sample to sample
+    assert alternation(coarse, h) < 0.05
+    assert alternation(fine, half) < 0.05
+    np.testing.assert_allclose(fine.state[::2, :50], coarse.state[: len(fine.state[::2]), :50], atol=5e-3)
+
+
+def test_a_loop_without_damping_keeps_its_energy(parts, urdf_folder):
+    system, q = parts.closed_loop(urdf_folder)
+    names = [name for name in system.parameters.names if name.endswith(".damping")]
+    step = compile_step(system, 0.01)
+    start = np.concatenate([q, np.zeros(step.sizes["n"] + step.sizes["nz"])])
+    theta = system.parameters.vector(dict.fromkeys(names, 0.0))
+    rollout = simulate(step, theta, start, 4000)
+    assert rollout.status.ok, rollout.status.message
+    e = step.equations
+    parts_of_energy = [e.rigid.kinetic, e.rigid.kinetic + e.rigid.potential]
+    function = ca.Function("energy", [e.q0, e.q1, e.theta, e.time_step], parts_of_energy)
+    states = rollout.state[:, : system.size]
+    kinetic, energy = (np.array(x).ravel() for x in function(states[:-1].T, states[1:].T, theta, 0.01))
+    # it falls along its slide as it swings
+    assert np.ptp(kinetic) > 1e3
+    assert np.ptp(energy) < 1e-6 * np.ptp(kinetic)
