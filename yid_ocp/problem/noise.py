@@ -61,6 +61,8 @@ class InputErrors:
         Steps over which the noise of one encoder sample reaches through interpolation.
     encoders : bool
         Whether the encoders are measurements.
+    offset : ndarray, shape (nu,)
+        Value of b that is taken off the recorded torque [N m], so that what is linearised is small.
     """
 
     torque_std: Array
@@ -69,6 +71,7 @@ class InputErrors:
     sample: Rows
     spread: float
     encoders: bool
+    offset: Array
 
 
 def input_errors(
@@ -112,6 +115,7 @@ def input_errors(
         sample.astype(np.int64),
         max(1.0, period / grid.time_step),
         encoders,
+        np.zeros(len(driven)),
     )
 
 
@@ -136,11 +140,14 @@ class Innovations:
     ----------
     steps : tuple of _FilterStep
         One for every node.
+    offset : ndarray, shape (nu,)
+        Value of b about which it is linearised [N m].
     bias_std : ndarray, shape (nu,)
         Standard deviation of b after all measurements [N m].
     """
 
     steps: tuple[_FilterStep, ...]
+    offset: Array
     bias_std: Array
 
     def whitened(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
@@ -149,18 +156,20 @@ class Innovations:
         Parameters
         ----------
         rows : ndarray, shape (r, c)
-            Columns of a residual, or of its derivative, in units of the sensors' noise.
+            A residual in units of the sensors' noise, then columns of its derivative.
         push : ndarray, shape (N, nu, c), or None
-            The tracking filter's correction of the torque, or its derivative [N m].
+            The tracking filter's correction of the torque, and its derivative [N m].
 
         Returns
         -------
         innovations : ndarray, shape (r, c)
         bias : ndarray, shape (nu, c)
-            Estimate of b from all rows [N m].
+            Estimate of b from all rows [N m], and its derivative.
         """
         result = np.empty_like(rows)
         mean = np.zeros((len(self.steps[0].transition), rows.shape[1]))
+        last = len(mean) - len(self.offset)
+        mean[last:, 0] = -self.offset
         for k, step in enumerate(self.steps):
             own = rows[step.rows]
             gap = own - step.observe @ mean
@@ -169,7 +178,8 @@ class Innovations:
                 gap -= step.ahead @ push[k]
                 mean += step.push @ push[k]
             result[step.rows] = step.whiten @ gap
-        return result, mean[len(mean) - len(self.bias_std) :]
+        mean[last:, 0] += self.offset
+        return result, mean[last:]
 
 
 @dataclass(frozen=True)
@@ -246,7 +256,7 @@ def innovations(course: Course, errors: InputErrors) -> Innovations:
         if here is not None:
             covariance = transition @ covariance @ transition.T + noise
             covariance = 0.5 * (covariance + covariance.T)
-    return Innovations(tuple(made), np.sqrt(np.maximum(np.diag(covariance)[nx + nu :], 0.0)))
+    return Innovations(tuple(made), errors.offset, np.sqrt(np.maximum(np.diag(covariance)[nx + nu :], 0.0)))
 
 
 def _moved(

@@ -184,6 +184,9 @@ class Predictor:
             Parameters by which to differentiate.
         """
         inputs = self._corrected(episode, theta, wanted)
+        if episode.errors is not None:
+            offset = episode.errors.offset
+            inputs = replace(inputs, torque=inputs.torque - offset, first_torque=inputs.first_torque - offset)
         if not self.system.driven or self.options.feedback != "lqr":
             return inputs
         shift = self.functions.momentum_shift
@@ -274,8 +277,12 @@ class Predictor:
             by_correction,
         )
 
-    def innovations(self, episode: Episode, theta: Array, offset: Array, guess: Array | None) -> Innovations | None:
-        """The filter that whitens an episode's residual, frozen at these unknowns; None where nothing drives it wrong.
+    def weighted(
+        self, episode: Episode, theta: Array, offset: Array, guess: Array | None, before: Innovations | None
+    ) -> tuple[Episode, Innovations | None]:
+        """The filter that whitens an episode's residual, frozen at these unknowns, and the episode that it belongs to.
+
+        None for the filter where nothing drives the motion wrong, or where the episode cannot be rolled out.
 
         Parameters
         ----------
@@ -285,19 +292,34 @@ class Predictor:
             Of an estimated start.
         guess : ndarray, shape (n,), or None
             Configuration near the equilibrium.
+        before : Innovations or None
+            The episode's filter, where it has one already: the new one is about the torque offsets that it sees.
         """
         if episode.errors is None:
-            return None
-        result = self.run(episode, theta, offset, False, guess)
+            return episode, None
+        result, errors = self.run(episode, theta, offset, False, guess), episode.errors
+        if before is not None and not isinstance(result, str) and np.any(errors.bias_std > 0):
+            errors = replace(errors, offset=self.torque_offset(episode, result, before))
+            episode = replace(episode, errors=errors)
+            result = self.run(episode, theta, offset, False, guess)
         if isinstance(result, str):
-            return None
+            return episode, None
+        return episode, innovations(self._course(episode, result, theta), errors)
+
+    def torque_offset(self, episode: Episode, result: EpisodeResult, whitening: Innovations) -> Array:
+        """Constant error of every driven joint's torque, as all measurements of an episode have it, (nu,) [N m]."""
+        push = None if result.correction is None else result.correction[:, :, None]
+        rows = [s.rows(y).residual for s, y in zip(episode.samples, result.predicted, strict=True)]
+        return whitening.whitened(np.concatenate(rows)[:, None], push)[1][:, 0]
+
+    def _course(self, episode: Episode, result: EpisodeResult, theta: Array) -> Course:
         own, rollout = self.own_theta(episode, theta), result.rollout
         late = (self.lateness(samples, own, ()) for samples in episode.samples)
         nx, nu = self.step.sizes["nx"], self.step.sizes["nu"]
         by_angles, by_torque = np.zeros((nx, nu)), np.zeros((nx, nu))
         if result.rest is not None:
             by_angles, by_torque = result.rest.by_posture[:, :nu], result.rest.by_torque
-        course = Course(
+        return Course(
             self.functions,
             own,
             rollout,
@@ -307,7 +329,6 @@ class Predictor:
             by_angles,
             by_torque,
         )
-        return innovations(course, episode.errors)
 
     def along(self, samples: Measurements, state: Array, by_state: Array, theta: Array) -> tuple[Array, Array]:
         """Readings along a given trajectory and their derivatives.

@@ -332,10 +332,9 @@ class EstimationProblem:
             result = None if whitening is None else self.predictor.run(self.episodes[i], *self.split(x, i), False)
             if whitening is None or result is None or isinstance(result, str):
                 found.append(None)
-                continue
-            push = None if result.correction is None else result.correction[:, :, None]
-            rows = joined(self.episodes[i].samples, result).residual[:, None]
-            found.append((whitening.whitened(rows, push)[1][:, 0], whitening.bias_std))
+            else:
+                value = self.predictor.torque_offset(self.episodes[i], result, whitening)
+                found.append((value, whitening.bias_std))
         return found
 
     def gradient(
@@ -505,6 +504,7 @@ class EstimationProblem:
         """The same problem with residuals weighted by all noise, that which drives the motion too, frozen at `x`.
 
         The problem itself where nothing is wrong with its torques and angles, or where it cannot be rolled out at `x`.
+        Of a problem that is weighted already, the new weights are about the torque offsets that the old ones see.
 
         Parameters
         ----------
@@ -515,15 +515,15 @@ class EstimationProblem:
         x = np.asarray(x, float)
         guesses = warm or (None,) * len(self.episodes)
 
-        def one(i: int) -> Innovations | None:
-            return self.predictor.innovations(self.episodes[i], *self.split(x, i), guesses[i])
+        def one(i: int) -> tuple[Episode, Innovations | None]:
+            return self.predictor.weighted(self.episodes[i], *self.split(x, i), guesses[i], self.innovations[i])
 
         if not self.disturbed:
             return self
-        made = map_threads(one, range(len(self.episodes)))
-        if any(m is None and e.errors is not None for m, e in zip(made, self.episodes, strict=True)):
+        episodes, made = zip(*map_threads(one, range(len(self.episodes))), strict=True)
+        if any(m is None and e.errors is not None for m, e in zip(made, episodes, strict=True)):
             return self
-        return self._changed(innovations=tuple(made), held_out_innovations=())
+        return self._changed(episodes=episodes, innovations=made, held_out_innovations=())
 
     def held_out_weighted_at(self, x: ArrayLike) -> EstimationProblem:
         """The same problem with the residuals of held-out recordings weighted like this as well, for `held_out_rows`.
@@ -532,12 +532,15 @@ class EstimationProblem:
         """
         x = np.asarray(x, float)
         theta = self._held_out_theta(x)
-        made = []
+        episodes, made = [], []
         for held in self.held_out:
-            episode = self._held_out_episode(held, theta)
+            episode, whitening = self._held_out_episode(held, theta), None
             offset = self._held_out_offset(episode, theta, x)
-            made.append(self.predictor.innovations(episode, theta, offset, None))
-        return self._changed(held_out_innovations=tuple(made))
+            for _ in range(2):
+                episode, whitening = self.predictor.weighted(episode, theta, offset, None, whitening)
+            episodes.append(replace(held, errors=episode.errors))
+            made.append(whitening)
+        return self._changed(held_out=tuple(episodes), held_out_innovations=tuple(made))
 
     def held_out_rows(self, i: int, episode: Episode, result: EpisodeResult) -> Rows:
         """Residual of a held-out recording, from its place and what `validate` says of it.

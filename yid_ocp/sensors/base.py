@@ -151,6 +151,8 @@ class JointData(Protocol):
     @property
     def effort_bias_std(self) -> float | Array | None: ...  # noqa: D102
     @property
+    def effort_taken_as(self) -> str: ...  # noqa: D102
+    @property
     def position_std(self) -> float | Array | None: ...  # noqa: D102
 
 
