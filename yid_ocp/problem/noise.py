@@ -236,7 +236,12 @@ def innovations(course: Course, errors: InputErrors) -> Innovations:
     made, linear = [], linear_steps(step, course.theta, course.rollout)
     for k in range(count + 1):
         here = next(linear, None)
-        rows, observe, ahead = readings.at(k, here, nu)
+        if here is None:
+            turn = _Turn(np.eye(len(covariance)), np.zeros((len(covariance), nu)), np.zeros_like(covariance), None)
+        else:
+            fresh = k + 1 < count and errors.sample[k + 1] != errors.sample[k]
+            turn = _turn(here, course.feedback, errors, k, fresh)
+        rows, observe, ahead = readings.at(k, turn)
         cross = observe @ covariance
         try:
             factor = np.linalg.cholesky(cross @ observe.T + np.eye(len(rows)))
@@ -245,34 +250,47 @@ def innovations(course: Course, errors: InputErrors) -> Innovations:
             factor = np.diag(np.sqrt(1.0 + np.maximum(np.sum(cross * observe, axis=1), 0.0)))
         whiten = scipy.linalg.solve_triangular(factor, np.eye(len(rows)), lower=True)
         known = whiten @ cross
-        covariance = covariance - known.T @ known
-        if here is None:
-            transition, push = np.eye(len(covariance)), np.zeros((len(covariance), nu))
-        else:
-            fresh = k + 1 < count and errors.sample[k + 1] != errors.sample[k]
-            transition, push, noise = _moved(here, course.feedback, errors, k, fresh)
-        gain = transition @ known.T @ whiten
-        made.append(_FilterStep(rows, observe, whiten, gain, transition - gain @ observe, ahead, push - gain @ ahead))
-        if here is not None:
-            covariance = transition @ covariance @ transition.T + noise
-            covariance = 0.5 * (covariance + covariance.T)
+        gain = turn.transition @ known.T @ whiten
+        kept = turn.transition - gain @ observe
+        made.append(_FilterStep(rows, observe, whiten, gain, kept, ahead, turn.push - gain @ ahead))
+        covariance = turn.transition @ (covariance - known.T @ known) @ turn.transition.T + turn.noise
+        covariance = 0.5 * (covariance + covariance.T)
     return Innovations(tuple(made), errors.offset, np.sqrt(np.maximum(np.diag(covariance)[nx + nu :], 0.0)))
 
 
-def _moved(
-    here: LinearStep, feedback: Feedback | None, errors: InputErrors, k: int, fresh: bool
-) -> tuple[Array, Array, Array]:
-    """Transition of (d, w, b), what a known correction of the torque adds, and the covariance that comes in."""
+@dataclass(frozen=True)
+class _Turn:
+    """How (d, w, b) comes through one step.
+
+    Attributes
+    ----------
+    transition : ndarray, shape (na, na)
+    push : ndarray, shape (na, nu)
+        By a known correction of the torque.
+    noise : ndarray, shape (na, na)
+        Covariance that comes in.
+    effort : ndarray, shape (nc, na), or None
+        Of prescribed coordinates at the node before; None after the last step.
+    """
+
+    transition: Array
+    push: Array
+    noise: Array
+    effort: Array | None
+
+
+def _turn(here: LinearStep, feedback: Feedback | None, errors: InputErrors, k: int, fresh: bool) -> _Turn:
     nx, nu = here.by_torque.shape
-    transition = np.eye(nx + 2 * nu)
-    transition[:nx, :nx] = here.by_state
-    transition[:nx, nx : nx + nu] = transition[:nx, nx + nu :] = here.by_torque
-    push, noise = np.zeros((nx + 2 * nu, nu)), np.zeros((nx + 2 * nu, nx + 2 * nu))
+    size = nx + 2 * nu
+    transition, push, noise = np.eye(size), np.zeros((size, nu)), np.zeros((size, size))
+    transition[:nx] = np.hstack([here.by_state, here.by_torque, here.by_torque])
+    effort = np.hstack([here.effort_by_state, here.effort_by_torque, here.effort_by_torque])
     if errors.encoders:
         push[:nx] = here.by_torque
     elif feedback is not None:
         pulled = here.by_torque @ feedback.gain[k]
         transition[:nx, feedback.index] -= pulled
+        effort[:, feedback.index] -= here.effort_by_torque @ feedback.gain[k]
         # an error of the angles that the filter follows; that of the momenta, their slope, averages out
         angles = pulled[:, :nu] * errors.angle_std * np.sqrt(errors.spread)
         noise[:nx, :nx] = angles @ angles.T
@@ -280,7 +298,7 @@ def _moved(
         torque = np.arange(nx, nx + nu)
         transition[torque, torque] = 0.0
         noise[torque, torque] = errors.torque_std**2
-    return transition, push, noise
+    return _Turn(transition, push, noise, effort)
 
 
 @dataclass(frozen=True)
@@ -339,14 +357,12 @@ class _Readings:
         first = np.searchsorted(at[order], np.arange(last + 2))
         return _Readings(order, first, np.vstack(before), np.vstack(after), np.vstack(effort))
 
-    def at(self, k: int, here: LinearStep | None, nu: int) -> tuple[Rows, Array, Array]:
+    def at(self, k: int, turn: _Turn) -> tuple[Rows, Array, Array]:
         """Rows of node k, their slopes by (d, w, b), and by a known correction of the torque over the step."""
         rows = self.order[self.first[k] : self.first[k + 1]]
-        before, after = self.before[rows], self.after[rows]
-        if here is None:
-            return rows, np.hstack([before, np.zeros((len(rows), 2 * nu))]), np.zeros((len(rows), nu))
-        ahead = after @ here.by_torque
-        effort = self.effort[rows]
-        torque = ahead + effort @ here.effort_by_torque
-        state = before + after @ here.by_state + effort @ here.effort_by_state
-        return rows, np.hstack([state, torque, torque]), ahead
+        before, after, nx = self.before[rows], self.after[rows], self.before.shape[1]
+        observe = after @ turn.transition[:nx]
+        observe[:, :nx] += before
+        if turn.effort is not None:
+            observe += self.effort[rows] @ turn.effort
+        return rows, observe, after @ turn.push[:nx]

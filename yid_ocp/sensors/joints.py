@@ -141,7 +141,7 @@ def measured_angles(around: Surroundings) -> list[SensorData]:
     """
     joints, choice, system = around.recording.joints, around.choice(POSITION), around.system
     names = system.driven if joints is not None else ()
-    arm = [group.name for group in around.recording.points if group.sensor == "arm"]
+    arm = [group.name for group in around.recording.points if "arm" in (group.sensor, group.name.rpartition("_")[2])]
     arm = [name for name in arm if around.choice(name).use is not False]
     if joints is None or not names or choice.use is False or (choice.use is None and arm):
         return []
