@@ -292,13 +292,14 @@ def _attempt(
             if problem.evaluate(x, derivatives=False).ok:
                 break
     passes = PASSES if problem.disturbed and carries_covariance(solver) else 1
-    warm: WarmStart | None = None
-    for _ in range(passes):
-        weighted = problem.weighted_at(x, warm) if passes > 1 else problem
+    weighted, warm = problem, None
+    for number in range(passes):
+        weighted = weighted.weighted_at(x, warm) if passes > 1 else problem
         outcome = solver.run(weighted, x, callback)
         x, warm, evaluations = outcome.x, outcome.warm, evaluations + outcome.evaluations
         history += outcome.history
-        if len(outcome.history) < 2:
+        # the second pass is the first about torque offsets that are not guessed
+        if number and len(outcome.history) < 2:
             break
     return (outcome, weighted.evaluate(outcome.x, warm=outcome.warm)), evaluations, history
 
