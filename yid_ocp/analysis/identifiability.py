@@ -191,6 +191,7 @@ def _information(
     given = unknown_vector(problem, solution)
     wide = with_nuisances(problem, given, start, grasp_std)
     x = carried(given, problem.names, wide)
+    wide = wide.weighted_at(x, rounds=2)
     evaluation = wide.evaluate(x)
     if not evaluation.ok or evaluation.jacobian is None:
         raise SolverError(

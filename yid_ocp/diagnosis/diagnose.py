@@ -261,8 +261,12 @@ def held_out_test(fit: Fit, limits: Thresholds = DEFAULTS) -> NullTest:
 
 
 def smooth_fit(fit: Fit, limits: Thresholds = DEFAULTS) -> Smoothed:
-    """The weak-constraint smoother about a fitted model."""
-    return smooth(fit.problem, fit.problem.vector(fit.values), fit.evaluation, limits)
+    """The weak-constraint smoother about a fitted model; noise that drives the motion is among its unknowns."""
+    problem, evaluation, x = fit.problem, fit.evaluation, fit.problem.vector(fit.values)
+    if problem.disturbed:
+        problem = problem.weighted_by_sensors()
+        evaluation = problem.evaluate(x, warm=fit.evaluation.warm)
+    return smooth(problem, x, evaluation, limits)
 
 
 def _closed(added: Sequence[Added]) -> dict[str, float]:

@@ -251,7 +251,7 @@ def _run(models: Sequence[Linear], variance: Mapping[Source, float], smooth: boo
     """All recordings at given variances: the parameters' step, its covariance, and the log evidence."""
 
     def passed(model: Linear) -> _Pass:
-        return _filter(model, np.array([variance[s] for s in model.sources]), smooth)
+        return _filter(model, np.array([variance[s] for s in model.sources]) + model.known, smooth)
 
     passes = tuple(map_threads(passed, models))
     products = np.sum([p.products for p in passes], axis=0)

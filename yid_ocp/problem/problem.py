@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.data.recording import Recording
-from yid_ocp.errors import ConfigError, DataError, nearest
+from yid_ocp.errors import DataError
 from yid_ocp.integrator.step import Step
 from yid_ocp.model.system import System
 from yid_ocp.parallel import map_threads
@@ -21,7 +21,7 @@ from yid_ocp.problem.measurements import Rows, huber
 from yid_ocp.problem.noise import Innovations
 from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.problem.prediction import EpisodeResult, Predictor, Start
-from yid_ocp.problem.unknowns import START, Unknowns, replaced
+from yid_ocp.problem.unknowns import START, Unknowns, check_bounds, check_free, replaced, start_names
 
 Array = NDArray[np.float64]
 HELD_OUT_START = 0.2
@@ -98,13 +98,13 @@ class EstimationProblem:
         may_free: Sequence[str] = (),
     ) -> None:
         options = options or ProblemOptions()
-        _check_free(step.system, free, options)
+        check_free(step.system, free, options)
         if not recordings:
             raise DataError("there is no recording to estimate on", hint="give at least one under recordings.estimate")
         theta = step.system.parameters.vector(values)
         names = (*free, *(name for name in may_free if name not in free))
         functions = ModelFunctions(step, names, options.start_parameters)
-        _check_bounds(step.system, free, theta)
+        check_bounds(step.system, free, theta)
         episodes, others = (
             tuple(prepare_episode(functions, recording, options, theta) for recording in group)
             for group in (recordings, held_out)
@@ -132,7 +132,7 @@ class EstimationProblem:
         self.unknowns = Unknowns(
             tuple(name for name in free if name not in options.local),
             tuple(name for name in free if name in options.local),
-            _start_names(functions.step.system) if options.initial_state == "estimated" else (),
+            start_names(functions.step.system) if options.initial_state == "estimated" else (),
             tuple(episode.name for episode in episodes),
         )
         self.predictor = Predictor(functions, options, self.unknowns)
@@ -500,7 +500,7 @@ class EstimationProblem:
         """Whether errors of torques or angles drive the motion of any recording."""
         return any(episode.errors is not None for episode in self.episodes)
 
-    def weighted_at(self, x: ArrayLike, warm: WarmStart | None = None) -> EstimationProblem:
+    def weighted_at(self, x: ArrayLike, warm: WarmStart | None = None, rounds: int = 1) -> EstimationProblem:
         """The same problem with residuals weighted by all noise, that which drives the motion too, frozen at `x`.
 
         The problem itself where nothing is wrong with its torques and angles, or where it cannot be rolled out at `x`.
@@ -511,6 +511,8 @@ class EstimationProblem:
         x : array_like, shape (nx,)
         warm : WarmStart, optional
             As in `evaluate`.
+        rounds : int
+            How often in a row; 2 at a fit.
         """
         x = np.asarray(x, float)
         guesses = warm or (None,) * len(self.episodes)
@@ -523,7 +525,17 @@ class EstimationProblem:
         episodes, made = zip(*map_threads(one, range(len(self.episodes))), strict=True)
         if any(m is None and e.errors is not None for m, e in zip(made, episodes, strict=True)):
             return self
-        return self._changed(episodes=episodes, innovations=made, held_out_innovations=())
+        made_of = self._changed(episodes=episodes, innovations=made, held_out_innovations=())
+        return made_of if rounds < 2 else made_of.weighted_at(x, warm, rounds - 1)
+
+    def weighted_by_sensors(self) -> EstimationProblem:
+        """The same problem with residuals in units of the sensors' noise alone, torque offsets as they are known."""
+        return self._changed(innovations=(), held_out_innovations=())
+
+    def without_input_errors(self) -> EstimationProblem:
+        """The same problem with torques and angles that drive the motion taken as they were recorded."""
+        parts = (tuple(replace(e, errors=None) for e in group) for group in (self.episodes, self.held_out))
+        return self.on(*parts)
 
     def held_out_weighted_at(self, x: ArrayLike) -> EstimationProblem:
         """The same problem with the residuals of held-out recordings weighted like this as well, for `held_out_rows`.
@@ -593,39 +605,3 @@ class EstimationProblem:
             else:
                 stds.append(float(options.priors.get(base, np.inf)))
         return np.array(stds)
-
-
-def _start_names(system: System) -> tuple[str, ...]:
-    """q and p of the coordinates that are neither driven, nor prescribed, nor follow their load at once."""
-    known = set(system.driven_indices) | set(system.prescribed_indices)
-    known |= {system.mechanism.joint_index(joint) for joint in system.compliant}
-    free = [name for i, name in enumerate(system.mechanism.joint_names) if i not in known]
-    return (*(f"q.{name}" for name in free), *(f"p.{name}" for name in free))
-
-
-def _check_free(system: System, free: Sequence[str], options: ProblemOptions) -> None:
-    for name in [*free, *options.local, *options.priors]:
-        system.parameters.index(name)
-    if len(set(free)) != len(free):
-        raise ConfigError("a free parameter is named twice", where=", ".join(free))
-    for name in (*options.local, *options.priors):
-        if name not in free:
-            raise ConfigError(f"'{name}' is not free", hint=nearest(name, free), where="local or priors")
-
-
-def _check_bounds(system: System, free: Sequence[str], theta: Array) -> None:
-    for name in free:
-        entry, value = system.parameters[name], theta[system.parameters.index(name)]
-        if not entry.lower <= value <= entry.upper:
-            raise ConfigError(
-                f"initial value {value:g} {entry.unit} of {name} lies outside its bounds",
-                where=f"parameters.{name}",
-                allowed=f"{entry.lower:g} to {entry.upper:g} {entry.unit}",
-            )
-        if not entry.lower < entry.upper:
-            raise ConfigError(
-                f"the bounds of {name} leave no room",
-                where=f"parameters.{name}",
-                allowed="lower below upper",
-                hint="fix the parameter instead of closing its bounds",
-            )
