@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.problem.problem import Evaluation, ResidualRows
+from yid_ocp.problem.evaluation import Evaluation, ResidualRows
 from yid_ocp.solvers.base import Estimate, Solution, Status
 
 

@@ -25,8 +25,8 @@ from yid_ocp.diagnosis.smoother_model import Source
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects.base import EffectBase, Quantity
 from yid_ocp.model.parameters import Parameter, Parameters
+from yid_ocp.problem.evaluation import Evaluation, ResidualRows
 from yid_ocp.problem.measurements import Measurements
-from yid_ocp.problem.problem import Evaluation, ResidualRows
 
 WHITE = (1.0,)
 

@@ -371,7 +371,7 @@ def test_predicted_efforts_have_the_noise_of_encoders_in_them(urdf_folder, posit
     step = pendulum_step(urdf_folder, prescribed=("shoulder",))
     made = taken(step, 1)
     made = replace(made, joints=replace(made.joints, position_std=position_std))
-    sensors = {"joints.effort": SensorOptions(position_std=stated)}
+    sensors = {"joints.position": SensorOptions(std=stated)}
     options = ProblemOptions(path_cutoff=math.inf, sensors=sensors)
     problem = EstimationProblem(step, [made], ("elbow.damping",), options)
     effort = next(s for s in problem.episodes[0].samples if s.sensor.efforts)

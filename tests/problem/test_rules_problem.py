@@ -15,8 +15,8 @@ from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import apparent_inertia, beginning
-from yid_ocp.problem.problem import ResidualRows, _check_bounds
-from yid_ocp.problem.unknowns import Unknowns, replaced
+from yid_ocp.problem.evaluation import ResidualRows
+from yid_ocp.problem.unknowns import Unknowns, check_bounds, replaced
 
 FREE = ("shoulder.stiffness", "elbow.stiffness", "elbow.rest")
 START = {"shoulder.stiffness": 6.0, "elbow.stiffness": 3.0, "elbow.rest": 0.1}
@@ -395,14 +395,14 @@ def test_a_free_parameter_has_room_about_its_start(bounds, words):
     lower, upper = bounds
     system = SimpleNamespace(parameters=Parameters([Parameter("k", lower, "N m/rad", lower, upper)]))
     with pytest.raises(ConfigError, match=words):
-        _check_bounds(system, ("k",), np.array([3.0]))
-    _check_bounds(system, (), np.array([3.0]))
+        check_bounds(system, ("k",), np.array([3.0]))
+    check_bounds(system, (), np.array([3.0]))
 
 
 @pytest.mark.parametrize("value", [0.0, 3.0, 5.0])
 def test_a_start_may_lie_on_a_bound(value):
     system = SimpleNamespace(parameters=Parameters([Parameter("k", 1.0, "N m/rad", 0.0, 5.0)]))
-    _check_bounds(system, ("k",), np.array([value]))
+    check_bounds(system, ("k",), np.array([value]))
 
 
 def test_there_must_be_something_to_estimate_on(free_step):

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.problem.problem import Evaluation, ResidualRows
+from yid_ocp.problem.evaluation import Evaluation, ResidualRows
 from yid_ocp.solvers.base import Iterate, Outcome, Status
 
 
@@ -49,7 +49,7 @@ class MadeUp:
         self.shared = self.names
         self.bounds = np.full(size, lower), np.full(size, upper)
         self.scales = np.abs(self.start) if scales is None else np.array(scales, float)
-        self.options = SimpleNamespace(weighting=weighting)
+        self.options, self.disturbed = SimpleNamespace(weighting=weighting), False
         values = [*self.start, *fixed]
         entries = [Parameter(f"k{i}", v, "N m/rad", lower, upper, "made up") for i, v in enumerate(values)]
         self.system = SimpleNamespace(parameters=Parameters(entries[::-1]))

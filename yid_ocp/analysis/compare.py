@@ -96,7 +96,8 @@ def compare(
 ) -> Comparison:
     """Run several methods from the same start and say whether they agree.
 
-    Steepest descent gets the paper's cost (points in metres, no noise levels, no weak prior), the others the problem's.
+    Steepest descent gets the paper's cost (points in metres, no noise levels, no weak prior), the others the problem's,
+    weighted by the sensors' noise alone where more drives the motion: not every method can carry its covariance.
 
     Parameters
     ----------
@@ -111,7 +112,7 @@ def compare(
     -------
     Comparison
     """
-    runs = []
+    runs, problem = [], problem.without_input_errors()
     for solver in solvers:
         own = problem
         if solver.name == "steepest_descent" and problem.options.weighting != "paper":

@@ -17,7 +17,7 @@ from yid_ocp.effects import make_effect
 from yid_ocp.errors import ConfigError, SolverError, nearest
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.problem import Evaluation
+from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.solvers.base import IDENTIFIABLE, WEAK, Solution, uncertainty, verdict
 
 Array = NDArray[np.float64]
@@ -191,6 +191,7 @@ def _information(
     given = unknown_vector(problem, solution)
     wide = with_nuisances(problem, given, start, grasp_std)
     x = carried(given, problem.names, wide)
+    wide = wide.weighted_at(x, rounds=2)
     evaluation = wide.evaluate(x)
     if not evaluation.ok or evaluation.jacobian is None:
         raise SolverError(

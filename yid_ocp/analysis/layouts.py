@@ -134,7 +134,7 @@ class Setting:
 def used_groups(problem: EstimationProblem, episode: Episode) -> list[PointGroup]:
     """Groups of points that the problem looks at."""
     sensors = problem.options.sensors
-    return [g for g in episode.recording.points if sensors.get(g.name, SensorOptions()).use]
+    return [g for g in episode.recording.points if sensors.get(g.name, SensorOptions()).use is not False]
 
 
 def regular_times(grid: Grid, rate: float) -> Array:
@@ -310,9 +310,9 @@ class LayoutBuilder:
         seen = sights(system)
         step = seeing(step, {sight.name: sight.frame for sight in seen if sight.frame is not None})
         wide = with_nuisances(base, setting.x, setting.start, setting.grasp_std)
-        sensors = {k: v for k, v in base.options.sensors.items() if k == "joints.effort"}
+        sensors = {k: replace(v, use=None) for k, v in base.options.sensors.items() if k.startswith("joints.")}
         if "torque" in mechanics:
-            sensors = {"joints.effort": self._torque_options()}
+            sensors["joints.effort"] = self._torque_options()
         options = replace(
             wide.options,
             sensors=sensors,
@@ -472,10 +472,7 @@ class LayoutBuilder:
         joints = self.setting.problem.episodes[0].recording.joints
         said = None if joints is None else joints.effort_std
         stated = said is not None and bool(np.all(np.asarray(said) > 0))
-        known = None if joints is None else joints.position_std
-        return SensorOptions(
-            std=None if stated else self.setting.torque_std, position_std=0.0 if known is None else None
-        )
+        return SensorOptions(std=None if stated else self.setting.torque_std)
 
 
 def _travel(system: System, values: Mapping[str, float], episode: Episode) -> float:

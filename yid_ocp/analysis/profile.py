@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.problem import Evaluation
+from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.solvers.base import uncertainty
 from yid_ocp.solvers.gauss_newton import GaussNewton, bounded_step
 

@@ -83,7 +83,9 @@ def _diagnosed(problem: EstimationProblem, search: Search, solution: Solution | 
     progress("fitting the nominal model")
     nominal = nominal_fit(problem, search.problem, solution, search.store, limits)
     angles = largest_angles(nominal)
-    composed = replace(search.problem, effects=tuple(effect.expected(angles) for effect in search.problem.effects))
+    # what all hypotheses are weighted by is frozen at the nominal fit
+    effects = tuple(effect.expected(angles) for effect in search.problem.effects)
+    composed = replace(search.problem, problem=nominal.problem, effects=effects)
     search = replace(search, problem=composed)
     clock.lap("nominal")
     before, held = fitted_test(nominal, limits), held_out_test(nominal, limits)
@@ -199,6 +201,8 @@ def nominal_fit(
     """
     start: Mapping[str, float] = {}
     known = recalled(composed, (), store)
+    if known is not None and composed.problem.disturbed:
+        known = recalled(composed.weighted_at(known.values), (), store)
     if known is not None:
         return known
     if not composed.blocks:
@@ -208,6 +212,10 @@ def nominal_fit(
         start = dict(zip(found.names, map(float, found.x), strict=True))
     elif solution is not None:
         start = dict(zip(solution.names, map(float, solution.x), strict=True))
+    if composed.problem.disturbed:
+        first = refit(composed.weighted_at(start), (), start, limits=limits)
+        start = start if first is None else first.values
+        composed = composed.weighted_at(start)
     fit = refit(composed, (), start, store, limits=limits)
     if fit is None:
         raise SolverError("the nominal model cannot be rolled out at its fit", where="diagnosis")
@@ -240,21 +248,25 @@ def held_out_test(fit: Fit, limits: Thresholds = DEFAULTS) -> NullTest:
     """
     problem = fit.problem
     residuals = []
-    for episode, result in problem.validate(problem.vector(fit.values)):
+    for i, (episode, result) in enumerate(problem.validate(problem.vector(fit.values))):
         if isinstance(result, str):
             raise DataError(
                 f"the held-out recording cannot be predicted: {result}",
                 where=episode.name,
                 hint="hold out a recording that the nominal model can follow",
             )
-        residuals += [s.rows(y).residual for s, y in zip(episode.samples, result.predicted, strict=True)]
+        residuals.append(problem.held_out_rows(i, episode, result).residual)
     series = residual_series(problem.on(problem.held_out, ()))
     return null_test(series, np.concatenate(residuals), 0, limits.level, limits.window)
 
 
 def smooth_fit(fit: Fit, limits: Thresholds = DEFAULTS) -> Smoothed:
-    """The weak-constraint smoother about a fitted model."""
-    return smooth(fit.problem, fit.problem.vector(fit.values), fit.evaluation, limits)
+    """The weak-constraint smoother about a fitted model; noise that drives the motion is among its unknowns."""
+    problem, evaluation, x = fit.problem, fit.evaluation, fit.problem.vector(fit.values)
+    if problem.disturbed:
+        problem = problem.weighted_by_sensors()
+        evaluation = problem.evaluate(x, warm=fit.evaluation.warm)
+    return smooth(problem, x, evaluation, limits)
 
 
 def _closed(added: Sequence[Added]) -> dict[str, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -155,6 +155,11 @@ class CandidateProblem:
     def nominal(self) -> tuple[str, ...]:
         """Parameters that the nominal problem frees."""
         return self.problem.free
+
+    def weighted_at(self, values: Mapping[str, float]) -> CandidateProblem:
+        """The same with residuals weighted by all noise, that which drives the motion too, frozen at these unknowns."""
+        x = self.problem.vector(values)
+        return replace(self, problem=self.problem.weighted_at(x).held_out_weighted_at(x))
 
     def freeing(self, effects: Sequence[EffectBase]) -> EstimationProblem:
         """The problem with the parameters of some effects free beside the nominal ones."""

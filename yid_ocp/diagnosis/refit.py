@@ -20,7 +20,7 @@ from yid_ocp.effects import EffectBase, Reported
 from yid_ocp.parallel import map_threads
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
-from yid_ocp.problem.problem import Evaluation
+from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.validation import channel_errors
 from yid_ocp.solvers import GaussNewton, Status
 from yid_ocp.solvers.base import Outcome, uncertainty
@@ -309,18 +309,20 @@ def held_out_loss(problem: EstimationProblem, x: Array) -> Loss:
     squares: list[Array] = []
     counts: list[Array] = []
     results, episodes = [], []
-    for episode, result in problem.validate(x):
+    for i, (episode, result) in enumerate(problem.validate(x)):
         number = int(episode.grid.steps * episode.grid.time_step / length) + 1
-        total, count = np.zeros(number), np.zeros(number)
-        for k, samples in enumerate(episode.samples):
+        blocks = []
+        for samples in episode.samples:
             block = np.minimum((sample_times(episode, samples) / length).astype(int), number - 1)
-            count += np.bincount(block, samples.seen.sum(axis=1), number)
-            if not isinstance(result, str):
-                r = samples.whitened(result.predicted[k])
-                total += np.bincount(block, np.sum(r**2, axis=1), number)
+            blocks.append(np.broadcast_to(block.reshape(len(block), -1), samples.seen.shape)[samples.seen])
+        of_row = np.concatenate(blocks)
+        count = np.bincount(of_row, minlength=number).astype(float)
         if isinstance(result, str):
-            total[:] = np.inf
+            total = np.full(number, np.inf)
         else:
+            total = np.bincount(
+                of_row, weights=problem.held_out_rows(i, episode, result).residual ** 2, minlength=number
+            )
             results.append(result)
             episodes.append(episode)
         keep = count > 0

@@ -28,7 +28,7 @@ from yid_ocp.diagnosis.smoother_model import Linear, Source, linear_model
 from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
 from yid_ocp.parallel import map_threads
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.problem import Evaluation
+from yid_ocp.problem.evaluation import Evaluation
 
 Array = NDArray[np.float64]
 
@@ -251,7 +251,7 @@ def _run(models: Sequence[Linear], variance: Mapping[Source, float], smooth: boo
     """All recordings at given variances: the parameters' step, its covariance, and the log evidence."""
 
     def passed(model: Linear) -> _Pass:
-        return _filter(model, np.array([variance[s] for s in model.sources]), smooth)
+        return _filter(model, np.array([variance[s] for s in model.sources]) + model.known, smooth)
 
     passes = tuple(map_threads(passed, models))
     products = np.sum([p.products for p in passes], axis=0)

@@ -27,8 +27,8 @@ from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, apparent_inertia
+from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.prediction import EpisodeResult
-from yid_ocp.problem.problem import Evaluation
 from yid_ocp.sensors import Sensor
 
 Array = NDArray[np.float64]
@@ -110,6 +110,8 @@ class Linear:
         Standard deviation of the first state beside that.
     decay : float
         Correlation of an unknown with itself one interval later.
+    known : ndarray, shape (nd,)
+        Variance that each has whatever its group's is: noise of recorded torques [squared reference].
     """
 
     recording: str
@@ -121,6 +123,7 @@ class Linear:
     at_rest: Array
     loose: Array
     decay: float
+    known: Array
 
 
 def linear_model(
@@ -397,6 +400,7 @@ def _recording(course: _Course, observed: Array, limits: Thresholds) -> Linear:
             at_rest[:, :driving] = np.linalg.lstsq(np.eye(ns) - slopes[0][0], slopes[1][0], rcond=1e-6)[0]
         intervals.append(_interval(slopes, unknowns, reading, j, observed))
     span = h * float(np.median(np.diff(edges)))
+    decay = math.exp(-span / MEMORY)
     return Linear(
         course.episode.name,
         tuple(intervals),
@@ -406,8 +410,28 @@ def _recording(course: _Course, observed: Array, limits: Thresholds) -> Linear:
         unknowns.reference,
         at_rest,
         np.zeros(ns) if rests else _loose_start(course)[moving.states],
-        math.exp(-span / MEMORY),
+        decay,
+        _torque_noise(course, unknowns, span, decay),
     )
+
+
+def _torque_noise(course: _Course, unknowns: _Unknowns, span: float, decay: float) -> Array:
+    """Variance of unknown forces that stand for the noise of recorded torques, in units of the squared reference.
+
+    White noise counts by its spectral density at low frequencies, which an unknown force of memory `decay` from
+    interval to interval must have as well.
+    """
+    errors, driven = course.episode.errors, course.system.driven
+    known = np.zeros(len(unknowns.names))
+    if errors is None:
+        return known
+    held = course.problem.step.time_step * len(errors.sample) / len(np.unique(errors.sample))
+    white = errors.torque_std**2 * (held / span) * (1 - decay) / (1 + decay)
+    for i, name in enumerate(unknowns.names[: len(unknowns.forced)]):
+        if name in driven:
+            at = driven.index(name)
+            known[i] = (white[at] + errors.bias_std[at] ** 2) / unknowns.reference[i] ** 2
+    return known
 
 
 def _loose_start(course: _Course) -> Array:

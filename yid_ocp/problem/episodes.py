@@ -18,9 +18,11 @@ from yid_ocp.problem.grid import Grid, make_grid
 from yid_ocp.problem.inputs import held_torque, joint_loads, measured_angles, prescribed_path
 from yid_ocp.problem.low_pass import LowPass
 from yid_ocp.problem.measurements import Measurements, paper_weighting, placed
+from yid_ocp.problem.noise import InputErrors, input_errors
 from yid_ocp.problem.options import ProblemOptions, SensorOptions
 from yid_ocp.problem.start import FittedStart
 from yid_ocp.sensors import SENSORS, Surroundings
+from yid_ocp.sensors.joints import POSITION
 
 Array = NDArray[np.float64]
 
@@ -48,6 +50,8 @@ class Episode:
         Tracking filter of the driven joints, its gains worked out at the nominal parameters.
     values : mapping of str to float
         Known values of parameters that differ from recording to recording.
+    errors : InputErrors or None
+        Of the torques and angles that drive the rollout; None where there are none.
     start : FittedStart or None
         Where the rollout begins, if it is neither at rest nor fitted at the parameters that are asked about.
     shares_start_of : int, optional
@@ -65,6 +69,7 @@ class Episode:
     smooth_arm: Array
     feedback: Feedback | None = None
     values: Mapping[str, float] = field(default_factory=dict)
+    errors: InputErrors | None = None
     start: FittedStart | None = None
     shares_start_of: int | None = None
 
@@ -119,6 +124,9 @@ def prepare_episode(functions: ModelFunctions, recording: Recording, options: Pr
         load,
         smooth,
         values=options.recording_values.get(recording.name, {}),
+        errors=None
+        if options.weighting == "paper"
+        else input_errors(recording, system, grid, options.sensors, samples),
         start=None if start is None else FittedStart(check_shape("known_start", start, (step.sizes["nx"],))),
     )
     return _tracked(episode, functions, options, theta)
@@ -144,7 +152,7 @@ def beginning(episode: Episode, steps: int) -> Episode:
         early = entry.node + entry.fraction <= last + 1e-9
         parts = {name: getattr(entry, name)[early] for name in ("node", "fraction", "value", "weight", "std")}
         samples.append(replace(entry, **parts, span=(entry.span[0], last)))
-    whole = episode.feedback
+    whole, errors = episode.feedback, episode.errors
     return replace(
         episode,
         grid=replace(episode.grid, steps=steps),
@@ -155,6 +163,7 @@ def beginning(episode: Episode, steps: int) -> Episode:
         load=episode.load[: steps + 1],
         smooth_arm=episode.smooth_arm[: steps + 1],
         feedback=None if whole is None else Feedback(whole.index, whole.gain[:steps], whole.reference[:steps]),
+        errors=None if errors is None else replace(errors, sample=errors.sample[:steps]),
     )
 
 
@@ -182,6 +191,9 @@ def _samples(
         lambda names: apparent_inertia(step, theta, names),
     )
     found = [data for kind in SENSORS for data in SENSORS[kind](around)]
+    if options.weighting == "paper":
+        # its cost is in square metres
+        found = [data for data in found if data.sensor.group != POSITION]
     # places before efforts, which follow from the motion
     found.sort(key=lambda data: bool(data.sensor.efforts))
     samples = tuple(placed(data, grid, recording.name) for data in found)

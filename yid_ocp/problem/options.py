@@ -15,27 +15,34 @@ from yid_ocp.problem.measurements import Weighting
 
 StartKind = Literal["equilibrium", "estimated", "fitted_to_points"]
 Positive = Annotated[float, Gt(0)]
+NotNegative = Annotated[float, Ge(0)]
 
 
 @dataclass(frozen=True)
 class SensorOptions:
-    """How one group of a recording is used: points, points_NAME or joints.effort."""
+    """How one group of a recording is used: points, points_NAME, joints.position or joints.effort."""
 
-    use: Annotated[bool, About("whether the estimation sees it")] = True
+    use: Annotated[
+        bool | None,
+        About(
+            "whether the estimation sees it; when absent yes, but for joints.position: the encoders of driven joints "
+            "are measurements where no points of the arm are, never beside them"
+        ),
+    ] = None
     std: Annotated[
         Positive | Mapping[str, Positive] | None,
-        About("noise standard deviation instead of the recorded one, by name where they differ", "m or N m"),
+        About("noise standard deviation instead of the recorded one, by name where they differ", "m, rad or N m"),
     ] = None
     frames: Annotated[
         Mapping[str, str], About("frame of the model that a point marks, where the two have different names")
     ] = field(default_factory=dict)
     points: Annotated[tuple[str, ...] | None, About("points to use; all that the model has when absent")] = None
-    position_std: Annotated[
-        Positive | Mapping[str, Positive] | None,
+    bias_std: Annotated[
+        NotNegative | Mapping[str, NotNegative] | None,
         About(
-            "noise standard deviation of the encoders whose motion is prescribed, instead of the recorded one; it adds "
-            "to that of predicted efforts (joints.effort only)",
-            "rad",
+            "standard deviation of a constant error in each joint's torque, another in every recording, instead of the "
+            "recorded one (joints.effort of driven joints only)",
+            "N m",
         ),
     ] = None
 

@@ -17,6 +17,7 @@ from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.functions import ModelFunctions
 from yid_ocp.problem.inputs import held_torque, held_torque_slope
 from yid_ocp.problem.measurements import Measurements
+from yid_ocp.problem.noise import Course, Innovations, innovations
 from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.problem.unknowns import Unknowns
 
@@ -37,6 +38,10 @@ class EpisodeResult:
     sensitivities : tuple of ndarray, shape (M, k, d) each, or None
     warm : ndarray, shape (n,), or None
         Configuration at `rest`, from which that of similar parameters is found quickly.
+    correction : ndarray, shape (N, nu), or None
+        What the tracking filter added to the recorded torque [N m], where encoders are measurements.
+    by_correction : ndarray, shape (N, nu, d), or None
+        Its derivative, with `sensitivities`.
     """
 
     rollout: Rollout
@@ -44,6 +49,8 @@ class EpisodeResult:
     predicted: tuple[Array, ...]
     sensitivities: tuple[Array, ...] | None
     warm: Array | None = None
+    correction: Array | None = None
+    by_correction: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -177,6 +184,9 @@ class Predictor:
             Parameters by which to differentiate.
         """
         inputs = self._corrected(episode, theta, wanted)
+        if episode.errors is not None:
+            offset = episode.errors.offset
+            inputs = replace(inputs, torque=inputs.torque - offset, first_torque=inputs.first_torque - offset)
         if not self.system.driven or self.options.feedback != "lqr":
             return inputs
         shift = self.functions.momentum_shift
@@ -236,15 +246,89 @@ class Predictor:
         )
         if not rollout.status.ok:
             return f"{episode.name}: {rollout.status.message}"
+        by_applied = None
+        if directions is not None and rollout.by_state is not None and driven:
+            by_applied = np.zeros((*rollout.torque.shape, directions.count))
+            if directions.torque is not None:
+                by_applied += directions.torque
+            if feedback is not None:
+                by_applied -= feedback.gain @ rollout.by_state[:-1, feedback.index]
         predicted, sensitivities = [], []
         for samples in episode.samples:
-            values, by_all = self._predict(samples, rollout, theta, wanted, derivatives)
+            values, by_all = self._predict(samples, rollout, by_applied, theta, wanted)
             predicted.append(values)
             sensitivities.append(by_all)
+        correction = by_correction = None
+        if episode.errors is not None and episode.errors.encoders and feedback is not None:
+            correction = rollout.torque - inputs.torque
+            by_correction = by_applied
+            if by_applied is not None and inputs.by_torque is not None:
+                by_correction = by_applied.copy()
+                by_correction[:, :, : len(wanted)] -= inputs.by_torque
         # states by all directions are the largest arrays of all, and what samples need of them has been taken
         rollout = replace(rollout, by_state=None, by_multipliers=None, by_effort=None)
-        warm = None if start.rest is None else start.rest.state[: self.system.size]
-        return EpisodeResult(rollout, start.rest, tuple(predicted), tuple(sensitivities) if derivatives else None, warm)
+        return EpisodeResult(
+            rollout,
+            start.rest,
+            tuple(predicted),
+            tuple(sensitivities) if derivatives else None,
+            None if start.rest is None else start.rest.state[: self.system.size],
+            correction,
+            by_correction,
+        )
+
+    def weighted(
+        self, episode: Episode, theta: Array, offset: Array, guess: Array | None, before: Innovations | None
+    ) -> tuple[Episode, Innovations | None]:
+        """The filter that whitens an episode's residual, frozen at these unknowns, and the episode that it belongs to.
+
+        None for the filter where nothing drives the motion wrong, or where the episode cannot be rolled out.
+
+        Parameters
+        ----------
+        episode : Episode
+        theta : ndarray, shape (ntheta,)
+        offset : ndarray
+            Of an estimated start.
+        guess : ndarray, shape (n,), or None
+            Configuration near the equilibrium.
+        before : Innovations or None
+            The episode's filter, where it has one already: the new one is about the torque offsets that it sees.
+        """
+        if episode.errors is None:
+            return episode, None
+        result, errors = self.run(episode, theta, offset, False, guess), episode.errors
+        if before is not None and not isinstance(result, str) and np.any(errors.bias_std > 0):
+            errors = replace(errors, offset=self.torque_offset(episode, result, before))
+            episode = replace(episode, errors=errors)
+            result = self.run(episode, theta, offset, False, guess)
+        if isinstance(result, str):
+            return episode, None
+        return episode, innovations(self._course(episode, result, theta), errors)
+
+    def torque_offset(self, episode: Episode, result: EpisodeResult, whitening: Innovations) -> Array:
+        """Constant error of every driven joint's torque, as all measurements of an episode have it, (nu,) [N m]."""
+        push = None if result.correction is None else result.correction[:, :, None]
+        rows = [s.rows(y).residual for s, y in zip(episode.samples, result.predicted, strict=True)]
+        return whitening.whitened(np.concatenate(rows)[:, None], push)[1][:, 0]
+
+    def _course(self, episode: Episode, result: EpisodeResult, theta: Array) -> Course:
+        own, rollout = self.own_theta(episode, theta), result.rollout
+        late = (self.lateness(samples, own, ()) for samples in episode.samples)
+        nx, nu = self.step.sizes["nx"], self.step.sizes["nu"]
+        by_angles, by_torque = np.zeros((nx, nu)), np.zeros((nx, nu))
+        if result.rest is not None:
+            by_angles, by_torque = result.rest.by_posture[:, :nu], result.rest.by_torque
+        return Course(
+            self.functions,
+            own,
+            rollout,
+            [s if by is None else s.late(by[0]) for s, by in zip(episode.samples, late, strict=True)],
+            episode.feedback,
+            self.efforts(rollout),
+            by_angles,
+            by_torque,
+        )
 
     def along(self, samples: Measurements, state: Array, by_state: Array, theta: Array) -> tuple[Array, Array]:
         """Readings along a given trajectory and their derivatives.
@@ -263,7 +347,7 @@ class Predictor:
         sensitivities : ndarray, shape (M, k, d)
         """
         effort = np.zeros((len(samples.nodes), self.system.size))
-        read = _Trajectory(state, by_state, effort, None)
+        read = _Trajectory(state, by_state, effort, None, None)
         y, total = self._read(samples, read, theta, self.unknowns.parameters)
         return samples.interpolate(y), samples.interpolate(total)
 
@@ -282,16 +366,16 @@ class Predictor:
         return None if found is None else (found[0] / self.step.time_step, found[1] / self.step.time_step)
 
     def _predict(
-        self, samples: Measurements, rollout: Rollout, theta: Array, wanted: tuple[str, ...], derivatives: bool
+        self, samples: Measurements, rollout: Rollout, by_applied: Array | None, theta: Array, wanted: tuple[str, ...]
     ) -> tuple[Array, Array]:
         unmoved, late = samples, self.lateness(samples, theta, wanted)
         if late is not None:
             samples = samples.late(late[0])
-        by_state = rollout.by_state if derivatives else None
         effort = self.efforts(rollout)[samples.nodes]
-        y, total = self._read(samples, _Trajectory(rollout.state, by_state, effort, rollout.by_effort), theta, wanted)
+        along = _Trajectory(rollout.state, rollout.by_state, effort, rollout.by_effort, by_applied)
+        y, total = self._read(samples, along, theta, wanted)
         predicted, slopes = samples.interpolate(y), samples.interpolate(total)
-        if late is not None and by_state is not None:
+        if late is not None and rollout.by_state is not None:
             slopes[:, :, : len(wanted)] -= samples.slope(y, unmoved, late[0])[:, :, None] * late[1]
         return predicted, slopes
 
@@ -307,9 +391,10 @@ class Predictor:
         total = by_q @ along.by_state[nodes, :n]
         if z.shape[1]:
             total += by_z @ along.by_state[nodes, 2 * n :]
-        fixed = list(self.system.prescribed_indices)
-        if fixed and along.by_effort is not None and np.any(by_load):
-            total += by_load[:, :, fixed] @ along.by_effort[np.minimum(nodes, len(along.by_effort) - 1)]
+        loads = ((self.system.prescribed_indices, along.by_effort), (self.system.driven_indices, along.by_torque))
+        for index, by_load_there in loads:
+            if index and by_load_there is not None and np.any(by_load[:, :, list(index)]):
+                total += by_load[:, :, list(index)] @ by_load_there[np.minimum(nodes, len(by_load_there) - 1)]
         total[:, :, : len(wanted)] += by_theta
         return y[:, :, 0], total
 
@@ -332,16 +417,18 @@ class Predictor:
         wanted, rollout = self.unknowns.parameters, result.rollout
         theta = self.own_theta(episode, theta)
         by_state = np.zeros((episode.grid.steps + 1, self.step.sizes["nx"]))
-        by_effort = np.zeros_like(rollout.effort)
+        by_effort, by_applied = np.zeros_like(rollout.effort), np.zeros_like(rollout.torque)
         total = np.zeros(len(wanted))
         for samples, pull in zip(episode.samples, pulls, strict=True):
-            total += self._pull(samples, pull, rollout, theta, by_state, by_effort)
+            total += self._pull(samples, pull, rollout, theta, _Pulls(by_state, by_effort, by_applied))
         feedback = episode.feedback
+        if feedback is not None:
+            by_state[:-1, feedback.index] -= np.einsum("kub,ku->kb", feedback.gain, by_applied)
         by_inputs = adjoint_gradient(self.step, theta, rollout, wanted, by_state, None, by_effort, feedback)
         inputs = self.inputs(episode, theta, wanted)
         by_torque = inputs.torque_directions(feedback, self.system.driven_indices)
         if by_torque is not None:
-            total += np.einsum("ku,kuw->w", by_inputs.by_torque, by_torque)
+            total += np.einsum("ku,kuw->w", by_inputs.by_torque + by_applied, by_torque)
         if inputs.by_path is not None:
             # node 0 is part of the start state
             total += np.einsum("kc,kcw->w", by_inputs.by_path[1:], inputs.by_path[1:])
@@ -349,9 +436,7 @@ class Predictor:
         own = np.concatenate([total + by_inputs.by_theta, np.zeros(len(self.unknowns.start))])
         return np.asarray(own + by_inputs.by_start @ by_start)
 
-    def _pull(
-        self, samples: Measurements, pull: Array, rollout: Rollout, theta: Array, by_state: Array, by_effort: Array
-    ) -> Array:
+    def _pull(self, samples: Measurements, pull: Array, rollout: Rollout, theta: Array, pulls: _Pulls) -> Array:
         """Spread the pull at one group's samples over states and efforts; the direct part by the parameters."""
         n, wanted = self.system.size, self.unknowns.parameters
         unmoved, late = samples, self.lateness(samples, theta, wanted)
@@ -364,20 +449,31 @@ class Predictor:
         direct = np.einsum("mk,mkq->q", at_nodes, by_theta)
         if late is not None:
             direct -= np.sum(pull * samples.slope(y[:, :, 0], unmoved, late[0]), axis=0) @ late[1]
-        by_state[nodes, :n] += np.einsum("mk,mkq->mq", at_nodes, by_q)
-        by_state[nodes, 2 * n :] += np.einsum("mk,mkq->mq", at_nodes, by_z)
-        fixed = list(self.system.prescribed_indices)
-        if fixed:
-            last = np.minimum(nodes, len(rollout.effort) - 1)
-            np.add.at(by_effort, last, np.einsum("mk,mkq->mq", at_nodes, by_load[:, :, fixed]))
+        pulls.by_state[nodes, :n] += np.einsum("mk,mkq->mq", at_nodes, by_q)
+        pulls.by_state[nodes, 2 * n :] += np.einsum("mk,mkq->mq", at_nodes, by_z)
+        last = np.minimum(nodes, len(rollout.effort) - 1)
+        loads = ((self.system.prescribed_indices, pulls.by_effort), (self.system.driven_indices, pulls.by_torque))
+        for index, by_load_there in loads:
+            if index:
+                np.add.at(by_load_there, last, np.einsum("mk,mkq->mq", at_nodes, by_load[:, :, list(index)]))
         return np.asarray(direct)
 
 
 @dataclass(frozen=True)
 class _Trajectory:
-    """States at all nodes, efforts at the nodes that are read, and their derivatives."""
+    """States at all nodes, efforts at the nodes that are read, and derivatives of states, efforts, applied torques."""
 
     state: Array
     by_state: Array | None
     effort: Array
     by_effort: Array | None
+    by_torque: Array | None
+
+
+@dataclass(frozen=True)
+class _Pulls:
+    """Derivatives of a cost by states, efforts of prescribed joints and applied torques, added up."""
+
+    by_state: Array
+    by_effort: Array
+    by_torque: Array

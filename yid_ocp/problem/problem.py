@@ -3,96 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.data.recording import Recording
-from yid_ocp.errors import ConfigError, DataError, nearest
+from yid_ocp.errors import DataError
 from yid_ocp.integrator.step import Step
 from yid_ocp.model.system import System
 from yid_ocp.parallel import map_threads
 from yid_ocp.problem.episodes import Episode, apparent_inertia, beginning, prepare_episode
+from yid_ocp.problem.evaluation import Evaluation, ResidualRows, WarmStart, joined
 from yid_ocp.problem.functions import ModelFunctions
-from yid_ocp.problem.measurements import huber
+from yid_ocp.problem.measurements import Rows, huber
+from yid_ocp.problem.noise import Innovations
 from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.problem.prediction import EpisodeResult, Predictor, Start
-from yid_ocp.problem.unknowns import START, Unknowns, replaced
+from yid_ocp.problem.unknowns import START, Unknowns, check_bounds, check_free, replaced, start_names
 
 Array = NDArray[np.float64]
-WarmStart = tuple[Array | None, ...]
-"""Configuration near the equilibrium at which each recording starts; None where it is not known."""
-
 HELD_OUT_START = 0.2
 """Time from which the start of a held-out recording is estimated, where starts are [s]."""
 HELD_OUT_ITERATIONS = 3
 """Gauss-Newton steps of that estimate, which is nearly linear."""
-
-
-@dataclass(frozen=True)
-class ResidualRows:
-    """How the residual of a problem is made up: measurements, then stated priors, then weak priors.
-
-    Attributes
-    ----------
-    measurements : tuple of tuple of slice
-        Rows of every group of measurements of every episode, those without a measurement left out.
-    data, stated_priors, weak_priors : slice
-    informing : slice
-        Data and stated priors: all that the weak priors are not.
-    """
-
-    measurements: tuple[tuple[slice, ...], ...]
-    data: slice
-    stated_priors: slice
-    weak_priors: slice
-
-    @property
-    def informing(self) -> slice:
-        """Data and stated priors: all that the weak priors are not."""
-        return slice(0, self.stated_priors.stop)
-
-    @staticmethod
-    def of(episodes: Sequence[Episode], stated: int, weak: int) -> ResidualRows:
-        """From the numbers of measurements and priors."""
-        at, groups = 0, []
-        for episode in episodes:
-            own = []
-            for samples in episode.samples:
-                own.append(slice(at, at + samples.count))
-                at += samples.count
-            groups.append(tuple(own))
-        return ResidualRows(tuple(groups), slice(0, at), slice(at, at + stated), slice(at + stated, at + stated + weak))
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """Residual of a problem at one point.
-
-    Attributes
-    ----------
-    cost : float
-        1/2 |r|^2, or the robust loss; infinite where the rollout failed.
-    residual : ndarray, shape (nr,)
-    jacobian : ndarray, shape (nr, nx), or None
-    ok : bool
-    message : str
-    episodes : tuple of EpisodeResult
-    """
-
-    cost: float
-    residual: Array
-    jacobian: Array | None
-    ok: bool
-    message: str
-    episodes: tuple[EpisodeResult, ...]
-
-    @property
-    def warm(self) -> WarmStart:
-        """Where to look for the equilibria of a point nearby."""
-        return tuple(result.warm for result in self.episodes)
 
 
 class EstimationProblem:
@@ -127,6 +62,10 @@ class EstimationProblem:
     episodes, held_out : tuple of Episode
     rows : ResidualRows
         How the residual is made up.
+    innovations : tuple of Innovations or None
+        What turns every recording's residual into innovations; None where the sensors' noise is all, see `weighted_at`.
+    held_out_innovations : tuple of Innovations or None
+        The same for held-out recordings, see `held_out_weighted_at`.
 
     Raises
     ------
@@ -145,6 +84,8 @@ class EstimationProblem:
     unknowns: Unknowns
     predictor: Predictor
     rows: ResidualRows
+    innovations: tuple[Innovations | None, ...]
+    held_out_innovations: tuple[Innovations | None, ...]
 
     def __init__(
         self,
@@ -157,13 +98,13 @@ class EstimationProblem:
         may_free: Sequence[str] = (),
     ) -> None:
         options = options or ProblemOptions()
-        _check_free(step.system, free, options)
+        check_free(step.system, free, options)
         if not recordings:
             raise DataError("there is no recording to estimate on", hint="give at least one under recordings.estimate")
         theta = step.system.parameters.vector(values)
         names = (*free, *(name for name in may_free if name not in free))
         functions = ModelFunctions(step, names, options.start_parameters)
-        _check_bounds(step.system, free, theta)
+        check_bounds(step.system, free, theta)
         episodes, others = (
             tuple(prepare_episode(functions, recording, options, theta) for recording in group)
             for group in (recordings, held_out)
@@ -180,14 +121,18 @@ class EstimationProblem:
         theta: Array,
         episodes: tuple[Episode, ...],
         held_out: tuple[Episode, ...],
+        innovations: tuple[Innovations | None, ...] = (),
+        held_out_innovations: tuple[Innovations | None, ...] = (),
     ) -> None:
         theta.setflags(write=False)
+        self.innovations = innovations or (None,) * len(episodes)
+        self.held_out_innovations = held_out_innovations or (None,) * len(held_out)
         self.functions, self.options, self.free, self.theta = functions, options, free, theta
         self.episodes, self.held_out = episodes, held_out
         self.unknowns = Unknowns(
             tuple(name for name in free if name not in options.local),
             tuple(name for name in free if name in options.local),
-            _start_names(functions.step.system) if options.initial_state == "estimated" else (),
+            start_names(functions.step.system) if options.initial_state == "estimated" else (),
             tuple(episode.name for episode in episodes),
         )
         self.predictor = Predictor(functions, options, self.unknowns)
@@ -200,7 +145,8 @@ class EstimationProblem:
     def _changed(self, **changes: Any) -> EstimationProblem:
         """Another problem that shares what is compiled and placed; nothing is prepared anew."""
         made = object.__new__(EstimationProblem)
-        same = {name: getattr(self, name) for name in ("functions", "options", "free", "theta", "episodes", "held_out")}
+        kept = ("functions", "options", "free", "theta", "episodes", "held_out")
+        same = {name: getattr(self, name) for name in (*kept, "innovations", "held_out_innovations")}
         made._set(**{**same, **changes})
         return made
 
@@ -345,14 +291,12 @@ class EstimationProblem:
         done = tuple(result for result in results if isinstance(result, EpisodeResult))
         cost, residuals, jacobians = 0.0, [], []
         for i, result in enumerate(done):
-            for k, samples in enumerate(self.episodes[i].samples):
-                slopes = None if result.sensitivities is None else result.sensitivities[k]
-                part = samples.rows(result.predicted[k], slopes, self.options.huber_threshold)
-                cost += part.cost
-                residuals.append(part.residual)
-                if part.jacobian is not None:
-                    jacobians.append(self.unknowns.placed(part.jacobian, i))
-        done = tuple(replace(result, sensitivities=None) for result in done)
+            part = self._rows(self.episodes[i], self.innovations[i], result)
+            cost += part.cost
+            residuals.append(part.residual)
+            if part.jacobian is not None:
+                jacobians.append(self.unknowns.placed(part.jacobian, i))
+        done = tuple(replace(result, sensitivities=None, by_correction=None) for result in done)
         prior_residual, prior_jacobian = self.prior(x)
         residual = np.concatenate([*residuals, prior_residual])
         cost += 0.5 * float(prior_residual @ prior_residual)
@@ -360,6 +304,38 @@ class EstimationProblem:
         if not np.isfinite(cost):
             return Evaluation(np.inf, residual, None, False, "the cost is not finite", done)
         return Evaluation(cost, residual, jacobian, True, "", done)
+
+    def _rows(self, episode: Episode, whitening: Innovations | None, result: EpisodeResult) -> Rows:
+        """One episode's part of the residual: in units of the sensors' noise, or innovations where they are frozen."""
+        if whitening is None:
+            return joined(episode.samples, result, self.options.huber_threshold)
+        plain = joined(episode.samples, result)
+        columns, push = plain.residual[:, None], result.correction
+        push = None if push is None else push[:, :, None]
+        if plain.jacobian is not None:
+            columns = np.hstack([columns, plain.jacobian])
+            if push is not None and result.by_correction is not None:
+                push = np.concatenate([push, result.by_correction], axis=2)
+        columns = whitening.whitened(columns, push)[0]
+        cost, factor = huber(columns[:, 0], self.options.huber_threshold)
+        columns = factor[:, None] * columns
+        return Rows(cost, columns[:, 0], None if plain.jacobian is None else columns[:, 1:], factor)
+
+    def torque_offsets(self, x: ArrayLike) -> list[tuple[Array, Array] | None]:
+        """Constant error of every driven joint's torque in every recording, at `x`: value and standard deviation [N m].
+
+        None for a recording whose torques are taken as true, and where nothing is frozen (`weighted_at`).
+        """
+        x = np.asarray(x, float)
+        found: list[tuple[Array, Array] | None] = []
+        for i, whitening in enumerate(self.innovations):
+            result = None if whitening is None else self.predictor.run(self.episodes[i], *self.split(x, i), False)
+            if whitening is None or result is None or isinstance(result, str):
+                found.append(None)
+            else:
+                value = self.predictor.torque_offset(self.episodes[i], result, whitening)
+                found.append((value, whitening.bias_std))
+        return found
 
     def gradient(
         self, x: ArrayLike, evaluation: Evaluation | None = None, warm: WarmStart | None = None
@@ -514,8 +490,77 @@ class EstimationProblem:
         return self._changed(theta=theta)
 
     def on(self, episodes: Sequence[Episode], held_out: Sequence[Episode]) -> EstimationProblem:
-        """The same problem on other episodes of its model."""
-        return self._changed(episodes=tuple(episodes), held_out=tuple(held_out))
+        """The same problem on other episodes of its model, weighted by the sensors' noise alone."""
+        return self._changed(
+            episodes=tuple(episodes), held_out=tuple(held_out), innovations=(), held_out_innovations=()
+        )
+
+    @property
+    def disturbed(self) -> bool:
+        """Whether errors of torques or angles drive the motion of any recording."""
+        return any(episode.errors is not None for episode in self.episodes)
+
+    def weighted_at(self, x: ArrayLike, warm: WarmStart | None = None, rounds: int = 1) -> EstimationProblem:
+        """The same problem with residuals weighted by all noise, that which drives the motion too, frozen at `x`.
+
+        The problem itself where nothing is wrong with its torques and angles, or where it cannot be rolled out at `x`.
+        Of a problem that is weighted already, the new weights are about the torque offsets that the old ones see.
+
+        Parameters
+        ----------
+        x : array_like, shape (nx,)
+        warm : WarmStart, optional
+            As in `evaluate`.
+        rounds : int
+            How often in a row; 2 at a fit.
+        """
+        x = np.asarray(x, float)
+        guesses = warm or (None,) * len(self.episodes)
+
+        def one(i: int) -> tuple[Episode, Innovations | None]:
+            return self.predictor.weighted(self.episodes[i], *self.split(x, i), guesses[i], self.innovations[i])
+
+        if not self.disturbed:
+            return self
+        episodes, made = zip(*map_threads(one, range(len(self.episodes))), strict=True)
+        if any(m is None and e.errors is not None for m, e in zip(made, episodes, strict=True)):
+            return self
+        made_of = self._changed(episodes=episodes, innovations=made, held_out_innovations=())
+        return made_of if rounds < 2 else made_of.weighted_at(x, warm, rounds - 1)
+
+    def weighted_by_sensors(self) -> EstimationProblem:
+        """The same problem with residuals in units of the sensors' noise alone, torque offsets as they are known."""
+        return self._changed(innovations=(), held_out_innovations=())
+
+    def without_input_errors(self) -> EstimationProblem:
+        """The same problem with torques and angles that drive the motion taken as they were recorded."""
+        parts = (tuple(replace(e, errors=None) for e in group) for group in (self.episodes, self.held_out))
+        return self.on(*parts)
+
+    def held_out_weighted_at(self, x: ArrayLike) -> EstimationProblem:
+        """The same problem with the residuals of held-out recordings weighted like this as well, for `held_out_rows`.
+
+        One that cannot be rolled out keeps its sensors' weights.
+        """
+        x = np.asarray(x, float)
+        theta = self._held_out_theta(x)
+        episodes, made = [], []
+        for held in self.held_out:
+            episode, whitening = self._held_out_episode(held, theta), None
+            offset = self._held_out_offset(episode, theta, x)
+            for _ in range(2):
+                episode, whitening = self.predictor.weighted(episode, theta, offset, None, whitening)
+            episodes.append(replace(held, errors=episode.errors))
+            made.append(whitening)
+        return self._changed(held_out=tuple(episodes), held_out_innovations=tuple(made))
+
+    def held_out_rows(self, i: int, episode: Episode, result: EpisodeResult) -> Rows:
+        """Residual of a held-out recording, from its place and what `validate` says of it.
+
+        Without a robust loss, in the order of its measurements; innovations where they are frozen.
+        """
+        plain = replace(self.options, huber_threshold=np.inf)
+        return self._changed(options=plain)._rows(episode, self.held_out_innovations[i], result)
 
     def shortened(self, duration: float) -> EstimationProblem:
         """The same problem over the first seconds of every recording, prepared anew, without held-out ones."""
@@ -560,39 +605,3 @@ class EstimationProblem:
             else:
                 stds.append(float(options.priors.get(base, np.inf)))
         return np.array(stds)
-
-
-def _start_names(system: System) -> tuple[str, ...]:
-    """q and p of the coordinates that are neither driven, nor prescribed, nor follow their load at once."""
-    known = set(system.driven_indices) | set(system.prescribed_indices)
-    known |= {system.mechanism.joint_index(joint) for joint in system.compliant}
-    free = [name for i, name in enumerate(system.mechanism.joint_names) if i not in known]
-    return (*(f"q.{name}" for name in free), *(f"p.{name}" for name in free))
-
-
-def _check_free(system: System, free: Sequence[str], options: ProblemOptions) -> None:
-    for name in [*free, *options.local, *options.priors]:
-        system.parameters.index(name)
-    if len(set(free)) != len(free):
-        raise ConfigError("a free parameter is named twice", where=", ".join(free))
-    for name in (*options.local, *options.priors):
-        if name not in free:
-            raise ConfigError(f"'{name}' is not free", hint=nearest(name, free), where="local or priors")
-
-
-def _check_bounds(system: System, free: Sequence[str], theta: Array) -> None:
-    for name in free:
-        entry, value = system.parameters[name], theta[system.parameters.index(name)]
-        if not entry.lower <= value <= entry.upper:
-            raise ConfigError(
-                f"initial value {value:g} {entry.unit} of {name} lies outside its bounds",
-                where=f"parameters.{name}",
-                allowed=f"{entry.lower:g} to {entry.upper:g} {entry.unit}",
-            )
-        if not entry.lower < entry.upper:
-            raise ConfigError(
-                f"the bounds of {name} leave no room",
-                where=f"parameters.{name}",
-                allowed="lower below upper",
-                hint="fix the parameter instead of closing its bounds",
-            )

@@ -9,7 +9,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from yid_ocp.errors import ConfigError, nearest
 from yid_ocp.model.system import System
+from yid_ocp.problem.options import ProblemOptions
 
 Array = NDArray[np.float64]
 START = "start."
@@ -73,3 +75,41 @@ class Unknowns:
 def replaced(x: Array, names: Sequence[str], values: Mapping[str, float]) -> Array:
     """An unknown vector with named entries replaced."""
     return np.array([values.get(name, value) for name, value in zip(names, x, strict=True)], float)
+
+
+def start_names(system: System) -> tuple[str, ...]:
+    """q and p of the coordinates that are neither driven, nor prescribed, nor follow their load at once."""
+    known = set(system.driven_indices) | set(system.prescribed_indices)
+    known |= {system.mechanism.joint_index(joint) for joint in system.compliant}
+    free = [name for i, name in enumerate(system.mechanism.joint_names) if i not in known]
+    return (*(f"q.{name}" for name in free), *(f"p.{name}" for name in free))
+
+
+def check_free(system: System, free: Sequence[str], options: ProblemOptions) -> None:
+    """Refuse parameters that are unknown, named twice, or local or with a prior without being free."""
+    for name in [*free, *options.local, *options.priors]:
+        system.parameters.index(name)
+    if len(set(free)) != len(free):
+        raise ConfigError("a free parameter is named twice", where=", ".join(free))
+    for name in (*options.local, *options.priors):
+        if name not in free:
+            raise ConfigError(f"'{name}' is not free", hint=nearest(name, free), where="local or priors")
+
+
+def check_bounds(system: System, free: Sequence[str], theta: Array) -> None:
+    """Refuse initial values outside their bounds, and bounds without room."""
+    for name in free:
+        entry, value = system.parameters[name], theta[system.parameters.index(name)]
+        if not entry.lower <= value <= entry.upper:
+            raise ConfigError(
+                f"initial value {value:g} {entry.unit} of {name} lies outside its bounds",
+                where=f"parameters.{name}",
+                allowed=f"{entry.lower:g} to {entry.upper:g} {entry.unit}",
+            )
+        if not entry.lower < entry.upper:
+            raise ConfigError(
+                f"the bounds of {name} leave no room",
+                where=f"parameters.{name}",
+                allowed="lower below upper",
+                hint="fix the parameter instead of closing its bounds",
+            )

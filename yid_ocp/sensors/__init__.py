@@ -10,6 +10,7 @@ from yid_ocp.sensors.base import Surroundings as Surroundings
 from yid_ocp.sensors.base import joint_columns as joint_columns
 from yid_ocp.sensors.base import sensor_function as sensor_function
 from yid_ocp.sensors.joints import EffortSensor as EffortSensor
+from yid_ocp.sensors.joints import PositionSensor as PositionSensor
 from yid_ocp.sensors.points import PointSensor as PointSensor
 from yid_ocp.sensors.points import camera_pose as camera_pose
 

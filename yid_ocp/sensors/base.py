@@ -143,9 +143,13 @@ class JointData(Protocol):
     @property
     def t(self) -> Array: ...  # noqa: D102
     @property
+    def position(self) -> Array: ...  # noqa: D102
+    @property
     def effort(self) -> Array | None: ...  # noqa: D102
     @property
     def effort_std(self) -> float | Array | None: ...  # noqa: D102
+    @property
+    def effort_bias_std(self) -> float | Array | None: ...  # noqa: D102
     @property
     def effort_taken_as(self) -> str: ...  # noqa: D102
     @property
@@ -167,7 +171,7 @@ class Choice(Protocol):
     """How one group of a recording is used; see `problem.options.SensorOptions`."""
 
     @property
-    def use(self) -> bool: ...  # noqa: D102
+    def use(self) -> bool | None: ...  # noqa: D102
     @property
     def std(self) -> float | Mapping[str, float] | None: ...  # noqa: D102
     @property
@@ -175,7 +179,7 @@ class Choice(Protocol):
     @property
     def points(self) -> tuple[str, ...] | None: ...  # noqa: D102
     @property
-    def position_std(self) -> float | Mapping[str, float] | None: ...  # noqa: D102
+    def bias_std(self) -> float | Mapping[str, float] | None: ...  # noqa: D102
 
 
 class Smoothing(Protocol):

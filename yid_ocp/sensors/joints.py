@@ -1,7 +1,8 @@
-"""Sensors of the robot's joints: effort."""
+"""Sensors of the robot's joints: the encoders of driven ones, the effort of prescribed ones."""
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,13 +10,72 @@ from typing import Literal
 
 import casadi as ca
 import numpy as np
+import scipy.special
 
 from yid_ocp.errors import ConfigError, DataError, nearest
 from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import NodeState
-from yid_ocp.sensors.base import SENSORS, Array, Choice, SensorData, Surroundings, joint_columns
+from yid_ocp.sensors.base import SENSORS, Array, Choice, JointData, SensorData, Surroundings, joint_columns
+
+log = logging.getLogger(__name__)
 
 EFFORT = "joints.effort"
+POSITION = "joints.position"
+DIFFERENCES = 6
+"""Order of the differences from which a noise level is read: they leave nothing of a motion that is slow beside the
+sampling."""
+
+
+@dataclass(frozen=True)
+class PositionSensor:
+    """Encoders of the named joints, which are driven."""
+
+    joints: tuple[str, ...]
+    group: str = POSITION
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """`joints.position.JOINT` for every joint."""
+        return tuple(f"{self.group}.{joint}" for joint in self.joints)
+
+    @property
+    def unit(self) -> str:
+        """Radians."""
+        return "rad"
+
+    @property
+    def width(self) -> int:
+        """One output a joint."""
+        return 1
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """No points."""
+        return ()
+
+    @property
+    def points(self) -> tuple[str, ...]:
+        """No points."""
+        return ()
+
+    @property
+    def efforts(self) -> tuple[str, ...]:
+        """No efforts."""
+        return ()
+
+    @property
+    def camera(self) -> Placement | None:
+        """No camera."""
+        return None
+
+    @property
+    def baseline(self) -> Literal["zero", "stays"]:
+        """Every joint stays where it was."""
+        return "stays"
+
+    def output(self, state: NodeState) -> ca.SX:
+        """Angles of the joints, shape (nj, 1) [rad]."""
+        return ca.vertcat(*(state.q[state.system.mechanism.joint_index(joint)] for joint in self.joints))
 
 
 @dataclass(frozen=True)
@@ -70,6 +130,35 @@ class EffortSensor:
         return ca.vertcat(*(state.effort[state.system.mechanism.joint_index(joint)] for joint in self.joints))
 
 
+@SENSORS.register(POSITION)
+def measured_angles(around: Surroundings) -> list[SensorData]:
+    """Recorded angles of driven joints, as they are; the first is left out, from which the posture at rest is taken.
+
+    Raises
+    ------
+    ConfigError
+        They are asked for beside points of the arm, which as a rule are computed from them.
+    """
+    joints, choice, system = around.recording.joints, around.choice(POSITION), around.system
+    names = system.driven if joints is not None else ()
+    arm = [group.name for group in around.recording.points if "arm" in (group.sensor, group.name.rpartition("_")[2])]
+    arm = [name for name in arm if around.choice(name).use is not False]
+    if joints is None or not names or choice.use is False or (choice.use is None and arm):
+        return []
+    if arm:
+        raise ConfigError(
+            f"the encoders and the arm's points '{arm[0]}' are both to be measurements: one follows from the other",
+            where="sensors.joints.position.use",
+            hint=f"set sensors.{arm[0]}.use: false, or leave the encoders out",
+        )
+    where = around.recording.name
+    later = joints.t > around.times[0] + 1e-9
+    later &= joints.t <= around.times[-1] + 1e-9
+    value = joints.position[later][:, joint_columns(joints, names, where)]
+    std = np.broadcast_to(angle_std(joints, names, choice, where), value.shape)
+    return [SensorData(PositionSensor(names), joints.t[later], value, std)]
+
+
 @SENSORS.register(EFFORT)
 def measured_efforts(around: Surroundings) -> list[SensorData]:
     """Recorded efforts of prescribed joints, smoothed like the motion, at nodes far enough apart to be independent.
@@ -80,7 +169,7 @@ def measured_efforts(around: Surroundings) -> list[SensorData]:
         No noise level, or a recording too short for the filter.
     """
     joints, choice = around.recording.joints, around.choice(EFFORT)
-    if joints is None or joints.effort is None or not choice.use:
+    if joints is None or joints.effort is None or choice.use is False:
         return []
     names = tuple(name for name in around.system.prescribed if name in joints.names)
     if not names:
@@ -90,7 +179,7 @@ def measured_efforts(around: Surroundings) -> list[SensorData]:
     # what stands for an interval belongs to its middle
     late = 0.0 if joints.effort_taken_as == "sample" else 0.5 * float(np.median(np.diff(joints.t)))
     measured = np.stack([np.interp(times, joints.t + late, column) for column in effort.T], axis=1)
-    std = _effort_std(around, names, choice, float(np.median(np.diff(joints.t))))
+    std = _smoothed_effort_std(around, names, choice, float(np.median(np.diff(joints.t))))
     # Smoothed values repeat their neighbours: only as many are kept as count as independent. Both ends are left out:
     # the filter sees one side alone there, the impulse at node 0 depends on the motion before the recording and that at
     # the last node on the motion after it.
@@ -108,25 +197,67 @@ def measured_efforts(around: Surroundings) -> list[SensorData]:
     return [SensorData(EffortSensor(names), times[kept], measured[kept], spread, (1, steps - 1))]
 
 
-def _effort_std(around: Surroundings, names: tuple[str, ...], choice: Choice, period: float) -> Array:
-    """Standard deviation of smoothed efforts: the sensor's noise and that of accelerations from noisy encoders."""
-    joints = around.recording.joints
-    assert joints is not None
+# -- noise levels -----------------------------------------------------------------------------------------------------
+
+
+def angle_std(joints: JointData, names: Sequence[str], choice: Choice, where: str) -> Array:
+    """Standard deviation of the encoders of driven joints, shape (len(names),) [rad]."""
+    given = choice.std if choice.std is not None else joints.position_std
+    if given is None:
+        return estimated_std(joints.position[:, joint_columns(joints, tuple(names), where)], where, POSITION, "rad")
+    return by_joint(given, joints.names, names, "sensors.joints.position.std")
+
+
+def torque_std(joints: JointData, names: Sequence[str], choice: Choice, where: str) -> Array:
+    """Standard deviation of a recorded torque of driven joints about the true one, shape (len(names),) [N m]."""
     given = choice.std if choice.std is not None else joints.effort_std
     if given is None:
+        assert joints.effort is not None
+        return estimated_std(joints.effort[:, joint_columns(joints, tuple(names), where)], where, EFFORT, "N m")
+    return by_joint(given, joints.names, names, "sensors.joints.effort.std")
+
+
+def torque_bias_std(joints: JointData, names: Sequence[str], choice: Choice) -> Array:
+    """Standard deviation of a constant error of recorded torques, shape (len(names),) [N m]; zero where unknown."""
+    given = choice.bias_std if choice.bias_std is not None else joints.effort_bias_std
+    return by_joint(0.0 if given is None else given, joints.names, names, "sensors.joints.effort.bias_std")
+
+
+def estimated_std(values: Array, where: str, group: str, unit: str) -> Array:
+    """White noise of evenly sampled channels that nobody stated, from differences of high order; said in the log.
+
+    Parameters
+    ----------
+    values : ndarray, shape (N, k)
+    where, group, unit : str
+        Names of the recording and of the channels, and their unit.
+
+    Returns
+    -------
+    ndarray, shape (k,)
+        Whatever else is as fast as the sampling counts as noise, so that this is rather too much than too little.
+    """
+    if len(values) <= DIFFERENCES:
         raise DataError(
-            "the noise level of the joint efforts is neither recorded nor given",
-            where=around.recording.name,
-            hint="set sensors.joints.effort.std [N m], from a stretch at rest or the data sheet",
+            f"{len(values)} samples are too few to see the noise of {group}",
+            where=where,
+            allowed=f"more than {DIFFERENCES}",
+            hint=f"set sensors.{group}.std [{unit}]",
         )
-    std = _by_joint(given, joints.names, names, "sensors.joints.effort.std")
-    value_gain, _, second_gain = around.low_pass.gains(period)
-    known = choice.position_std if choice.position_std is not None else joints.position_std
-    angle = _by_joint(0.0 if known is None else known, joints.names, names, "sensors.joints.effort.position_std")
-    return np.asarray(np.sqrt((std * value_gain) ** 2 + (around.inertia(names) * angle * second_gain) ** 2))
+    size = math.sqrt(scipy.special.comb(2 * DIFFERENCES, DIFFERENCES))
+    found = np.sqrt(np.mean(np.diff(values, DIFFERENCES, axis=0) ** 2, axis=0)) / size
+    log.warning(
+        "%s: the noise of %s is neither recorded nor configured; %.2g to %.2g %s estimated from its fastest changes",
+        where,
+        group,
+        found.min(),
+        found.max(),
+        unit,
+    )
+    return np.asarray(found)
 
 
-def _by_joint(
+def by_joint(
     given: float | Array | Mapping[str, float], recorded: Sequence[str], names: Sequence[str], key: str
 ) -> Array:
     """One number for each of `names` from one for all, one for each recorded joint, or a mapping."""
@@ -137,3 +268,22 @@ def _by_joint(
         return np.array([float(given[name]) for name in names])
     wide = np.broadcast_to(np.asarray(given, float), (len(recorded),))
     return wide[[list(recorded).index(name) for name in names]]
+
+
+def _smoothed_effort_std(around: Surroundings, names: tuple[str, ...], choice: Choice, period: float) -> Array:
+    """Standard deviation of smoothed efforts: the sensor's noise and that of accelerations from noisy encoders."""
+    joints = around.recording.joints
+    assert joints is not None
+    given = choice.std if choice.std is not None else joints.effort_std
+    if given is None:
+        raise DataError(
+            "the noise level of the joint efforts is neither recorded nor given",
+            where=around.recording.name,
+            hint="set sensors.joints.effort.std [N m], from a stretch at rest or the data sheet",
+        )
+    std = by_joint(given, joints.names, names, "sensors.joints.effort.std")
+    value_gain, _, second_gain = around.low_pass.gains(period)
+    encoders = around.choice(POSITION)
+    known = encoders.std if encoders.std is not None else joints.position_std
+    angle = by_joint(0.0 if known is None else known, joints.names, names, "sensors.joints.position.std")
+    return np.asarray(np.sqrt((std * value_gain) ** 2 + (around.inertia(names) * angle * second_gain) ** 2))

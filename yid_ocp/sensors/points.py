@@ -83,7 +83,7 @@ def measured_points(around: Surroundings) -> list[SensorData]:
     return [
         _points(around, group, around.choice(group.name))
         for group in around.recording.points
-        if around.choice(group.name).use
+        if around.choice(group.name).use is not False
     ]
 
 

@@ -14,7 +14,8 @@ import numpy as np
 import threadpoolctl
 from numpy.typing import NDArray
 
-from yid_ocp.problem.problem import EstimationProblem, Evaluation, WarmStart
+from yid_ocp.problem.evaluation import Evaluation, WarmStart
+from yid_ocp.problem.problem import EstimationProblem
 from yid_ocp.registry import Registry
 
 log = logging.getLogger(__name__)
@@ -195,6 +196,8 @@ CONTINUATION = (0.06, 0.12, 0.25, 0.5)
 # it is started again from these multiples of the initial values, and the best is kept.
 POOR_FIT = 5.0
 RESTARTS = (4.0, 2.0, 10.0)
+# Noise that drives the motion is linearised where a pass begins; passes end when one changes nothing.
+PASSES = 6
 
 
 def solve(
@@ -204,6 +207,8 @@ def solve(
 
     Where the rollout fails at the start (a soft object snaps, an arm falls), the problem is first solved over its first
     seconds only, and then over longer and longer horizons. A poor fit is started again from other initial values.
+    Where noise drives the motion, methods that can weigh residuals by it do so in several passes, its covariance frozen
+    in each (`EstimationProblem.weighted_at`).
 
     Parameters
     ----------
@@ -245,6 +250,8 @@ def _solved(
     outcome, finish = best
     covariance, chi2 = uncertainty(problem, finish)
     status, message = outcome.status, outcome.message
+    if problem.disturbed and not carries_covariance(solver):
+        message += "; weighted by the sensors' noise alone, without the noise that drives the motion"
     if not finish.ok:
         status, message = Status.FAILED, finish.message
     elif tried > 1:
@@ -284,9 +291,22 @@ def _attempt(
             history += [replace(entry, note=f"first {fraction * longest:.3g} s") for entry in part.history]
             if problem.evaluate(x, derivatives=False).ok:
                 break
-    outcome = solver.run(problem, x, callback)
-    history += outcome.history
-    return (outcome, problem.evaluate(outcome.x, warm=outcome.warm)), evaluations + outcome.evaluations, history
+    passes = PASSES if problem.disturbed and carries_covariance(solver) else 1
+    weighted, warm = problem, None
+    for number in range(passes):
+        weighted = weighted.weighted_at(x, warm) if passes > 1 else problem
+        outcome = solver.run(weighted, x, callback)
+        x, warm, evaluations = outcome.x, outcome.warm, evaluations + outcome.evaluations
+        history += outcome.history
+        # the second pass is the first about torque offsets that are not guessed
+        if number and len(outcome.history) < 2:
+            break
+    return (outcome, weighted.evaluate(outcome.x, warm=outcome.warm)), evaluations, history
+
+
+def carries_covariance(solver: Solver) -> bool:
+    """Whether a method can weigh residuals by noise that drives the motion."""
+    return bool(getattr(solver, "carries_covariance", False))
 
 
 def _good_fit(problem: EstimationProblem, finish: Evaluation) -> bool:

@@ -12,7 +12,8 @@ from annotated_types import Ge, Gt
 from numpy.typing import NDArray
 
 from yid_ocp.options import About, check
-from yid_ocp.problem.problem import EstimationProblem, Evaluation
+from yid_ocp.problem.evaluation import Evaluation
+from yid_ocp.problem.problem import EstimationProblem
 from yid_ocp.solvers.base import SOLVERS, Callback, Outcome, Recorder, Status, projected_gradient
 
 Array = NDArray[np.float64]
@@ -42,6 +43,7 @@ class GaussNewton:
         float, Gt(0), About("initial mu, in units of the largest diagonal entry of the scaled normal matrix")
     ] = 1e-6
     name: ClassVar[str] = "gauss_newton"
+    carries_covariance: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         check(self, f"solver {self.name}")

@@ -10,7 +10,8 @@ from annotated_types import Ge, Gt, Lt
 from numpy.typing import NDArray
 
 from yid_ocp.options import About, check
-from yid_ocp.problem.problem import EstimationProblem, Evaluation
+from yid_ocp.problem.evaluation import Evaluation
+from yid_ocp.problem.problem import EstimationProblem
 from yid_ocp.solvers.base import SOLVERS, Callback, Outcome, Recorder, Status, projected_gradient
 
 Array = NDArray[np.float64]

@@ -507,7 +507,9 @@ def check_grasps(run: Run, problem: EstimationProblem) -> None:
 
 def _check_sensors(run: Run, recordings: Sequence[Recording]) -> None:
     known = {group.name for recording in recordings for group in recording.points}
-    known |= {"joints.effort"} if any(recording.joints is not None for recording in recordings) else set()
+    known |= (
+        {"joints.position", "joints.effort"} if any(recording.joints is not None for recording in recordings) else set()
+    )
     for name in run.sensors:
         if name not in known:
             raise run.refuse(

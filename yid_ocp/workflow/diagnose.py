@@ -16,7 +16,7 @@ import numpy as np
 from yid_ocp.config.reader import DIAGNOSIS_DEFAULT, load_config
 from yid_ocp.config.settings import Run, dump_config
 from yid_ocp.diagnosis import Finding, diagnose
-from yid_ocp.problem import EstimationProblem, SensorOptions
+from yid_ocp.problem import EstimationProblem
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import Findings
 from yid_ocp.report.terminal import diagnose_summary
@@ -146,7 +146,11 @@ def in_units_of_noise(problem: EstimationProblem, run: Run) -> EstimationProblem
     if share == 1:
         return problem
     used = {samples.sensor.group for episode in problem.episodes for samples in episode.samples}
+    recorded = [e.recording.joints.position_std for e in problem.episodes if e.recording.joints is not None]
+    if "joints.effort" in used and any(std is not None and np.any(std) for std in recorded):
+        used.add("joints.position")  # the encoders' noise is part of that of efforts
     sensors = dict(options.sensors)
+    used |= {"joints.position"} & set(sensors)
     for group in sorted(used):
         std = sensors[group].std if group in sensors else None
         if std is None:
@@ -156,9 +160,7 @@ def in_units_of_noise(problem: EstimationProblem, run: Run) -> EstimationProblem
                 "noise_fraction",
                 hint=f"set sensors.{group}.std",
             )
-        sensors[group] = replace(
-            sensors[group], std=_times(share, std), position_std=_encoder(run, problem, sensors, group)
-        )
+        sensors[group] = replace(sensors[group], std=_times(share, std))
     return problem.with_options(
         replace(
             options,
@@ -174,24 +176,6 @@ def in_units_of_noise(problem: EstimationProblem, run: Run) -> EstimationProblem
 
 def _times(share: float, std: float | Mapping[str, float]) -> float | Mapping[str, float]:
     return {name: share * value for name, value in std.items()} if isinstance(std, Mapping) else share * std
-
-
-def _encoder(
-    run: Run, problem: EstimationProblem, sensors: Mapping[str, SensorOptions], group: str
-) -> float | Mapping[str, float] | None:
-    """The encoders' standard deviation, which enters that of efforts, shrunk alike."""
-    stated = sensors[group].position_std
-    if stated is not None:
-        return _times(run.diagnosis.noise_fraction, stated)
-    recorded = [e.recording.joints.position_std for e in problem.episodes if e.recording.joints is not None]
-    if group == "joints.effort" and any(std is not None and np.any(std) for std in recorded):
-        raise run.refuse(
-            "the fraction of noise is given, but the encoders' std is only in the recordings",
-            "diagnosis",
-            "noise_fraction",
-            hint=f"set sensors.{group}.position_std",
-        )
-    return None
 
 
 def predictions(finding: Finding) -> list[Prediction]:

@@ -1,0 +1,260 @@
+"""Innovations against dense algebra: the covariance of all residuals from rollouts whose inputs are wrong."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_problems import H, pendulum_step, taken
+
+from yid_ocp.errors import ConfigError
+from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
+from yid_ocp.problem.evaluation import joined
+
+TORQUE, BIAS, ANGLE = 0.3, 0.2, 2e-3
+TRACKED = {"feedback": "proportional", "gains": (9.0,)}
+
+
+def problem_of(folder, *, encoders, period=1, feedback=TRACKED, effects=(), size=1.0, angle=ANGLE, **more):
+    """A pendulum whose shoulder is driven by wrong torques, `period` steps a sample; errors `size` times as large."""
+    step = pendulum_step(folder, effects, driven=("shoulder",))
+    made = taken(step, 3, steps=24)
+    group = made.joints
+    assert group is not None
+    group = replace(group, effort_std=size * TORQUE, effort_bias_std=size * BIAS, effort_kind="command")
+    group = replace(group, position_std=size * angle)
+    if period > 1:
+        group = replace(group, t=group.t[::period], position=group.position[::period], effort=group.effort[::period])
+    points = tuple(g for g in made.points if not encoders or g.name == "points_camera")
+    recording = replace(made, joints=group, points=points)
+    options = ProblemOptions(**feedback, **more)
+    names = ("elbow.damping", "elbow.stiffness", *(n for e in step.system.effects for n in e.parameters.names))
+    return EstimationProblem(step, [recording], names, options)
+
+
+def residual(problem, x, torque=0.0, posture=0.0, reference=None):
+    """Residual by the sensors' noise alone of an episode whose torques, first angles and reference are changed."""
+    episode = problem.episodes[0]
+    errors = replace(episode.errors, offset=np.zeros(1))
+    arm = episode.measured_arm.copy()
+    arm[0] += posture
+    feedback = episode.feedback
+    if reference is not None and feedback is not None:
+        feedback = replace(feedback, reference=feedback.reference + reference)
+    changed = replace(episode, torque=episode.torque + torque, measured_arm=arm, feedback=feedback, errors=errors)
+    result = problem.predictor.run(changed, *problem.split(x, 0), False)
+    return joined(changed.samples, result).residual
+
+
+def slopes(change, count, size):
+    """Derivative of a residual by inputs, column by column, by central differences."""
+    return np.stack([(change(k, size) - change(k, -size)) / (2 * size) for k in range(count)], axis=1)
+
+
+def dense_covariance(problem, x, angle):
+    """Covariance of the residual where encoders are no measurements, the tracking filter at work on wrong angles."""
+    episode = problem.episodes[0]
+    errors, steps = episode.errors, episode.grid.steps
+    samples = np.unique(errors.sample)
+
+    def held(k, size):
+        return residual(problem, x, torque=size * (errors.sample == samples[k])[:, None])
+
+    def followed(k, size):
+        return residual(problem, x, reference=size * (np.arange(steps) == k)[:, None])
+
+    by_torque = slopes(held, len(samples), 1e-3)
+    by_angle = slopes(followed, steps, 1e-4)
+    by_first = slopes(lambda _, size: residual(problem, x, posture=size), 1, 1e-4)
+    total = np.eye(len(by_torque)) + TORQUE**2 * by_torque @ by_torque.T
+    constant = by_torque.sum(axis=1, keepdims=True)
+    total += BIAS**2 * constant @ constant.T + angle**2 * by_angle @ by_angle.T
+    return total + angle**2 * by_first @ by_first.T
+
+
+@pytest.fixture
+def point(urdf_folder):
+    problem = problem_of(urdf_folder, encoders=False)
+    return problem, problem.start * 1.1
+
+
+@pytest.mark.parametrize(
+    ("how", "effects"),
+    [
+        ({}, ()),
+        ({"feedback": {"feedback": "none"}}, ()),
+        ({}, (("camera_latency", "camera", {"delay": 0.0137}),)),
+        # the noise of interpolated angles is only as large as white noise makes it
+        ({"period": 2, "angle": 1e-9}, ()),
+    ],
+    ids=["tracked", "open_loop", "late_camera", "two_steps_a_sample"],
+)
+def test_innovations_weigh_by_the_covariance_of_all_residuals(urdf_folder, how, effects):
+    problem = problem_of(urdf_folder, encoders=False, effects=effects, **how)
+    x = problem.start * 1.1
+    plain, weighted = problem.evaluate(x), problem.weighted_at(x).evaluate(x)
+    rows = problem.rows.data
+    covariance = dense_covariance(problem, x, how.get("angle", ANGLE))
+    solved = np.linalg.solve(covariance, np.column_stack([plain.residual[rows], plain.jacobian[rows]]))
+    left = np.column_stack([plain.residual[rows], plain.jacobian[rows]]).T @ solved
+    mine = np.column_stack([weighted.residual[rows], weighted.jacobian[rows]])
+    np.testing.assert_allclose(mine.T @ mine, left, rtol=2e-5, atol=1e-6 * np.abs(left).max())
+    np.testing.assert_array_equal(weighted.residual[rows.stop :], plain.residual[rows.stop :])
+
+
+@pytest.mark.parametrize("gain", [0.0, 20.0])
+def test_with_encoders_the_outcome_does_not_depend_on_the_tracking_filter(urdf_folder, gain):
+    """Encoders are measurements and the filter only says where to linearise: gains move chi2 by what is not linear."""
+    costs = []
+    for g in (9.0, gain):
+        feedback = {"feedback": "proportional", "gains": (g,)}
+        problem = small_gap(problem_of(urdf_folder, encoders=True, feedback=feedback, size=0.1), size=0.1)
+        weighted = problem.weighted_at(problem.start)
+        rows = problem.rows.data
+        found = weighted.evaluate(problem.start)
+        r, jacobian = found.residual[rows], found.jacobian[rows]
+        costs.append(
+            (r @ r, np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ r), np.linalg.inv(jacobian.T @ jacobian))
+        )
+    (one, step, covariance), (other, moved, _) = costs
+    assert one == pytest.approx(other, rel=1e-4)
+    np.testing.assert_allclose((moved - step) / np.sqrt(np.diag(covariance)), 0.0, atol=0.02)
+
+
+def small_gap(problem, size=1.0):
+    """The same problem with measurements near what the model says: a true motion with wrong torques."""
+    episode = problem.episodes[0]
+    rng = np.random.default_rng(5)
+    truth = replace(episode, torque=episode.torque + 0.3 * size * TORQUE * rng.standard_normal(episode.torque.shape))
+    truth = replace(truth, feedback=None)
+    result = problem.predictor.run(truth, *problem.split(problem.start, 0), False)
+    samples = tuple(
+        replace(s, value=y + s.std * rng.standard_normal(y.shape))
+        for s, y in zip(episode.samples, result.predicted, strict=True)
+    )
+    angles = result.rollout.state[:, :1] + size * ANGLE * rng.standard_normal((len(result.rollout.state), 1))
+    angles[0] = episode.measured_arm[0]
+    feedback = episode.feedback
+    if feedback is not None:
+        feedback = replace(feedback, reference=angles[:-1].copy())
+    return problem.on([replace(episode, samples=samples, feedback=feedback, measured_arm=angles)], [])
+
+
+def test_without_errors_of_inputs_nothing_changes(urdf_folder):
+    step = pendulum_step(urdf_folder, driven=("shoulder",))
+    made = taken(step, 3)
+    made = replace(made, joints=replace(made.joints, effort_std=0.0))
+    problem = EstimationProblem(step, [made], ("elbow.stiffness",), ProblemOptions(**TRACKED))
+    assert not problem.disturbed
+    assert problem.weighted_at(problem.start) is problem
+
+
+def test_the_papers_cost_knows_no_noise(urdf_folder):
+    problem = problem_of(urdf_folder, encoders=False, weighting="paper")
+    assert not problem.disturbed
+    assert {s.sensor.group for s in problem.episodes[0].samples} == {"points_arm", "points_camera"}
+
+
+def test_a_constant_error_is_seen_and_its_spread_said(urdf_folder):
+    problem = small_gap(problem_of(urdf_folder, encoders=True))
+    episode = problem.episodes[0]
+    problem = problem.on([replace(episode, torque=episode.torque + 0.35)], [])
+    weighted = problem.weighted_at(problem.start)
+    ((value, std),) = weighted.torque_offsets(problem.start)
+    assert std[0] < BIAS
+    assert value[0] == pytest.approx(0.35, abs=4 * std[0])
+    again = weighted.weighted_at(problem.start)
+    np.testing.assert_allclose(again.episodes[0].errors.offset, value)
+    ((settled, _),) = again.torque_offsets(problem.start)
+    assert settled[0] == pytest.approx(value[0], abs=0.5 * std[0])
+    assert problem.torque_offsets(problem.start) == [None]
+
+
+def test_weights_are_frozen_until_they_are_asked_for_again(point):
+    problem, x = point
+    weighted = problem.weighted_at(x)
+    there, back = weighted.evaluate(1.2 * x), weighted.evaluate(x)
+    assert weighted.innovations[0] is weighted.freeing(problem.free[:1]).innovations[0]
+    np.testing.assert_array_equal(back.residual, weighted.evaluate(x).residual)
+    assert there.cost != back.cost
+    assert problem.innovations == (None,)
+
+
+def test_jacobians_of_innovations_are_those_of_differences(urdf_folder):
+    problem = small_gap(problem_of(urdf_folder, encoders=True))
+    weighted = problem.weighted_at(problem.start)
+    x = problem.start * 1.05
+    found = weighted.evaluate(x)
+    for i in range(len(x)):
+        step = np.zeros(len(x))
+        step[i] = 1e-5 * x[i]
+        ends = [weighted.evaluate(x + sign * step, warm=found.warm).residual for sign in (1, -1)]
+        numeric = (ends[0] - ends[1]) / (2 * step[i])
+        np.testing.assert_allclose(numeric, found.jacobian[:, i], atol=2e-5 * np.abs(found.jacobian[:, i]).max())
+
+
+# -- which encoders are measurements, and what is known of noise -------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arm", "use", "expected"),
+    [(True, None, False), (False, None, True), (False, False, False), (False, True, True)],
+)
+def test_encoders_are_measurements_where_no_point_of_the_arm_is(urdf_folder, arm, use, expected):
+    step = pendulum_step(urdf_folder, driven=("shoulder",))
+    made = taken(step, 3)
+    group = replace(made.points[0], sensor="arm")
+    made = replace(made, points=(group, made.points[1]) if arm else made.points[1:])
+    sensors = {} if use is None else {"joints.position": SensorOptions(use=use)}
+    problem = EstimationProblem(step, [made], ("elbow.stiffness",), ProblemOptions(sensors=sensors, **TRACKED))
+    found = [s for s in problem.episodes[0].samples if s.sensor.group == "joints.position"]
+    assert bool(found) == expected
+    assert problem.episodes[0].errors.encoders == expected
+    if expected:
+        # the first angle is where the rollout starts
+        assert found[0].node[0] == 1
+        np.testing.assert_allclose(found[0].std, 1e-3)
+
+
+def test_encoders_beside_points_of_the_arm_are_refused(urdf_folder):
+    step = pendulum_step(urdf_folder, driven=("shoulder",))
+    made = taken(step, 3)
+    made = replace(made, points=(replace(made.points[0], sensor="arm"),))
+    options = ProblemOptions(sensors={"joints.position": SensorOptions(use=True)}, **TRACKED)
+    with pytest.raises(ConfigError, match=r"points_arm.*both") as caught:
+        EstimationProblem(step, [made], ("elbow.stiffness",), options)
+    assert "sensors.points_arm.use: false" in caught.value.hint
+
+
+@pytest.mark.parametrize("said", [0.02, None])
+def test_noise_that_nobody_states_is_read_from_the_recording(urdf_folder, said, caplog):
+    step = pendulum_step(urdf_folder, driven=("shoulder",))
+    made = taken(step, 3, steps=400)
+    rng = np.random.default_rng(1)
+    noisy = made.joints.effort + 0.02 * rng.standard_normal(made.joints.effort.shape)
+    made = replace(made, joints=replace(made.joints, effort=noisy, effort_std=said))
+    with caplog.at_level("WARNING"):
+        problem = EstimationProblem(step, [made], ("elbow.stiffness",), ProblemOptions(**TRACKED))
+    assert problem.episodes[0].errors.torque_std[0] == pytest.approx(0.02, rel=0.15)
+    assert ("neither recorded nor configured" in caplog.text) == (said is None)
+
+
+def test_torques_beside_encoders_are_never_taken_as_exact(urdf_folder):
+    step = pendulum_step(urdf_folder, driven=("shoulder",))
+    made = taken(step, 3)
+    made = replace(made, joints=replace(made.joints, effort_std=0.0), points=made.points[1:])
+    problem = EstimationProblem(step, [made], ("elbow.stiffness",), ProblemOptions(**TRACKED))
+    assert problem.episodes[0].errors.torque_std[0] == pytest.approx(1e-3 * np.std(made.joints.effort))
+
+
+def test_a_step_over_several_samples_averages_their_noise(urdf_folder):
+    step = pendulum_step(urdf_folder, driven=("shoulder",))
+    made = taken(step, 3, steps=48)
+    group = replace(made.joints, t=1.0 + 0.5 * (made.joints.t - 1.0))
+    problem = EstimationProblem(step, [replace(made, joints=group)], ("elbow.stiffness",), ProblemOptions(**TRACKED))
+    errors = problem.episodes[0].errors
+    assert errors.torque_std[0] == pytest.approx(0.3 * math.sqrt(0.5))
+    assert problem.episodes[0].grid.time_step == H
+    assert len(np.unique(errors.sample)) == problem.episodes[0].grid.steps

@@ -1,0 +1,98 @@
+"""A residual: how it is made up, and its value and derivative at one point."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.measurements import Measurements, Rows
+from yid_ocp.problem.prediction import EpisodeResult
+
+Array = NDArray[np.float64]
+WarmStart = tuple[Array | None, ...]
+"""Configuration near the equilibrium at which each recording starts; None where it is not known."""
+
+
+@dataclass(frozen=True)
+class ResidualRows:
+    """How the residual of a problem is made up: measurements, then stated priors, then weak priors.
+
+    Attributes
+    ----------
+    measurements : tuple of tuple of slice
+        Rows of every group of measurements of every episode, those without a measurement left out.
+    data, stated_priors, weak_priors : slice
+    informing : slice
+        Data and stated priors: all that the weak priors are not.
+    """
+
+    measurements: tuple[tuple[slice, ...], ...]
+    data: slice
+    stated_priors: slice
+    weak_priors: slice
+
+    @property
+    def informing(self) -> slice:
+        """Data and stated priors: all that the weak priors are not."""
+        return slice(0, self.stated_priors.stop)
+
+    @staticmethod
+    def of(episodes: Sequence[Episode], stated: int, weak: int) -> ResidualRows:
+        """From the numbers of measurements and priors."""
+        at, groups = 0, []
+        for episode in episodes:
+            own = []
+            for samples in episode.samples:
+                own.append(slice(at, at + samples.count))
+                at += samples.count
+            groups.append(tuple(own))
+        return ResidualRows(tuple(groups), slice(0, at), slice(at, at + stated), slice(at + stated, at + stated + weak))
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Residual of a problem at one point.
+
+    Attributes
+    ----------
+    cost : float
+        1/2 |r|^2, or the robust loss; infinite where the rollout failed.
+    residual : ndarray, shape (nr,)
+    jacobian : ndarray, shape (nr, nx), or None
+    ok : bool
+    message : str
+    episodes : tuple of EpisodeResult
+    """
+
+    cost: float
+    residual: Array
+    jacobian: Array | None
+    ok: bool
+    message: str
+    episodes: tuple[EpisodeResult, ...]
+
+    @property
+    def warm(self) -> WarmStart:
+        """Where to look for the equilibria of a point nearby."""
+        return tuple(result.warm for result in self.episodes)
+
+
+def joined(measurements: Sequence[Measurements], result: EpisodeResult, threshold: float = math.inf) -> Rows:
+    """Residual of one recording in units of the sensors' noise, group after group; see `Measurements.rows`."""
+    slopes = result.sensitivities or (None,) * len(measurements)
+    parts = [
+        samples.rows(predicted, by_unknowns, threshold)
+        for samples, predicted, by_unknowns in zip(measurements, result.predicted, slopes, strict=True)
+    ]
+    jacobians = [part.jacobian for part in parts if part.jacobian is not None]
+    return Rows(
+        sum(part.cost for part in parts),
+        np.concatenate([part.residual for part in parts]),
+        np.vstack(jacobians) if jacobians else None,
+        np.concatenate([part.weight for part in parts]),
+    )
