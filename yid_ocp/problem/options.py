@@ -27,7 +27,7 @@ class SensorOptions:
         About("noise standard deviation instead of the recorded one, by name where they differ", "m or N m"),
     ] = None
     frames: Annotated[
-        Mapping[str, str], About("frame of the model that a point marks, where the two have different names")
+        Mapping[str, str], About("frame of the model that a point marks, or T1:40%, where the two have different names")
     ] = field(default_factory=dict)
     points: Annotated[tuple[str, ...] | None, About("points to use; all that the model has when absent")] = None
     position_std: Annotated[
