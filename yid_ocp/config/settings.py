@@ -287,6 +287,13 @@ class OutputSettings:
 
     folder: Annotated[FilePath | None, About("in which run folders are made; `runs` in the working folder")] = None
     report: Annotated[bool, About("whether report.html is written")] = True
+    discretisation: Annotated[
+        Literal["none", "time_step", "both"] | None,
+        About(
+            "what `solve` refines to see how far estimates move: the time step, the links as well; both for an object "
+            "of segments and the time step for any other when absent"
+        ),
+    ] = None
 
 
 @dataclass(frozen=True, kw_only=True)
