@@ -17,7 +17,7 @@ from yid_ocp.data import read_recording
 
 SOLVE_KEYS = {
     "format", "status", "message", "parameters", "cost", "iterations", "evaluations", "seconds", "residuals",
-    "held_out", "inputs", "versions", "notes", "discretisation", "discretisation_notes",
+    "held_out", "inputs", "versions", "notes", "discretisation", "discretisation_notes", "stability",
 }  # fmt: skip
 PARAMETER_KEYS = {"value", "std", "unit", "initial", "lower", "upper", "free", "verdict"}
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from yid_ocp.analysis.stability import growth_of_fit
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import Run
 from yid_ocp.data.recording import Recording
@@ -128,6 +129,9 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
 def _moves(run: Run, problem: EstimationProblem, warnings: list[str], progress: Progress) -> dict[str, Any]:
     """How far estimates would move with a finer model if they were the initial values, and by what they are known."""
     x = problem.start
+    growth = growth_of_fit(problem, x)
+    if growth is not None and not growth.stable:
+        warnings.append(f"with the initial parameters {growth.words}")
     at_x = problem.evaluate(x)
     if not at_x.ok:
         warnings.append(f"the model cannot be rolled out with the initial parameters: {at_x.message}")

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from yid_ocp.analysis.convergence import Frequencies, natural_frequencies
 from yid_ocp.analysis.discretisation import Moves, Refined, counting, divided_joints, moves
+from yid_ocp.analysis.stability import growth_of_fit
 from yid_ocp.config.settings import Run, SegmentedObject, YObject
 from yid_ocp.errors import YidError
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.problem import Evaluation
-from yid_ocp.solvers import Solution
+from yid_ocp.solvers import Solution, Status
 from yid_ocp.workflow.build import build_step, build_system, finer_factor
 from yid_ocp.workflow.progress import SILENT, Progress
 
@@ -129,6 +130,25 @@ def _with_half_the_step(run: Run, problem: EstimationProblem) -> Refined:
     step = build_step(replace(run, problem=said))
     recordings = [episode.recording for episode in problem.episodes]
     return Refined(EstimationProblem(step, recordings, problem.free, problem.options))
+
+
+# -- stability --------------------------------------------------------------------------------------------------------
+
+
+def steadied(problem: EstimationProblem, solution: Solution) -> tuple[Solution, dict[str, Any]]:
+    """A solution that has not converged where its step is not stable, and for result.json what was found.
+
+    Along the recorded motions, at the start of the search and at the estimate. A search may begin where the step is not
+    stable and leave that place; one that ends there has followed the step's own errors.
+    """
+    begin, end = growth_of_fit(problem, problem.start), growth_of_fit(problem, solution.x)
+    found = {key: None if own is None else asdict(own) for key, own in (("start", begin), ("estimate", end))}
+    if end is not None and not end.stable:
+        status = Status.STALLED if solution.status == Status.CONVERGED else solution.status
+        return replace(solution, status=status, message=f"at the estimate {end.words} ({solution.message})"), found
+    if solution.status == Status.FAILED and begin is not None and not begin.stable:
+        return replace(solution, message=f"at the start {begin.words} ({solution.message})"), found
+    return solution, found
 
 
 # -- frequencies ------------------------------------------------------------------------------------------------------

@@ -24,7 +24,7 @@ from yid_ocp.workflow.command import DONE, FAILED, carry_out
 from yid_ocp.workflow.folder import new_run_folder
 from yid_ocp.workflow.held_out import held_out_entry
 from yid_ocp.workflow.progress import SILENT, Progress
-from yid_ocp.workflow.refine import Discretisation, counted, discretisation, wanted
+from yid_ocp.workflow.refine import Discretisation, counted, discretisation, steadied, wanted
 from yid_ocp.workflow.trajectories import write_trajectories
 
 FORMAT = "yid-solve/1"
@@ -93,6 +93,7 @@ def run_solve(run: Run, out: str | Path | None = None, progress: Progress = SILE
             progress.iterate(entry)
 
         solution = solve(problem, run.solver, callback=iterate)
+        solution, stability = steadied(problem, solution)
         finer = Discretisation({})
         if solution.evaluation is not None:
             finer = discretisation(run, problem, solution.x, solution.evaluation, wanted(run), progress)
@@ -102,7 +103,11 @@ def run_solve(run: Run, out: str | Path | None = None, progress: Progress = SILE
         held_out = problem.validate(solution.x)
         folder.log("end", status=solution.status.value, message=solution.message, seconds_solving=solution.seconds)
         write_trajectories(folder.path / "trajectories.h5", problem, solution, held_out)
-        more = {"discretisation": finer.result(data_std), "discretisation_notes": list(finer.notes)}
+        more = {
+            "discretisation": finer.result(data_std),
+            "discretisation_notes": list(finer.notes),
+            "stability": stability,
+        }
         written = folder.finish(solve_result(problem, solution, held_out, build_cable(run)) | more)
         if run.output.report:
             progress.stage("writing the report")
