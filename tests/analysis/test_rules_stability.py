@@ -149,8 +149,10 @@ def test_the_worst_recording_counts(monkeypatch, pendulum):
     assert growth_of_fit(problem, problem.start).recording == "twin"
     twice = problem.on((problem.episodes[0],) * 2, ())
     found = iter([Growth("a", 7.0, 1.1, 0.0, H), Growth("b", 2.0, 1.9, 0.0, H)])
-    monkeypatch.setattr(module, "growth_along", lambda *arguments: next(found))
+    looks = []
+    monkeypatch.setattr(module, "growth_along", lambda *arguments: looks.append(arguments[-1]) or next(found))
     assert growth_of_fit(twice, problem.start).recording == "a"
+    assert looks == [LOOKS // 2] * 2
 
 
 # -- a light cable between two hands ----------------------------------------------------------------------------------

@@ -14,8 +14,8 @@ from yid_ocp.problem import EstimationProblem
 
 Array = NDArray[np.float64]
 
-LOOKS = 24
-"""Nodes of a motion at which the linearised step is looked at."""
+LOOKS, FEWEST = 24, 4
+"""Nodes at which the linearised step is looked at: of all motions together, and of one at least."""
 
 TOLERATED = 6.0
 """Powers of ten by which an alternating error may grow: from the rounding of a step (1e-12) to what no sensor sees."""
@@ -66,7 +66,12 @@ class Growth:
 
 
 def growth_along(
-    step: Step, theta: ArrayLike, rollout: Rollout, feedback: Feedback | None = None, name: str = "motion"
+    step: Step,
+    theta: ArrayLike,
+    rollout: Rollout,
+    feedback: Feedback | None = None,
+    name: str = "motion",
+    looks: int = LOOKS,
 ) -> Growth:
     """Growth of alternating errors along a rollout, as far as it got.
 
@@ -81,6 +86,8 @@ def growth_along(
         The tracking filter, which is part of the loop.
     name : str
         Of the motion.
+    looks : int
+        Number of nodes at which A is worked out.
 
     Returns
     -------
@@ -88,14 +95,14 @@ def growth_along(
 
     Notes
     -----
-    The eigenvalues of A_k - B_k K_k are taken at `LOOKS` nodes (A_k by the implicit function theorem, so that the
+    The eigenvalues of A_k - B_k K_k are taken at some nodes (A_k by the implicit function theorem, so that the
     constraints are in it), their largest alternating magnitude counts for the steps in between in its logarithm, and
     the stretch of the largest sum is what grows. A step at which Newton failed or the derivatives are singular ends the
     motion.
     """
     failed = np.flatnonzero(~np.isfinite(rollout.state).all(axis=1))
     steps = (int(failed[0]) if len(failed) else len(rollout.state)) - 1
-    nodes = np.unique(np.linspace(0, max(steps - 1, 0), LOOKS).astype(int)) if steps > 0 else np.zeros(0, int)
+    nodes = np.unique(np.linspace(0, max(steps - 1, 0), looks).astype(int)) if steps > 0 else np.zeros(0, int)
     at, magnitudes = [], []
     for node in nodes:
         found = alternating(step, np.asarray(theta, float), rollout, int(node), feedback)
@@ -161,6 +168,7 @@ def growth_of_fit(problem: EstimationProblem, x: ArrayLike) -> Growth | None:
     """
     predictor, system = problem.predictor, problem.system
     found = []
+    looks = max(LOOKS // len(problem.episodes), FEWEST)
     for i, episode in enumerate(problem.episodes):
         shared, offset = problem.split(x, i)
         theta = predictor.own_theta(episode, shared)
@@ -170,5 +178,5 @@ def growth_of_fit(problem: EstimationProblem, x: ArrayLike) -> Growth | None:
         inputs = predictor.inputs(episode, theta, ())
         feedback = inputs.guided(episode.feedback, system.driven_indices, episode.measured_arm)
         rollout = simulate(problem.step, theta, begin.state, episode.grid.steps, inputs.torque, inputs.path, feedback)
-        found.append(growth_along(problem.step, theta, rollout, feedback, episode.name))
+        found.append(growth_along(problem.step, theta, rollout, feedback, episode.name, looks))
     return max(found, key=lambda growth: (growth.decades, growth.factor), default=None)
