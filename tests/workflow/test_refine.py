@@ -65,9 +65,13 @@ def test_settings_say_what_is_refined(folder, tmp_path):
 
 
 def test_check_says_it_before_anything_is_solved(folder, tmp_path):
-    """At the truth the move is nearly the one at the estimate, whatever the data are."""
-    result = run_check(load_config(configuration(folder, 4, ["north"], 1.0)), tmp_path / "check").result
+    """At the truth the move is nearly the one at the estimate, whatever the data; a poor fit makes nothing unsure."""
+    poor, result = (
+        run_check(load_config(configuration(folder, 4, ["north"], start)), tmp_path / f"check_{start}").result
+        for start in (2.0, 1.0)
+    )
     moved = result["discretisation"]["north.bend"]
+    assert 1 < poor["discretisation"]["north.bend"]["std"] / moved["std"] < 10
     assert -0.3 < moved["links"] / TRUTH["north.bend"] < -0.08
     assert abs(moved["time_step"]) < 0.02 * TRUTH["north.bend"]
     assert moved["std"] < 0.02 * TRUTH["north.bend"]

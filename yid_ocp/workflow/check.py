@@ -138,7 +138,8 @@ def _moves(run: Run, problem: EstimationProblem, warnings: list[str], progress: 
         return {}
     found = discretisation(run, problem, x, at_x, ("links", "time_step"), progress, models_alone=True)
     warnings += found.notes
-    covariance, _ = uncertainty(problem, at_x)
+    # how poorly initial values fit says nothing of how sure the data will be of what fits
+    covariance, _ = uncertainty(problem, replace(at_x, residual=np.zeros_like(at_x.residual)))
     std = estimates(problem, x, covariance)
     return found.result({name: std[name].std for name in found.moves})
 
