@@ -11,7 +11,7 @@ from yid_ocp.analysis.layouts import (
     Setting,
 )
 from yid_ocp.data.recording import PointGroup, Recording
-from yid_ocp.model import Grasp, Segment, System, flexible_object
+from yid_ocp.model import Grasp, Mechanism, Segment, System, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import ProblemOptions
@@ -31,7 +31,7 @@ def setting(*groups, sensors=None, frames=("a", "b", "tip"), **more):
     problem = SimpleNamespace(
         episodes=(episode,),
         options=ProblemOptions(sensors=sensors or {}),
-        system=SimpleNamespace(mechanism=SimpleNamespace(frames=dict.fromkeys(frames))),
+        system=SimpleNamespace(mechanism=Mechanism("made", (), dict.fromkeys(frames))),
     )
     return Setting(problem, np.zeros(1), **more), episode
 

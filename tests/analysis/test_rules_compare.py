@@ -157,6 +157,22 @@ def test_the_papers_answers():
         assert tuple(values) == ("T1.bend", "T1.twist", "T2.bend", "T2.twist", "T3.bend", "T3.twist")
 
 
+def test_whoever_finds_the_papers_answers_agrees_with_them():
+    """To half a percent, and to nothing where the paper found nothing."""
+    answers = {
+        "single_arm_no_vision": (23.78, 0.0, 18.357, 11.103, 3.2, 3.059),
+        "single_arm_vision": (22.27, 13.593, 10.735, 8.202, 11.511, 9.692),
+        "dual_arm_no_vision": (19.559, 4.965, 8.575, 10.374, 0.0, 11.287),
+        "dual_arm_vision": (24.84, 0.0, 12.373, 30.775, 1.406, 24.9),
+    }
+    assert set(answers) == set(module.PUBLISHED)
+    for name, values in answers.items():
+        found = {f"{key[:2]}_{key[3:]}": estimate(value, 0.0) for key, value in module.PUBLISHED[name].items()}
+        own = {f"{tube}_{kind}": None for tube in ("T1", "T2", "T3") for kind in ("bend", "twist")}
+        own = {key: estimate(value, 0.0) for key, value in zip(own, values, strict=True)}
+        assert _differences(run(**found), run(**own)) == []
+
+
 # -- running them -----------------------------------------------------------------------------------------------------
 
 
@@ -229,3 +245,23 @@ def test_resident_memory_is_in_mebibytes():
     pages = int(STATM.read_text(encoding="ascii").split()[1])
     page = os.sysconf("SC_PAGE_SIZE")
     assert module._resident() == pytest.approx(pages * page / 2**20, rel=0.1)
+
+
+def test_the_watch_over_memory_keeps_no_process_alive_and_looks_often(monkeypatch):
+    looks = []
+    monkeypatch.setattr(module, "_resident", lambda: float(looks.append(1) or len(looks)))
+    with module._Memory() as memory:
+        assert memory._thread.daemon
+        time.sleep(0.3)
+    assert len(looks) >= 5
+    assert memory.peak == len(looks)
+
+
+@pytest.mark.parametrize(("platform", "unit"), [("linux", 1024.0), ("darwin", 1024.0**2)])
+def test_memory_where_the_system_tells_only_its_peak(monkeypatch, platform, unit):
+    """Kibibytes everywhere but on macOS, which counts bytes."""
+    resource = pytest.importorskip("resource")
+    monkeypatch.setattr(Path, "is_file", lambda self: False)
+    monkeypatch.setattr("sys.platform", platform)
+    monkeypatch.setattr(resource, "getrusage", lambda who: SimpleNamespace(ru_maxrss=96.0 * unit))
+    assert module._resident() == pytest.approx(96.0)

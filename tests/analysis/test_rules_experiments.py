@@ -12,6 +12,7 @@ import pytest
 from made_recordings import GRID, group, holding_pendulum, places, setting
 
 from yid_ocp.analysis import layouts as module
+from yid_ocp.analysis.identifiability import carried, with_grasp_offsets, with_nuisances
 from yid_ocp.analysis.layouts import (
     ARM,
     CAMERA,
@@ -472,6 +473,55 @@ def test_information_is_of_the_sensors_alone(swung, options):
     assert built.names == ("elbow.stiffness", "elbow.rest")
     assert not np.any(built.fixed)
     np.testing.assert_allclose(found, rows.T @ rows, rtol=1e-9)
+
+
+def test_the_same_mechanics_need_no_other_step(swung):
+    problem = swung()
+    same, _ = informed(problem)
+    other, _ = informed(problem, ["torque"])
+    assert same.problem.step.kernel is problem.step.kernel
+    # torques as a measurement take the arm's motion as known, which is another system even where it was known already
+    assert other.problem.step.kernel is not problem.step.kernel
+
+
+@pytest.mark.parametrize(
+    ("initial", "start", "becomes", "given"),
+    [
+        ("equilibrium", "known", "equilibrium", False),
+        ("equilibrium", "unknown", "estimated", False),
+        ("estimated", "known", "equilibrium", True),
+        ("estimated", "unknown", "estimated", False),
+        ("fitted_to_points", "known", "fitted_to_points", True),
+        ("fitted_to_points", "unknown", "estimated", True),
+    ],
+)
+def test_starts_are_unknown_or_stay_where_the_fit_has_them(swung, initial, start, becomes, given):
+    problem = swung(initial_state=initial)
+    x = problem.start
+    made = with_nuisances(problem, x, start, None)
+    assert made.options.initial_state == becomes
+    assert (made is problem) == (becomes == initial)
+    assert made.free == problem.free
+    if made is not problem:
+        assert set(made.options.known_start) == ({"swing"} if given else set())
+    if given and made is not problem:
+        episode = problem.episodes[0]
+        before = problem.start_state(episode, *problem.split(x, 0)).state
+        np.testing.assert_allclose(made.options.known_start["swing"], before)
+        after = made.start_state(made.episodes[0], *made.split(carried(x, problem.names, made), 0)).state
+        np.testing.assert_allclose(after, before)
+
+
+@pytest.mark.parametrize("std", [None, 2e-3])
+def test_where_grasps_sit_is_unknown_only_where_that_is_asked(held_tube, std):
+    step = compile_step(with_grasp_offsets(held_tube.system), 0.02, use_compiler=False)
+    recordings = [episode.recording for episode in held_tube.episodes]
+    free = (*held_tube.free, "grasp_offset@hand.dy")
+    problem = EstimationProblem(step, recordings, free, held_tube.options)
+    made = with_nuisances(problem, problem.start, "known", std)
+    added = () if std is None else ("grasp_offset@hand.dx", "grasp_offset@hand.dz")
+    assert made.free == (*free, *added)
+    assert made.options.priors == dict.fromkeys(added, std)
 
 
 def test_shorter_recordings_tell_less(swung):

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from made_models import Formula, estimate, solution
+from made_recordings import holding_pendulum
 
 from yid_ocp.analysis import identifiability as module
 from yid_ocp.analysis.combinations import Component, combination_words, listed_names, sparse_basis
-from yid_ocp.analysis.identifiability import carried, identifiability, unknown_vector, without
+from yid_ocp.analysis.identifiability import carried, identifiability, unknown_vector, with_grasp_offsets, without
+from yid_ocp.effects import make_effect
 from yid_ocp.errors import ConfigError, SolverError
+from yid_ocp.model import Grasp
 
 
 def judged(problem, at=None, **more):
@@ -298,6 +302,30 @@ def test_a_point_is_a_solution_an_array_or_the_start():
         unknown_vector(problem, [1.0])
     with pytest.raises(SolverError, match="b is not finite"):
         unknown_vector(problem, [1.0, math.nan])
+
+
+@pytest.mark.parametrize("size", [1e-12, 1.0, 1e12])
+def test_what_is_explained_does_not_depend_on_the_size_of_the_explanation(size):
+    rng = np.random.default_rng(4)
+    columns, explained = rng.standard_normal((6, 2)), rng.standard_normal((6, 3))
+    explained = np.column_stack([explained, explained @ [1.0, 2.0, 3.0]])
+    left = without(columns, size * explained)
+    np.testing.assert_allclose(explained.T @ left, 0.0, atol=1e-12)
+    projected = explained @ np.linalg.lstsq(explained, columns, rcond=1e-9)[0]
+    np.testing.assert_allclose(left, columns - projected, atol=1e-12)
+
+
+def test_every_grasp_without_an_offset_gets_one(urdf_folder):
+    """Other effects on a grasp do not count as its offset, whatever they are called."""
+    system = holding_pendulum(urdf_folder)
+    other = Grasp("other", "lower", "T1_1_tip")
+    system = replace(system, grasps=(*system.grasps, other))
+    for there in ((), (("grasp_compliance", "hand"),), (("grasp_offset", "other"), ("grasp_compliance", "other"))):
+        made = system.with_effects([make_effect(kind, place, system) for kind, place in there])
+        found = [(e.kind, e.location) for e in with_grasp_offsets(made).effects]
+        assert found[: len(there)] == list(there)
+        missing = [place for place in ("hand", "other") if ("grasp_offset", place) not in there]
+        assert found[len(there) :] == [("grasp_offset", place) for place in missing]
 
 
 def test_unknowns_are_carried_over_by_name():

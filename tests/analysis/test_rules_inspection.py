@@ -9,8 +9,10 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 import pytest
+from made_recordings import places
 from matplotlib.figure import Figure
 
+from yid_ocp.analysis import convergence
 from yid_ocp.analysis.convergence import grasp_gaps, held_still, natural_frequencies
 from yid_ocp.analysis.inspection import (
     DIFFERENCE,
@@ -327,3 +329,34 @@ def test_each_grasp_has_its_gap(reaching):
     found = grasp_gaps(system, {"shoulder": 0.0, "elbow": 0.0}, system.parameters.vector())
     assert list(found) == ["hand", "other"]
     assert min(found.values()) > 0.05
+
+
+@pytest.mark.parametrize(
+    ("starts", "searches", "gap"),
+    [((0.0, 0.4, 1.0), 3, 0.0), ((0.0, 0.2, 0.4, 0.3, 1.0), 4, 0.6), ((1.0, 0.0), 1, 0.0)],
+    ids=["the third closes it", "the best of four", "at once"],
+)
+def test_a_gap_is_sought_from_four_starts_until_it_closes(reaching, monkeypatch, starts, searches, gap):
+    """Made-up searches that end so much of the way from the straight rod to the one that reaches the hand."""
+    system, whole = reaching(), {}
+    search = convergence.scipy.optimize.least_squares
+
+    def found(fun, start, jac, max_nfev):
+        if not whole:
+            whole["x"] = search(fun, start, jac, max_nfev=max_nfev).x
+        done.append(1)
+        return SimpleNamespace(x=starts[len(done) - 1] * whole["x"])
+
+    done: list[int] = []
+    monkeypatch.setattr(convergence.scipy.optimize, "least_squares", found)
+    gaps = grasp_gaps(system, {"shoulder": 0.0, "elbow": 0.0}, system.parameters.vector())
+    assert len(done) == searches
+    q = np.zeros(system.size)
+    ends = [starts[i] * whole["x"] for i in range(searches)]
+    distances = []
+    for end in ends:
+        q[2:] = end
+        tip, held = places(system, ["tip", "w_T1"], q)
+        distances.append(float(np.linalg.norm(tip - held)))
+    assert gaps["hand"] == pytest.approx(min(distances))
+    assert (min(distances) < 1e-3) == (gap == 0.0)

@@ -172,6 +172,57 @@ def test_edges_take_few_refits():
     assert above[:3] == pytest.approx([1.0, 1.0, 0.5], rel=1e-6)
 
 
+def refits(problem, std):
+    """What the other unknown is tried at, where the profiled one was first moved to above its best fit."""
+    best = problem.evaluate(problem.start)
+    problem.asked.clear()
+    profiled(problem, std=std, evaluation=best)
+    above = [x for x in problem.asked if x[0] > problem.start[0]]
+    return above[0][0], [b for a, b in above if a == above[0][0]]
+
+
+SEARCH = [1e-8, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0, 10.0]
+
+
+@pytest.mark.parametrize(
+    ("reach", "parts"),
+    [
+        (0.0, [1 / (1 + d) for d in SEARCH]),
+        (0.6, [*(1 / (1 + d) for d in SEARCH[:8]), *(0.5 + 0.5 / (1 + d) for d in (0.2, 2.0, 20.0))]),
+    ],
+    ids=["never", "once the step is half"],
+)
+def test_a_refit_that_fails_takes_ever_shorter_steps_and_gives_up_after_nine(reach, parts):
+    """The other unknown would follow on a parabola; where it goes too far the model cannot be rolled out."""
+    whole = 0.3 * (100 * HALF) ** 2
+    problem = Formula(
+        lambda x: [0.01 * (x["a"] - 3.0), x["b"] - 0.3 * (x["a"] - 3.0) ** 2],
+        {"a": 3.0, "b": 0.0},
+        bounds=OPEN,
+        scales={"a": 100.0, "b": 1.0},
+        fails=lambda v: v["b"] > reach * whole + 1e-9,
+    )
+    at, tried = refits(problem, 100.0)
+    assert at == pytest.approx(3.0 + 100 * HALF)
+    assert tried[0] == 0.0
+    found = np.array(tried[1 : len(parts) + 1]) / whole
+    np.testing.assert_allclose(found, parts, rtol=1e-6)
+    if not reach:
+        assert len(tried) == 1 + len(parts)
+
+
+@pytest.mark.parametrize(("left", "refitted"), [(0.7e-3, False), (1.5e-3, True)])
+def test_a_refit_is_worth_a_thousandth_of_chi2(left, refitted):
+    problem = Formula(
+        lambda x: [x["a"] - 3.0, x["b"] - math.sqrt(left) * ((x["a"] - 3.0) / HALF) ** 2],
+        {"a": 3.0, "b": 0.0},
+        bounds=OPEN,
+        scales={"a": 1.0, "b": 1.0},
+    )
+    _, tried = refits(problem, 1.0)
+    assert (len(tried) > 1) is refitted
+
+
 # -- positive unknowns ------------------------------------------------------------------------------------------------
 
 
@@ -229,6 +280,15 @@ def test_bounds_are_open_ends_unless_the_level_comes_first():
     assert either.lower == pytest.approx(3 - HALF, rel=0.02)
     assert either.upper is None
     assert either.values[-1] == pytest.approx(4.0)
+
+
+@pytest.mark.parametrize(("start", "side"), [(6.0, "upper"), (2.5, "lower")])
+def test_an_unknown_at_its_bound_is_open_there_without_a_search(start, side):
+    problem = Formula(lambda x: [1 * (x["a"] - start)], {"a": start}, bounds={"a": (2.5, 6.0)})
+    found = profiled(problem, std=1.0)
+    assert getattr(found, side) is None
+    assert found.notes == ()
+    assert all((x[0] < start) == (side == "upper") for x in problem.asked if x[0] != start)
 
 
 def test_others_stop_at_their_bounds():

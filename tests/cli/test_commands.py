@@ -17,7 +17,7 @@ from yid_ocp.data import read_recording
 
 SOLVE_KEYS = {
     "format", "status", "message", "parameters", "cost", "iterations", "evaluations", "seconds", "residuals",
-    "held_out", "inputs", "versions", "notes",
+    "held_out", "inputs", "versions", "notes", "discretisation", "discretisation_notes", "stability",
 }  # fmt: skip
 PARAMETER_KEYS = {"value", "std", "unit", "initial", "lower", "upper", "free", "verdict"}
 
@@ -78,6 +78,13 @@ def test_solve_finds_what_the_efforts_say(cli, pendulum, pendulum_data, tmp_path
         assert entry["verdict"] == "identifiable"
     assert result["parameters"]["shoulder.rest"]["verdict"] == "fixed"
     channel = result["residuals"]["joints.effort.shoulder"]
+    assert set(result["discretisation"]) == set(pendulum_data.truth)
+    for name, moved in result["discretisation"].items():
+        # its damping is that of a robot's joints, without links
+        assert moved["links"] is None
+        assert abs(moved["time_step"]) < 0.01 * pendulum_data.truth[name]
+        assert 0 < moved["std"] <= result["parameters"][name]["std"]
+    assert done.out.count("with half the time step") == 1
     assert set(channel) == {"rmse", "unit", "n"}
     assert channel["unit"] == "N m"
     assert 0.005 < channel["rmse"] < 0.02
@@ -159,6 +166,8 @@ def test_check(cli, pendulum, tmp_path):
     assert result["format"] == "yid-check/1"
     assert result["model"]["n"] == 2
     assert [entry["role"] for entry in result["recordings"]] == ["estimate", "held_out"]
+    assert {"time_step", "links", "std"} == set(result["discretisation"]["shoulder.stiffness"])
+    assert "if the initial values were the estimates:" in done.out
     assert "100 Hz" in done.out
     assert "run folder: c" in done.out
     assert not any("effort_kind" in text for text in result["warnings"])
@@ -192,7 +201,7 @@ def test_check_refines_links_and_time_step(cli, tmp_path, monkeypatch):
     done = cli("check", "beam.yaml", "--out", "c")
     assert done.code == 0, done.err
     convergence = json.loads((tmp_path / "c" / "result.json").read_text())["convergence"]
-    assert [row["value"] for row in convergence["links"]] == [2, 4, 8]
+    assert [row["value"] for row in convergence["links"]] == [4, 8]
     assert [row["value"] for row in convergence["time_step"]] == [0.01, 0.005, 0.0025]
     # a clamped uniform beam: f1 = 1.8751^2/(2 pi) sqrt(EI/(rho A L^4))
     exact = 1.8751**2 / 6.2832 * (0.5 / (0.3 / 0.5 * 0.5**4)) ** 0.5

@@ -27,14 +27,15 @@ TWINS = 60
 def arm(urdf_folder):
     """arm(effort, cutoff): both joints moved as measured for six seconds at 100 Hz, their efforts measured."""
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
-    step = compile_step(System.build(robot, prescribed=JOINTS, damping=0.1), 0.01)
+    system = System.build(robot, prescribed=JOINTS, damping=0.1)
+    steps = {h: compile_step(system, h, use_compiler=h == 0.01) for h in (0.02, 0.01, 0.005, 0.0025)}
     t = 0.01 * np.arange(601)
     path = np.stack([0.6 * np.sin(2.9 * t), 0.5 * np.sin(3.7 * t + 1)], axis=1)
 
-    def build(effort: np.ndarray, cutoff: float, kind: str | None = None) -> EstimationProblem:
+    def build(effort: np.ndarray, cutoff: float, kind: str | None = None, time_step: float = 0.01) -> EstimationProblem:
         joints = JointGroup(JOINTS, t, path, effort=effort, position_std=0.0, effort_std=NOISE, effort_kind=kind)
         options = ProblemOptions(path_cutoff=cutoff, weak_prior_factor=0.0)
-        return EstimationProblem(step, [Recording(joints, name="arm")], tuple(TRUTH), options, TRUTH)
+        return EstimationProblem(steps[time_step], [Recording(joints, name="arm")], tuple(TRUTH), options, TRUTH)
 
     return build
 
@@ -76,3 +77,20 @@ def test_an_effort_that_stands_for_an_interval_belongs_to_its_middle(arm, kind, 
     at = 0.01 * (samples.node + samples.fraction)[:, None]
     expected = np.hstack([at - late, 2 - at + late])
     np.testing.assert_allclose(samples.value.reshape(len(at), 2), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("cutoff", [math.inf, CUTOFF])
+@pytest.mark.parametrize("time_step", [0.02, 0.005, 0.0025])
+def test_efforts_are_compared_where_they_were_measured(arm, cutoff, time_step):
+    """Never between samples, however short the step: what lies there was not measured."""
+    effort = np.random.default_rng(0).standard_normal((601, 2))
+    found = {}
+    for h in (0.01, time_step):
+        samples = arm(effort, cutoff, time_step=h).episodes[0].samples[0]
+        found[h] = dict(zip(np.round((samples.node + samples.fraction) * h / 0.01, 6), samples.value, strict=True))
+    assert all(time == round(time) for time in found[time_step])
+    if time_step < 0.01:
+        assert len(found[time_step]) == len(found[0.01])
+    if math.isinf(cutoff):
+        for time, value in found[time_step].items():
+            np.testing.assert_allclose(value, effort[round(time)], atol=1e-12)

@@ -72,6 +72,23 @@ def test_a_solve_says_what_is_not_found():
     assert not any("p_fixed" in line for line in lines)
 
 
+def test_a_solve_says_which_estimates_a_finer_model_moves():
+    moved = {
+        "p.a": {"links": -5.5, "time_step": 0.01, "std": 0.073},
+        "p.b": {"links": 0.1, "time_step": -0.02, "std": 0.2},
+        "p.c": {"links": 1e3, "time_step": 1e3, "std": None},
+    }
+    lines = terminal.solve_summary(solved() | {"discretisation": moved, "discretisation_notes": ["it snaps"]})
+    said = "these move by more than the data's standard deviation"
+    at = lines.index(f"with twice the links {said}: p.a by -5.5 (± 0.073 from the data)")
+    assert lines[at + 1 : at + 3] == [
+        "with half the time step no estimate moves by more than its standard deviation",
+        "it snaps",
+    ]
+    moved = {name: own | {"links": None} for name, own in moved.items()}
+    assert not any("twice the links" in line for line in terminal.solve_summary(solved() | {"discretisation": moved}))
+
+
 def test_a_failed_solve_says_nothing_of_its_parameters():
     lines = terminal.solve_summary(solved(status="failed", message="step 3"))
     assert not any(word in line for line in lines for word in VERDICT_WORDS.values())

@@ -63,3 +63,15 @@ def test_every_channel_knows_its_own_frame(system, read) -> None:
 def test_a_frame_that_is_not_there_is_refused(system, read) -> None:
     with pytest.raises(ModelError, match="w_T9"):
         read(system, PointSensor("points", ("p",), ("w_T9",)))
+
+
+def test_points_along_a_segment(system, read) -> None:
+    """Halfway along two links lies the joint between them; a quarter beyond it, half of the second link."""
+    q = np.random.default_rng(1).uniform(-0.5, 0.5, system.size)
+    found = read(system, PointSensor("points", ("a", "b", "c", "d"), ("T1:50%", "T1_0_tip", "T1:75%", "w_T1")), q)
+    half, joint, further, tip = found.reshape(4, 3)
+    assert half == pytest.approx(joint)
+    assert further == pytest.approx((joint + tip) / 2)
+    near = system.with_effects([make_effect("surface_offset", "camera", system, {"fraction": 1.0})])
+    along = PointSensor("points_camera", ("a",), ("T1:75%",), tuple(map(tuple, POSE)))
+    assert np.linalg.norm(read(near, along, q) - read(system, along, q)) == pytest.approx(0.03)

@@ -24,8 +24,9 @@ mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: 
         (SYSTEMS[1], TRUTH),
         (SYSTEMS[2], {**TRUTH, "T2.mass": 0.03, "T3.length": 0.9, "left_w0.mass": 3.0}),
         (clamped_beam(), {"B.length": 0.6}),
+        (replace(clamped_beam(), points=("w_B", "B:40%")), {}),
     ],
-    ids=["single", "dual", "clamp"],
+    ids=["single", "dual", "clamp", "along"],
 )
 def test_mechanics_equals_the_symbolic_one(system: System, values: dict[str, float]) -> None:
     q, v = ca.SX.sym("q", system.size), ca.SX.sym("v", system.size)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -9,6 +10,7 @@ import yid_ocp as yid
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import SegmentedObject, YObject, dump_config
 from yid_ocp.errors import ConfigError, ModelError
+from yid_ocp.model import forward_kinematics
 from yid_ocp.workflow.build import build_problem, build_system, load_problem, load_system, problem_options
 
 
@@ -64,18 +66,35 @@ def test_an_object_of_segments_on_a_robots_hand(written):
     assert len(system.prescribed) == 7
     assert system.parameters["beam.bend"].unit == "N m^2"
     assert system.parameters["tip.damping"].value == 0.001
-    finer = build_system(run, links=10)
-    assert finer.size == 7 + 30 + 6
+    finer = build_system(run, finer=2)
+    assert finer.size == 7 + 30 + 12
     assert finer.parameters["beam.bend"].value == 1.3
-    assert finer.parameters["tip.bend"].value == 3.0
+    assert finer.parameters["tip.bend"].value == 6.0
+    assert finer.parameters["tip.damping"].value == 0.002
+    kinematics = forward_kinematics(finer.mechanism.numeric(), ca.SX(ca.DM(np.zeros(finer.size))))
+    same = forward_kinematics(system.mechanism.numeric(), ca.SX(ca.DM(np.zeros(system.size))))
+    for fine, coarse in (("tip_1_tip", "tip_0_tip"), ("w_tip", "w_tip"), ("beam_5_tip", "beam_2_tip")):
+        assert np.allclose(np.array(ca.DM(kinematics.position(fine))), np.array(ca.DM(same.position(coarse))))
+
+
+def test_a_branch_stays_at_its_place_of_a_finer_parent(written):
+    text = (
+        "model:\n  object:\n    kind: segments\n    segments:\n"
+        "      a: {length: 0.4, mass: 0.1, radius: 0.01, links: 4}\n"
+        "      b: {length: 0.1, mass: 0.1, radius: 0.01, links: 1, parent: a, at_link: 0}\n"
+    )
+    for finer in (1, 2, 3):
+        system = build_system(load_config(written(text)), finer)
+        kinematics = forward_kinematics(system.mechanism.numeric(), ca.SX(ca.DM(np.zeros(system.size))))
+        assert np.allclose(np.array(ca.DM(kinematics.position("b:0%"))).ravel(), [0, 0, 0.1])
 
 
 def test_more_links_keep_the_stiffness_of_a_tube(written):
     run = load_config(written("model: {object: {kind: y, mount: {xyz: [0, 0, 1]}}, damping: 0.02}\n"))
     assert isinstance(run.model.object, YObject)
-    finer = build_system(run, links=8)
+    finer = build_system(run, finer=2)
     assert finer.parameters["T1.bend"].value == 6.0
-    assert finer.parameters["T1.damping"].value == 0.02
+    assert finer.parameters["T1.damping"].value == 0.04
     assert finer.size == 72
 
 
@@ -166,14 +185,15 @@ def test_a_stiffness_stands_under_parameters_alone(written):
 
 
 def test_more_links_scale_what_is_said_of_a_stiffness_per_joint(written):
-    finer = build_system(load_config(written(SEGMENTED)), links=6).parameters
+    finer = build_system(load_config(written(SEGMENTED)), finer=3).parameters
     assert [finer[name].value for name in ("a.bend", "a.twist", "b.bend", "b.damping")] == [15, 6, 5, 0.3]
+    assert finer["a.damping"].value == pytest.approx(0.15)
     assert (finer["a.bend"].lower, finer["a.bend"].upper) == (3, 24)
     assert (finer["b.bend"].lower, finer["b.bend"].upper) == (1, 8)
-    finer = build_system(load_config(written(SEGMENTED.split("parameters:")[0])), links=6).parameters
+    finer = build_system(load_config(written(SEGMENTED.split("parameters:")[0])), finer=3).parameters
     assert [finer[name].value for name in ("a.bend", "a.twist", "b.bend")] == [9, 9, 3]
     foam = load_config(written("model: {object: {kind: y}}\nparameters: {T1.bend: {initial: 10}}\n"))
-    finer = build_system(foam, links=8).parameters
+    finer = build_system(foam, finer=2).parameters
     assert [finer[name].value for name in ("T1.bend", "T2.bend")] == [20, 6]
 
 

@@ -120,7 +120,7 @@ class Setting:
         choice = self.problem.options.sensors.get(group.name, SensorOptions())
         wanted = choice.points if choice.points is not None else group.names
         frames = {point: choice.frames.get(point, point) for point in wanted}
-        return {p: f for p, f in frames.items() if f in self.problem.system.mechanism.frames}
+        return {p: f for p, f in frames.items() if self.problem.system.mechanism.has_frame(f)}
 
     def _std(self, group: PointGroup) -> Array:
         said = self.problem.options.sensors.get(group.name, SensorOptions()).std

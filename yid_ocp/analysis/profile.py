@@ -169,6 +169,8 @@ class _Walk:
             trial = s + sign * step
             trial = min(trial, reach) if sign > 0 else max(trial, reach)
             if abs(trial - s) < 1e-9 * max(1.0, abs(s)):
+                if barrier is None:
+                    return None  # it stands at its bound
                 break
             point = self._refit(inside, trial)
             if point is None:

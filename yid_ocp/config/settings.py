@@ -108,7 +108,7 @@ class GraspSettings:
     """A frame of the robot that holds a frame of the object."""
 
     holder: Annotated[str, About("frame of the robot")]
-    held: Annotated[str, About("frame of the object")]
+    held: Annotated[str, About("frame of the object, or a point along a segment such as T1:40%")]
     kind: Annotated[GraspName, About("3, 5 or 6 equations")] = "point"
     rpy: Annotated[Triple, About("orientation of held in holder, for axis and weld", "rad")] = (0.0, 0.0, 0.0)
 
@@ -167,7 +167,9 @@ class ModelSettings:
         ),
     ] = 0.05
     gravity: Annotated[Triple, About("acceleration of free fall in the world", "m/s^2")] = (0.0, 0.0, -9.81)
-    points: Annotated[tuple[str, ...] | None, About("frames that sensors may see; the segments' tips")] = None
+    points: Annotated[
+        tuple[str, ...] | None, About("frames that sensors may see, such as T1:40%; the segments' tips")
+    ] = None
     effects: Annotated[tuple[EffectSettings, ...], About("added to the nominal model, in this order")] = ()
 
 
@@ -286,6 +288,13 @@ class OutputSettings:
 
     folder: Annotated[FilePath | None, About("in which run folders are made; `runs` in the working folder")] = None
     report: Annotated[bool, About("whether report.html is written")] = True
+    discretisation: Annotated[
+        Literal["none", "time_step", "both"] | None,
+        About(
+            "what `solve` refines to see how far estimates move: the time step, the links as well; both for an object "
+            "of segments and the time step for any other when absent"
+        ),
+    ] = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -194,7 +194,7 @@ def _arms_only(system: System) -> System:
             hint="use proportional gains instead",
         )
     frames = {name: frame for name, frame in mechanism.frames.items() if frame.joint < len(keep)}
-    arms = replace(mechanism, joints=mechanism.joints[: len(keep)], frames=frames)
+    arms = replace(mechanism, joints=mechanism.joints[: len(keep)], frames=frames, lines={})
     wanted: Sequence[str] = system.driven
     return replace(
         system,

@@ -30,7 +30,7 @@ from numpy.typing import ArrayLike, NDArray
 from yid_ocp.errors import DataError, ModelError, nearest
 from yid_ocp.model import Grasp, Mechanism, System, flexible_object
 from yid_ocp.model.flexible import AXES, FlexibleObject, Segment, polyline_rotations
-from yid_ocp.model.mechanism import Frame, Placement
+from yid_ocp.model.mechanism import Frame, Line, Placement
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.rotations import about_axis
 from yid_ocp.model.system import floating_clamp
@@ -291,11 +291,11 @@ def cable_system(lengths: Mapping[tuple[str, str], float], cable: Cable, options
     clamps = _start_clamp(lengths[cable.parent[0], cable.parent[1]], cable).joined(floating_clamp(END))
     end_roll = Parameter(END_ROLL, 0.0, "rad", -np.pi, np.pi, "roll of the end clamp about the last edge")
     if options.end == "weld":
-        clamps = Mechanism(clamps.name, clamps.joints, clamps.frames, clamps.parameters.joined([end_roll]))
+        clamps = replace(clamps, parameters=clamps.parameters.joined([end_roll]))
     rotation = about_axis(AXES["z"], end_roll.symbol) if options.end == "weld" else ca.SX(ca.DM.eye(3))
     return System.build(
         clamps,
-        objects=((_with_vertices(item, cable), START_EDGE, None),),
+        objects=((_with_vertices(item, cable, lengths), START_EDGE, None),),
         grasps=(Grasp(END, END, LAST_EDGE, options.end, rotation),),
         prescribed=tuple(f"{clamp}_{prefix}{axis}" for clamp in (START, END) for prefix in ("", "r") for axis in "xyz"),
         damping={},
@@ -336,7 +336,8 @@ def _with_memory(item: FlexibleObject, memory: float) -> FlexibleObject:
     return replace(item, mechanism=tree, elastic=tuple(elastic))
 
 
-def _with_vertices(item: FlexibleObject, cable: Cable) -> FlexibleObject:
+def _with_vertices(item: FlexibleObject, cable: Cable, lengths: Mapping[tuple[str, str], float]) -> FlexibleObject:
+    """The object with its vertices as frames, the parent's line counted from clamp to clamp."""
     tree = item.mechanism
     frames = dict(tree.frames)
     for name, chain in cable.chains.items():
@@ -346,7 +347,11 @@ def _with_vertices(item: FlexibleObject, cable: Cable) -> FlexibleObject:
             frames[f"junction_{name}"] = frames[chain[0]]
     last = tree.joint_index(item.segment(cable.parent_name).links[-1][-1])
     frames[LAST_EDGE] = Frame(last, Placement.identity())
-    return replace(item, mechanism=replace(tree, frames=frames))
+    parent = tree.lines[cable.parent_name]
+    edges = np.array([lengths[edge] for edge in pairwise(cable.parent)])
+    whole = Line((cable.parent[1], *parent.tips), tuple(map(float, edges / edges.sum())))
+    lines = {**tree.lines, cable.parent_name: whole}
+    return replace(item, mechanism=replace(tree, frames=frames, lines=lines))
 
 
 def _start_clamp(length: float, cable: Cable) -> Mechanism:

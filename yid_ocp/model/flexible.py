@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import ModelError, nearest
-from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement
+from yid_ocp.model.mechanism import Frame, Inertia, Joint, Line, Mechanism, Placement
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.rotations import snapped, turn
 
@@ -122,7 +122,8 @@ class SegmentLayout:
 class FlexibleObject:
     """A generated object: its tree, its elastic joints and where each segment stands.
 
-    Frames: `SEGMENT` tip as `w_SEGMENT`, tip of link i as `SEGMENT_i_tip`, and the root frame `object_root`.
+    Frames: `SEGMENT` tip as `w_SEGMENT`, tip of link i as `SEGMENT_i_tip`, the root frame `object_root`, and points by
+    arc length, independent of the number of links, as `SEGMENT:40%`.
     """
 
     mechanism: Mechanism
@@ -173,7 +174,8 @@ def flexible_object(
     for segment in segments:
         _check(segment, parts.layouts)
         _add_segment(parts, segment, root, fraction)
-    mechanism = Mechanism(name, tuple(parts.joints), parts.frames, Parameters(parts.parameters))
+    lines = {segment.name: _line(segment) for segment in segments}
+    mechanism = Mechanism(name, tuple(parts.joints), parts.frames, Parameters(parts.parameters), lines)
     return FlexibleObject(mechanism, tuple(parts.elastic), tuple(parts.layouts.values()))
 
 
@@ -302,6 +304,11 @@ def _shares(segment: Segment) -> NDArray[np.float64]:
         return np.full(segment.links, 1.0 / segment.links)
     lengths = np.asarray(segment.link_lengths, float)
     return lengths / lengths.sum()
+
+
+def _line(segment: Segment) -> Line:
+    parts = tuple(map(float, _shares(segment)))
+    return Line(tuple(f"{segment.name}_{i}_tip" for i in range(len(parts))), parts)
 
 
 def _per_joint(segment: Segment, length: ca.SX, before: ca.SX | None) -> ca.SX:

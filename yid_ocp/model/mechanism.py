@@ -134,6 +134,32 @@ class Frame:
 
 
 @dataclass(frozen=True)
+class Line:
+    """A chain of straight links.
+
+    Attributes
+    ----------
+    tips : tuple of str
+        Frame at the far end of every link, base to tip; its translation is the link, whose base is the joint's origin.
+    parts : tuple of float
+        Part of the nominal arc length that each link has; they sum to one.
+    """
+
+    tips: tuple[str, ...]
+    parts: tuple[float, ...]
+
+    def locate(self, part: float) -> tuple[str, float]:
+        """Tip of the link on which a part of the arc length ends (0 to 1), and the part of that link before it."""
+        before = 0.0
+        for tip, own in zip(self.tips, self.parts, strict=True):
+            # what ends a link belongs to it, not to the next one
+            if part <= before + own * (1 + 1e-9) or tip == self.tips[-1]:
+                return tip, min((part - before) / own, 1.0)
+            before += own
+        raise ModelError("a line has no links")
+
+
+@dataclass(frozen=True)
 class Mechanism:
     """A tree of joints in an order in which parents come first.
 
@@ -144,12 +170,15 @@ class Mechanism:
     frames : mapping of str to Frame
     parameters : Parameters
         Those on which placements and inertias depend.
+    lines : mapping of str to Line
+        Chains of straight links along which `NAME:40%` names a point by arc length.
     """
 
     name: str
     joints: tuple[Joint, ...]
     frames: Mapping[str, Frame]
     parameters: Parameters = field(default_factory=Parameters)
+    lines: Mapping[str, Line] = field(default_factory=dict)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -168,11 +197,30 @@ class Mechanism:
             raise ModelError(f"there is no joint '{name}'", where=self.name, hint=nearest(name, names))
         return names.index(name)
 
+    def has_frame(self, name: str) -> bool:
+        """Whether `frame` knows a name, or would if only its percentage were right."""
+        return name in self.frames or (":" in name and name.partition(":")[0] in self.lines)
+
     def frame(self, name: str) -> Frame:
-        """A frame by name; `ModelError` with the nearest name where there is none."""
-        if name not in self.frames:
-            raise ModelError(f"there is no frame '{name}'", where=self.name, hint=nearest(name, self.frames))
-        return self.frames[name]
+        """A frame by name, or a point of a line by its arc length from the base, such as `T1:40%`.
+
+        Such a point lies on the straight link that reaches there and turns with it, so that it stays where it is on the
+        object however many links that has; where links have length parameters of their own, by their nominal lengths.
+
+        Raises
+        ------
+        ModelError
+            No such frame or line (with the nearest name), or no percentage from 0 to 100.
+        """
+        if name in self.frames:
+            return self.frames[name]
+        line, _, said = name.partition(":")
+        if not self.has_frame(name):
+            known = (*self.frames, *(f"{entry}:{said}" for entry in self.lines if said))
+            raise ModelError(f"there is no frame '{name}'", where=self.name, hint=nearest(name, known))
+        tip, part = self.lines[line].locate(_fraction(name, said))
+        end = self.frames[tip]
+        return Frame(end.joint, Placement(end.placement.rotation, part * end.placement.translation))
 
     def ancestors(self, index: int) -> tuple[int, ...]:
         """Indices from the root to joint `index`, itself included; empty for the world."""
@@ -220,6 +268,7 @@ class Mechanism:
             tuple(joints),
             frames,
             self.parameters.joined(other.parameters),
+            {**self.lines, **other.lines},
         )
 
     def with_frame(self, name: str, frame: str | None, placement: ArrayLike) -> Mechanism:
@@ -283,6 +332,23 @@ class Mechanism:
         ]
         frames = {name: Frame(moved(frame.joint), frame.placement) for name, frame in self.frames.items()}
         return replace(self, joints=tuple(joints), frames=frames)
+
+
+def _fraction(name: str, said: str) -> float:
+    """Part of a length from a percentage in a frame's name."""
+    number = said.strip().removesuffix("%")
+    try:
+        value = float(number) if said.strip().endswith("%") else math.nan
+    except ValueError:
+        value = math.nan
+    if not 0.0 <= value <= 100.0:
+        raise ModelError(
+            f"'{said}' is no place along '{name.partition(':')[0]}'",
+            where=name,
+            allowed="a percentage of its length from 0% to 100%, base to tip",
+            hint=f"{name.partition(':')[0]}:40%",
+        )
+    return value / 100.0
 
 
 def merged(bodies: Iterable[Inertia]) -> Inertia | None:

@@ -357,7 +357,7 @@ class System:
         gravity : array_like, shape (3,)
             [m/s^2]
         points : sequence of str, optional
-            Frames that sensors may see; the segments' tips `w_*` when absent.
+            Frames that sensors may see, points along a segment as `T1:40%`; the segments' tips `w_*` when absent.
         effects : sequence of Effect
         springs : mapping of str to Spring, optional
             By joint of the robot; become the parameters `JOINT.stiffness` and `JOINT.rest`.

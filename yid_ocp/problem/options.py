@@ -34,7 +34,7 @@ class SensorOptions:
         About("noise standard deviation instead of the recorded one, by name where they differ", "m, rad or N m"),
     ] = None
     frames: Annotated[
-        Mapping[str, str], About("frame of the model that a point marks, where the two have different names")
+        Mapping[str, str], About("frame of the model that a point marks, or T1:40%, where the two have different names")
     ] = field(default_factory=dict)
     points: Annotated[tuple[str, ...] | None, About("points to use; all that the model has when absent")] = None
     bias_std: Annotated[

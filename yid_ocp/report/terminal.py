@@ -36,6 +36,7 @@ def solve_summary(result: Mapping[str, Any]) -> list[str]:
         without = ", ".join(f"{error:.3g} ({name})" for name, error in row.baselines.items())
         rows.append((row.recording, row.channel, f"{row.rmse:.3g}", row.unit, without))
     lines += [*table(rows), ""] if len(rows) > 1 else []
+    lines += [*_moved_lines(result), *result.get("discretisation_notes", ())]
     if failed:
         lines.append("the values are the best point that was reached; nothing can be said about how sure they are")
     else:
@@ -56,6 +57,20 @@ def _unsure(free: Mapping[str, Mapping[str, Any]]) -> list[str]:
     if weak:
         lines.append(f"only {VERDICT_WORDS['weak']}: {', '.join(weak)}")
         lines.append("their standard deviations are too small on one side; `yid-ocp identifiability` gives intervals")
+    return lines
+
+
+def _moved_lines(result: Mapping[str, Any]) -> list[str]:
+    """One sentence for each refinement: which estimates it moves by more than their standard deviation."""
+    lines = []
+    for key, words in (("links", "twice the links"), ("time_step", "half the time step")):
+        tried = {name: own for name, own in result.get("discretisation", {}).items() if own[key] is not None}
+        moved = {n: own for n, own in tried.items() if own["std"] is not None and abs(own[key]) > own["std"]}
+        changes = [f"{name} by {own[key]:+.2g} (± {own['std']:.2g} from the data)" for name, own in moved.items()]
+        if moved:
+            lines.append(f"with {words} these move by more than the data's standard deviation: {', '.join(changes)}")
+        elif tried:
+            lines.append(f"with {words} no estimate moves by more than its standard deviation")
     return lines
 
 
@@ -221,6 +236,8 @@ def check_summary(result: Mapping[str, Any]) -> list[str]:
                 f"{entry['recording']}: " + "; ".join([*said, *(["grasp gaps " + ", ".join(gaps)] if gaps else [])])
             )
     lines += _convergence_lines(result["convergence"])
+    moved = _moved_lines(result)
+    lines += ["", "if the initial values were the estimates:", *moved] if moved else []
     lines += ["", *(f"warning: {text}" for text in result["warnings"])]
     lines.append(
         "nothing stands in the way of a run" if not result["warnings"] else "a run is possible; see the warnings"

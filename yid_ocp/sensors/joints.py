@@ -177,15 +177,18 @@ def measured_efforts(around: Surroundings) -> list[SensorData]:
     times, low_pass, where = around.times, around.low_pass, around.recording.name
     effort = low_pass(joints.t, joints.effort[:, joint_columns(joints, names, where)])
     # what stands for an interval belongs to its middle
-    late = 0.0 if joints.effort_taken_as == "sample" else 0.5 * float(np.median(np.diff(joints.t)))
+    period = float(np.median(np.diff(joints.t)))
+    late = 0.0 if joints.effort_taken_as == "sample" else 0.5 * period
     measured = np.stack([np.interp(times, joints.t + late, column) for column in effort.T], axis=1)
-    std = _smoothed_effort_std(around, names, choice, float(np.median(np.diff(joints.t))))
+    std = _smoothed_effort_std(around, names, choice, period)
     # Smoothed values repeat their neighbours: only as many are kept as count as independent. Both ends are left out:
     # the filter sees one side alone there, the impulse at node 0 depends on the motion before the recording and that at
     # the last node on the motion after it.
+    # Steps shorter than the recording's period have nodes between its samples, where nothing was measured.
     step, steps = around.time_step, len(times) - 1
-    ends = max(1, math.ceil(low_pass.settling / step))
-    kept = np.arange(ends, steps + 1 - ends, low_pass.stride(step))
+    apart = max(1, round(period / step))
+    ends = apart * math.ceil(max(1, math.ceil(low_pass.settling / step)) / apart)
+    kept = np.arange(ends, steps + 1 - ends, apart * math.ceil(low_pass.stride(step) / apart))
     if not len(kept):
         raise DataError(
             f"{steps * step:.3g} s of efforts are too short for a filter of {low_pass.cutoff:g} Hz",

@@ -91,13 +91,13 @@ def _points(around: Surroundings, group: PointData, choice: Choice) -> SensorDat
     where = around.recording.name
     wanted = choice.points if choice.points is not None else group.names
     frames = {p: choice.frames.get(p, p) for p in wanted}
-    known = tuple(p for p in wanted if frames[p] in around.system.mechanism.frames)
+    known = tuple(p for p in wanted if around.system.mechanism.has_frame(frames[p]))
     if not known:
         raise DataError(
             f"none of the points of group '{group.name}' is a frame of the model",
             where=where,
             allowed=", ".join(around.system.points),
-            hint=f"name them under sensors.{group.name}.frames, or switch the group off",
+            hint=f"name their frames (or T1:40%) under sensors.{group.name}.frames, or switch the group off",
         )
     for point in known:
         if point not in group.names:

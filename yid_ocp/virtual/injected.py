@@ -429,7 +429,7 @@ def _camera_error(group: PointGroup, system: System, effect: InjectedEffect, dur
         return replace(group, t=late[inside], position=position[inside], std=std)
     value = Evaluator(system, {})
     radius = {s.name: float(value(s.radius)[0]) for s in system.segments}
-    own = np.array([radius.get(name.removeprefix("w_"), 0.0) for name in group.names])
+    own = np.array([radius.get(name.removeprefix("w_").partition(":")[0], 0.0) for name in group.names])
     ray = centre - position
     away = ray / np.linalg.norm(ray, axis=2, keepdims=True)
     return replace(group, position=position + size["fraction"] * own[:, None] * away)

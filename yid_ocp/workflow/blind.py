@@ -164,8 +164,7 @@ def _make(run: Run, folder: Path, count: int, seed: int, progress: Progress) -> 
 
 def _ensemble(run: Run, seed: int) -> Ensemble:
     problem = build_problem(run)
-    links = len(problem.system.segments[0].links) if problem.system.segments else 0
-    finer = (lambda times: build_system(run, links * times)) if links else None
+    finer = (lambda times: build_system(run, times)) if problem.system.segments else None
     return Ensemble(problem, seed, finer, run.diagnosis.candidates, run.diagnosis)
 
 

@@ -34,6 +34,7 @@ from yid_ocp.problem.episodes import Episode
 GIVEN_FRAMES = 2  # of a cable's free points, from which every prediction starts
 LARGEST_GAP = 0.01  # what encoder noise and a slightly wrong length of the object can make of a grasp [m]
 OBJECT = "object"  # key of the object's damping beside those of the joints
+PER_JOINT = ("bend", "twist", "damping", "twist_damping")
 JOINT_DAMPING = 0.05  # of joints that a damping by name does not mention [N m s/rad]
 Placed = tuple[FlexibleObject, str | None, np.ndarray | None]
 
@@ -50,15 +51,15 @@ def located(run: Run, *path: str | int) -> Iterator[None]:
         raise type(error)(error.what, where=where, allowed=error.allowed, hint=error.hint) from error
 
 
-def build_system(run: Run, links: int | None = None) -> System:
+def build_system(run: Run, finer: int = 1) -> System:
     """The system of a run, its parameters at the values and bounds of the settings.
 
     Parameters
     ----------
     run : Run
-    links : int, optional
-        Rigid links of every tube of the object instead of those of the settings, with the same stiffness per tube; for
-        convergence checks.
+    finer : int
+        Into how many links each of the object's is divided, the stiffness and damping of a tube kept; to see what the
+        number of links does. A cable's edges stay as they are.
 
     Returns
     -------
@@ -81,7 +82,7 @@ def build_system(run: Run, links: int | None = None) -> System:
         if spring.damping is not None:
             damping[name] = spring.damping
     with located(run, "model", "object"):
-        objects = _objects(run, of_object, links)
+        objects = _objects(run, of_object, finer)
     mode = model.arms.mode
     for i, name in enumerate(model.arms.passive):
         if name not in joints:
@@ -105,7 +106,7 @@ def build_system(run: Run, links: int | None = None) -> System:
             points=model.points,
             springs={name: Spring(s.stiffness, s.rest) for name, s in model.springs.items()},
         )
-    return _completed(run, system, links)
+    return _completed(run, system, finer)
 
 
 def _dampings(run: Run, joints: Sequence[str]) -> tuple[dict[str, float], float]:
@@ -128,12 +129,12 @@ def _dampings(run: Run, joints: Sequence[str]) -> tuple[dict[str, float], float]
     return {name: said.get(name, JOINT_DAMPING) for name in joints}, said.get(OBJECT, JOINT_DAMPING)
 
 
-def _completed(run: Run, system: System, links: int | None = None) -> System:
+def _completed(run: Run, system: System, finer: int = 1) -> System:
     """The system with its effects, its parameters at the values and bounds of the settings."""
     for i, said in enumerate(run.model.effects):
         with located(run, "model", "effects", i):
             system = system.with_effects([make_effect(said.kind, said.location, system, dict(said.values))])
-    return replace(system, parameters=_set_parameters(run, system.parameters, links))
+    return replace(system, parameters=_set_parameters(run, system.parameters, finer))
 
 
 def _cable_model(run: Run) -> System:
@@ -216,19 +217,18 @@ def _existing(run: Run, file: Path, noun: str, *key: str | int) -> Path:
     raise run.refuse(f"there is no such {noun}: {file}", *key, hint=hint)
 
 
-def _objects(run: Run, damping: float, links: int | None) -> list[Placed]:
+def _objects(run: Run, damping: float, finer: int) -> list[Placed]:
     item = run.model.object
     if item is None or isinstance(item, CableObject):
         return []
     if isinstance(item, YObject):
-        factor = _stiffening(item, "", links)
         segments = [
             replace(
                 segment,
-                links=item.links if links is None else links,
-                bend=segment.bend * factor,
-                twist=segment.twist * factor,
-                damping=damping,
+                links=item.links * finer,
+                bend=segment.bend * finer,
+                twist=segment.twist * finer,
+                damping=damping * finer,
             )
             for segment in y_segments()
         ]
@@ -237,7 +237,7 @@ def _objects(run: Run, damping: float, links: int | None) -> list[Placed]:
             return [(made, None, None)]
         made = flexible_object(segments, None, "y_object", item.gravity_fraction)
         return [(made, item.mount.frame, _placement(item.mount))]
-    made = flexible_object(_segments(item, damping, links), name="object", gravity_fraction=item.gravity_fraction)
+    made = flexible_object(_segments(item, damping, finer), name="object", gravity_fraction=item.gravity_fraction)
     return [(made, item.mount.frame, _placement(item.mount))]
 
 
@@ -245,30 +245,32 @@ def _placement(mount: MountSettings) -> np.ndarray:
     return placement_matrix(mount.xyz, mount.rpy)
 
 
-def _segments(item: SegmentedObject, damping: float, links: int | None) -> list[Segment]:
+def _segments(item: SegmentedObject, damping: float, finer: int) -> list[Segment]:
     result = []
     for name, s in item.segments.items():
         if s.length is None and s.link_lengths is None:
             raise ModelError(
                 f"segment '{name}' has no length", where=f"segments.{name}", hint="set length or link_lengths"
             )
-        count = s.links if links is None or s.link_lengths is not None else links
-        factor = _stiffening(item, name, links)
+        # a rigidity does not depend on the number of links, a stiffness per joint does
+        factor = 1 if s.rigidity else finer
+        lengths = s.link_lengths
         result.append(
             Segment(
                 name,
-                s.length if s.length is not None else float(sum(s.link_lengths or ())),
+                s.length if s.length is not None else float(sum(lengths or ())),
                 s.mass,
                 s.radius,
-                count,
-                s.link_lengths,
+                s.links * finer,
+                None if lengths is None else [length / finer for length in lengths for _ in range(finer)],
                 s.parent,
-                s.at_link,
+                # a child stays at the same place of its parent
+                None if s.at_link is None else (s.at_link + 1) * finer - 1,
                 roll_pitch_yaw(*s.rpy),
                 bend=Segment.bend * factor,
                 twist=Segment.twist * factor,
-                damping=damping,
-                twist_damping=damping if s.twist_damping else None,
+                damping=damping * factor,
+                twist_damping=damping * factor if s.twist_damping else None,
                 rigidity=s.rigidity,
                 clamped=s.clamped,
                 joint_order=s.joint_order,
@@ -277,17 +279,6 @@ def _segments(item: SegmentedObject, damping: float, links: int | None) -> list[
             )
         )
     return result
-
-
-def _stiffening(item: YObject | SegmentedObject, name: str, links: int | None) -> float:
-    """How many times as stiff every joint of a segment is with other links than those of the settings."""
-    if links is None:
-        return 1.0
-    if isinstance(item, YObject):
-        return links / item.links
-    said = item.segments[name]
-    # a rigidity does not depend on the number of links, a stiffness per joint does
-    return 1.0 if said.rigidity or said.link_lengths is not None else links / said.links
 
 
 # -- parameters -------------------------------------------------------------------------------------------------------
@@ -317,12 +308,12 @@ def parameter_settings(run: Run, parameters: Parameters) -> dict[str, ParameterS
     return result
 
 
-def _set_parameters(run: Run, parameters: Parameters, links: int | None) -> Parameters:
+def _set_parameters(run: Run, parameters: Parameters, finer: int) -> Parameters:
     chosen = parameter_settings(run, parameters)
     entries = []
     for entry in parameters:
         if entry.name in chosen:
-            said, factor = chosen[entry.name], _parameter_factor(run, entry.name, links)
+            said, factor = chosen[entry.name], finer_factor(run, entry.name, finer)
             lower, upper = (entry.lower, entry.upper) if said.bounds is None else (factor * b for b in said.bounds)
             value = entry.value if said.initial is None else factor * said.initial
             key = _key_of(run, entry.name)
@@ -340,12 +331,15 @@ def _set_parameters(run: Run, parameters: Parameters, links: int | None) -> Para
     return Parameters(entries)
 
 
-def _parameter_factor(run: Run, name: str, links: int | None) -> float:
-    """By what a setting of a parameter is multiplied with other links than those of the settings."""
+def finer_factor(run: Run, name: str, finer: int) -> int:
+    """By what a parameter per joint is multiplied where each link is divided, so that it means the same tube."""
     item, (owner, _, quantity) = run.model.object, name.rpartition(".")
-    if item is None or isinstance(item, CableObject) or quantity not in ("bend", "twist") or "@" in owner:
-        return 1.0
-    return _stiffening(item, owner, links)
+    if quantity not in PER_JOINT or isinstance(item, CableObject):
+        return 1
+    if isinstance(item, YObject):
+        return finer if owner in [segment.name for segment in y_segments()] else 1
+    owned = None if item is None else item.segments.get(owner)
+    return 1 if owned is None or owned.rigidity else finer
 
 
 def _key_of(run: Run, name: str) -> str:

@@ -9,21 +9,21 @@ from typing import Any
 
 import numpy as np
 
-from yid_ocp.analysis.convergence import Frequencies, natural_frequencies
+from yid_ocp.analysis.stability import growth_of_fit
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import Run
 from yid_ocp.data.recording import Recording
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.report.terminal import check_summary
-from yid_ocp.workflow.build import build_problem, build_step, build_system, first_gaps
+from yid_ocp.solvers.base import estimates, uncertainty
+from yid_ocp.workflow.build import build_problem, build_step, first_gaps
 from yid_ocp.workflow.command import DONE, carry_out
 from yid_ocp.workflow.folder import new_run_folder
 from yid_ocp.workflow.progress import SILENT, Progress
+from yid_ocp.workflow.refine import discretisation, refine
 
 FORMAT = "yid-check/1"
-TOLERATED = 0.02  # a frequency that moves by more than this fraction when links or steps are refined is worth a warning
-MODES = 3
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,8 @@ def run_check(run: Run, out: str | Path | None = None, progress: Progress = SILE
     Returns
     -------
     CheckOutcome
-        `warnings` in its result lists what will work but should be looked at.
+        `warnings` in its result lists what will work but should be looked at; `discretisation` says how far every
+        estimate would move with a finer model if it were the initial value.
 
     Raises
     ------
@@ -76,11 +77,13 @@ def run_check(run: Run, out: str | Path | None = None, progress: Progress = SILE
                 recordings += [_recording(problem, role, episode, warnings) for episode in episodes]
         progress.stage("refining links and time step")
         convergence = refine(run, problem, warnings)
+        moved = {} if problem is None else _moves(plain, problem, warnings, progress)
         result = {
             "format": FORMAT,
             "model": model,
             "recordings": recordings,
             "convergence": convergence,
+            "discretisation": moved,
             "warnings": warnings,
         }
         written = folder.finish(result)
@@ -129,6 +132,24 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
     return entry
 
 
+def _moves(run: Run, problem: EstimationProblem, warnings: list[str], progress: Progress) -> dict[str, Any]:
+    """How far estimates would move with a finer model if they were the initial values, and by what they are known."""
+    x = problem.start
+    growth = growth_of_fit(problem, x)
+    if growth is not None and not growth.stable:
+        warnings.append(f"with the initial parameters {growth.words}")
+    at_x = problem.evaluate(x)
+    if not at_x.ok:
+        warnings.append(f"the model cannot be rolled out with the initial parameters: {at_x.message}")
+        return {}
+    found = discretisation(run, problem, x, at_x, ("links", "time_step"), progress, models_alone=True)
+    warnings += found.notes
+    # how poorly initial values fit says nothing of how sure the data will be of what fits
+    covariance, _ = uncertainty(problem, replace(at_x, residual=np.zeros_like(at_x.residual)))
+    std = estimates(problem, x, covariance)
+    return found.result({name: std[name].std for name in found.moves})
+
+
 def _groups(recording: Recording) -> dict[str, dict[str, Any]]:
     result: dict[str, dict[str, Any]] = {}
     for group in recording.groups:
@@ -138,103 +159,3 @@ def _groups(recording: Recording) -> dict[str, dict[str, Any]]:
         longest = float(np.max(steps)) if len(steps) else 0.0
         result[name] = {"samples": len(group.t), "rate": rate, "longest_gap": longest, "names": list(group.names)}
     return result
-
-
-def refine(run: Run, problem: EstimationProblem | None, warnings: list[str]) -> dict[str, Any]:
-    """Lowest frequencies at half and twice the links, and at half and a quarter of the time step.
-
-    Returns
-    -------
-    dict
-        `links` and `time_step`: lists of {value, hertz, growing, message}; empty where there is nothing to vary.
-    """
-    system = build_system(run)
-    h = run.problem.time_step
-    posture = _posture(system, problem)
-    if posture is None:
-        return {"links": [], "time_step": [], "message": "no posture is known: the run names no recording"}
-    theta, guess = system.parameters.vector(), None
-    rule = (run.problem.force_split, run.problem.constraint_force)
-    if problem is not None:
-        first = problem.episodes[0]
-        theta = problem.predictor.own_theta(first, theta)
-        guess = None if first.start is None else first.start.state[: system.size]
-    own = natural_frequencies(system, posture, theta, h, *rule, guess)
-    if own.message:
-        return {"links": [], "time_step": [], "message": own.message}
-    if own.growing:
-        remedy = "problem.constraint_force: midpoint, " if rule[1] == "node" and system.grasps else ""
-        warnings.append(
-            f"{own.growing} modes grow from step to step about the first posture: take a shorter problem.time_step, "
-            f"{remedy}or more damping"
-        )
-    values = dict(zip(system.parameters.names, theta, strict=True))
-    steps = [_row(h, own)]
-    steps += [_row(h / k, natural_frequencies(system, posture, theta, h / k, *rule, guess)) for k in (2, 4)]
-    _warn(warnings, "the time step goes", "s", steps, len(steps) - 1, 0)
-    count = object_links(run)
-    rows = []
-    if count is not None:
-        for links in sorted({max(1, count // 2), count, 2 * count}):
-            other = system if links == count else build_system(run, links=links)
-            factor = links / count
-            scaled = other.parameters.vector(
-                {
-                    name: value * (factor if _per_joint(run, name) else 1.0)
-                    for name, value in values.items()
-                    if name in other.parameters
-                }
-            )
-            found = own if links == count else natural_frequencies(other, posture, scaled, h, *rule)
-            rows.append(_row(links, found))
-        _warn(warnings, "the links go", "", rows, len(rows) - 1, [row["value"] for row in rows].index(count))
-    return {"links": rows, "time_step": steps, "message": ""}
-
-
-def object_links(run: Run) -> int | None:
-    """Number of equal links of the object's tubes, None where there is no such number to vary."""
-    item = run.model.object
-    if item is None or item.kind == "cable":
-        return None
-    if item.kind == "y":
-        return item.links
-    counts = {segment.links for segment in item.segments.values() if segment.link_lengths is None}
-    return counts.pop() if len(counts) == 1 else None
-
-
-def _per_joint(run: Run, name: str) -> bool:
-    """Whether a parameter is a stiffness per joint, which must grow with the number of links."""
-    owner, _, quantity = name.rpartition(".")
-    item = run.model.object
-    if quantity not in ("bend", "twist") or item is None:
-        return False
-    if item.kind == "segments":
-        return owner in item.segments and not item.segments[owner].rigidity
-    return item.kind == "y"
-
-
-def _posture(system: Any, problem: EstimationProblem | None) -> dict[str, float] | None:
-    names = (*system.driven, *system.prescribed)
-    if not names:
-        return {}
-    if problem is None:
-        return None
-    return dict(zip(names, map(float, problem.episodes[0].posture), strict=True))
-
-
-def _row(value: float, found: Frequencies) -> dict[str, Any]:
-    return {
-        "value": value,
-        "hertz": found.hertz[:MODES].tolist(),
-        "growing": found.growing,
-        "message": found.message,
-    }
-
-
-def _warn(warnings: list[str], what: str, unit: str, rows: list[dict[str, Any]], finest: int, own: int) -> None:
-    fine, coarse = rows[finest]["hertz"], rows[own]["hertz"]
-    for i, (a, b) in enumerate(zip(coarse, fine, strict=False)):
-        if b > 0 and abs(a - b) / b > TOLERATED:
-            change = f"from {rows[own]['value']:g} to {rows[finest]['value']:g} {unit}".rstrip()
-            moved = f"{a:.3g} Hz to {b:.3g} Hz ({100 * abs(a - b) / b:.2g} %)"
-            warnings.append(f"frequency {i + 1} moves from {moved} when {what} {change}")

@@ -24,6 +24,7 @@ from yid_ocp.workflow.command import DONE, FAILED, carry_out
 from yid_ocp.workflow.folder import new_run_folder
 from yid_ocp.workflow.held_out import held_out_entry
 from yid_ocp.workflow.progress import SILENT, Progress
+from yid_ocp.workflow.refine import Discretisation, counted, discretisation, steadied, wanted
 from yid_ocp.workflow.trajectories import write_trajectories
 
 FORMAT = "yid-solve/1"
@@ -92,11 +93,22 @@ def run_solve(run: Run, out: str | Path | None = None, progress: Progress = SILE
             progress.iterate(entry)
 
         solution = solve(problem, run.solver, callback=iterate)
+        solution, stability = steadied(problem, solution)
+        finer = Discretisation({})
+        if solution.evaluation is not None:
+            finer = discretisation(run, problem, solution.x, solution.evaluation, wanted(run), progress)
+        # the ± and the verdict of everything below count how far the estimate is from a fine model's
+        data_std, solution = solution.std, counted(solution, finer)
         progress.stage("predicting the held-out recordings")
         held_out = problem.validate(solution.x)
         folder.log("end", status=solution.status.value, message=solution.message, seconds_solving=solution.seconds)
         write_trajectories(folder.path / "trajectories.h5", problem, solution, held_out)
-        written = folder.finish(solve_result(problem, solution, held_out, build_cable(run)))
+        more = {
+            "discretisation": finer.result(data_std),
+            "discretisation_notes": list(finer.notes),
+            "stability": stability,
+        }
+        written = folder.finish(solve_result(problem, solution, held_out, build_cable(run)) | more)
         if run.output.report:
             progress.stage("writing the report")
             findings = Findings(run.name, run.description, written, problem, solution, tuple(held_out))

@@ -1,0 +1,179 @@
+"""How far estimates move with a finer model, rule by rule, on formulas and on chains."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from made_models import Formula, estimate
+
+from yid_ocp.analysis.discretisation import Moves, Refined, counting, divided_joints, lower_of, moves
+from yid_ocp.integrator.step import compile_step
+from yid_ocp.model import Segment, System, flexible_object
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.solvers import GaussNewton, solve
+
+OPEN = {"a": (-math.inf, math.inf), "b": (-math.inf, math.inf)}
+
+
+def problem(rows, start, shared=None, **more):
+    made = Formula(rows, start, **more)
+    made.shared = tuple(start) if shared is None else shared
+    made.system = SimpleNamespace(mechanism=SimpleNamespace(joint_names=()))
+    return made
+
+
+# -- the step ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("factor", [1.0, 2.0])
+def test_an_estimate_moves_to_where_a_linear_finer_model_fits_best(factor):
+    """The finer model's own parameter is so many times the coarse one's; its best fit is at 3.3 coarse units."""
+    coarse = problem(lambda x: [2 * (x["a"] - 3.0), x["a"] + x["b"] - 5.0], {"a": 3.0, "b": 2.0}, bounds=OPEN)
+    finer = problem(
+        lambda x: [2 * (x["a"] / factor - 3.3), x["a"] / factor + x["b"] - 5.1],
+        {"a": 1.0, "b": 1.0},
+        bounds=OPEN,
+    )
+    at = coarse.evaluate(coarse.start)
+    found = moves(Refined(finer, {"a": factor}), coarse, coarse.start, at)
+    assert found == pytest.approx({"a": 0.3, "b": -0.2})
+
+
+def test_a_point_that_is_no_estimate_counts_the_difference_of_the_models_alone():
+    """At 2 the coarse model wants to go to 3 and the finer one to 3.3."""
+    coarse = problem(lambda x: [2 * (x["a"] - 3.0)], {"a": 2.0}, bounds=OPEN)
+    finer = problem(lambda x: [2 * (x["a"] - 3.3)], {"a": 2.0}, bounds=OPEN)
+    at = coarse.evaluate(coarse.start)
+    assert moves(Refined(finer), coarse, coarse.start, at) == pytest.approx({"a": 1.3})
+    assert moves(Refined(finer), coarse, coarse.start, at, models_alone=True) == pytest.approx({"a": 0.3})
+
+
+def test_a_move_ends_at_the_bound():
+    coarse = problem(lambda x: [x["a"] - 1.0], {"a": 1.0})
+    finer = problem(lambda x: [x["a"] + 5.0], {"a": 1.0})
+    at = coarse.evaluate(coarse.start)
+    assert moves(Refined(finer), coarse, coarse.start, at) == pytest.approx({"a": -1.0})
+
+
+def test_a_finer_model_that_cannot_be_rolled_out_says_why():
+    coarse = problem(lambda x: [x["a"] - 1.0], {"a": 1.0})
+    finer = problem(lambda x: [x["a"]], {"a": 1.0}, fails=lambda values: True)
+    assert moves(Refined(finer), coarse, coarse.start, coarse.evaluate(coarse.start)) == "it snaps"
+
+
+def test_models_that_are_compared_at_other_samples_have_no_difference():
+    coarse = problem(lambda x: [x["a"] - 1.0], {"a": 1.0})
+    finer = problem(lambda x: [x["a"], x["a"]], {"a": 1.0})
+    at = coarse.evaluate(coarse.start)
+    assert "other samples" in moves(Refined(finer), coarse, coarse.start, at, models_alone=True)
+
+
+# -- what stands for what ---------------------------------------------------------------------------------------------
+
+
+def chain(links):
+    tube = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=links, joint_order="xy")])
+    return System.build(None, objects=[(tube, None, None)])
+
+
+def test_divided_links_share_their_angle():
+    coarse, fine = chain(2), chain(4)
+    divided = divided_joints(coarse, fine)
+    assert divided == {
+        "T1_0_x": ("T1_0_x", "T1_1_x"),
+        "T1_0_y": ("T1_0_y", "T1_1_y"),
+        "T1_1_x": ("T1_2_x", "T1_3_x"),
+        "T1_1_y": ("T1_2_y", "T1_3_y"),
+    }
+    assert divided_joints(coarse, coarse) == {}
+    made = problem(lambda x: [x["a"]], {"a": 1.0})
+    made.system = fine
+    [warm] = Refined(made, divided=divided).warm(coarse, (np.array([0.2, -0.4, 0.6, 0.8]),))
+    np.testing.assert_allclose(warm, [0.1, -0.2, 0.1, -0.2, 0.3, 0.4, 0.3, 0.4])
+    assert Refined(made, divided=divided).warm(coarse, (None,)) == (None,)
+
+
+def test_a_start_is_carried_to_the_finer_chain():
+    names = [f"start.{kind}.{joint}[run]" for kind in "qp" for joint in ("T1_0_x", "T1_1_x")]
+    coarse = ("a", "c[run]", "start.q.T1_0_x[run]", "start.p.T1_0_x[run]", "gone")
+    start = {"a": 1.0, "c[run]": 1.0, "b": 7.0, **dict.fromkeys(names, 0.0)}
+    made = problem(lambda x: [x["a"]], start, bounds=dict.fromkeys(names, (-9.0, 9.0)))
+    refined = Refined(made, {"a": 2.0, "c": 3.0}, {"T1_0_x": ("T1_0_x", "T1_1_x")})
+    point = dict(zip(made.names, refined.point(coarse, np.array([1.5, 2.0, 0.4, 0.9, 5.0])), strict=True))
+    assert point == {"a": 3.0, "c[run]": 6.0, "b": 7.0, **dict(zip(names, (0.2, 0.2, 0.0, 0.0), strict=True))}
+
+
+# -- what it leaves of a standard deviation ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("links", "time_step", "std"),
+    [
+        (None, None, 0.1),
+        (0.1, -0.1, 0.1),
+        (-0.3, 0.05, math.hypot(0.1, 0.6)),
+        (0.05, 0.3, math.hypot(0.1, 0.6)),
+        (0.3, -0.4, math.hypot(0.1, 0.6, 0.8)),
+    ],
+    ids=["not tried", "within it", "links", "time step", "both"],
+)
+def test_a_move_larger_than_the_standard_deviation_widens_it_to_where_the_limit_is(links, time_step, std):
+    assert Moves(links, time_step).counted(0.1) == pytest.approx(std)
+
+
+@pytest.mark.parametrize(
+    ("move", "before", "after"),
+    [
+        (0.01, "identifiable", "identifiable"),
+        (0.4, "identifiable", "identifiable"),
+        (0.6, "identifiable", "weak"),
+        (30.0, "identifiable", "not_identifiable"),
+        (0.6, "weak", "weak"),
+        (0.4, "weak", "weak"),
+        (0.6, "at_bound", "at_bound"),
+        (30.0, "not_identifiable", "not_identifiable"),
+    ],
+)
+def test_a_verdict_is_lowered_by_moves_and_never_raised(move, before, after):
+    """Of a value of 10 and a standard deviation of 0.02: ten percent are reached by a move of half of them."""
+    said = {"a": estimate(10.0, 0.02, verdict=before), "b": estimate(10.0, 0.02), "c": estimate(3.0, 0.0, free=False)}
+    found = counting(said, {"a": Moves(move), "c": Moves(9.0)})
+    assert found["a"].verdict == after
+    assert found["a"].std == (0.02 if move < 0.02 else pytest.approx(math.hypot(0.02, 2 * move)))
+    assert found["b"] == said["b"]
+    assert found["c"] == said["c"]
+    assert replace(found["a"], std=0.02, verdict=before) == said["a"]
+
+
+def test_what_nothing_informs_stays_unknown():
+    said = {"a": estimate(10.0, math.inf, verdict="not_identifiable")}
+    assert counting(said, {"a": Moves(5.0, 5.0)}) == said
+
+
+def test_the_worse_of_two_verdicts():
+    assert lower_of("identifiable", "weak") == lower_of("weak", "identifiable") == "weak"
+    assert lower_of("not_trusted", "weak") == "not_trusted"
+
+
+# -- on a real chain --------------------------------------------------------------------------------------------------
+
+
+def test_half_the_step_of_a_pendulum_is_where_its_own_fit_goes(pendulum, twin):
+    """The problem's own answer with half the step is what one Gauss-Newton step says, to second order."""
+    clean = pendulum()
+    recording = twin(clean, clean.start, 3)
+    coarse = pendulum(recording)
+    step = compile_step(coarse.system, coarse.step.time_step / 2, coarse.step.force_split, use_compiler=False)
+    fine = EstimationProblem(
+        step, [recording], coarse.free, coarse.options, dict(zip(coarse.free, coarse.start, strict=True))
+    )
+    found = solve(coarse, GaussNewton())
+    finer = solve(fine, GaussNewton(), start=found.x)
+    own = moves(Refined(fine), coarse, found.x, found.evaluation)
+    change = finer.x - found.x
+    assert np.abs(change).max() > 1e-5
+    np.testing.assert_allclose([own[name] for name in coarse.names], change, rtol=0.1, atol=0.05 * np.abs(change).max())

@@ -1,0 +1,272 @@
+"""Errors that alternate from step to step: which modes count, how far they grow, what is said."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from made_models import estimate as estimated
+from made_models import solution
+from made_recordings import places
+
+from yid_ocp.analysis import stability as module
+from yid_ocp.analysis.stability import LOOKS, TOLERATED, Growth, growth_along, growth_of_fit
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.integrator.rollout import simulate
+from yid_ocp.integrator.statics import Statics
+from yid_ocp.integrator.step import compile_step
+from yid_ocp.integrator.step_model import Feedback
+from yid_ocp.model import Grasp, Segment, System, flexible_object
+from yid_ocp.model.urdf import read_urdf
+from yid_ocp.problem import EstimationProblem, ProblemOptions
+from yid_ocp.solvers import GaussNewton, Status, solve
+from yid_ocp.workflow import refine
+from yid_ocp.workflow.refine import steadied
+
+H = 0.01
+
+
+def made(matrices, *, by_torque=None, fixed=(), finite=None):
+    """A step whose A is given node by node, of two coordinates, and a rollout that stays where it is."""
+    count = len(matrices)
+    step = SimpleNamespace(
+        system=SimpleNamespace(size=2, prescribed_indices=fixed),
+        sizes={"nx": 4},
+        time_step=H,
+        jacobians=lambda q, p, u, theta, prescribed, z, names: (
+            np.array(matrices[int(u[0])], float),
+            np.zeros((4, 1)) if by_torque is None else np.array(by_torque, float)[:, None],
+            None,
+        ),
+    )
+    state = np.zeros((count + 1, 4))
+    if finite is not None:
+        state[finite:] = np.nan
+    return step, SimpleNamespace(state=state, torque=np.arange(count, dtype=float)[:, None])
+
+
+def swap(pair):
+    """Step, theta and rollout."""
+    step, rollout = pair
+    return step, np.zeros(0), rollout
+
+
+def diagonal(*values):
+    return np.diag(np.array(values, float))
+
+
+def turned(size, degrees):
+    """Two modes of a magnitude that turn by an angle in every step, beside two that do not move."""
+    a, c, s = np.zeros((4, 4)), np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    a[:2, :2] = size * np.array([[c, -s], [s, c]])
+    return a
+
+
+@pytest.mark.parametrize(
+    ("matrix", "factor"),
+    [
+        (diagonal(-1.3, 0.5, 1, 0), 1.3),
+        (diagonal(1.3, 0.5, 1, 0), 0.0),
+        (diagonal(1.5, -0.9, -0.2, 0), 0.9),
+        (turned(1.2, 170), 1.2),
+        (turned(1.2, 91), 1.2),
+        (turned(1.2, 89), 0.0),
+    ],
+    ids=["alternates", "falls over", "dies out", "nearly alternates", "turns back", "swings"],
+)
+def test_only_what_turns_back_at_every_step_is_the_methods_own(matrix, factor):
+    found = growth_along(*swap(made([matrix] * 10)))
+    assert found.factor == pytest.approx(factor)
+    assert found.decades == pytest.approx(10 * np.log10(factor) if factor > 1 else 0.0)
+    assert found.time_step == H
+
+
+def test_prescribed_coordinates_do_not_count():
+    step, rollout = made([diagonal(-3.0, -1.1, -5.0, 0.3)] * 4, fixed=(0,))
+    assert growth_along(step, np.zeros(0), rollout).factor == pytest.approx(1.1)
+
+
+def test_the_tracking_filter_is_part_of_the_loop():
+    """Gains too high for the time step alternate by themselves, others calm what would."""
+    matrix = diagonal(0.9, 0.5, -1.2, 0.0)
+    step, rollout = made([matrix] * 4, by_torque=[1.0, 0.0, 0.0, 0.0])
+    feedback = Feedback(np.array([0], np.int32), np.full((4, 1, 1), 2.4), np.zeros((4, 1)))
+    assert growth_along(step, np.zeros(0), rollout).factor == pytest.approx(1.2)
+    assert growth_along(step, np.zeros(0), rollout, feedback).factor == pytest.approx(1.5)
+    calm = replace(feedback, index=np.array([2], np.int32), gain=np.full((4, 1, 1), -0.4))
+    step, rollout = made([matrix] * 4, by_torque=[0.0, 0.0, 1.0, 0.0])
+    assert growth_along(step, np.zeros(0), rollout, calm).factor == pytest.approx(0.8)
+
+
+def test_growth_is_that_of_the_worst_stretch():
+    """Ten steps of ten percent, five that calm it down, three of fifty percent."""
+    sizes = [1.1] * 10 + [0.1] * 5 + [1.5] * 3
+    found = growth_along(*swap(made([diagonal(-size, 0, 0, 0) for size in sizes])))
+    assert found.decades == pytest.approx(max(10 * np.log10(1.1), 3 * np.log10(1.5)))
+    assert found.factor == pytest.approx(1.5)
+    assert found.time == pytest.approx(15 * H)
+    joined = growth_along(*swap(made([diagonal(-size, 0, 0, 0) for size in [1.1] * 10 + [0.9] + [1.5] * 3])))
+    assert joined.decades == pytest.approx(10 * np.log10(1.1) + np.log10(0.9) + 3 * np.log10(1.5))
+
+
+def test_long_motions_are_looked_at_here_and_there():
+    asked = []
+    step, rollout = made([diagonal(-1.01, 0, 0, 0)] * 1000)
+    inner = step.jacobians
+    step.jacobians = lambda *arguments, **more: asked.append(1) or inner(*arguments, **more)
+    found = growth_along(step, np.zeros(0), rollout)
+    assert len(asked) == LOOKS
+    assert found.decades == pytest.approx(1000 * np.log10(1.01))
+
+
+def test_a_rollout_that_failed_counts_as_far_as_it_got():
+    step, rollout = made([diagonal(-1.2, 0, 0, 0)] * 20, finite=8)
+    assert growth_along(step, np.zeros(0), rollout).decades == pytest.approx(7 * np.log10(1.2))
+    step, rollout = made([diagonal(-1.2, 0, 0, 0)] * 20, finite=1)
+    assert growth_along(step, np.zeros(0), rollout) == Growth("motion", 0.0, 0.0, 0.0, H)
+    broken = [diagonal(-1.2, 0, 0, 0)] * 5 + [np.full((4, 4), np.nan)] * 5
+    assert growth_along(*swap(made(broken))).decades == pytest.approx(5 * np.log10(1.2))
+
+
+@pytest.mark.parametrize(("decades", "stable"), [(0.0, True), (TOLERATED, True), (TOLERATED + 0.1, False)])
+def test_what_is_said(decades, stable):
+    growth = Growth("run", decades, 1.29, 0.35, 0.005)
+    assert growth.stable is stable
+    if stable:
+        assert growth.words == "run: the step of 0.005 s is stable along the motion"
+    else:
+        assert growth.words == (
+            "run: the step of 0.005 s is not stable: an error that alternates from step to step grows by 29 % in a "
+            "step at 0.35 s; take a shorter problem.time_step (0.0025 s, say)"
+        )
+
+
+def test_the_worst_recording_counts(monkeypatch, pendulum):
+    problem = pendulum()
+    assert growth_of_fit(problem, problem.start).stable
+    assert growth_of_fit(problem, problem.start).recording == "twin"
+    twice = problem.on((problem.episodes[0],) * 2, ())
+    found = iter([Growth("a", 7.0, 1.1, 0.0, H), Growth("b", 2.0, 1.9, 0.0, H)])
+    looks = []
+    monkeypatch.setattr(module, "growth_along", lambda *arguments: looks.append(arguments[-1]) or next(found))
+    assert growth_of_fit(twice, problem.start).recording == "a"
+    assert looks == [LOOKS // 2] * 2
+
+
+# -- a light cable between two hands ----------------------------------------------------------------------------------
+
+
+HANDS = """<robot name="hands"><link name="wall"/>
+<joint name="x" type="prismatic"><parent link="wall"/><child link="a"/><axis xyz="1 0 0"/>
+  <limit lower="-1" upper="2" effort="100" velocity="5"/></joint>
+<link name="a"><inertial><mass value="0.5"/><inertia ixx="1e-3" ixy="0" ixz="0" iyy="1e-3" iyz="0" izz="1e-3"/>
+  </inertial></link>
+<joint name="z" type="prismatic"><parent link="a"/><child link="hand"/><axis xyz="0 0 1"/>
+  <limit lower="-1" upper="2" effort="100" velocity="5"/></joint>
+<link name="hand"><inertial><mass value="0.5"/><inertia ixx="1e-3" ixy="0" ixz="0" iyy="1e-3" iyz="0" izz="1e-3"/>
+  </inertial></link></robot>
+"""
+
+
+NODE = ("symmetric", "node")
+"""The rule under which the constraints pull at the nodes, which is what does not bear a light cable's tension."""
+
+
+@pytest.fixture(scope="module")
+def light(tmp_path_factory):
+    """light(stiffness, time_step): the step of twenty grams on a metre; `path(time_step)` moves its hands."""
+    file = tmp_path_factory.mktemp("hands") / "hands.urdf"
+    file.write_text(HANDS)
+    robot = read_urdf(file)
+
+    def build(stiffness, time_step):
+        segment = Segment("cable", 1.0, 0.02, 0.003, links=8, bend=stiffness, twist=stiffness, damping=1e-4)
+        grasps = [Grasp("hand", "hand", "w_cable")]
+        objects = [(flexible_object([segment]), None, None)]
+        system = System.build(
+            robot, objects=objects, grasps=grasps, prescribed=["x", "z"], points=["cable:30%", "cable:60%"]
+        )
+        return compile_step(system, time_step, *NODE, use_compiler=False)
+
+    return build
+
+
+def moved(step, duration):
+    """Times, the hands' path and the rollout from rest."""
+    t = step.time_step * np.arange(round(duration / step.time_step) + 1)
+    ramp = np.minimum(t / 0.3, 1.0) ** 2
+    path = np.stack([0.35 + 0.1 * ramp * np.sin(6 * t), 0.75 + 0.08 * ramp * np.sin(9 * t)], axis=1)
+    theta = step.system.parameters.vector()
+    rest = Statics(step).solve(path[0], theta)
+    return t, path, simulate(step, theta, rest.state, len(t) - 1, path=path)
+
+
+@pytest.mark.parametrize(("stiffness", "time_step", "stable"), [(0.5, 0.005, False), (0.5, 0.0025, True)])
+def test_a_light_cable_between_two_hands(light, stiffness, time_step, stable):
+    """The rollout converges at every step all the same."""
+    step = light(stiffness, time_step)
+    _, _, rollout = moved(step, 0.4)
+    assert rollout.status.ok
+    growth = growth_along(step, step.system.parameters.vector(), rollout)
+    assert growth.stable is stable
+    assert (growth.factor > 1.1) is not stable
+
+
+@pytest.fixture(scope="module")
+def light_recording(light):
+    """The cable as a step of a millisecond moves it, its points seen to a millimetre at 100 Hz."""
+    fine = light(0.5, 0.001)
+    t, path, rollout = moved(fine, 0.8)
+    assert growth_along(fine, fine.system.parameters.vector(), rollout).stable
+    seen = np.array([places(fine.system, fine.system.points, q) for q in rollout.state[::10, : fine.system.size]])
+    seen += 1e-3 * np.random.default_rng(0).standard_normal(seen.shape)
+    points = PointGroup("points", fine.system.points, t[::10], seen, 1e-3)
+    return Recording(JointGroup(["x", "z"], t[::5], path[::5], position_std=0.0), (points,), name="light")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("time_step", "status"), [(0.005, Status.STALLED), (0.0025, Status.CONVERGED)])
+def test_a_fit_that_walked_away_from_an_unstable_truth_has_not_converged(light, light_recording, time_step, status):
+    """At 5 ms it ends, with every sign of success, thousands of standard deviations from the truth."""
+    options = ProblemOptions(path_cutoff=np.inf)
+    problem = EstimationProblem(light(0.3, time_step), [light_recording], ("cable.bend",), options)
+    found = solve(problem, GaussNewton())
+    assert found.status == Status.CONVERGED
+    entry = found.parameters["cable.bend"]
+    assert (abs(entry.value - 0.5) > 100 * entry.std) == (status == Status.STALLED)
+    judged, said = steadied(problem, found)
+    assert judged.status == status
+    assert set(said) == {"start", "estimate"}
+    if status == Status.STALLED:
+        assert judged.message.startswith("at the estimate light: the step of 0.005 s is not stable")
+        assert found.message in judged.message
+    else:
+        assert abs(entry.value - 0.5) < 3 * entry.std
+        assert judged == found
+
+
+@pytest.mark.parametrize(
+    ("before", "start", "estimate", "after"),
+    [
+        (Status.CONVERGED, 0.0, 0.0, Status.CONVERGED),
+        (Status.CONVERGED, 9.0, 0.0, Status.CONVERGED),
+        (Status.CONVERGED, 0.0, 9.0, Status.STALLED),
+        (Status.ITERATION_LIMIT, 0.0, 9.0, Status.ITERATION_LIMIT),
+        (Status.FAILED, 9.0, 0.0, Status.FAILED),
+        (Status.FAILED, 0.0, 0.0, Status.FAILED),
+    ],
+)
+def test_a_search_may_begin_but_not_end_where_the_step_is_not_stable(monkeypatch, before, start, estimate, after):
+    grown = {0.0: Growth("run", start, 1.3, 0.1, H), 1.0: Growth("run", estimate, 1.3, 0.1, H)}
+    monkeypatch.setattr(refine, "growth_of_fit", lambda problem, x: grown[float(x[0])])
+    found = replace(solution(status=before, a=estimated(1.0)), message="done")
+    judged, said = steadied(SimpleNamespace(start=np.zeros(1)), found)
+    assert judged.status == after
+    assert (said["start"]["decades"], said["estimate"]["decades"]) == (start, estimate)
+    named = "at the estimate run" if estimate else "at the start run" if start and before == Status.FAILED else "done"
+    assert judged.message.startswith(named)
+    assert "done" in judged.message
+    monkeypatch.setattr(refine, "growth_of_fit", lambda problem, x: None)
+    assert steadied(SimpleNamespace(start=np.zeros(1)), found) == (found, {"start": None, "estimate": None})

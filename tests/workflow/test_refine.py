@@ -1,0 +1,94 @@
+"""What the number of links and the time step do to estimates, against an object that is a finer chain in truth."""
+
+from __future__ import annotations
+
+import pytest
+from made_cross import TRUTH, configuration, record
+
+from yid_ocp.config.reader import load_config
+from yid_ocp.report.terminal import solve_summary
+from yid_ocp.workflow.check import run_check
+from yid_ocp.workflow.refine import wanted
+from yid_ocp.workflow.solve import run_solve
+
+pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
+WHOLE = ("north", "south", "east", "west")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """One branch, recorded."""
+    made = tmp_path_factory.mktemp("branch")
+    record(made, ["north"])
+    return made
+
+
+def judged(result, links):
+    """Relative error, its standard deviation alone and with discretisation, of every free parameter."""
+    found = {}
+    for name, truth in TRUTH.items():
+        if name in result["parameters"]:
+            entry, moved = result["parameters"][name], result["discretisation"][name]
+            scale = truth * links / 4
+            found[name] = ((entry["value"] - scale) / scale, moved["std"] / scale, entry["std"] / scale, entry)
+    return found
+
+
+def test_too_few_links_are_told_and_counted(folder, tmp_path):
+    """A branch of twelve links estimated with four: a quarter too stiff, known from the data to half a percent."""
+    run = load_config(configuration(folder, 4, ["north"], 1.5))
+    assert wanted(run) == ("links", "time_step")
+    result = run_solve(run, tmp_path / "run").result
+    error, alone, counted, entry = judged(result, 4)["north.bend"]
+    assert error > 0.15
+    assert alone < 0.02
+    assert error < 2 * counted
+    assert entry["verdict"] == "weak"
+    # with twice the links it is nearer to the truth by what is said
+    moved = result["discretisation"]["north.bend"]["links"] / TRUTH["north.bend"]
+    assert -error < moved < -0.4 * error
+    told = solve_summary(result)
+    assert any(line.startswith("with twice the links these move by more than the data's") for line in told)
+
+
+def test_settings_say_what_is_refined(folder, tmp_path):
+    file = configuration(folder, 4, ["north"])
+    said = {"none": set(), "time_step": {"time_step"}, "both": {"links", "time_step"}}
+    for setting, tried in said.items():
+        run = load_config(file, [f"output.discretisation={setting}", "solver.iterations=1"])
+        assert set(wanted(run)) == tried
+    result = run_solve(load_config(file, ["output.discretisation=none"]), tmp_path / "none").result
+    assert result["discretisation"] == {}
+    _, alone, *_ = result["parameters"]["north.bend"], result["parameters"]["north.bend"]["std"]
+    assert alone < 0.02 * TRUTH["north.bend"]
+    assert result["parameters"]["north.bend"]["verdict"] == "identifiable"
+
+
+def test_check_says_it_before_anything_is_solved(folder, tmp_path):
+    """At the truth the move is nearly the one at the estimate, whatever the data; a poor fit makes nothing unsure."""
+    poor, result = (
+        run_check(load_config(configuration(folder, 4, ["north"], start)), tmp_path / f"check_{start}").result
+        for start in (2.0, 1.0)
+    )
+    moved = result["discretisation"]["north.bend"]
+    assert 1 < poor["discretisation"]["north.bend"]["std"] / moved["std"] < 10
+    assert -0.3 < moved["links"] / TRUTH["north.bend"] < -0.08
+    assert abs(moved["time_step"]) < 0.02 * TRUTH["north.bend"]
+    assert moved["std"] < 0.02 * TRUTH["north.bend"]
+
+
+@pytest.mark.slow
+def test_a_cross_of_few_links_is_not_called_found(tmp_path):
+    """With four links both are a third too stiff and say so; with eight the error is a third of that, within its ±."""
+    record(tmp_path, WHOLE)
+    largest = {}
+    for links in (4, 8):
+        run = load_config(configuration(tmp_path, links, WHOLE, 1.2), ["problem.compiler=true"])
+        found = judged(run_solve(run, tmp_path / f"run_{links}").result, links)
+        assert set(found) == set(TRUTH)
+        largest[links] = max(abs(error) for error, *_ in found.values())
+        for error, _, counted, entry in found.values():
+            assert abs(error) < 2 * counted
+            assert not (entry["verdict"] == "identifiable" and abs(error) > 0.1)
+    assert largest[4] > 0.2
+    assert largest[8] < 0.5 * largest[4]

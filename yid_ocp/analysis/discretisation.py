@@ -1,0 +1,174 @@
+"""How far estimates move with finer links and shorter steps, and what that leaves of their standard deviations."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.model.system import System
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.evaluation import Evaluation, WarmStart
+from yid_ocp.problem.unknowns import START
+from yid_ocp.solvers.base import Estimate, verdict
+from yid_ocp.solvers.gauss_newton import bounded_step
+
+Array = NDArray[np.float64]
+
+ANGLE = f"{START}q."
+REMAINING = 2.0
+"""Distance to the limit of many links or short steps over the move of one halving, where the error falls as their size:
+m + m/2 + m/4 + ... What falls faster has less to go."""
+
+
+@dataclass(frozen=True)
+class Moves:
+    """How far one estimate moves, in its own unit.
+
+    Attributes
+    ----------
+    links : float or None
+        With every link divided in two; None where that was not tried or the finer model could not be rolled out.
+    time_step : float or None
+        With half the time step.
+    """
+
+    links: float | None = None
+    time_step: float | None = None
+
+    def counted(self, std: float) -> float:
+        """Standard deviation together with the moves that are larger than it.
+
+        Such a move counts `REMAINING` times, as that is how far the estimate is from a fine model's. Smaller ones are
+        within what the standard deviation says already.
+        """
+        found = [move for move in (self.links, self.time_step) if move is not None and abs(move) > std]
+        return math.hypot(std, *(REMAINING * move for move in found)) if found else std
+
+
+@dataclass(frozen=True)
+class Refined:
+    """A finer problem of the same data, and how its unknowns compare.
+
+    Attributes
+    ----------
+    problem : EstimationProblem
+    factors : mapping of str to float
+        By what a parameter must be multiplied to mean the same object in the finer model; 1 where a name is not there.
+    divided : mapping of str to tuple of str
+        Joints into which each joint of a divided link went, which share its angle.
+    """
+
+    problem: EstimationProblem
+    factors: Mapping[str, float] = field(default_factory=dict)
+    divided: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def factor(self, name: str) -> float:
+        """Of an unknown, which may carry its recording's name."""
+        return float(self.factors.get(name.split("[")[0], 1.0))
+
+    def point(self, names: Sequence[str], x: Array) -> Array:
+        """The finer problem's unknowns at a point of the coarse one.
+
+        Of an estimated start, divided links share their angle and begin at rest.
+        """
+        made, at = self.problem.start, {name: i for i, name in enumerate(self.problem.names)}
+        for name, value in zip(names, x, strict=True):
+            base, bracket, recording = name.partition("[")
+            parts = self.divided.get(base.rpartition(".")[2]) if base.startswith(START) else None
+            if parts is None and name in at:
+                made[at[name]] = value * self.factor(name)
+            elif parts is not None and base.startswith(ANGLE):
+                for part in parts:
+                    made[at[f"{ANGLE}{part}{bracket}{recording}"]] = value / len(parts)
+        return np.clip(made, *self.problem.bounds)
+
+    def warm(self, coarse: System, found: WarmStart) -> WarmStart:
+        """Where equilibria of the finer model are looked for: at the coarse one's shapes."""
+        return tuple(None if q is None else self._shape(coarse, q) for q in found)
+
+    def _shape(self, coarse: System, q: Array) -> Array:
+        tree = self.problem.system.mechanism
+        fine = np.zeros(len(tree.joints))
+        for name, angle in zip(coarse.mechanism.joint_names, q, strict=True):
+            parts = self.divided.get(name, (name,))
+            fine[[tree.joint_index(part) for part in parts]] = angle / len(parts)
+        return fine
+
+
+def divided_joints(coarse: System, fine: System) -> dict[str, tuple[str, ...]]:
+    """Joints of a finer model into which every joint of the coarse one's segments went, where it was divided."""
+    found = {}
+    for segment in coarse.segments:
+        links = fine.segment(segment.name).links
+        times = len(links) // len(segment.links)
+        for i, joints in enumerate(segment.links):
+            for axis, joint in enumerate(joints):
+                found[joint] = tuple(links[times * i + k][axis] for k in range(times))
+    return {joint: parts for joint, parts in found.items() if len(parts) > 1}
+
+
+def moves(
+    refined: Refined, coarse: EstimationProblem, x: Array, at_x: Evaluation, *, models_alone: bool = False
+) -> dict[str, float] | str:
+    """How far each shared free parameter moves by one Gauss-Newton step of a finer model, from a coarse one's point.
+
+    At an estimate that is the change which the finer model wants, with the data, bounds and priors of the coarse one.
+    Elsewhere the coarse model wants to move as well: with `models_alone` its prediction stands for the data, and what
+    is left is the difference between the two models.
+
+    Parameters
+    ----------
+    refined : Refined
+    coarse : EstimationProblem
+    x : ndarray, shape (nx,)
+    at_x : Evaluation
+        Of the coarse problem at `x`.
+    models_alone : bool
+
+    Returns
+    -------
+    dict of str to float, or str
+        In the coarse parameters' units; why the step cannot be made, in words.
+    """
+    point, warm = refined.point(coarse.names, x), refined.warm(coarse.system, at_x.warm)
+    weighted = any(own is not None for own in coarse.innovations)
+    problem = refined.problem.weighted_at(point, warm, rounds=2) if weighted else refined.problem
+    evaluation = problem.evaluate(point, warm=warm)
+    if not evaluation.ok or evaluation.jacobian is None:
+        return evaluation.message
+    residual = evaluation.residual
+    if models_alone:
+        if problem.rows != coarse.rows:
+            return "the finer model is compared at other samples"
+        residual = residual - at_x.residual
+    lower, upper = (bound - point for bound in problem.bounds)
+    scale = problem.scales
+    step = scale * bounded_step(evaluation.jacobian * scale, residual, 0.0, lower / scale, upper / scale)
+    at = {name: i for i, name in enumerate(problem.names)}
+    return {name: float(step[at[name]]) / refined.factor(name) for name in problem.shared}
+
+
+def counting(estimates: Mapping[str, Estimate], found: Mapping[str, Moves]) -> dict[str, Estimate]:
+    """Estimates whose standard deviation and verdict count how far discretisation moves them.
+
+    This is the one place where the two meet; a verdict is only ever lowered.
+    """
+    counted = dict(estimates)
+    for name, own in found.items():
+        entry = counted[name]
+        std = own.counted(entry.std)
+        if entry.free and std > entry.std:
+            counted[name] = replace(entry, std=std, verdict=lower_of(entry.verdict, verdict(entry.value, std)))
+    return counted
+
+
+def lower_of(before: str, after: str) -> str:
+    """The worse of two verdicts; one that these three do not rank stays."""
+    ranks = ("identifiable", "weak", "not_identifiable")
+    if before not in ranks or after not in ranks:
+        return before
+    return max(before, after, key=ranks.index)
