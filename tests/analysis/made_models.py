@@ -10,7 +10,8 @@ import numpy as np
 
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.problem.problem import Evaluation, ResidualRows
-from yid_ocp.solvers.base import Estimate, Solution, Status
+from yid_ocp.solvers.base import Solution, Status
+from yid_ocp.solvers.judgement import Estimate
 
 
 class Formula:

@@ -14,9 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from yid_ocp.diagnosis.finding import Absorbed, Finding
-from yid_ocp.diagnosis.hypotheses import Series
 from yid_ocp.diagnosis.localise import Place
-from yid_ocp.diagnosis.null_test import Floor, NullTest, Window
 from yid_ocp.diagnosis.refit import Fit, Loss
 from yid_ocp.diagnosis.screening import Confusability, Linearisation, Score, Signature, Visibility
 from yid_ocp.diagnosis.select import Added, Closure
@@ -26,6 +24,7 @@ from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects.base import EffectBase, Quantity
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.problem.measurements import Measurements
+from yid_ocp.problem.null_test import Floor, NullTest, Series, Window
 from yid_ocp.problem.problem import Evaluation, ResidualRows
 
 WHITE = (1.0,)

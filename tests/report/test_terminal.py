@@ -8,7 +8,7 @@ import pytest
 from yid_ocp.data import JointGroup, Recording
 from yid_ocp.report import terminal
 from yid_ocp.report.sections import SECTIONS, Findings
-from yid_ocp.solvers.base import verdict
+from yid_ocp.solvers.judgement import verdict
 from yid_ocp.solvers.words import PREDICATES, VERDICT_WORDS
 
 

@@ -8,16 +8,8 @@ import numpy as np
 import pytest
 from made_problems import MadeUp, Steps
 
-from yid_ocp.solvers.base import (
-    Recorder,
-    Solution,
-    Status,
-    estimates,
-    projected_gradient,
-    solve,
-    uncertainty,
-    verdict,
-)
+from yid_ocp.solvers.base import Recorder, Solution, Status, projected_gradient, solve
+from yid_ocp.solvers.judgement import estimates, uncertainty, verdict
 
 # -- verdicts ---------------------------------------------------------------------------------------------------------
 

@@ -11,7 +11,7 @@ import pytest
 import scipy.stats
 from factories import samples, series
 
-from yid_ocp.diagnosis.null_test import noise_floor, null_test, spread
+from yid_ocp.problem.null_test import noise_floor, null_test, spread
 
 CHI2 = scipy.stats.chi2
 
