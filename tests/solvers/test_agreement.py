@@ -37,7 +37,7 @@ def within(solution, reference, deviations=0.1):
 def test_gauss_newton_recovers_the_truth_of_another_engine(make_problem, recording):
     solution = solve(make_problem(), GaussNewton())
     assert solution.status == Status.CONVERGED
-    assert 0.9 < solution.chi2_per_dof < 1.2
+    assert 0.9 < solution.fit.chi2_per_dof < 1.2
     for name, entry in solution.parameters.items():
         if entry.free and entry.verdict == "identifiable":
             assert abs(entry.value - recording.truth[name]) < max(0.05 * recording.truth[name], 3 * entry.std), name

@@ -22,6 +22,7 @@ from yid_ocp.problem.problem import Evaluation
 from yid_ocp.solvers.base import Solution
 from yid_ocp.solvers.judgement import (
     IDENTIFIABLE,
+    UNINFORMED,
     WEAK,
     Estimate,
     covariance_of_fit,
@@ -227,11 +228,13 @@ def _information(
     view = _Sensitivities(wide, x, evaluation, names, chosen, split_rows(wide, evaluation, chosen), scale, inflation)
     judged = estimates(wide, x, evaluation, covariance, fit)
     std = np.array([judged[name].std for name in names])
+    plain = np.sqrt(np.diag(covariance)[chosen])
+    informed = np.where(plain < UNINFORMED * np.maximum(scale, wide.scales[chosen]), plain, np.inf)
     profiles = _profiles(view, std, wanted)
     return Identifiability(
         _parameters(view, judged, profiles),
         names,
-        _correlations(covariance[np.ix_(chosen, chosen)], std),
+        _correlations(covariance[np.ix_(chosen, chosen)], informed),
         view.relative.T @ view.relative,
         _directions(view),
         tuple(name for name in wide.names if name not in names),

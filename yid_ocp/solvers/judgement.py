@@ -17,7 +17,7 @@ Interval = tuple[float | None, float | None]
 
 IDENTIFIABLE = 0.1
 WEAK = 4.0
-# A standard deviation of so many times the value, or its start, stands for none at all.
+# A standard deviation of so many times the value, or its typical size, stands for none at all.
 UNINFORMED = 1e6
 # A value so near its bound, in units of the unknown's typical size, lies at it.
 AT_BOUND = 1e-4
@@ -297,13 +297,14 @@ def by_size(value: float, std: float, scale: float = 0.0) -> str:
 
 
 def typical_sizes(problem: EstimationProblem, x: Array) -> Mapping[str, float]:
-    """Size that each free parameter might have: by its prior, its bounds, or the others of its kind; 0 if unknown.
+    """Size that each free parameter might have: by its prior, its bounds, the others of its kind, or its start.
 
     A prior counts with its standard deviation, finite bounds with half of what lies between them, the others of the
     same kind (`bend`, say, or else of the same unit) with the median of their sizes.
     """
     theta, _ = problem.split(x, 0)
     entries = list(problem.system.parameters)
+    scales = {name.split("[")[0]: float(scale) for name, scale in zip(problem.names, problem.scales, strict=True)}
     sizes = dict(zip((entry.name for entry in entries), np.abs(theta), strict=True))
     found = {}
     for entry in entries:
@@ -318,7 +319,7 @@ def typical_sizes(problem: EstimationProblem, x: Array) -> Mapping[str, float]:
         elif math.isfinite(width):
             found[entry.name] = width / 2
         else:
-            found[entry.name] = float(np.median(others)) if others and "@" not in entry.name else 0.0
+            found[entry.name] = float(np.median(others)) if others and "@" not in entry.name else scales[entry.name]
     return found
 
 
@@ -355,7 +356,7 @@ def estimates(
         entry = problem.system.parameters[name.split("[")[0]]
         value, initial = float(x[at]), float(problem.start[at])
         std = float(spread[at])
-        std = std if std < UNINFORMED * max(abs(value), abs(initial), 1e-12) else math.inf
+        std = std if std < UNINFORMED * max(abs(value), float(scales[at])) else math.inf
         side = bound_side(value, float(lower[at]), float(upper[at]), float(scales[at])) if known else 0
         explains = fit is None or fit.explains
         said = verdict(value, std, scale=sizes[entry.name], explains=explains, at_bound=side != 0)
