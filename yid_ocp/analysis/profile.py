@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.problem import Evaluation
 from yid_ocp.solvers import Solution
-from yid_ocp.solvers.gauss_newton import GaussNewton, bounded_step
+from yid_ocp.solvers.gauss_newton import GaussNewton
 from yid_ocp.solvers.judgement import Interval, uncertainty
+from yid_ocp.solvers.linear_model import bounded_step
 
 Array = NDArray[np.float64]
 

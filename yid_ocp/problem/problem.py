@@ -19,7 +19,7 @@ from yid_ocp.problem.functions import ModelFunctions
 from yid_ocp.problem.measurements import huber
 from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.problem.prediction import EpisodeResult, Predictor, Start
-from yid_ocp.problem.unknowns import START, Unknowns, replaced
+from yid_ocp.problem.unknowns import START, Unknowns, replaced, soft_logarithm
 
 Array = NDArray[np.float64]
 WarmStart = tuple[Array | None, ...]
@@ -406,9 +406,9 @@ class EstimationProblem:
         rows[np.arange(len(stated)), stated] = weight
         start = self.start
         spread = np.log(max(self.options.weak_prior_factor, 1.0 + 1e-9))
-        ratio = np.maximum(x[weak] / start[weak], 1e-9)
-        rows[len(stated) + np.arange(len(weak)), weak] = 1.0 / (spread * ratio * start[weak])
-        return np.concatenate([weight * (x - start)[stated], np.log(ratio) / spread]), rows
+        value, slope = soft_logarithm(x[weak] / start[weak])
+        rows[len(stated) + np.arange(len(weak)), weak] = slope / (spread * start[weak])
+        return np.concatenate([weight * (x - start)[stated], value / spread]), rows
 
     def informing(self, evaluation: Evaluation) -> tuple[Array, Array]:
         """What data and stated priors say, in units of their noise: residual (r,) and Jacobian (r, nx).

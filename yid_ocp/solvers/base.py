@@ -13,10 +13,12 @@ import numpy as np
 import threadpoolctl
 from numpy.typing import NDArray
 
+from yid_ocp.errors import DataError, YidError
 from yid_ocp.problem.null_test import USUAL, GapLimits
 from yid_ocp.problem.problem import EstimationProblem, Evaluation, WarmStart
 from yid_ocp.registry import Registry
 from yid_ocp.solvers.judgement import Estimate, Fit, covariance_of_fit, estimates, judge_fit, uncertainty
+from yid_ocp.solvers.linear_model import settled
 
 log = logging.getLogger(__name__)
 
@@ -169,6 +171,7 @@ CONTINUATION = (0.06, 0.12, 0.25, 0.5)
 # it is started again from these multiples of the initial values, and the best is kept.
 POOR_FIT = 5.0
 RESTARTS = (4.0, 2.0, 10.0)
+REMEDY = "start nearer, widen the bounds, or use gauss_newton"
 
 
 def solve(
@@ -221,7 +224,12 @@ def _solved(
             break
         x = np.where(problem.positive, np.clip(first * factor, lower, upper), first)
         log.info("starting again from %g times the initial values", factor)
-        again, more, steps = _attempt(problem, solver, x, callback)
+        try:
+            again, more, steps = _attempt(problem, solver, x, callback)
+        except YidError as error:
+            # another start is a chance, never a reason to lose what is there
+            log.info("no fit from there: %s", error)
+            continue
         tried, evaluations = tried + 1, evaluations + more
         history += [replace(entry, note=f"start x {factor:g}") for entry in steps]
         if again[1].cost < best[1].cost:
@@ -232,6 +240,9 @@ def _solved(
     status, message = outcome.status, outcome.message
     if not finish.ok:
         status, message = Status.FAILED, finish.message
+    elif status == Status.CONVERGED and not settled(problem, outcome.x, finish):
+        status = Status.STALLED
+        message = f"the search stopped where a further step would lower the cost ({message}); {REMEDY}"
     elif tried > 1:
         message += f" (best of {tried} starts)"
     return Solution(
@@ -261,7 +272,12 @@ def _attempt(
     if getattr(solver, "needs_rollout", True) and not problem.evaluate(x, derivatives=False).ok:
         longest = max(episode.grid.steps for episode in problem.episodes) * problem.step.time_step
         for fraction in CONTINUATION:
-            shorter = problem.shortened(fraction * longest)
+            try:
+                shorter = problem.shortened(fraction * longest)
+            except DataError as error:
+                # so short a piece may hold too little for a filter, or nothing to compare with
+                log.info("the first %.3g s are left out: %s", fraction * longest, error)
+                continue
             if not shorter.evaluate(x, derivatives=False).ok:
                 continue
             part = solver.run(shorter, x, callback)
