@@ -13,6 +13,7 @@ from yid_ocp.errors import SolverError
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import GaussNewton, Lifted, MultipleShooting, SingleShooting, Status, SteepestDescent, solve
+from yid_ocp.solvers.transcription import Transcription
 
 FREE = ("T1.bend", "T1.twist", "T2.bend", "T2.twist", "T3.bend", "T3.twist")
 SEEN = ("T1.bend", "T1.twist", "T2.bend")
@@ -176,3 +177,17 @@ def test_iteration_limit_is_a_status_with_the_best_point(short):
         assert solution.status == Status.ITERATION_LIMIT
         assert np.all(np.isfinite(solution.x))
         assert "iterations" in solution.message
+
+
+def test_trial_points_that_cannot_be_worked_out_are_told_in_the_status_and_not_on_stderr(short, monkeypatch, capfd):
+    plain = Transcription.constraints
+
+    def broken(self, w, derivatives):
+        value, jacobian = plain(self, w, derivatives)
+        return (value if derivatives else value * np.nan), jacobian
+
+    monkeypatch.setattr(Transcription, "constraints", broken)
+    found = MultipleShooting(node_interval=10, iterations=3).run(short, short.start, None)
+    assert found.status == Status.STALLED
+    assert "trial points could not be worked out" in found.message
+    assert capfd.readouterr() == ("", "")

@@ -44,8 +44,8 @@ def test_a_short_step_beside_a_steep_row_is_no_end():
     assert not settled(problem, np.array([3.0, 0.0]), problem.evaluate([3.0, 0.0]))
     end = np.array([1.0, -2e-9])
     assert settled(problem, end, problem.evaluate(end))
-    found = GaussNewton().run(problem, np.array([3.0, 0.0]), None)
-    assert (found.status, found.x[0]) == (Status.CONVERGED, pytest.approx(1.0))
+    found = GaussNewton(iterations=3).run(problem, np.array([3.0, 0.0]), None)
+    assert found.status != Status.CONVERGED
 
 
 @pytest.mark.parametrize(
