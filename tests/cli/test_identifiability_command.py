@@ -19,9 +19,9 @@ RESULT = {
         "format": {"const": "yid-identifiability/1"},
         "parameters": {
             "additionalProperties": {
-                "required": ["value", "unit", "std_relative", "verdict", "interval", "std_alone", "std_relative_known"],
+                "required": ["value", "unit", "std_relative", "verdict", "interval", "std_alone"],
                 "properties": {
-                    "verdict": {"enum": ["identifiable", "weak", "not_identifiable"]},
+                    "verdict": {"enum": ["identifiable", "weak", "not_identifiable", "at_bound", "not_trusted"]},
                     "interval": {"type": ["array", "null"], "items": {"type": ["number", "null"]}},
                 },
             }
@@ -42,7 +42,13 @@ def read(folder):
 
 def test_springs_that_cannot_be_told_apart(cli, repository, tmp_path):
     done = cli(
-        "identifiability", repository / "configs" / "springs_torsion.yaml", "--out", tmp_path / "run", "--what-if"
+        "identifiability",
+        repository / "configs" / "springs_torsion.yaml",
+        "--out",
+        tmp_path / "run",
+        "--what-if",
+        "--unknown-start",
+        "--unknown-grasp",
     )
     assert done.code == 0, done.err
     assert "none of 2 parameters can be found" in done.out
@@ -64,7 +70,7 @@ def test_springs_that_cannot_be_told_apart(cli, repository, tmp_path):
 
 def test_springs_that_can(cli, repository, tmp_path):
     file = repository / "configs" / "springs_series_joint.yaml"
-    options = ("--intervals", "spring_1.stiffness", "--known-start", "--known-grasp", "--set", "output.report=false")
+    options = ("--intervals", "spring_1.stiffness", "--set", "output.report=false")
     done = cli("identifiability", file, "--out", tmp_path / "run", *options)
     assert done.code == 0, done.err
     assert "2 of 2 parameters can be found" in done.out
@@ -115,7 +121,7 @@ def test_a_failed_solve_leaves_no_point_to_judge_at(cli, repository, tmp_path, m
     from yid_ocp.solvers import GaussNewton, Status, solve
     from yid_ocp.workflow import identifiability
 
-    def failing(problem, solver, callback=None):
+    def failing(problem, solver, callback=None, limits=None):
         done = solve(problem, GaussNewton(iterations=1))
         return replace(done, status=Status.FAILED, message="the rollout failed", evaluation=None)
 

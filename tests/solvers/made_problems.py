@@ -63,7 +63,7 @@ class MadeUp:
         self.options = SimpleNamespace(weighting=weighting, priors=dict(priors or {}), path_cutoff=np.inf)
         values = [*self.start, *fixed]
         entries = [Parameter(f"k{i}", v, "N m/rad", lower, upper, "made up") for i, v in enumerate(values)]
-        self.system = SimpleNamespace(parameters=Parameters(entries[::-1]))
+        self.system = SimpleNamespace(parameters=Parameters(entries[::-1]), effects=())
         self.theta = np.array(values[::-1])
         self.step = SimpleNamespace(time_step=0.1)
         self._count = len(rows(self.start, duration)[0]) if count is None else count

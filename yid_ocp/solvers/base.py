@@ -19,6 +19,7 @@ from yid_ocp.problem.problem import EstimationProblem, Evaluation, WarmStart
 from yid_ocp.registry import Registry
 from yid_ocp.solvers.judgement import Estimate, Fit, covariance_of_fit, estimates, judge_fit, uncertainty
 from yid_ocp.solvers.linear_model import settled
+from yid_ocp.solvers.off_neutral import off_neutral
 
 log = logging.getLogger(__name__)
 
@@ -183,8 +184,9 @@ def solve(
 ) -> Solution:
     """Run a solver on a problem and say what was found, how sure, and what was not.
 
-    Where the rollout fails at the start (a soft object snaps, an arm falls), the problem is first solved over its first
-    seconds only, and then over longer and longer horizons. A poor fit is started again from other initial values.
+    Free effects begin off their neutral value (`off_neutral`) unless a start is given. Where the rollout fails at the
+    start (a soft object snaps, an arm falls), the problem is first solved over its first seconds only, and then over
+    longer and longer horizons. A poor fit is started again from other initial values.
 
     Parameters
     ----------
@@ -216,7 +218,7 @@ def _solved(
 ) -> Solution:
     begun = time.perf_counter()
     lower, upper = problem.bounds
-    first = np.clip(problem.start if start is None else np.asarray(start, float), lower, upper)
+    first = off_neutral(problem, problem.start) if start is None else np.clip(np.asarray(start, float), lower, upper)
     best, evaluations, history = _attempt(problem, solver, first, callback)
     tried = 1
     for factor in RESTARTS:
