@@ -41,15 +41,8 @@ def read(folder):
 
 
 def test_springs_that_cannot_be_told_apart(cli, repository, tmp_path):
-    done = cli(
-        "identifiability",
-        repository / "configs" / "springs_torsion.yaml",
-        "--out",
-        tmp_path / "run",
-        "--what-if",
-        "--unknown-start",
-        "--unknown-grasp",
-    )
+    asked = ("--what-if", "--unknown-start", "--unknown-grasp")
+    done = cli("identifiability", repository / "configs" / "springs_torsion.yaml", "--out", tmp_path / "run", *asked)
     assert done.code == 0, done.err
     assert "none of 2 parameters can be found" in done.out
     assert "1/spring_1.stiffness + 1/spring_2.stiffness, as springs in series are" in done.out

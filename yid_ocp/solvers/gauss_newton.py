@@ -16,6 +16,9 @@ from yid_ocp.solvers.linear_model import bounded_step, promised, settled
 
 Array = NDArray[np.float64]
 
+# A positive unknown falls by no more than this factor in one step, until it is this part of its typical size.
+REACH, NEAR_ZERO = 10.0, 1e-3
+
 
 @SOLVERS.register("gauss_newton")
 @dataclass(frozen=True)
@@ -71,7 +74,9 @@ class GaussNewton:
                     f"no convergence in {self.iterations} iterations; raise solver.iterations or free fewer parameters"
                 )
                 return self._end(Status.ITERATION_LIMIT, message, x, recorder, now)
-            step = bounded_step(jacobian * size, residual, mu, (lower - x) / size, (upper - x) / size) * size
+            # the linear model is good for a factor, not for a jump to a bound at zero, whence little leads back
+            low = np.where(problem.positive & (x > NEAR_ZERO * scale), np.maximum(lower, x / REACH), lower)
+            step = bounded_step(jacobian * size, residual, mu, (low - x) / size, (upper - x) / size) * size
             fall = promised(jacobian, residual, step)
             # damping makes any step promise little
             if fall <= self.cost_tolerance * max(now.cost, 1e-300) and settled(problem, x, now):
