@@ -116,8 +116,8 @@ def with_intervals(
 ) -> Solution:
     """A solution whose weakly determined parameters have an interval by profile likelihood, and the verdict it allows.
 
-    There the cost is no parabola and a standard deviation tells one side at best. Nothing is added to a problem of more
-    than `MOST_INTERVALS` such parameters or `MOST_UNKNOWNS` unknowns, for which profiles take long.
+    There the cost is no parabola and a standard deviation tells one side at best. Nothing is added to a problem that
+    is not `small`, for which profiles take long.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def with_intervals(
     """
     weak = [name for name, entry in solution.parameters.items() if entry.verdict == "weak"]
     usable = solution.evaluation is not None and problem.options.weighting != "paper"
-    if not weak or not usable or len(weak) > MOST_INTERVALS or len(problem.start) > MOST_UNKNOWNS:
+    if not weak or not usable or not small(problem):
         return solution
     if progress is not None:
         progress(f"intervals of {', '.join(weak)} by profile likelihood")
@@ -142,6 +142,12 @@ def with_intervals(
         std = math.inf if said == "not_identifiable" else judged[name].std
         judged[name] = replace(judged[name], verdict=said, std=std, interval=interval)
     return replace(solution, parameters=judged)
+
+
+def small(problem: EstimationProblem) -> bool:
+    """Whether intervals of a problem's parameters are worked out unasked."""
+    parameters = [name for name in problem.names if not name.startswith("start.")]
+    return len(parameters) <= MOST_INTERVALS and len(problem.names) <= MOST_UNKNOWNS
 
 
 def lowered(said: str, interval: Interval | None) -> str:

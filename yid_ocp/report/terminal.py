@@ -45,6 +45,7 @@ def solve_summary(result: Mapping[str, Any]) -> list[str]:
         lines += _unsure(free)
         if result["fit"]["explains"]:
             lines.append(fit_words(result["fit"]["chi2_per_dof"], True))
+    lines += [result["safeguard"]] if result.get("safeguard") else []
     lines.append(
         f"{result['status']}: {result['message']} ({result['iterations']} iterations, {result['seconds']:.1f} s)"
     )

@@ -16,7 +16,8 @@ from yid_ocp.analysis.identifiability import (
     identifiability,
     with_grasp_offsets,
 )
-from yid_ocp.analysis.profile import MOST_INTERVALS, MOST_UNKNOWNS
+from yid_ocp.analysis.profile import small
+from yid_ocp.analysis.start_in_motion import safe_start
 from yid_ocp.analysis.what_if import Outcome, WhatIf, what_if
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import GraspSettings, Run
@@ -125,7 +126,11 @@ def run_identifiability(
         system = build_system(run)
         problem = build_problem(run, build_step(run, with_grasp_offsets(system)))
         limits = run.diagnosis.of_a_fit
-        solution = _solved(run, problem, folder, progress) if asked.at == "solution" else None
+        solution = None
+        if asked.at == "solution":
+            solved = _solved(run, problem, folder, progress)
+            safe = safe_start(problem, run.solver, solved, limits)
+            problem, solution = safe.problem, safe.solution
         unknown = information = ranking = None
         if solution is None or solution.status != Status.FAILED:
             progress.stage("Fisher information")
@@ -157,7 +162,7 @@ def _information(
 ) -> Identifiability:
     judged = partial(identifiability, problem, solution, start=asked.start, grasp_std=asked.grasp_std, limits=limits)
     information = judged()
-    wanted = _wanted(information, asked)
+    wanted = _wanted(problem, information, asked)
     if not wanted:
         return information
     progress.stage(f"intervals of {len(wanted)} parameters by profile likelihood")
@@ -183,13 +188,11 @@ def _ranking(
     )
 
 
-def _wanted(information: Identifiability, asked: Question) -> Sequence[str]:
+def _wanted(problem: EstimationProblem, information: Identifiability, asked: Question) -> Sequence[str]:
     """Parameters whose intervals are worked out."""
     if asked.intervals not in ("auto", "all"):
         return asked.intervals
-    count = len(information.names)
-    small = count <= MOST_INTERVALS and count + len(information.nuisances) <= MOST_UNKNOWNS
-    return information.names if small or asked.intervals == "all" else ()
+    return information.names if asked.intervals == "all" or small(problem) else ()
 
 
 def second_arm(run: Run, system: System) -> System | None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from yid_ocp.analysis.profile import with_intervals
+from yid_ocp.analysis.start_in_motion import safe_start
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import Run
 from yid_ocp.model.cable import Cable
@@ -93,12 +94,14 @@ def run_solve(run: Run, out: str | Path | None = None, progress: Progress = SILE
             progress.iterate(entry)
 
         solution = solve(problem, run.solver, callback=iterate, limits=run.diagnosis.of_a_fit)
-        solution = with_intervals(problem, solution, progress.stage)
+        safe = safe_start(problem, run.solver, solution, run.diagnosis.of_a_fit)
+        problem, solution = safe.problem, with_intervals(safe.problem, safe.solution, progress.stage)
         progress.stage("predicting the held-out recordings")
         held_out = problem.validate(solution.x)
         folder.log("end", status=solution.status.value, message=solution.message, seconds_solving=solution.seconds)
         write_trajectories(folder.path / "trajectories.h5", problem, solution, held_out)
-        written = folder.finish(solve_result(problem, solution, held_out, build_cable(run)))
+        result = solve_result(problem, solution, held_out, build_cable(run)) | {"safeguard": safe.message}
+        written = folder.finish(result)
         if run.output.report:
             progress.stage("writing the report")
             findings = Findings(run.name, run.description, written, problem, solution, tuple(held_out))
