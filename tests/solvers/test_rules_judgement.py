@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from yid_ocp.solvers.judgement import (
     estimates,
     judge_fit,
     one_sided,
+    parameter_names,
     standing_std,
     typical_sizes,
     uncertainty,
@@ -359,3 +361,9 @@ def test_rounding_below_zero_is_no_variance_and_no_unknowns_need_none():
     assert estimated(problem, [1.0], [[-1e-20]])["k0"].std == 0.0
     none = MadeUp(linear(np.zeros((1, 0))), (), fixed=(3.0,))
     assert estimated(none, np.zeros(0), np.zeros((0, 0)))["k0"].verdict == "fixed"
+
+
+def test_initial_states_are_no_parameters_and_a_parameter_of_the_start_is_one():
+    names = ("k", "start.speed_scale", "rest[run]", "start.q.elbow[run]", "start.p.elbow[run]")
+    problem = SimpleNamespace(names=names, shared=("k", "start.speed_scale"), local=("rest",))
+    assert parameter_names(problem) == names[:3]

@@ -28,6 +28,7 @@ from yid_ocp.solvers.judgement import (
     covariance_of_fit,
     estimates,
     judge_fit,
+    parameter_names,
     uncertainty,
     verdict,
 )
@@ -200,7 +201,7 @@ def _information(
     intervals: Iterable[str] | Literal["all"],
     limits: GapLimits,
 ) -> Identifiability:
-    names = tuple(name for name in problem.names if not name.startswith("start."))
+    names = parameter_names(problem)
     wanted = names if intervals == "all" else tuple(intervals)
     for name in wanted:
         if name not in names:

@@ -13,7 +13,7 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.problem import Evaluation
 from yid_ocp.solvers import Solution
 from yid_ocp.solvers.gauss_newton import GaussNewton
-from yid_ocp.solvers.judgement import Interval, uncertainty
+from yid_ocp.solvers.judgement import Interval, parameter_names, uncertainty
 from yid_ocp.solvers.linear_model import bounded_step
 
 Array = NDArray[np.float64]
@@ -146,8 +146,7 @@ def with_intervals(
 
 def small(problem: EstimationProblem) -> bool:
     """Whether intervals of a problem's parameters are worked out unasked."""
-    parameters = [name for name in problem.names if not name.startswith("start.")]
-    return len(parameters) <= MOST_INTERVALS and len(problem.names) <= MOST_UNKNOWNS
+    return len(parameter_names(problem)) <= MOST_INTERVALS and len(problem.names) <= MOST_UNKNOWNS
 
 
 def lowered(said: str, interval: Interval | None) -> str:

@@ -212,9 +212,8 @@ def standing_std(problem: EstimationProblem, x: Array, evaluation: Evaluation, c
     spread = plain_std(covariance, x)
     lower, upper = problem.bounds
     scale = max(1.0, uncertainty(problem, evaluation)[1])
-    for i, name in enumerate(problem.names):
-        if name.startswith("start."):
-            continue
+    for name in parameter_names(problem):
+        i = problem.names.index(name)
         size = max(abs(float(x[i])), float(problem.scales[i]))
         if not math.isfinite(spread[i]) or not IDENTIFIABLE * abs(x[i]) < spread[i] < UNINFORMED * size:
             continue
@@ -233,6 +232,12 @@ def standing_std(problem: EstimationProblem, x: Array, evaluation: Evaluation, c
         if heights and min(heights) < PROMISED:
             spread[i] /= math.sqrt(min(heights))
     return spread
+
+
+def parameter_names(problem: EstimationProblem) -> tuple[str, ...]:
+    """Unknowns that are parameters, local ones with their recording's name; initial states are left out."""
+    parameters = {*problem.shared, *problem.local}
+    return tuple(name for name in problem.names if name.split("[")[0] in parameters)
 
 
 def plain_std(covariance: Array, x: Array) -> Array:
@@ -347,7 +352,7 @@ def estimates(
     sizes, theta = typical_sizes(problem, x), problem.split(x, 0)[0]
     scales, (lower, upper) = problem.scales, problem.bounds
     result: dict[str, Estimate] = {}
-    free = {name: i for i, name in enumerate(problem.names) if not name.startswith("start.")}
+    free = {name: problem.names.index(name) for name in parameter_names(problem)}
     for i, entry in enumerate(problem.system.parameters):
         if entry.name not in problem.local:
             value, bounds = float(theta[i]), (entry.lower, entry.upper)

@@ -30,6 +30,7 @@ def prepare(findings: Findings) -> Mapping[str, Any] | None:
         "words": VERDICT_WORDS,
         "by_verdict": by_verdict,
         "interval": interval_words,
+        "safeguard": result.get("safeguard", ""),
         "guesses": guess_sentences(fit.get("worse_than_guess", ())),
         "misfit": None if fit.get("explains", True) else fit_words(fit["chi2_per_dof"], False),
         "pictures": [figures.html(figures.estimates(values, unit)) for unit, values in by_unit.items()],
