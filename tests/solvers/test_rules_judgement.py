@@ -11,6 +11,7 @@ from made_problems import MadeUp, linear
 
 from yid_ocp.problem.null_test import GapLimits
 from yid_ocp.solvers.judgement import (
+    MOST_ASKED,
     NO_FIT,
     Fit,
     bound_side,
@@ -367,3 +368,13 @@ def test_initial_states_are_no_parameters_and_a_parameter_of_the_start_is_one():
     names = ("k", "start.speed_scale", "rest[run]", "start.q.elbow[run]", "start.p.elbow[run]")
     problem = SimpleNamespace(names=names, shared=("k", "start.speed_scale"), local=("rest",))
     assert parameter_names(problem) == names[:3]
+
+
+@pytest.mark.parametrize(("count", "asked"), [(MOST_ASKED, True), (MOST_ASKED + 1, False)])
+def test_of_many_parameters_none_is_asked(count, asked):
+    problem = MadeUp(linear(np.eye(count)), np.ones(count))
+    x = np.ones(count)
+    found = problem.evaluate(x)
+    before = len(problem.asked)
+    standing_std(problem, x, found, np.eye(count))
+    assert (len(problem.asked) > before) is asked

@@ -13,7 +13,7 @@ import numpy as np
 import threadpoolctl
 from numpy.typing import NDArray
 
-from yid_ocp.errors import DataError, YidError
+from yid_ocp.errors import YidError
 from yid_ocp.problem.null_test import USUAL, GapLimits
 from yid_ocp.problem.problem import EstimationProblem, Evaluation, WarmStart
 from yid_ocp.registry import Registry
@@ -276,13 +276,13 @@ def _attempt(
         for fraction in CONTINUATION:
             try:
                 shorter = problem.shortened(fraction * longest)
-            except DataError as error:
-                # so short a piece may hold too little for a filter, or nothing to compare with
+                if not shorter.evaluate(x, derivatives=False).ok:
+                    continue
+                part = solver.run(shorter, x, callback)
+            except YidError as error:
+                # so short a piece may hold too little for a filter or a node, or nothing to compare with
                 log.info("the first %.3g s are left out: %s", fraction * longest, error)
                 continue
-            if not shorter.evaluate(x, derivatives=False).ok:
-                continue
-            part = solver.run(shorter, x, callback)
             x, evaluations = part.x, evaluations + part.evaluations
             history += [replace(entry, note=f"first {fraction * longest:.3g} s") for entry in part.history]
             if problem.evaluate(x, derivatives=False).ok:

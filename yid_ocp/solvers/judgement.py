@@ -29,6 +29,8 @@ BLOCKS, SHORTEST, LONGEST = 24, 0.25, 2.0
 ENOUGH_RECORDINGS = 4
 # A parabola whose end the cost reaches with a smaller part of the promised height is no likelihood's.
 PROMISED = 0.5
+# With more parameters two rollouts for each take longer than the search itself.
+MOST_ASKED = 12
 
 
 @dataclass(frozen=True)
@@ -122,9 +124,15 @@ def uncertainty(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Arr
     inverse = 1.0 / np.maximum(inverse, 1e-8)
     basis = np.eye(count) if len(vectors) == 0 else _completed(vectors, count)
     covariance = (basis.T * inverse**2) @ basis * np.outer(scale, scale)
-    data = residual[problem.rows.data]
-    chi2 = float(data @ data) / max(len(residual) - count, 1)
+    chi2 = _chi2_per_dof(problem, evaluation)
     return covariance * max(1.0, chi2), chi2
+
+
+def _chi2_per_dof(problem: EstimationProblem, evaluation: Evaluation) -> float:
+    """Of the data, stated priors counting as observations."""
+    residual, _ = problem.informing(evaluation)
+    data = residual[problem.rows.data]
+    return float(data @ data) / max(len(residual) - len(problem.start), 1)
 
 
 def _completed(vectors: Array, count: int) -> Array:
@@ -207,12 +215,13 @@ def standing_std(problem: EstimationProblem, x: Array, evaluation: Evaluation, c
     The covariance is that of a parabola at the fit. Where it does not fix a parameter well, the cost is worked out at
     the end of its 95 % interval, the others moved along; where it rises less than the parabola promised, the
     standard deviation is that of a parabola through there, infinite where the cost does not rise at all. Stiffnesses
-    that are small by chance look informed at the fit and are not.
+    that are small by chance look informed at the fit and are not. Of more than `MOST_ASKED` parameters none is asked.
     """
     spread = plain_std(covariance, x)
     lower, upper = problem.bounds
-    scale = max(1.0, uncertainty(problem, evaluation)[1])
-    for name in parameter_names(problem):
+    scale = max(1.0, _chi2_per_dof(problem, evaluation))
+    parameters = parameter_names(problem)
+    for name in parameters if len(parameters) <= MOST_ASKED else ():
         i = problem.names.index(name)
         size = max(abs(float(x[i])), float(problem.scales[i]))
         if not math.isfinite(spread[i]) or not IDENTIFIABLE * abs(x[i]) < spread[i] < UNINFORMED * size:
@@ -400,5 +409,5 @@ def one_sided(value: float, std: float, side: int, slope: float) -> Interval:
 def _pull(problem: EstimationProblem, evaluation: Evaluation, at: int) -> float:
     """Size of the gradient of the cost by one unknown, in units of the noise that the misfit makes."""
     residual, jacobian = problem.informing(evaluation)
-    scale = max(1.0, uncertainty(problem, evaluation)[1])
+    scale = max(1.0, _chi2_per_dof(problem, evaluation))
     return abs(float(jacobian[:, at] @ residual)) / scale
