@@ -116,7 +116,7 @@ def uncertainty(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Arr
     if evaluation.jacobian is None or not evaluation.ok:
         return np.full((count, count), np.nan), math.nan
     scale = problem.scales
-    residual, jacobian = problem.informing(evaluation)
+    _, jacobian = problem.informing(evaluation)
     jacobian = jacobian * scale
     _, singular, vectors = np.linalg.svd(jacobian, full_matrices=False)
     inverse = np.zeros(count)
