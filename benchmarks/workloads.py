@@ -27,7 +27,7 @@ from yid_ocp.model import System
 from yid_ocp.model.urdf import urdf_text
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import WarmStart
-from yid_ocp.solvers.gauss_newton import bounded_step
+from yid_ocp.solvers.linear_model import bounded_step
 from yid_ocp.virtual.experiment import paper_system
 
 Array = NDArray[np.float64]

@@ -69,8 +69,9 @@ def _identifiability(parser: argparse.ArgumentParser) -> None:
     text = "95 %% intervals by profile likelihood of: all, none, or NAME,NAME; by default all if they are few"
     parser.add_argument("--intervals", metavar="NAMES", default="auto", help=text)
     parser.add_argument("--initial", action="store_true", help="judge at the initial values, without solving")
-    parser.add_argument("--known-start", action="store_true", help="take initial states as known, not estimated along")
-    parser.add_argument("--known-grasp", action="store_true", help="take the places of grasps as known")
+    text = "judge with initial states estimated along, whatever the settings assume"
+    parser.add_argument("--unknown-start", action="store_true", help=text)
+    parser.add_argument("--unknown-grasp", action="store_true", help="judge with the places of grasps estimated along")
 
 
 def _blind(parser: argparse.ArgumentParser) -> None:

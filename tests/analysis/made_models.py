@@ -7,10 +7,12 @@ from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
+from made_series import samples
 
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.problem.evaluation import Evaluation, ResidualRows
-from yid_ocp.solvers.base import Estimate, Solution, Status
+from yid_ocp.solvers.base import Solution, Status
+from yid_ocp.solvers.judgement import Estimate, Fit
 
 
 class Formula:
@@ -52,7 +54,7 @@ class Formula:
         self.scales = np.array([sizes[name] or 1.0 for name in self.names])
         data = residual.numel() - stated - weak
         self.rows = ResidualRows(
-            (), slice(0, data), slice(data, data + stated), slice(data + stated, data + stated + weak)
+            ((slice(0, data),),), slice(0, data), slice(data, data + stated), slice(data + stated, data + stated + weak)
         )
         self.noise, self._fails = noise, fails or (lambda values: False)
         self.options = SimpleNamespace(
@@ -61,7 +63,17 @@ class Formula:
             known_start={},
             recording_values={},
             priors={},
+            path_cutoff=np.inf,
         )
+        everything = samples(
+            ("points.tip",), np.full((data, 1), noise), seen=np.ones((data, 1), bool), value=np.zeros((data, 1)),
+            node=np.arange(data), fraction=np.zeros(data), count=data,
+        )  # fmt: skip
+        grid = SimpleNamespace(steps=data, time_step=0.1)
+        self.episodes = (SimpleNamespace(name="run", grid=grid, samples=(everything,)),)
+        self.step = SimpleNamespace(time_step=0.1)
+        self.shared = tuple(name for name in self.free if "[" not in name)
+        self.local = tuple(dict.fromkeys(name.split("[")[0] for name in self.free if "[" in name))
         kinds = dict(units or {})
         self.system = SimpleNamespace(
             parameters=Parameters(
@@ -70,6 +82,14 @@ class Formula:
             )
         )
         self.asked: list[tuple[float, ...]] = []
+
+    def split(self, x: np.ndarray, episode: int) -> tuple[np.ndarray, np.ndarray]:
+        values = dict(zip((name.split("[")[0] for name in self.names), np.asarray(x, float), strict=True))
+        return np.array([values[name] for name in self.system.parameters.names]), np.zeros(0)
+
+    @property
+    def theta(self) -> np.ndarray:
+        return self.split(self.start, 0)[0]
 
     @property
     def positive(self) -> np.ndarray:
@@ -82,13 +102,18 @@ class Formula:
             return Evaluation(np.inf, np.zeros(0), None, False, "it snaps", ())
         residual, jacobian = (np.array(ca.densify(part)) for part in self._function(x))
         residual = residual.ravel()
-        return Evaluation(0.5 * float(residual @ residual), residual, jacobian if derivatives else None, True, "", ())
+        done = (SimpleNamespace(predicted=(residual[self.rows.data, None],), warm=None),)
+        cost = 0.5 * float(residual @ residual)
+        return Evaluation(cost, residual, jacobian if derivatives else None, True, "", done)
 
     def informing(self, evaluation: Evaluation) -> tuple[np.ndarray, np.ndarray]:
         rows = self.rows.informing
         unit = np.ones(rows.stop)
         unit[self.rows.data] = self.noise
         return evaluation.residual[rows] / unit, evaluation.jacobian[rows] / unit[:, None]
+
+
+GOOD = Fit(1.0, 0.5, True)
 
 
 def estimate(value, std=0.1, verdict="identifiable", free=True, initial=1.0) -> Estimate:
@@ -99,4 +124,4 @@ def solution(method="gauss_newton", status=Status.CONVERGED, cost=1.0, **paramet
     """What a method found; names are written with underscores for dots."""
     named = {name.replace("_", "."): entry for name, entry in parameters.items()}
     x = np.array([entry.value for entry in named.values()])
-    return Solution(status, "done", tuple(named), x, np.eye(len(x)), named, cost, 1.0, (), 1, 1, 0.1, None, method)
+    return Solution(status, "done", tuple(named), x, np.eye(len(x)), named, cost, GOOD, (), 1, 1, 0.1, None, method)

@@ -201,7 +201,7 @@ def test_methods_run_one_by_one_and_the_lowest_cost_is_the_reference(monkeypatch
     solved, told = [], []
     answers = {"lifted": 3.0, "gauss_newton": 2.0, "steepest_descent": 5.0}
 
-    def solve(problem, solver, callback):
+    def solve(problem, solver, callback, limits):
         solved.append((solver.name, problem.options.weighting))
         callback("step")
         return solution(solver.name, a=estimate(answers[solver.name]))

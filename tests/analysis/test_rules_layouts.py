@@ -30,9 +30,9 @@ from yid_ocp.problem.grid import Grid
 # -- what a recording saw ---------------------------------------------------------------------------------------------
 
 
-def test_settings_ask_for_an_unknown_start_and_known_grasps_unless_told():
+def test_settings_ask_for_the_start_that_is_assumed_and_known_grasps_unless_told():
     made, _ = setting(group())
-    assert (made.start, made.grasp_std, made.second_arm, made.torque_std, made.seed) == ("unknown", None, None, 0.1, 11)
+    assert (made.start, made.grasp_std, made.second_arm, made.torque_std, made.seed) == ("assumed", None, None, 0.1, 11)
 
 
 @pytest.mark.parametrize(

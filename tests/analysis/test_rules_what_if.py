@@ -473,7 +473,7 @@ def pieces(monkeypatch, seen):
 
 def test_all_single_changes_the_smallest_sets_and_the_greedy_ones(pieces):
     found = what_if("problem", progress=print)
-    assert pieces.settings == [("problem", ("problem", None), "unknown", module.GRASP_STD, None, 0.1, 11)]
+    assert pieces.settings == [("problem", ("problem", None), "assumed", None, None, 0.1, 11)]
     assert pieces.progress is print
     assert pieces.judged == []
     assert found.base.std_relative == pytest.approx({"a": 0.1, "b": 1.0})

@@ -180,7 +180,7 @@ def test_the_smallest_set_finds_all_six_in_another_engine(repository):
     step = compile_step(system, 0.01)
     problem = EstimationProblem(step, [recording], made.free, made.options, dict.fromkeys(TRUTH, 3.0))
     solution = solve(problem, GaussNewton())
-    assert solution.chi2_per_dof < 1.1
+    assert solution.fit.chi2_per_dof < 1.1
     info = identifiability(problem, solution, intervals="all")
     assert set(info.identifiable) == set(TRUTH)
     for name, truth in TRUTH.items():

@@ -16,10 +16,10 @@ from yid_ocp.config.schema import schema
 from yid_ocp.data import read_recording
 
 SOLVE_KEYS = {
-    "format", "status", "message", "parameters", "cost", "iterations", "evaluations", "seconds", "residuals",
-    "held_out", "inputs", "versions", "notes", "discretisation", "discretisation_notes", "stability",
+    "format", "status", "message", "parameters", "cost", "iterations", "evaluations", "seconds", "residuals", "fit",
+    "held_out", "inputs", "versions", "notes", "safeguard", "discretisation", "discretisation_notes", "stability",
 }  # fmt: skip
-PARAMETER_KEYS = {"value", "std", "unit", "initial", "lower", "upper", "free", "verdict"}
+PARAMETER_KEYS = {"value", "std", "unit", "initial", "lower", "upper", "free", "verdict", "interval"}
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["solve", "--help"], ["--version"]])
@@ -77,6 +77,10 @@ def test_solve_finds_what_the_efforts_say(cli, pendulum, pendulum_data, tmp_path
         assert abs(entry["value"] - value) < 4 * entry["std"] < 0.2 * value
         assert entry["verdict"] == "identifiable"
     assert result["parameters"]["shoulder.rest"]["verdict"] == "fixed"
+    assert result["fit"]["explains"] is True
+    assert result["fit"]["worse_than_guess"] == []
+    assert 0.01 < result["fit"]["p_value"] <= 1
+    assert "the model explains the recordings to within their noise" in done.out
     channel = result["residuals"]["joints.effort.shoulder"]
     assert set(result["discretisation"]) == set(pendulum_data.truth)
     for name, moved in result["discretisation"].items():

@@ -19,9 +19,9 @@ RESULT = {
         "format": {"const": "yid-identifiability/1"},
         "parameters": {
             "additionalProperties": {
-                "required": ["value", "unit", "std_relative", "verdict", "interval", "std_alone", "std_relative_known"],
+                "required": ["value", "unit", "std_relative", "verdict", "interval", "std_alone"],
                 "properties": {
-                    "verdict": {"enum": ["identifiable", "weak", "not_identifiable"]},
+                    "verdict": {"enum": ["identifiable", "weak", "not_identifiable", "at_bound", "not_trusted"]},
                     "interval": {"type": ["array", "null"], "items": {"type": ["number", "null"]}},
                 },
             }
@@ -41,9 +41,8 @@ def read(folder):
 
 
 def test_springs_that_cannot_be_told_apart(cli, repository, tmp_path):
-    done = cli(
-        "identifiability", repository / "configs" / "springs_torsion.yaml", "--out", tmp_path / "run", "--what-if"
-    )
+    asked = ("--what-if", "--unknown-start", "--unknown-grasp")
+    done = cli("identifiability", repository / "configs" / "springs_torsion.yaml", "--out", tmp_path / "run", *asked)
     assert done.code == 0, done.err
     assert "none of 2 parameters can be found" in done.out
     assert "1/spring_1.stiffness + 1/spring_2.stiffness, as springs in series are" in done.out
@@ -64,7 +63,7 @@ def test_springs_that_cannot_be_told_apart(cli, repository, tmp_path):
 
 def test_springs_that_can(cli, repository, tmp_path):
     file = repository / "configs" / "springs_series_joint.yaml"
-    options = ("--intervals", "spring_1.stiffness", "--known-start", "--known-grasp", "--set", "output.report=false")
+    options = ("--intervals", "spring_1.stiffness", "--set", "output.report=false")
     done = cli("identifiability", file, "--out", tmp_path / "run", *options)
     assert done.code == 0, done.err
     assert "2 of 2 parameters can be found" in done.out
@@ -115,7 +114,7 @@ def test_a_failed_solve_leaves_no_point_to_judge_at(cli, repository, tmp_path, m
     from yid_ocp.solvers import GaussNewton, Status, solve
     from yid_ocp.workflow import identifiability
 
-    def failing(problem, solver, callback=None):
+    def failing(problem, solver, callback=None, limits=None):
         done = solve(problem, GaussNewton(iterations=1))
         return replace(done, status=Status.FAILED, message="the rollout failed", evaluation=None)
 
@@ -125,3 +124,40 @@ def test_a_failed_solve_leaves_no_point_to_judge_at(cli, repository, tmp_path, m
     assert "failed: the rollout failed; there is no point at which to judge" in done.out
     assert read(tmp_path / "run")["parameters"] == {}
     assert "There is no point at which to judge" in (tmp_path / "run" / "report.html").read_text()
+
+
+@pytest.mark.parametrize("named", ["pendulum", "springs_torsion", "springs_series_joint"])
+def test_no_two_commands_give_two_verdicts_for_one_parameter(cli, repository, pendulum, tmp_path, named):
+    file = pendulum if named == "pendulum" else repository / "configs" / f"{named}.yaml"
+    quick = ("--set", "output.report=false")
+    methods = ("--set", "compare.methods={gauss_newton: {}, single_shooting: {}}")
+    for command, more in (("solve", ()), ("identifiability", ()), ("compare", methods)):
+        done = cli(command, file, "--out", tmp_path / command, *quick, *more)
+        assert done.code == 0, done.err
+    solved, judged, compared = (read(tmp_path / command) for command in ("solve", "identifiability", "compare"))
+    reference = compared["methods"][compared["reference"]]["parameters"]
+    free = [name for name, entry in solved["parameters"].items() if entry["free"]]
+    assert free
+    for name in free:
+        said = {entry[name]["verdict"] for entry in (solved["parameters"], judged["parameters"], reference)}
+        assert len(said) == 1, (name, said)
+        if solved["parameters"][name]["verdict"] == "identifiable":
+            assert judged["parameters"][name]["std"] == pytest.approx(solved["parameters"][name]["std"], rel=0.05)
+
+
+def test_a_model_that_does_not_explain_its_recordings_is_said_first_by_all(cli, pendulum, tmp_path):
+    """The same pendulum with its noise stated ten times too small."""
+    quick = ("--set", "output.report=false", "--set", "sensors={joints.effort: {std: 0.001}}")
+    methods = ("--set", "compare.methods={gauss_newton: {}}")
+    for command, more in (("solve", ()), ("identifiability", ()), ("compare", methods)):
+        done = cli(command, pendulum, "--out", tmp_path / command, *quick, *more)
+        assert done.code == 0, done.err
+        first = done.out.strip().splitlines()[0]
+        assert first.startswith("the model does not explain the recordings (chi2 per degree of freedom is "), command
+        assert first.endswith("run `yid-ocp diagnose`")
+        assert "not to be trusted" in done.out
+        result = read(tmp_path / command)
+        own = result["methods"]["gauss_newton"] if command == "compare" else result
+        assert own["fit"]["explains"] is False
+        verdicts = {entry["verdict"] for entry in own["parameters"].values()} - {"fixed"}
+        assert verdicts == {"not_trusted"}

@@ -12,11 +12,10 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+from made_series import seeing
 
 from yid_ocp.diagnosis.finding import Absorbed, Finding
-from yid_ocp.diagnosis.hypotheses import Series
 from yid_ocp.diagnosis.localise import Place
-from yid_ocp.diagnosis.null_test import Floor, NullTest, Window
 from yid_ocp.diagnosis.refit import Fit, Loss
 from yid_ocp.diagnosis.screening import Confusability, Linearisation, Score, Signature, Visibility
 from yid_ocp.diagnosis.select import Added, Closure
@@ -27,9 +26,7 @@ from yid_ocp.effects.base import EffectBase, Quantity
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.problem.evaluation import Evaluation, ResidualRows
 from yid_ocp.problem.measurements import Measurements
-
-WHITE = (1.0,)
-
+from yid_ocp.problem.null_test import Floor, NullTest, Window
 
 # -- effects ----------------------------------------------------------------------------------------------------------
 
@@ -65,13 +62,6 @@ def effect(label="friction@elbow", *quantities: Quantity) -> EffectBase:
 
 
 # -- null test --------------------------------------------------------------------------------------------------------
-
-
-def series(rows, t=None, recording="run", channel="points.tip", colour=WHITE, period=0.01) -> Series:
-    """One output of one recording; times at even intervals unless given."""
-    rows = np.asarray(rows)
-    t = period * np.arange(len(rows)) if t is None else np.asarray(t, float)
-    return Series(recording, channel, "points", "m", t, rows, np.asarray(colour, float))
 
 
 def outcome(p=0.5, chi2=1.0, degrees=100.0, channels=None, windows=()) -> NullTest:
@@ -328,19 +318,6 @@ class Recorded:
 
 
 # -- recordings on nodes ----------------------------------------------------------------------------------------------
-
-
-def samples(channels: Sequence[str], std, unit="m", width=1, **more):
-    """What one sensor measured, as far as rules look at it."""
-    columns = tuple(channel for channel in channels for _ in range(width))
-    return SimpleNamespace(
-        sensor=seeing(channels, unit, width), channel_of_column=columns, std=np.asarray(std, float), **more
-    )
-
-
-def seeing(channels: Sequence[str], unit="m", width=1, efforts=()):
-    """A sensor, as far as rules look at it."""
-    return SimpleNamespace(channels=tuple(channels), unit=unit, width=width, group="points", efforts=tuple(efforts))
 
 
 def measurements(channels, node, fraction, value, weight, span=(0, 100), **sensor) -> Measurements:

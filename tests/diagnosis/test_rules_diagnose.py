@@ -21,11 +21,11 @@ from factories import (
     outcome,
     place,
     score,
-    series,
     smoothed,
     visible,
     window,
 )
+from made_series import series
 
 from yid_ocp.diagnosis.hypotheses import CandidateProblem
 from yid_ocp.diagnosis.refit import Search

@@ -8,7 +8,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from factories import amplitude, costing, effect, evaluation, fit, loss, measurements, series, shape
+from factories import amplitude, costing, effect, evaluation, fit, loss, measurements, shape
+from made_series import series
 
 from yid_ocp.diagnosis.refit import (
     Refitted,

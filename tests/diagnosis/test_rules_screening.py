@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 import scipy.stats
-from factories import Candidates, alike, amplitude, effect, point, score, series, shape, signature, visible
+from factories import Candidates, alike, amplitude, effect, point, score, shape, signature, visible
+from made_series import series
 
 from yid_ocp.diagnosis import screening
 from yid_ocp.diagnosis.screening import (

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from yid_ocp.diagnosis import closure, confusability, linearise, null_test, refit, residual_series, scores, visibility
-from yid_ocp.diagnosis.hypotheses import CandidateProblem, Series, chosen_effects, smoothed_colour
+from yid_ocp.diagnosis import closure, confusability, linearise, refit, scores, visibility
+from yid_ocp.diagnosis.hypotheses import CandidateProblem, chosen_effects
 from yid_ocp.diagnosis.refit import Loss
 from yid_ocp.diagnosis.screening import Linearisation, Signature, robust, shape_grid
 from yid_ocp.diagnosis.select import gain, out_of_shape, oversized, within_reach
 from yid_ocp.effects import make_effect
 from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.null_test import Series, null_test, residual_series, smoothed_colour
 
 
 def white(rows, colour=None):

@@ -12,7 +12,7 @@ import pytest
 
 from yid_ocp.integrator.discrete import ConstraintForce, ForceSplit
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.integrator.step_model import Directions, StepCode
+from yid_ocp.integrator.step_model import LIMIT, Directions, StepCode, StepStatus
 from yid_ocp.model import Grasp, Segment, System, flexible_object
 from yid_ocp.model.system import floating_clamp
 from yid_ocp.model.urdf import read_urdf
@@ -215,3 +215,17 @@ def test_both_kernels_agree(hard):
     back = [step.kernel.adjoint(theta, one, None, names, by_state, None, None) for step in steps]
     for key in vars(back[0]):
         close(getattr(back[0], key), getattr(back[1], key), 1e-9 * hard.conditioning)
+
+
+@pytest.mark.parametrize(
+    ("code", "step", "late"),
+    [
+        (StepCode.NOT_CONVERGED, 700, True),
+        (StepCode.NOT_FINITE, 700, True),
+        (StepCode.NOT_CONVERGED, 3, False),
+        (StepCode.SINGULAR, 700, False),
+        (StepCode.OK, 700, False),
+    ],
+)
+def test_a_failure_after_hundreds_of_steps_names_the_methods_limit(code, step, late):
+    assert (LIMIT in StepStatus(code, step, 0.1, 5, 5).message) is late

@@ -16,7 +16,7 @@ from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import apparent_inertia, beginning
 from yid_ocp.problem.evaluation import ResidualRows
-from yid_ocp.problem.unknowns import Unknowns, check_bounds, replaced
+from yid_ocp.problem.unknowns import Unknowns, check_bounds, replaced, soft_logarithm
 
 FREE = ("shoulder.stiffness", "elbow.stiffness", "elbow.rest")
 START = {"shoulder.stiffness": 6.0, "elbow.stiffness": 3.0, "elbow.rest": 0.1}
@@ -148,8 +148,20 @@ def test_weak_priors_are_log_normal_and_only_of_positive_unknowns_without_anothe
         slice(problem.rows.data.stop + 1, problem.rows.data.stop + 2),
         slice(0, problem.rows.data.stop + 1),
     )
-    low, _ = problem.prior(np.array([7.0, 0.0, 0.5]))
-    assert low[1] == pytest.approx(-9.0)
+    # at its bound the row is one that a step can follow: a thousandth of the start has its value but for 0.65
+    low, slope = problem.prior(np.array([7.0, 0.0, 0.5]))
+    assert low[1] == pytest.approx(-3.0 - 1.5 / math.log(10.0))
+    assert slope[1, 1] == pytest.approx(2000.0 / (math.log(10.0) * 3.0))
+
+
+def test_the_weak_priors_logarithm_ends_smoothly_where_the_ratio_is_small():
+    ratio = np.array([0.0, 1e-6, 5e-4, 0.999e-3, 1.001e-3, 0.1, 1.0, 700.0])
+    value, slope = soft_logarithm(ratio)
+    np.testing.assert_array_equal(value[4:], np.log(ratio[4:]))
+    step = 1e-7 * np.maximum(ratio, 1e-2)
+    np.testing.assert_allclose((soft_logarithm(ratio + step)[0] - value) / step, slope, rtol=1e-5)
+    assert np.all(np.diff(value) > 0)
+    assert slope[3] == pytest.approx(slope[4], rel=3e-3)
 
 
 @pytest.mark.parametrize("options", [{"weak_prior_factor": 1.0}, {"weak_prior_factor": 0.0}, {"weighting": "paper"}])

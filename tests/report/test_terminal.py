@@ -8,31 +8,34 @@ import pytest
 from yid_ocp.data import JointGroup, Recording
 from yid_ocp.report import terminal
 from yid_ocp.report.sections import SECTIONS, Findings
-from yid_ocp.solvers.base import verdict
+from yid_ocp.solvers.judgement import verdict
 from yid_ocp.solvers.words import PREDICATES, VERDICT_WORDS
+
+GOOD = {"chi2_per_dof": 1.03, "p_value": 0.3, "explains": True, "worse_than_guess": []}
+BAD = {"chi2_per_dof": 41.7, "p_value": 0.0, "explains": False, "worse_than_guess": []}
 
 
 def parameter(said: str, value: float = 2.0) -> dict:
     return {
         "value": value, "std": 0.1, "unit": "N m/rad", "initial": 3.0, "lower": 0.0, "upper": None,
-        "free": said != "fixed", "verdict": said,
+        "free": said != "fixed", "verdict": said, "interval": (0.0, 0.5) if said == "at_bound" else None,
     }  # fmt: skip
 
 
 def solved(**changes) -> dict:
-    verdicts = ("identifiable", "weak", "not_identifiable", "fixed")
+    verdicts = ("identifiable", "weak", "not_identifiable", "at_bound", "fixed")
     return {
         "format": "yid-solve/1", "status": "converged", "message": "done", "iterations": 4, "evaluations": 9,
         "seconds": 1.0, "parameters": {f"p_{said}": parameter(said) for said in verdicts}, "residuals": {},
-        "held_out": [], "whitened_cost": 5.0, "wall_seconds": 1.0, "cpu_seconds": 1.0, "peak_memory_mib": 50.0,
-        "disagreements": [],
+        "held_out": [], "fit": GOOD, "whitened_cost": 5.0, "wall_seconds": 1.0, "cpu_seconds": 1.0,
+        "peak_memory_mib": 50.0, "disagreements": [],
     } | changes  # fmt: skip
 
 
 def judged(said: str) -> dict:
     return {
-        "value": 2.0, "unit": "N m/rad", "std_relative": 0.5, "std_relative_known": 0.4, "std_alone": 0.3,
-        "verdict": said, "interval": None,
+        "value": 2.0, "unit": "N m/rad", "std_relative": 0.5, "std_relative_unknown": 0.6, "std_alone": 0.3,
+        "verdict": said, "verdict_unknown": "weak", "interval": None,
     }  # fmt: skip
 
 
@@ -42,11 +45,12 @@ def line_of(lines: list[str], name: str) -> str:
 
 def test_every_verdict_has_its_words():
     possible = {verdict(1.0, std) for std in (0.01, 1.0, 100.0, float("inf"))} | {"fixed"}
+    possible |= {verdict(1.0, 0.01, explains=False), verdict(1.0, 0.01, at_bound=True)}
     assert set(PREDICATES) == set(VERDICT_WORDS) == possible
     assert VERDICT_WORDS["identifiable"] == "found"
 
 
-@pytest.mark.parametrize("said", ["identifiable", "weak", "not_identifiable"])
+@pytest.mark.parametrize("said", ["identifiable", "weak", "not_identifiable", "at_bound"])
 def test_a_verdict_reads_alike_in_every_command(said):
     words, name = VERDICT_WORDS[said], f"p_{said}"
     assert words in line_of(terminal.solve_summary(solved()), name)
@@ -57,7 +61,7 @@ def test_a_verdict_reads_alike_in_every_command(said):
     assert words in line_of(terminal.compare_summary(compared), name)
     information = {
         "format": "yid-identifiability/1", "status": "converged", "message": "", "parameters": {name: judged(said)},
-        "directions": [], "profiles": {}, "what_if": None,
+        "directions": [], "profiles": {}, "what_if": None, "fit": GOOD,
     }  # fmt: skip
     assert words in line_of(terminal.identifiability_summary(information), name)
     for section, result in (("summary", solved()), ("identifiability", information)):
@@ -69,7 +73,47 @@ def test_a_solve_says_what_is_not_found():
     assert "cannot be found from these recordings: p_not_identifiable" in lines
     assert "only weakly determined: p_weak" in lines
     assert lines[-1] == "converged: done (4 iterations, 1.0 s)"
+    assert lines[-2] == "the model explains the recordings to within their noise (chi2 per degree of freedom is 1.03)"
     assert not any("p_fixed" in line for line in lines)
+    assert "the search ended at a bound of p_at_bound: what is beyond it was not tried" in lines
+    assert line_of(lines, "p_at_bound").split()[1:5] == ["2", "0", "to", "0.5"]
+
+
+def test_of_what_nothing_informs_no_spread_is_shown():
+    lost = solved(parameters={"a": parameter("not_identifiable") | {"std": None}, "b": parameter("identifiable")})
+    lines = terminal.solve_summary(lost)
+    assert line_of(lines, "a").split() == ["a", "2", "N", "m/rad", "cannot", "be", "found", "3"]
+    assert "±" not in "".join(lines[1:])
+
+
+def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said_but_for_a_better_guess():
+    worse = {"recording": "run", "channel": "w_T2", "rmse": 0.05, "unit": "m", "baseline": "stays", "guess": 0.02}
+    doubtful = {"a": parameter("not_trusted")}
+    said = solved(fit=BAD, parameters=doubtful)
+    first = "the model does not explain the recordings (chi2 per degree of freedom is 41.7, 1 is noise alone): "
+    first += "no number is to be trusted; run `yid-ocp diagnose`"
+    assert terminal.solve_summary(said)[0] == first
+    said["fit"] = BAD | {"worse_than_guess": [worse] * 6}
+    lines = terminal.solve_summary(said)
+    assert lines[0] == "worse than a guess without a model: w_T2 of run, 0.05 m against 0.02 m (stays)"
+    assert lines[4:6] == ["and so for 2 more channels, in result.json", first]
+    compared = {
+        "methods": {"gauss_newton": said}, "reference": "gauss_newton", "published": {}, "truth": {}, "explained": [],
+        "agree": True,
+    }  # fmt: skip
+    lines = terminal.compare_summary(compared)
+    assert first in lines[:6]
+    assert "the model does not explain the recordings, so agreement of methods says nothing of the truth" in lines
+    judgement = {
+        "parameters": {"a": judged("not_trusted")},
+        "directions": [],
+        "profiles": {},
+        "what_if": None,
+        "fit": BAD,
+    }
+    assert terminal.identifiability_summary(judgement)[0] == first
+    html = SECTIONS["summary"].prepare(Findings("x", "", said))
+    assert (html["misfit"], html["guesses"][0]) == (first, terminal.solve_summary(said)[0])
 
 
 def test_a_solve_says_which_estimates_a_finer_model_moves():
@@ -116,6 +160,7 @@ def test_what_if_names_the_fewest_changes_or_that_there_are_none():
     base = {"words": "as it is", "identifiable": 0, "gain": None, "message": ""}
     asked = {"base": base, "singles": [base | {"words": "a camera", "gain": 2.0}], "smallest": []}
     result = {"status": "", "parameters": {"a": judged("weak")}, "directions": [], "profiles": {}, "what_if": asked}
+    result["fit"] = None
     lines = terminal.identifiability_summary(result)
     assert "with no set of up to three changes can all of them be found" in lines
     assert lines[-1] == "none of 1 parameters can be found from these recordings"

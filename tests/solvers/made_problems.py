@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import SimpleNamespace
 
 import numpy as np
+from made_series import samples
 
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.problem.evaluation import Evaluation, ResidualRows
 from yid_ocp.solvers.base import Iterate, Outcome, Status
+
+
+def linear(matrix, residual=None):
+    """Rows of a linear model about zero."""
+    matrix = np.array(matrix, float)
+    offset = np.zeros(len(matrix)) if residual is None else np.array(residual, float)
+    return lambda x, duration: (offset + matrix @ x, matrix)
 
 
 class MadeUp:
@@ -24,6 +32,8 @@ class MadeUp:
         How many rows at the end are stated and weak priors.
     count : int, optional
         Of all rows; needed where the start fails.
+    priors : mapping, optional
+        Stated standard deviations by name, for what is said of a parameter's size.
     """
 
     def __init__(
@@ -41,24 +51,36 @@ class MadeUp:
         fixed: Sequence[float] = (),
         duration: float = 10.0,
         count: int | None = None,
+        priors: Mapping[str, float] | None = None,
     ) -> None:
         self._rows, self._stated, self._weak, self.noise, self.duration = rows, stated, weak, noise, duration
         self.start = np.array(start, float)
         size = len(self.start)
         self.names = tuple(f"k{i}" for i in range(size))
-        self.shared = self.names
+        self.shared, self.local = self.names, ()
         self.bounds = np.full(size, lower), np.full(size, upper)
         self.scales = np.abs(self.start) if scales is None else np.array(scales, float)
-        self.options, self.disturbed = SimpleNamespace(weighting=weighting), False
+        self.options = SimpleNamespace(weighting=weighting, priors=dict(priors or {}), path_cutoff=np.inf)
+        self.disturbed = False
         values = [*self.start, *fixed]
         entries = [Parameter(f"k{i}", v, "N m/rad", lower, upper, "made up") for i, v in enumerate(values)]
-        self.system = SimpleNamespace(parameters=Parameters(entries[::-1]))
+        self.system = SimpleNamespace(parameters=Parameters(entries[::-1]), effects=())
         self.theta = np.array(values[::-1])
         self.step = SimpleNamespace(time_step=0.1)
-        grids = (SimpleNamespace(steps=round(duration / 0.2)), SimpleNamespace(steps=round(duration / 0.1)))
-        self.episodes = tuple(SimpleNamespace(grid=grid) for grid in grids)
         self._count = len(rows(self.start, duration)[0]) if count is None else count
+        self.episodes = tuple(self._episode(i, round(duration / period)) for i, period in enumerate((0.2, 0.1)))
         self.asked: list[tuple[np.ndarray, bool, object]] = []
+
+    def _episode(self, i: int, steps: int) -> SimpleNamespace:
+        """A recording; the first one has all the measurements, evenly in time."""
+        data = (self._count - self._stated - self._weak) if i == 0 else 0
+        node = np.linspace(0, steps, data).astype(int)
+        group = samples(
+            ("points.tip",), np.full((data, 1), self.noise), seen=np.ones((data, 1), bool), value=np.zeros((data, 1)),
+            node=node, fraction=np.zeros(data), count=data,
+        )  # fmt: skip
+        grid = SimpleNamespace(steps=steps, time_step=0.1)
+        return SimpleNamespace(name=f"run {i}", grid=grid, samples=(group,))
 
     @property
     def positive(self) -> np.ndarray:
@@ -68,7 +90,7 @@ class MadeUp:
     def rows(self) -> ResidualRows:
         total = self._count
         data = total - self._stated - self._weak
-        made = ResidualRows.of((), self._stated, self._weak)
+        made = ResidualRows.of(self.episodes, self._stated, self._weak)
         return ResidualRows(made.measurements, slice(0, data), slice(data, data + self._stated), slice(data, total))
 
     def informing(self, evaluation: Evaluation) -> tuple[np.ndarray, np.ndarray]:
@@ -88,7 +110,10 @@ class MadeUp:
         if found is None:
             return Evaluation(np.inf, np.zeros(0), None, False, "it snaps", ())
         residual, jacobian = found
-        return Evaluation(0.5 * float(residual @ residual), residual, jacobian if derivatives else None, True, "", ())
+        data = np.asarray(residual)[self.rows.data, None]
+        done = tuple(SimpleNamespace(predicted=(part,), warm="warm") for part in (data, data[:0]))
+        cost = 0.5 * float(residual @ residual)
+        return Evaluation(cost, residual, jacobian if derivatives else None, True, "", done)
 
     def shortened(self, duration: float) -> MadeUp:
         lower, upper = self.bounds

@@ -11,11 +11,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from yid_ocp.analysis.profile import with_intervals
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.null_test import USUAL, GapLimits
 from yid_ocp.problem.prediction import EpisodeResult
 from yid_ocp.solvers import Iterate, Solution, Status, solve
-from yid_ocp.solvers.base import IDENTIFIABLE, Solver
+from yid_ocp.solvers.base import Solver
+from yid_ocp.solvers.judgement import IDENTIFIABLE
 from yid_ocp.solvers.words import PREDICATES, VERDICT_WORDS
 
 Array = NDArray[np.float64]
@@ -93,6 +96,7 @@ def compare(
     solvers: Sequence[Solver],
     truth: Mapping[str, float] | None = None,
     callback: Callable[[str, Iterate], None] | None = None,
+    limits: GapLimits = USUAL,
 ) -> Comparison:
     """Run several methods from the same start and say whether they agree.
 
@@ -107,6 +111,8 @@ def compare(
         Known parameter values.
     callback : callable, optional
         Called with the method's name and every `Iterate`.
+    limits : GapLimits, optional
+        What makes a residual more than noise.
 
     Returns
     -------
@@ -124,11 +130,14 @@ def compare(
 
         wall, cpu = time.perf_counter(), time.process_time()
         with _Memory() as memory:
-            solution = solve(own, solver, callback=progress)
+            solution = solve(own, solver, callback=progress, limits=limits)
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         cost = problem.evaluate(solution.x, derivatives=False).cost
         runs.append(MethodRun(solver.name, solution, cost, own.validate(solution.x), wall, cpu, memory.peak))
     best = min(runs, key=lambda run: run.whitened_cost)
+    if best.method != "steepest_descent":
+        judged = replace(best, solution=with_intervals(problem, best.solution))
+        runs[runs.index(best)] = best = judged
     agreement = {run.method: _differences(run, best) for run in runs}
     return Comparison(tuple(runs), best.method, agreement, tuple(_explanations(runs, best, truth or {})))
 

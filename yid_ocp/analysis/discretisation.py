@@ -13,12 +13,13 @@ from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation, WarmStart
 from yid_ocp.problem.unknowns import START
-from yid_ocp.solvers.base import Estimate, verdict
-from yid_ocp.solvers.gauss_newton import bounded_step
+from yid_ocp.solvers.judgement import Estimate, by_size
+from yid_ocp.solvers.linear_model import bounded_step
 
 Array = NDArray[np.float64]
 
 ANGLE = f"{START}q."
+NORMAL_95 = 1.96
 REMAINING = 2.0
 """Distance to the limit of many links or short steps over the move of one halving, where the error falls as their size:
 m + m/2 + m/4 + ... What falls faster has less to go."""
@@ -152,17 +153,34 @@ def moves(
     return {name: float(step[at[name]]) / refined.factor(name) for name in problem.shared}
 
 
-def counting(estimates: Mapping[str, Estimate], found: Mapping[str, Moves]) -> dict[str, Estimate]:
-    """Estimates whose standard deviation and verdict count how far discretisation moves them.
+def counting(
+    estimates: Mapping[str, Estimate], found: Mapping[str, Moves], sizes: Mapping[str, float] | None = None
+) -> dict[str, Estimate]:
+    """Estimates whose standard deviation, interval and verdict count how far discretisation moves them.
 
     This is the one place where the two meet; a verdict is only ever lowered.
+
+    Parameters
+    ----------
+    estimates : mapping of str to Estimate
+    found : mapping of str to Moves
+    sizes : mapping of str to float, optional
+        Size that each parameter might have; see `solvers.judgement.verdict`.
     """
     counted = dict(estimates)
     for name, own in found.items():
         entry = counted[name]
         std = own.counted(entry.std)
-        if entry.free and std > entry.std:
-            counted[name] = replace(entry, std=std, verdict=lower_of(entry.verdict, verdict(entry.value, std)))
+        if not entry.free or not std > entry.std:
+            continue
+        said = lower_of(entry.verdict, by_size(entry.value, std, (sizes or {}).get(name, 0.0)))
+        interval = entry.interval
+        if interval is not None:
+            further = NORMAL_95 * math.sqrt(std**2 - entry.std**2)
+            low, high = interval
+            low = None if low is None else max(low - further, entry.lower)
+            interval = low, None if high is None else min(high + further, entry.upper)
+        counted[name] = replace(entry, std=std, verdict=said, interval=interval)
     return counted
 
 

@@ -12,16 +12,29 @@ import threadpoolctl
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.analysis.combinations import Component, combination_words, listed_names, sparse_basis
-from yid_ocp.analysis.profile import Profile, best_fit, profile_likelihood
+from yid_ocp.analysis.profile import Profile, best_fit, lowered, profile_likelihood
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ConfigError, SolverError, nearest
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.solvers.base import IDENTIFIABLE, WEAK, Solution, uncertainty, verdict
+from yid_ocp.problem.null_test import USUAL, GapLimits
+from yid_ocp.solvers.base import Solution
+from yid_ocp.solvers.judgement import (
+    IDENTIFIABLE,
+    UNINFORMED,
+    WEAK,
+    Estimate,
+    covariance_of_fit,
+    estimates,
+    judge_fit,
+    parameter_names,
+    uncertainty,
+    verdict,
+)
 
 Array = NDArray[np.float64]
-StartKnowledge = Literal["known", "unknown"]
+StartKnowledge = Literal["assumed", "known", "unknown"]
 
 GRASP_EFFECT = "grasp_offset"
 GRASP_NUISANCE = f"{GRASP_EFFECT}@"
@@ -46,8 +59,8 @@ class ParameterInformation:
     std_alone : float
         Relative standard deviation if everything else were known.
     verdict : str
-        identifiable (relative standard deviation up to 10 %), weak (up to 400 %) or not_identifiable; a parameter whose
-        interval was asked for and is open on one side is at best weak, open on both sides not_identifiable.
+        That of a solution at the same point (`solvers.judgement.verdict`); a parameter whose interval was asked for and
+        is open on one side is at best weak, open on both sides not_identifiable.
     interval : (float or None, float or None), or None
         95 % interval by profile likelihood about the best fit of all unknowns, None for an open end; None as a whole
         where it was not asked for.
@@ -133,9 +146,10 @@ def identifiability(
     problem: EstimationProblem,
     solution: Solution | ArrayLike | None = None,
     *,
-    start: StartKnowledge = "unknown",
-    grasp_std: float | None = GRASP_STD,
+    start: StartKnowledge = "assumed",
+    grasp_std: float | None = None,
     intervals: Iterable[str] | Literal["all"] = (),
+    limits: GapLimits = USUAL,
 ) -> Identifiability:
     """Which free parameters the problem's recordings determine, and what they leave open.
 
@@ -147,13 +161,16 @@ def identifiability(
     problem : EstimationProblem
     solution : Solution or array_like, optional
         Point at which to judge (a solution of this problem, or its unknown vector); the initial values when absent.
-    start : "unknown" or "known"
-        Whether every recording's initial state is estimated along, with the problem's prior about what it assumes.
+    start : "assumed", "unknown" or "known"
+        As the problem has it, so that verdicts are those of its solution; or every recording's initial state estimated
+        along, with the problem's prior about what it assumes; or none.
     grasp_std : float, optional
         Prior standard deviation of the fixed `grasp_offset@...` parameters of a system that has any (see
         `with_grasp_offsets`), which are estimated along [m]; None for grasps that are known.
     intervals : iterable of str, or "all"
         Parameters whose interval by profile likelihood is wanted.
+    limits : GapLimits, optional
+        What makes a residual at a solution more than noise.
 
     Returns
     -------
@@ -173,7 +190,7 @@ def identifiability(
     """
     # the matrices are small: threads of the linear algebra library cost more than they give
     with threadpoolctl.threadpool_limits(1):
-        return _information(problem, solution, start, grasp_std, intervals)
+        return _information(problem, solution, start, grasp_std, intervals, limits)
 
 
 def _information(
@@ -182,8 +199,9 @@ def _information(
     start: StartKnowledge,
     grasp_std: float | None,
     intervals: Iterable[str] | Literal["all"],
+    limits: GapLimits,
 ) -> Identifiability:
-    names = tuple(name for name in problem.names if not name.startswith("start."))
+    names = parameter_names(problem)
     wanted = names if intervals == "all" else tuple(intervals)
     for name in wanted:
         if name not in names:
@@ -200,19 +218,25 @@ def _information(
         )
     covariance, chi2 = uncertainty(wide, evaluation)
     inflation = math.sqrt(max(1.0, chi2))
+    fit = None
     if solution is None:
         # far from the data chi2 says nothing of the noise
         covariance, inflation = covariance / inflation**2, 1.0
+    else:
+        fit = judge_fit(problem, evaluation if wide is problem else problem.evaluate(given), limits)
+        covariance = covariance_of_fit(wide, evaluation, fit)
     chosen = np.array([wide.names.index(name) for name in names], int)
     scale = np.where(x[chosen] != 0, np.abs(x[chosen]), wide.scales[chosen])
     view = _Sensitivities(wide, x, evaluation, names, chosen, split_rows(wide, evaluation, chosen), scale, inflation)
-    std = np.sqrt(np.diag(covariance)[chosen])
-    std = np.where(std < 1e6 * np.maximum(scale, np.abs(wide.start[chosen])), std, np.inf)
+    judged = estimates(wide, x, evaluation, covariance, fit)
+    std = np.array([judged[name].std for name in names])
+    plain = np.sqrt(np.diag(covariance)[chosen])
+    informed = np.where(plain < UNINFORMED * np.maximum(scale, wide.scales[chosen]), plain, np.inf)
     profiles = _profiles(view, std, wanted)
     return Identifiability(
-        _parameters(view, std, profiles),
+        _parameters(view, judged, profiles),
         names,
-        _correlations(covariance[np.ix_(chosen, chosen)], std),
+        _correlations(covariance[np.ix_(chosen, chosen)], informed),
         view.relative.T @ view.relative,
         _directions(view),
         tuple(name for name in wide.names if name not in names),
@@ -234,20 +258,22 @@ def _profiles(view: _Sensitivities, std: Array, wanted: Sequence[str]) -> dict[s
     }
 
 
-def _parameters(view: _Sensitivities, std: Array, profiles: Mapping[str, Profile]) -> dict[str, ParameterInformation]:
+def _parameters(
+    view: _Sensitivities, judged: Mapping[str, Estimate], profiles: Mapping[str, Profile]
+) -> dict[str, ParameterInformation]:
     """What is known of each parameter, from standard deviations with all others free and from its interval."""
     found = {}
     for i, name in enumerate(view.names):
         profile = profiles.get(name)
-        interval = None if profile is None else (profile.lower, profile.upper)
+        interval = judged[name].interval if profile is None else (profile.lower, profile.upper)
         scale, alone = float(view.scale[i]), float(view.alone[i])
         found[name] = ParameterInformation(
             float(view.x[view.chosen[i]]),
             view.unit(name),
-            float(std[i]),
-            float(std[i]) / scale,
+            judged[name].std,
+            judged[name].std / scale,
             1.0 / alone if alone > 0 else math.inf,
-            lowered(verdict(scale, float(std[i])), interval),
+            judged[name].verdict if profile is None else lowered(judged[name].verdict, interval),
             interval,
         )
     return found
@@ -259,15 +285,6 @@ def _correlations(covariance: Array, std: Array) -> Array:
     found = np.full(covariance.shape, np.nan)
     found[np.ix_(known, known)] = (covariance / np.outer(std, std))[np.ix_(known, known)]
     return found
-
-
-def lowered(said: str, interval: tuple[float | None, float | None] | None) -> str:
-    """A verdict that an interval with open ends does not contradict."""
-    if interval is None or None not in interval:
-        return said
-    if interval == (None, None):
-        return "not_identifiable"
-    return "weak" if said == "identifiable" else said
 
 
 # -- nuisances --------------------------------------------------------------------------------------------------------
@@ -312,10 +329,12 @@ def with_nuisances(
     grasp_std : float, optional
         [m]
     """
+    if start == "assumed" and grasp_std is None:
+        return problem
     options = problem.options
     initial, known = options.initial_state, dict(options.known_start)
     values = {name: dict(entry) for name, entry in options.recording_values.items()}
-    if initial == "fitted_to_points":
+    if initial == "fitted_to_points" and start != "assumed":
         # the fit's start stays where it is, and becomes the centre of a prior where it is unknown
         for episode in problem.episodes:
             if episode.name not in known and episode.start is not None:
@@ -327,7 +346,8 @@ def with_nuisances(
             if begin.message:
                 raise SolverError(f"there is no start to be known: {begin.message}", where=episode.name)
             known[episode.name] = begin.state
-    initial = "estimated" if start == "unknown" else "equilibrium" if initial == "estimated" else initial
+    if start != "assumed":
+        initial = "estimated" if start == "unknown" else "equilibrium" if initial == "estimated" else initial
     grasps = [
         entry.name
         for entry in problem.system.parameters

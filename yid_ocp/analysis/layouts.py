@@ -77,7 +77,7 @@ class Setting:
 
     problem: EstimationProblem
     x: Array
-    start: StartKnowledge = "unknown"
+    start: StartKnowledge = "assumed"
     grasp_std: float | None = None
     second_arm: System | None = None
     torque_std: float = TORQUE_STD

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.solvers.base import uncertainty
-from yid_ocp.solvers.gauss_newton import GaussNewton, bounded_step
+from yid_ocp.solvers import Solution
+from yid_ocp.solvers.gauss_newton import GaussNewton
+from yid_ocp.solvers.judgement import Interval, parameter_names, uncertainty
+from yid_ocp.solvers.linear_model import bounded_step
 
 Array = NDArray[np.float64]
 
@@ -23,6 +26,7 @@ ANCHOR = math.log(1e3)  # standard deviation that keeps other positive unknowns 
 REFIT_TOLERANCE = 1e-3  # chi2 that a refit may leave on the table
 ROOT_TOLERANCE = 0.01  # of the root of delta chi2 against its level's
 REFITS, ATTEMPTS = 30, 12
+MOST_INTERVALS, MOST_UNKNOWNS = 12, 300  # beyond, profiles take long and are worked out only where asked for
 POLISH = 20  # iterations that bring all unknowns, nuisances among them, to their best fit
 CLIFF, EDGE = 10.0, 1e-3  # height that is no parabola's, of the level's; distance of two sides, of that from the fit
 WIDENING, OVERSHOOT = 3.0, 1.3
@@ -105,6 +109,53 @@ def profile_likelihood(
     if walk.base < -0.1 * level:
         notes = [*notes, f"a fit better by {-walk.base:.2g} in chi2 was met; the point was not the best one"]
     return Profile(problem.names[index], float(x[index]), lower, upper, values, deltas, tuple(notes))
+
+
+def with_intervals(
+    problem: EstimationProblem, solution: Solution, progress: Callable[[str], None] | None = None
+) -> Solution:
+    """A solution whose weakly determined parameters have an interval by profile likelihood, and the verdict it allows.
+
+    There the cost is no parabola and a standard deviation tells one side at best. Nothing is added to a problem that
+    is not `small`, for which profiles take long.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    solution : Solution
+        Of this problem.
+    progress : callable, optional
+        Told what takes time.
+    """
+    weak = [name for name, entry in solution.parameters.items() if entry.verdict == "weak"]
+    usable = solution.evaluation is not None and problem.options.weighting != "paper"
+    if not weak or not usable or not small(problem):
+        return solution
+    if progress is not None:
+        progress(f"intervals of {', '.join(weak)} by profile likelihood")
+    best, there = best_fit(problem, solution.x)
+    judged = dict(solution.parameters)
+    for name in weak:
+        found = profile_likelihood(problem, best, problem.names.index(name), judged[name].std, there)
+        interval = (found.lower, found.upper)
+        said = lowered(judged[name].verdict, interval)
+        std = math.inf if said == "not_identifiable" else judged[name].std
+        judged[name] = replace(judged[name], verdict=said, std=std, interval=interval)
+    return replace(solution, parameters=judged)
+
+
+def small(problem: EstimationProblem) -> bool:
+    """Whether intervals of a problem's parameters are worked out unasked."""
+    return len(parameter_names(problem)) <= MOST_INTERVALS and len(problem.names) <= MOST_UNKNOWNS
+
+
+def lowered(said: str, interval: Interval | None) -> str:
+    """A verdict that an interval with open ends does not contradict."""
+    if interval is None or None not in interval:
+        return said
+    if interval == (None, None):
+        return "not_identifiable"
+    return "weak" if said == "identifiable" else said
 
 
 def best_fit(problem: EstimationProblem, x: Array) -> tuple[Array, Evaluation]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from yid_ocp.analysis.identifiability import GRASP_STD, StartKnowledge, identifiability, unknown_vector
+from yid_ocp.analysis.identifiability import StartKnowledge, identifiability, unknown_vector
 from yid_ocp.analysis.layouts import (
     ARM,
     CAMERA,
@@ -27,7 +27,8 @@ from yid_ocp.errors import SolverError
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
-from yid_ocp.solvers.base import WEAK, Solution, verdict
+from yid_ocp.solvers.base import Solution
+from yid_ocp.solvers.judgement import WEAK, verdict
 
 Array = NDArray[np.float64]
 
@@ -148,8 +149,8 @@ def what_if(
     problem: EstimationProblem,
     solution: Solution | ArrayLike | None = None,
     *,
-    start: StartKnowledge = "unknown",
-    grasp_std: float | None = GRASP_STD,
+    start: StartKnowledge = "assumed",
+    grasp_std: float | None = None,
     second_arm: System | None = None,
     options: WhatIfOptions | None = None,
     progress: Callable[[str], None] | None = None,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, Gt, Le, Len, Lt
@@ -21,6 +21,7 @@ from yid_ocp.errors import ConfigError
 from yid_ocp.integrator.discrete import ConstraintForce, ForceSplit
 from yid_ocp.model.cable import CableOptions
 from yid_ocp.options import About, Among, options_of, stripped
+from yid_ocp.problem.null_test import GapLimits
 from yid_ocp.problem.options import ProblemOptions, SensorOptions
 from yid_ocp.solvers import SOLVERS, GaussNewton, Lifted, MultipleShooting, SingleShooting, SteepestDescent
 from yid_ocp.solvers.base import Solver
@@ -217,6 +218,11 @@ class DiagnosisSettings(Thresholds):
         Le(1),
         About("part of the sensors' std that is noise, where the rest stands for the model's error"),
     ] = 1.0
+
+    @property
+    def of_a_fit(self) -> GapLimits:
+        """What makes the residual of a fit, in the sensors' stated units, more than noise."""
+        return replace(self.gap, noise_fraction=self.noise_fraction)
 
 
 def _compared() -> dict[str, Solver]:

@@ -3,11 +3,8 @@
 from yid_ocp.diagnosis.diagnose import diagnose as diagnose
 from yid_ocp.diagnosis.finding import Finding as Finding
 from yid_ocp.diagnosis.hypotheses import CandidateProblem as CandidateProblem
-from yid_ocp.diagnosis.hypotheses import residual_series as residual_series
 from yid_ocp.diagnosis.localise import Place as Place
 from yid_ocp.diagnosis.localise import localise as localise
-from yid_ocp.diagnosis.null_test import NullTest as NullTest
-from yid_ocp.diagnosis.null_test import null_test as null_test
 from yid_ocp.diagnosis.refit import Refitted as Refitted
 from yid_ocp.diagnosis.refit import refit as refit
 from yid_ocp.diagnosis.screening import confusability as confusability

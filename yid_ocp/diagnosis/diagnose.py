@@ -12,9 +12,8 @@ import threadpoolctl
 
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.finding import Finding, absorption
-from yid_ocp.diagnosis.hypotheses import CandidateProblem, Choice, chosen_effects, residual_series
+from yid_ocp.diagnosis.hypotheses import CandidateProblem, Choice, chosen_effects
 from yid_ocp.diagnosis.localise import Place, attributed, localise, merged
-from yid_ocp.diagnosis.null_test import NullTest, noise_floor, null_test
 from yid_ocp.diagnosis.refit import Fit, Progress, Search, Store, recalled, refit
 from yid_ocp.diagnosis.screening import screen
 from yid_ocp.diagnosis.select import Added, Closure, closure, compose
@@ -24,6 +23,7 @@ from yid_ocp.diagnosis.verdict import decide, explained_part, has_gap, shapeless
 from yid_ocp.diagnosis.words import next_experiment, sentences, shortage
 from yid_ocp.errors import DataError, SolverError
 from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.null_test import NullTest, noise_floor, null_test, residual_series
 from yid_ocp.solvers import GaussNewton, Solution, solve
 
 log = logging.getLogger(__name__)

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from yid_ocp.diagnosis.localise import Place
-from yid_ocp.diagnosis.null_test import Floor, NullTest
 from yid_ocp.diagnosis.refit import Fit
 from yid_ocp.diagnosis.screening import Confusability, Score, Visibility
 from yid_ocp.diagnosis.select import Added, Closure, closure
 from yid_ocp.diagnosis.smoother import Smoothed
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EffectBase
+from yid_ocp.problem.null_test import Floor, NullTest
 
 FORMAT = "yid-diagnosis/1"
 

@@ -17,40 +17,12 @@ from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.inputs import sensors_present
-from yid_ocp.problem.low_pass import LowPass
-from yid_ocp.problem.measurements import Measurements
 
 Array = NDArray[np.float64]
 Choice = Literal["all"] | Sequence[str]
 
 BLOCK = 1.0
 """Length of the blocks in which a single recording is split [s]."""
-
-
-@dataclass(frozen=True)
-class Series:
-    """One scalar output of one recording, as it stands in the residual of a problem.
-
-    Attributes
-    ----------
-    recording, channel : str
-    group : str
-    unit : str
-    t : ndarray, shape (M,)
-        Times since the start of the recording [s].
-    rows : ndarray of int, shape (M,)
-        Places in the residual.
-    colour : ndarray, shape (L + 1,)
-        Autocorrelation of the noise at lags 0 to L samples.
-    """
-
-    recording: str
-    channel: str
-    group: str
-    unit: str
-    t: Array
-    rows: NDArray[np.int64]
-    colour: Array
 
 
 def chosen_effects(system: System, recordings: Sequence[Recording], choice: Choice) -> list[EffectBase]:
@@ -198,49 +170,6 @@ def _masked(episode: Episode, parity: int) -> Episode:
         value, weight = np.where(hidden, np.nan, entry.value), np.where(hidden, 0.0, entry.weight)
         samples.append(replace(entry, value=value, weight=weight))
     return replace(episode, samples=tuple(samples))
-
-
-def sample_times(episode: Episode, samples: Measurements) -> Array:
-    """Times of samples since the start of their recording, shape (M,) [s]."""
-    return np.asarray((samples.node + samples.fraction) * episode.grid.time_step)
-
-
-def residual_series(problem: EstimationProblem) -> tuple[Series, ...]:
-    """How the residual of a problem is made up, output by output."""
-    series: list[Series] = []
-    for episode, groups in zip(problem.episodes, problem.rows.measurements, strict=True):
-        for samples, rows in zip(episode.samples, groups, strict=True):
-            t = sample_times(episode, samples)
-            place = np.full(samples.seen.shape, -1)
-            place[samples.seen] = np.arange(rows.start, rows.stop)
-            colour = noise_colour(problem, episode, samples)
-            for column, channel in enumerate(samples.channel_of_column):
-                seen = samples.seen[:, column]
-                if seen.any():
-                    text = (episode.name, channel, samples.sensor.group, samples.sensor.unit)
-                    series.append(Series(*text, t[seen], place[seen, column], colour))
-    return tuple(series)
-
-
-def noise_colour(problem: EstimationProblem, episode: Episode, samples: Measurements) -> Array:
-    """Autocorrelation of a sensor's noise at lags 0, 1, ... samples: white, but for efforts, which are smoothed."""
-    if not samples.sensor.efforts:
-        return np.ones(1)
-    stride = LowPass(problem.options.path_cutoff).stride(episode.grid.time_step)
-    return smoothed_colour(problem.options.path_cutoff, episode.grid.time_step)[::stride]
-
-
-def smoothed_colour(cutoff: float, step: float) -> Array:
-    """Autocorrelation of white noise after the zero-phase filter of paths and efforts."""
-    if not np.isfinite(cutoff):
-        return np.ones(1)
-    half = int(2 / (cutoff * step)) + 10
-    impulse = np.zeros((2 * half + 1, 1))
-    impulse[half] = 1.0
-    times = step * np.arange(2 * half + 1, dtype=float)
-    response = LowPass(cutoff)(times, impulse)[:, 0]
-    full = np.correlate(response, response, "full")[2 * half :]
-    return np.asarray(full[:half] / full[0])
 
 
 def describe(effects: Sequence[Any]) -> str:

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.diagnosis.hypotheses import CandidateProblem, describe, residual_series, sample_times
+from yid_ocp.diagnosis.hypotheses import CandidateProblem, describe
 from yid_ocp.diagnosis.screening import robust
 from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
 from yid_ocp.effects import EffectBase, Reported
@@ -21,9 +21,11 @@ from yid_ocp.parallel import map_threads
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.evaluation import Evaluation
+from yid_ocp.problem.null_test import residual_series, sample_times
 from yid_ocp.problem.validation import channel_errors
 from yid_ocp.solvers import GaussNewton, Status
-from yid_ocp.solvers.base import Outcome, uncertainty
+from yid_ocp.solvers.base import Outcome
+from yid_ocp.solvers.judgement import uncertainty
 
 Array = NDArray[np.float64]
 

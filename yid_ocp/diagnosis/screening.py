@@ -24,10 +24,11 @@ import scipy.signal
 import scipy.stats
 from numpy.typing import NDArray
 
-from yid_ocp.diagnosis.hypotheses import CandidateProblem, Series, residual_series
+from yid_ocp.diagnosis.hypotheses import CandidateProblem
 from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import SolverError
+from yid_ocp.problem.null_test import Series, residual_series
 
 Array = NDArray[np.float64]
 

@@ -8,6 +8,7 @@ from typing import Annotated
 from annotated_types import Ge, Gt, Le, Lt
 
 from yid_ocp.options import About
+from yid_ocp.problem.null_test import USUAL, WINDOW, GapLimits
 
 
 @dataclass(frozen=True)
@@ -72,11 +73,13 @@ class Thresholds:
     """
 
     # is there a gap
-    level: Annotated[float, Gt(0), Lt(1), About("significance below which a gap counts as one")] = 0.01
-    smallest_gap: Annotated[float, Ge(0), About("chi2/n - 1 below which a gap is not worth a name")] = 0.1
+    level: Annotated[float, Gt(0), Lt(1), About("significance below which a gap counts as one")] = USUAL.level
+    smallest_gap: Annotated[float, Ge(0), About("chi2/n - 1 below which a gap is not worth a name")] = (
+        USUAL.smallest_gap
+    )
     shapeless: Annotated[float, Gt(0), Le(1), About("part of the level that an excess without shape must reach")] = 0.01
     samples_per_unknown: Annotated[float, Gt(0), About("effective samples needed for every unknown")] = 3.0
-    window: Annotated[float, Gt(0), About("length of the windows of the residual", "s")] = 0.5
+    window: Annotated[float, Gt(0), About("length of the windows of the residual", "s")] = WINDOW
     # which candidates are worth a refit
     detection: Annotated[float, Gt(0), About("standard deviations of a detectable amplitude")] = 2.576 + 1.282
     shape_values: Annotated[int, Ge(1), About("values tried of every shape parameter")] = 4
@@ -101,6 +104,11 @@ class Thresholds:
     bias: Annotated[float, Gt(0), About("unknown bias over the noise of its sensor")] = 3.0
     sure: Annotated[float, Gt(0), About("standard deviations from zero at which the gap is there")] = 3.0
     mapped: Annotated[float, Ge(0), Lt(1), About("1 - posterior/prior variance of an informed value")] = 0.5
+
+    @property
+    def gap(self) -> GapLimits:
+        """What makes a residual more than noise; the same for a fit."""
+        return GapLimits(self.level, self.smallest_gap)
 
 
 DEFAULTS = Thresholds()

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from yid_ocp.diagnosis.null_test import NullTest
 from yid_ocp.diagnosis.refit import Fit
 from yid_ocp.diagnosis.screening import Score, Visibility
 from yid_ocp.diagnosis.select import Added, Closure
 from yid_ocp.diagnosis.smoother import Smoothed
 from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.problem.null_test import NullTest, more_than_noise
 
 
 def has_gap(before: NullTest, held_out: NullTest, limits: Thresholds, ranked: Sequence[Score] = ()) -> bool:
@@ -25,8 +25,7 @@ def has_gap(before: NullTest, held_out: NullTest, limits: Thresholds, ranked: Se
     ranked : sequence of Score
         Of all visible candidates; their smallest p-value counts as the best of that many tries.
     """
-    p = min(1.0, 2 * min(before.p_value, held_out.p_value))
-    if p < limits.level and max(before.chi2_per_dof, held_out.chi2_per_dof) > 1 + limits.smallest_gap:
+    if more_than_noise((before, held_out), limits.gap):
         return True
     best = _best_of(ranked)
     largest = max((*before.channels.values(), *held_out.channels.values()), default=1.0)

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 
 from yid_ocp.diagnosis.finding import Finding
 from yid_ocp.diagnosis.localise import Place
-from yid_ocp.diagnosis.null_test import NullTest
 from yid_ocp.diagnosis.refit import Fit
 from yid_ocp.diagnosis.screening import Visibility
 from yid_ocp.diagnosis.select import Added
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.effects.base import ASPECTS
+from yid_ocp.problem.null_test import NullTest
 
 NAMED = 0.1
 """Share of the gap from which a place is named, and relative change from which a nominal parameter is."""

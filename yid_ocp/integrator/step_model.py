@@ -97,6 +97,14 @@ MESSAGES = {
 }
 
 
+LONG = 100
+"""Steps after which a failure is one of the method rather than of the start."""
+LIMIT = (
+    "the midpoint rule damps nothing by itself: without damping in the model the fastest modes grow over some hundred "
+    "steps until a step of this length cannot follow them"
+)
+
+
 @dataclass(frozen=True)
 class StepStatus:
     """Outcome of a step or of a rollout.
@@ -134,7 +142,9 @@ class StepStatus:
         """The outcome in words, with the step, the residual and what to try."""
         if self.ok:
             return MESSAGES[self.code]
-        return f"step {self.step}: {MESSAGES[self.code]} (last correction {self.error:.2g})"
+        said = f"step {self.step}: {MESSAGES[self.code]} (last correction {self.error:.2g})"
+        late = self.code in (StepCode.NOT_CONVERGED, StepCode.NOT_FINITE) and self.step >= LONG
+        return f"{said}; {LIMIT}" if late else said
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from yid_ocp.problem.measurements import Rows, huber
 from yid_ocp.problem.noise import Innovations
 from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.problem.prediction import EpisodeResult, Predictor, Start
-from yid_ocp.problem.unknowns import START, Unknowns, check_bounds, check_free, replaced, start_names
+from yid_ocp.problem.unknowns import START, Unknowns, check_bounds, check_free, replaced, soft_logarithm, start_names
 
 Array = NDArray[np.float64]
 HELD_OUT_START = 0.2
@@ -382,9 +382,9 @@ class EstimationProblem:
         rows[np.arange(len(stated)), stated] = weight
         start = self.start
         spread = np.log(max(self.options.weak_prior_factor, 1.0 + 1e-9))
-        ratio = np.maximum(x[weak] / start[weak], 1e-9)
-        rows[len(stated) + np.arange(len(weak)), weak] = 1.0 / (spread * ratio * start[weak])
-        return np.concatenate([weight * (x - start)[stated], np.log(ratio) / spread]), rows
+        value, slope = soft_logarithm(x[weak] / start[weak])
+        rows[len(stated) + np.arange(len(weak)), weak] = slope / (spread * start[weak])
+        return np.concatenate([weight * (x - start)[stated], value / spread]), rows
 
     def informing(self, evaluation: Evaluation) -> tuple[Array, Array]:
         """What data and stated priors say, in units of their noise: residual (r,) and Jacobian (r, nx).

@@ -15,6 +15,8 @@ from yid_ocp.problem.options import ProblemOptions
 
 Array = NDArray[np.float64]
 START = "start."
+SMALL_RATIO = 1e-3
+"""Part of its start below which the weak prior of an unknown is no logarithm any more."""
 
 
 @dataclass(frozen=True)
@@ -113,3 +115,21 @@ def check_bounds(system: System, free: Sequence[str], theta: Array) -> None:
                 allowed="lower below upper",
                 hint="fix the parameter instead of closing its bounds",
             )
+
+
+def soft_logarithm(ratio: Array) -> tuple[Array, Array]:
+    """log(ratio) and its slope, from `SMALL_RATIO` down the parabola that joins it twice differentiably.
+
+    A weak prior on an unknown that its bound keeps at zero then has a value and a slope like any other row, where the
+    logarithm would be a wall that nothing climbs.
+
+    Parameters
+    ----------
+    ratio : ndarray, shape (k,)
+        Zero or above.
+    """
+    below = (ratio - SMALL_RATIO) / SMALL_RATIO
+    small = below < 0
+    kept = np.where(small, SMALL_RATIO, ratio)
+    value = np.log(kept) + np.where(small, below - below**2 / 2, 0.0)
+    return value, np.where(small, (1 - below) / SMALL_RATIO, 1 / kept)

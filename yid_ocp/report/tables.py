@@ -60,6 +60,18 @@ def medians(rows: Sequence[HeldOutRow]) -> list[HeldOutRow]:
     return result
 
 
+def guess_sentences(worse: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Sentences on the channels of a `yid-solve/1` result that a guess without a model predicts better."""
+    lines = []
+    for entry in worse[:MOST_POINTS]:
+        own, other = (f"{entry[key]:.3g} {entry['unit']}".rstrip() for key in ("rmse", "guess"))
+        where = f"{entry['channel']} of {entry['recording']}"
+        lines.append(f"worse than a guess without a model: {where}, {own} against {other} ({entry['baseline']})")
+    if len(worse) > MOST_POINTS:
+        lines.append(f"and so for {len(worse) - MOST_POINTS} more channels, in result.json")
+    return lines
+
+
 def blind_table(result: Mapping[str, Any]) -> list[str]:
     """The score and every case, as Markdown."""
 

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from yid_ocp.data import Recording
-from yid_ocp.report.tables import blind_table, held_out_rows, medians
-from yid_ocp.solvers.words import VERDICT_WORDS
+from yid_ocp.report.tables import blind_table, guess_sentences, held_out_rows, medians
+from yid_ocp.solvers.words import VERDICT_WORDS, fit_words, interval_words, parameter_words
 
 Rows = list[Sequence[str]]
 
@@ -17,12 +17,15 @@ def solve_summary(result: Mapping[str, Any]) -> list[str]:
     """Lines that tell a person what a `yid-solve/1` result says."""
     free = {name: entry for name, entry in result["parameters"].items() if entry["free"]}
     failed = result["status"] == "failed"
-    rows: Rows = [("parameter", "value", "± std", "unit", "verdict", "start")]
+    rows: Rows = [("parameter", "value", "± std", "95 % interval", "unit", "verdict", "start")]
     for name, entry in free.items():
-        std = "unknown" if entry["std"] is None else f"{entry['std']:.2g}"
+        known = not failed and entry["std"] is not None
+        std = f"{entry['std']:.2g}" if known and entry["verdict"] != "at_bound" else ""
+        interval = "" if failed or entry["interval"] is None else interval_words(*entry["interval"])
         verdict = "" if failed else VERDICT_WORDS[entry["verdict"]]
-        rows.append((name, f"{entry['value']:.4g}", std, entry["unit"], verdict, f"{entry['initial']:.4g}"))
-    lines = [*table(rows), ""]
+        rows.append((name, f"{entry['value']:.4g}", std, interval, entry["unit"], verdict, f"{entry['initial']:.4g}"))
+    lines = [] if failed else _misfit(result["fit"])
+    lines += [*table(rows), ""]
     rows = [("channel", "error (rms)", "unit", "samples")]
     rows += [(c, f"{e['rmse']:.3g}", e["unit"], str(e["n"])) for c, e in result["residuals"].items()]
     if len(rows) > 1:
@@ -41,22 +44,36 @@ def solve_summary(result: Mapping[str, Any]) -> list[str]:
         lines.append("the values are the best point that was reached; nothing can be said about how sure they are")
     else:
         lines += _unsure(free)
+        if result["fit"]["explains"]:
+            lines.append(fit_words(result["fit"]["chi2_per_dof"], True))
+    lines += [result["safeguard"]] if result.get("safeguard") else []
     lines.append(
         f"{result['status']}: {result['message']} ({result['iterations']} iterations, {result['seconds']:.1f} s)"
     )
     return lines
 
 
+def _misfit(fit: Mapping[str, Any]) -> list[str]:
+    """What has to be said before anything else: a guess does better, or the model does not explain the recordings."""
+    lines = guess_sentences(fit.get("worse_than_guess", ()))
+    if not fit["explains"]:
+        lines.append(fit_words(fit["chi2_per_dof"], False))
+    return [*lines, ""] if lines else []
+
+
 def _unsure(free: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Sentences on parameters that are not found."""
-    lost, weak = (
+    lost, weak, bound = (
         [name for name, entry in free.items() if entry["verdict"] == verdict]
-        for verdict in ("not_identifiable", "weak")
+        for verdict in ("not_identifiable", "weak", "at_bound")
     )
     lines = [f"{VERDICT_WORDS['not_identifiable']} from these recordings: {', '.join(lost)}"] if lost else []
     if weak:
         lines.append(f"only {VERDICT_WORDS['weak']}: {', '.join(weak)}")
-        lines.append("their standard deviations are too small on one side; `yid-ocp identifiability` gives intervals")
+        if any(free[name]["interval"] is None for name in weak):
+            lines.append("`yid-ocp identifiability` gives intervals that need not be symmetric")
+    if bound:
+        lines.append(f"the search ended at a bound of {', '.join(bound)}: what is beyond it was not tried")
     return lines
 
 
@@ -102,16 +119,19 @@ def compare_summary(result: Mapping[str, Any]) -> list[str]:
         cells = []
         for entry in methods.values():
             found = entry["parameters"][name]
-            cells.append(f"{found['value']:.4g}" + ("" if found["std"] is None else f" ± {found['std']:.2g}"))
+            cells.append(parameter_words(found["value"], found["std"], found["interval"]))
         known = [f"{result[key][name]:.4g}" if name in result[key] else "" for key in beside]
         rows.append((name, *cells, *known, VERDICT_WORDS[methods[result["reference"]]["parameters"][name]["verdict"]]))
-    lines = [*table(rows), "", *table(_efforts(methods)), ""]
+    fit = methods[result["reference"]]["fit"]
+    lines = [*_misfit(fit), *table(rows), "", *table(_efforts(methods)), ""]
     for name, entry in methods.items():
         if entry["status"] != "converged":
             lines.append(f"{name} did not converge: {entry['message']}")
         lines += [f"{name} differs: {sentence}" for sentence in entry["disagreements"]]
     lines += result["explained"]
-    if not any(methods[result["reference"]]["parameters"][name]["verdict"] == "identifiable" for name in free):
+    if not fit["explains"]:
+        lines.append("the model does not explain the recordings, so agreement of methods says nothing of the truth")
+    elif not any(methods[result["reference"]]["parameters"][name]["verdict"] == "identifiable" for name in free):
         lines.append("no parameter can be found from these recordings, so there is nothing to agree on")
         lines.append("`yid-ocp identifiability CONFIG --what-if` says what would have to be measured")
     elif result["agree"]:
@@ -126,6 +146,8 @@ def _efforts(methods: Mapping[str, Mapping[str, Any]]) -> Rows:
     rows: Rows = [("", *methods)]
     rows.append(("status", *(entry["status"] for entry in entries)))
     rows.append(("cost (whitened)", *("failed" if cost is None else f"{cost:.6g}" for cost in costs)))
+    ratios = [entry["fit"]["chi2_per_dof"] for entry in entries]
+    rows.append(("chi2 per degree of freedom", *("unknown" if r is None else f"{r:.3g}" for r in ratios)))
     for channel in sorted({c for e in entries for h in e["held_out"] for c in h.get("rmse", {})}):
         errors = [[h["rmse"][channel] for h in e["held_out"] if channel in h.get("rmse", {})] for e in entries]
         rows.append((f"held out: {channel}", *(f"{sum(e) / len(e):.3g}" if e else "failed" for e in errors)))
@@ -141,12 +163,14 @@ def identifiability_summary(result: Mapping[str, Any]) -> list[str]:
     """Lines that tell a person what a `yid-identifiability/1` result says."""
     if not result["parameters"]:
         return [f"{result['status']}: {result['message']}; there is no point at which to judge"]
-    rows: Rows = [("parameter", "value", "±", "± if start and grasps were known", "95 % interval", "unit", "verdict")]
+    unsure = "± if start and grasps were unknown"
+    rows: Rows = [("parameter", "value", "±", unsure, "95 % interval", "unit", "verdict")]
     for name, entry in result["parameters"].items():
-        spread = (_percent(entry["std_relative"]), _percent(entry["std_relative_known"]))
-        interval = "" if entry["interval"] is None else _interval(*entry["interval"])
+        spread = (_percent(entry["std_relative"]), _percent(entry["std_relative_unknown"]))
+        interval = "" if entry["interval"] is None else interval_words(*entry["interval"])
         rows.append((name, f"{entry['value']:.4g}", *spread, interval, entry["unit"], VERDICT_WORDS[entry["verdict"]]))
-    lines = [*table(rows), ""]
+    lines = [] if result["fit"] is None else _misfit(result["fit"])
+    lines += [*table(rows), ""]
     hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"]
     if len(hidden) > 8:
         hidden = [*hidden[:8], f"and {len(hidden) - 8} more directions, in result.json"]
@@ -155,8 +179,11 @@ def identifiability_summary(result: Mapping[str, Any]) -> list[str]:
         lines.append("intervals of parameters are worked out on request: --intervals NAME,NAME or --intervals all")
     lines += [f"{name}: {note}" for name, entry in result["profiles"].items() for note in entry["notes"]]
     lines += [] if result["what_if"] is None else _what_if_lines(result["what_if"], len(result["parameters"]))
-    found = sum(entry["verdict"] == "identifiable" for entry in result["parameters"].values())
-    lines.append(f"{found or 'none'} of {len(result['parameters'])} parameters can be found from these recordings")
+    found = [name for name, entry in result["parameters"].items() if entry["verdict"] == "identifiable"]
+    lines.append(f"{len(found) or 'none'} of {len(result['parameters'])} parameters can be found from these recordings")
+    lost = [name for name in found if result["parameters"][name]["verdict_unknown"] != "identifiable"]
+    if lost:
+        lines.append(f"not found if start and grasps were unknown: {', '.join(lost)}")
     return lines
 
 
@@ -172,14 +199,6 @@ def _what_if_lines(asked: Mapping[str, Any], total: int) -> list[str]:
 
 def _percent(value: float | None) -> str:
     return "unknown" if value is None else f"{100 * value:.2g} %" if value < 10 else f"{value:.2g} times"
-
-
-def _interval(lower: float | None, upper: float | None) -> str:
-    if lower is None and upper is None:
-        return "open"
-    if lower is None:
-        return f"below {upper:.4g}"
-    return f"above {lower:.4g}" if upper is None else f"{lower:.4g} to {upper:.4g}"
 
 
 def diagnose_summary(result: Mapping[str, Any]) -> list[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,16 +13,18 @@ import numpy as np
 import threadpoolctl
 from numpy.typing import NDArray
 
+from yid_ocp.errors import YidError
 from yid_ocp.problem.evaluation import Evaluation, WarmStart
+from yid_ocp.problem.null_test import USUAL, GapLimits
 from yid_ocp.problem.problem import EstimationProblem
 from yid_ocp.registry import Registry
+from yid_ocp.solvers.judgement import Estimate, Fit, covariance_of_fit, estimates, judge_fit, uncertainty
+from yid_ocp.solvers.linear_model import settled
+from yid_ocp.solvers.off_neutral import off_neutral
 
 log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
-
-IDENTIFIABLE = 0.1
-WEAK = 4.0
 
 
 class Status(str, Enum):
@@ -64,31 +65,6 @@ class Iterate:
 
 
 @dataclass(frozen=True)
-class Estimate:
-    """One parameter after the fit.
-
-    Attributes
-    ----------
-    value, std : float
-        In `unit`; `std` is infinite where the data do not inform the parameter.
-    unit : str
-    initial, lower, upper : float
-    free : bool
-    verdict : str
-        identifiable (relative standard deviation up to 10 %), weak (up to 400 %), not_identifiable, or fixed.
-    """
-
-    value: float
-    std: float
-    unit: str
-    initial: float
-    lower: float
-    upper: float
-    free: bool
-    verdict: str
-
-
-@dataclass(frozen=True)
 class Solution:
     """Outcome of an identification.
 
@@ -102,18 +78,21 @@ class Solution:
     x : ndarray, shape (nx,)
         Best point so far.
     covariance : ndarray, shape (nx, nx)
-        From the data and stated priors (the weak prior excluded), scaled by chi2 per degree of freedom above one.
+        From the data and stated priors (the weak prior excluded), scaled by chi2 per degree of freedom above one, and
+        counting the misfit where the model does not explain the data (`judgement.counting_misfit`).
     parameters : dict of str to Estimate
         Free parameters shared by all recordings, and the fixed ones that the problem's model has.
     cost : float
-    chi2_per_dof : float
-        NaN for a cost that is not whitened.
+    fit : Fit
+        Whether the model explains the recordings.
     history : tuple of Iterate
     iterations, evaluations : int
     seconds : float
     evaluation : Evaluation or None
         At `x`.
     method : str
+    problem : EstimationProblem, optional
+        As it was solved: its weights frozen at `x`.
     """
 
     status: Status
@@ -123,13 +102,14 @@ class Solution:
     covariance: Array
     parameters: dict[str, Estimate]
     cost: float
-    chi2_per_dof: float
+    fit: Fit
     history: tuple[Iterate, ...]
     iterations: int
     evaluations: int
     seconds: float
     evaluation: Evaluation | None
     method: str
+    problem: EstimationProblem | None = None
 
     @property
     def std(self) -> dict[str, float]:
@@ -198,17 +178,23 @@ POOR_FIT = 5.0
 RESTARTS = (4.0, 2.0, 10.0)
 # Noise that drives the motion is linearised where a pass begins; passes end when one changes nothing.
 PASSES = 6
+REMEDY = "start nearer, widen the bounds, or use gauss_newton"
 
 
 def solve(
-    problem: EstimationProblem, solver: Solver, start: Sequence[float] | None = None, callback: Callback | None = None
+    problem: EstimationProblem,
+    solver: Solver,
+    start: Sequence[float] | None = None,
+    callback: Callback | None = None,
+    limits: GapLimits = USUAL,
 ) -> Solution:
     """Run a solver on a problem and say what was found, how sure, and what was not.
 
-    Where the rollout fails at the start (a soft object snaps, an arm falls), the problem is first solved over its first
-    seconds only, and then over longer and longer horizons. A poor fit is started again from other initial values.
-    Where noise drives the motion, methods that can weigh residuals by it do so in several passes, its covariance frozen
-    in each (`EstimationProblem.weighted_at`).
+    Free effects begin off their neutral value (`off_neutral`) unless a start is given. Where the rollout fails at the
+    start (a soft object snaps, an arm falls), the problem is first solved over its first seconds only, and then over
+    longer and longer horizons. A poor fit is started again from other initial values. Where noise drives the motion,
+    methods that can weigh residuals by it do so in several passes, its covariance frozen in each
+    (`EstimationProblem.weighted_at`).
 
     Parameters
     ----------
@@ -218,6 +204,8 @@ def solve(
         Initial unknown vector; the problem's when absent.
     callback : callable, optional
         Called with every `Iterate`.
+    limits : GapLimits, optional
+        What makes a residual more than noise.
 
     Returns
     -------
@@ -226,15 +214,19 @@ def solve(
     """
     # the matrices are small: threads of the linear algebra library cost more than they give
     with threadpoolctl.threadpool_limits(1):
-        return _solved(problem, solver, start, callback)
+        return _solved(problem, solver, start, callback, limits)
 
 
 def _solved(
-    problem: EstimationProblem, solver: Solver, start: Sequence[float] | None, callback: Callback | None
+    problem: EstimationProblem,
+    solver: Solver,
+    start: Sequence[float] | None,
+    callback: Callback | None,
+    limits: GapLimits,
 ) -> Solution:
     begun = time.perf_counter()
     lower, upper = problem.bounds
-    first = np.clip(problem.start if start is None else np.asarray(start, float), lower, upper)
+    first = off_neutral(problem, problem.start) if start is None else np.clip(np.asarray(start, float), lower, upper)
     best, evaluations, history = _attempt(problem, solver, first, callback)
     tried = 1
     for factor in RESTARTS:
@@ -242,18 +234,29 @@ def _solved(
             break
         x = np.where(problem.positive, np.clip(first * factor, lower, upper), first)
         log.info("starting again from %g times the initial values", factor)
-        again, more, steps = _attempt(problem, solver, x, callback)
+        try:
+            again, more, steps = _attempt(problem, solver, x, callback)
+        except YidError as error:
+            # another start is a chance, never a reason to lose what is there
+            log.info("no fit from there: %s", error)
+            continue
         tried, evaluations = tried + 1, evaluations + more
         history += [replace(entry, note=f"start x {factor:g}") for entry in steps]
         if again[1].cost < best[1].cost:
             best = again
-    outcome, finish = best
-    covariance, chi2 = uncertainty(problem, finish)
-    status, message = outcome.status, outcome.message
+    outcome, finish, weighted = best
     if problem.disturbed and not carries_covariance(solver):
-        message += "; weighted by the sensors' noise alone, without the noise that drives the motion"
+        remark = "; weighted by the sensors' noise alone, without the noise that drives the motion"
+        outcome = replace(outcome, message=outcome.message + remark)
+    problem = weighted
+    fit = judge_fit(problem, finish, limits)
+    covariance = covariance_of_fit(problem, finish, fit)
+    status, message = outcome.status, outcome.message
     if not finish.ok:
         status, message = Status.FAILED, finish.message
+    elif status == Status.CONVERGED and not settled(problem, outcome.x, finish):
+        status = Status.STALLED
+        message = f"the search stopped where a further step would lower the cost ({message}); {REMEDY}"
     elif tried > 1:
         message += f" (best of {tried} starts)"
     return Solution(
@@ -262,31 +265,37 @@ def _solved(
         problem.names,
         outcome.x,
         covariance,
-        estimates(problem, outcome.x, covariance),
+        estimates(problem, outcome.x, finish, covariance, fit),
         finish.cost,
-        chi2,
+        fit,
         tuple(history),
         max(len(history) - 1, 0),
         evaluations,
         time.perf_counter() - begun,
         finish if finish.ok else None,
         solver.name,
+        problem,
     )
 
 
 def _attempt(
     problem: EstimationProblem, solver: Solver, x: Array, callback: Callback | None
-) -> tuple[tuple[Outcome, Evaluation], int, list[Iterate]]:
-    """One run from one start, by shorter horizons where the rollout fails there."""
+) -> tuple[tuple[Outcome, Evaluation, EstimationProblem], int, list[Iterate]]:
+    """One run from one start, by shorter horizons where the rollout fails there, and the problem as it was weighted."""
     history: list[Iterate] = []
     evaluations = 0
     if getattr(solver, "needs_rollout", True) and not problem.evaluate(x, derivatives=False).ok:
         longest = max(episode.grid.steps for episode in problem.episodes) * problem.step.time_step
         for fraction in CONTINUATION:
-            shorter = problem.shortened(fraction * longest)
-            if not shorter.evaluate(x, derivatives=False).ok:
+            try:
+                shorter = problem.shortened(fraction * longest)
+                if not shorter.evaluate(x, derivatives=False).ok:
+                    continue
+                part = solver.run(shorter, x, callback)
+            except YidError as error:
+                # so short a piece may hold too little for a filter or a node, or nothing to compare with
+                log.info("the first %.3g s are left out: %s", fraction * longest, error)
                 continue
-            part = solver.run(shorter, x, callback)
             x, evaluations = part.x, evaluations + part.evaluations
             history += [replace(entry, note=f"first {fraction * longest:.3g} s") for entry in part.history]
             if problem.evaluate(x, derivatives=False).ok:
@@ -301,7 +310,7 @@ def _attempt(
         # the second pass is the first about torque offsets that are not guessed
         if number and len(outcome.history) < 2:
             break
-    return (outcome, weighted.evaluate(outcome.x, warm=outcome.warm)), evaluations, history
+    return (outcome, weighted.evaluate(outcome.x, warm=outcome.warm), weighted), evaluations, history
 
 
 def carries_covariance(solver: Solver) -> bool:
@@ -314,69 +323,6 @@ def _good_fit(problem: EstimationProblem, finish: Evaluation) -> bool:
     if problem.options.weighting == "paper":
         return finish.ok
     return finish.ok and uncertainty(problem, finish)[1] < POOR_FIT
-
-
-def uncertainty(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, float]:
-    """Covariance of the unknowns from data and stated priors, not the weak prior, and chi2 per degree of freedom.
-
-    Directions that the data do not inform get a variance of (1e8 x scale)^2 rather than an infinite one.
-    """
-    count = len(problem.start)
-    if evaluation.jacobian is None or not evaluation.ok:
-        return np.full((count, count), np.nan), math.nan
-    scale = problem.scales
-    residual, jacobian = problem.informing(evaluation)
-    jacobian = jacobian * scale
-    _, singular, vectors = np.linalg.svd(jacobian, full_matrices=False)
-    inverse = np.zeros(count)
-    inverse[: len(singular)] = singular
-    inverse = 1.0 / np.maximum(inverse, 1e-8)
-    basis = np.eye(count) if len(vectors) == 0 else _completed(vectors, count)
-    covariance = (basis.T * inverse**2) @ basis * np.outer(scale, scale)
-    data = residual[problem.rows.data]
-    chi2 = float(data @ data) / max(len(residual) - count, 1)
-    return covariance * max(1.0, chi2), chi2
-
-
-def _completed(vectors: Array, count: int) -> Array:
-    if len(vectors) == count:
-        return vectors
-    rest = np.linalg.svd(np.eye(count) - vectors.T @ vectors)[0][:, : count - len(vectors)]
-    return np.vstack([vectors, rest.T])
-
-
-def verdict(value: float, std: float) -> str:
-    """identifiable, weak or not_identifiable, by the relative standard deviation (limits 10 % and 400 %)."""
-    if not math.isfinite(std):
-        return "not_identifiable"
-    relative = std / max(abs(value), 1e-12)
-    if relative <= IDENTIFIABLE:
-        return "identifiable"
-    return "weak" if relative <= WEAK else "not_identifiable"
-
-
-def estimates(problem: EstimationProblem, x: Array, covariance: Array) -> dict[str, Estimate]:
-    """Every parameter of the model with its value, standard deviation and verdict."""
-    theta, _ = problem.split(x, 0)
-    spread = np.sqrt(np.maximum(np.diag(covariance), 0.0)) if len(covariance) else np.zeros(0)
-    result: dict[str, Estimate] = {}
-    for i, entry in enumerate(problem.system.parameters):
-        free = entry.name in problem.shared
-        at = problem.shared.index(entry.name) if free else -1
-        std = float(spread[at]) if free else 0.0
-        value, initial = float(theta[i]), float(problem.theta[i])
-        std = std if std < 1e6 * max(abs(value), abs(initial), 1e-12) else math.inf
-        result[entry.name] = Estimate(
-            value,
-            std,
-            entry.unit,
-            initial,
-            entry.lower,
-            entry.upper,
-            free,
-            verdict(value, std) if free else "fixed",
-        )
-    return result
 
 
 def projected_gradient(x: Array, gradient: Array, lower: Array, upper: Array, scale: Array) -> float:

@@ -14,7 +14,7 @@ from yid_ocp.options import About, check
 from yid_ocp.problem.prediction import Start
 from yid_ocp.problem.problem import EstimationProblem
 from yid_ocp.solvers.base import SOLVERS, Callback, Outcome, Recorder, Status, projected_gradient
-from yid_ocp.solvers.gauss_newton import bounded_step
+from yid_ocp.solvers.linear_model import bounded_step
 from yid_ocp.solvers.transcription import Transcription
 
 Array = NDArray[np.float64]

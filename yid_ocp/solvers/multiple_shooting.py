@@ -87,7 +87,7 @@ class MultipleShooting:
         w = np.array(result["x"]).ravel()
         best = w if np.all(np.isfinite(w)) else nlp.best
         defect = float(np.max(np.abs(transcription.constraints(w, False)[0]), initial=0.0))
-        status, message = self._ended(solver.stats()["return_status"], defect)
+        status, message = self._ended(solver.stats()["return_status"], defect, nlp.lost)
         history, evaluations = tuple(nlp.recorder.history), nlp.recorder.evaluations
         return Outcome(status, message, transcription.unknowns(best), history, evaluations, transcription.warm)
 
@@ -97,6 +97,8 @@ class MultipleShooting:
             "print_time": False,
             "no_nlp_grad": True,
             "error_on_fail": False,
+            # a trial point that cannot be worked out is counted and told in the status instead
+            "show_eval_warnings": False,
             "ipopt": {
                 "print_level": 0,
                 "sb": "yes",
@@ -121,13 +123,15 @@ class MultipleShooting:
             },
         }
 
-    def _ended(self, returned: str, defect: float) -> tuple[Status, str]:
-        """Status and message from IPOPT's own word and the largest defect."""
+    def _ended(self, returned: str, defect: float, lost: int) -> tuple[Status, str]:
+        """Status and message from IPOPT's own word, the largest defect and the trial points without a value."""
         if returned in SUCCESS:
             return Status.CONVERGED, f"IPOPT: {returned}, largest defect {defect:.1e}"
         if returned == "Maximum_Iterations_Exceeded":
             limit = f"IPOPT stopped after {self.iterations} iterations, largest defect {defect:.1e}"
             return Status.ITERATION_LIMIT, f"{limit}; raise solver.iterations"
+        if lost:
+            returned += f", {lost} trial points could not be worked out"
         remedy = "start nearer, use more nodes, or use gauss_newton"
         return Status.STALLED, f"IPOPT: {returned}, largest defect {defect:.1e}; {remedy}"
 
@@ -186,6 +190,7 @@ class _Nlp:
         self.hessian = hessian
         self.recorder = recorder
         self.best = np.zeros(transcription.size)
+        self.lost = 0
         self._asked = np.zeros(0)
         self._ridge = RIDGE
         self._change = np.zeros(len(transcription.problem.shared))
@@ -249,7 +254,9 @@ class _Nlp:
             # IPOPT asks for the cost and for the constraints of a point one after the other
             self.recorder.evaluations += 1
             self._asked = w
-        return [self.transcription.residual(w, False)[2] / self._unit, self.transcription.constraints(w, False)[0]]
+        cost, constraints = self.transcription.residual(w, False)[2], self.transcription.constraints(w, False)[0]
+        self.lost += not (np.isfinite(cost) and np.all(np.isfinite(constraints)))
+        return [cost / self._unit, constraints]
 
     def _gradient(self, w: Array, _: Array) -> list:
         residual, slope, cost = self.transcription.residual(w, True)

@@ -146,7 +146,7 @@ def _moves(run: Run, problem: EstimationProblem, warnings: list[str], progress: 
     warnings += found.notes
     # how poorly initial values fit says nothing of how sure the data will be of what fits
     covariance, _ = uncertainty(problem, replace(at_x, residual=np.zeros_like(at_x.residual)))
-    std = estimates(problem, x, covariance)
+    std = estimates(problem, x, at_x, covariance, None)
     return found.result({name: std[name].std for name in found.moves})
 
 

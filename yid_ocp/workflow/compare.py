@@ -92,7 +92,7 @@ def run_compare(run: Run, out: str | Path | None = None, progress: Progress = SI
             folder.log("iterate", method=name, iteration=entry.iteration, cost=entry.cost, seconds=entry.seconds)
             progress.iterate(entry)
 
-        comparison = compare(problem, solvers, truth, iterate)
+        comparison = compare(problem, solvers, truth, iterate, run.diagnosis.of_a_fit)
         draw_convergence(folder.path / "convergence.png", comparison)
         written = folder.finish(compare_result(problem, comparison, published, truth))
     return CompareOutcome(folder.path, written, comparison)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from yid_ocp.problem.validation import linear_carry, move_with_clamps, stay
 
 Array = NDArray[np.float64]
 
+CLEARLY = 1.05  # two errors nearer than that are alike
 GIVEN = 2  # frames from which the baselines of a cable start, as its own start state does
 
 
@@ -49,6 +51,29 @@ def held_out_entry(
             if errors:
                 entry["baselines"].setdefault(name, {}).update(errors)
     return entry
+
+
+def worse_than_guess(entries: Sequence[Mapping[str, Any]], units: Mapping[str, str]) -> list[dict[str, Any]]:
+    """Channels of `held_out_entry` entries that a guess without a model predicts better, by more than a little."""
+    worse = []
+    for entry in entries:
+        for channel, error in entry["rmse"].items():
+            guesses = {name: errors[channel] for name, errors in entry["baselines"].items() if channel in errors}
+            best = min(guesses, key=guesses.__getitem__, default=None)
+            if best is not None and error > CLEARLY * guesses[best]:
+                said = {
+                    "recording": entry["recording"],
+                    "channel": channel,
+                    "rmse": error,
+                    "unit": _unit(channel, units),
+                }
+                worse.append(said | {"baseline": best, "guess": guesses[best]})
+    return worse
+
+
+def _unit(channel: str, units: Mapping[str, str]) -> str:
+    """Unit of a channel, or of the first channel of a group."""
+    return next((unit for name, unit in units.items() if name == channel or name.startswith(f"{channel}.")), "")
 
 
 def _start_end(problem: EstimationProblem, episode: Episode) -> float:

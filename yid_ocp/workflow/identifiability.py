@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,12 +16,15 @@ from yid_ocp.analysis.identifiability import (
     identifiability,
     with_grasp_offsets,
 )
+from yid_ocp.analysis.profile import small
+from yid_ocp.analysis.start_in_motion import safe_start
 from yid_ocp.analysis.what_if import Outcome, WhatIf, what_if
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import GraspSettings, Run
 from yid_ocp.errors import YidError
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.null_test import GapLimits
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import Findings
 from yid_ocp.report.terminal import identifiability_summary
@@ -31,7 +35,6 @@ from yid_ocp.workflow.folder import RunFolder, new_run_folder
 from yid_ocp.workflow.progress import SILENT, Progress
 
 FORMAT = "yid-identifiability/1"
-MOST_INTERVALS, MOST_UNKNOWNS = 12, 300  # beyond, profiles take long and are worked out only where asked for
 OTHER_SIDE = {"left": "right", "right": "left"}
 
 
@@ -43,10 +46,10 @@ class Question:
     ----------
     at : "solution" or "initial"
         Point at which to judge: where the solver ends, or the initial values, without solving.
-    start : "unknown" or "known"
-        Whether initial states are estimated along.
+    start : "assumed" or "unknown"
+        Initial states as the settings have them, so that verdicts are those of `solve`, or all estimated along.
     grasp_std : float or None
-        Prior standard deviation of where the grasps sit [m]; None for grasps that are known.
+        Prior standard deviation of where the grasps sit [m]; None for grasps as the settings have them.
     intervals : "auto", "all" or sequence of str
         Parameters whose interval by profile likelihood is wanted; `auto` for all of a small problem, none of a large
         one.
@@ -55,8 +58,8 @@ class Question:
     """
 
     at: Literal["solution", "initial"] = "solution"
-    start: StartKnowledge = "unknown"
-    grasp_std: float | None = GRASP_STD
+    start: StartKnowledge = "assumed"
+    grasp_std: float | None = None
     intervals: Literal["auto", "all"] | Sequence[str] = "auto"
     what_if: bool = False
 
@@ -81,8 +84,8 @@ def run(arguments: argparse.Namespace) -> int:
     names = [name for name in arguments.intervals.split(",") if name]
     asked = Question(
         at="initial" if arguments.initial else "solution",
-        start="known" if arguments.known_start else "unknown",
-        grasp_std=None if arguments.known_grasp else Question().grasp_std,
+        start="unknown" if arguments.unknown_start else "assumed",
+        grasp_std=GRASP_STD if arguments.unknown_grasp else None,
         intervals={"auto": "auto", "all": "all", "none": ()}.get(arguments.intervals, names),
         what_if=arguments.what_if,
     )
@@ -121,15 +124,20 @@ def run_identifiability(
         folder.begin(run, "identifiability")
         progress.stage("building the model and its compiled step")
         system = build_system(run)
-        problem = build_problem(run, build_step(run, _nuisanced(system, asked)))
-        solution = _solved(run, problem, folder, progress) if asked.at == "solution" else None
-        known = information = ranking = None
+        problem = build_problem(run, build_step(run, with_grasp_offsets(system)))
+        limits = run.diagnosis.of_a_fit
+        solution = None
+        if asked.at == "solution":
+            solved = _solved(run, problem, folder, progress)
+            safe = safe_start(problem, run.solver, solved, limits)
+            problem, solution = safe.problem, safe.solution
+        unknown = information = ranking = None
         if solution is None or solution.status != Status.FAILED:
             progress.stage("Fisher information")
-            known = identifiability(problem, solution, start="known", grasp_std=None)
-            information = _information(problem, solution, asked, progress)
+            unknown = identifiability(problem, solution, start="unknown", grasp_std=GRASP_STD, limits=limits)
+            information = _information(problem, solution, asked, progress, limits)
             ranking = _ranking(run, system, problem, solution, asked, progress) if asked.what_if else None
-        result = identifiability_result(problem, solution, information, known, ranking, asked)
+        result = identifiability_result(problem, solution, information, unknown, ranking, asked)
         folder.log("end", status=result["status"], message=result["message"])
         written = folder.finish(result)
         if run.output.report:
@@ -146,18 +154,19 @@ def _solved(run: Run, problem: EstimationProblem, folder: RunFolder, progress: P
         folder.log("iterate", iteration=entry.iteration, cost=entry.cost, seconds=entry.seconds)
         progress.iterate(entry)
 
-    return solve(problem, run.solver, callback=iterate)
+    return solve(problem, run.solver, callback=iterate, limits=run.diagnosis.of_a_fit)
 
 
 def _information(
-    problem: EstimationProblem, solution: Solution | None, asked: Question, progress: Progress
+    problem: EstimationProblem, solution: Solution | None, asked: Question, progress: Progress, limits: GapLimits
 ) -> Identifiability:
-    information = identifiability(problem, solution, start=asked.start, grasp_std=asked.grasp_std)
-    wanted = _wanted(information, asked)
+    judged = partial(identifiability, problem, solution, start=asked.start, grasp_std=asked.grasp_std, limits=limits)
+    information = judged()
+    wanted = _wanted(problem, information, asked)
     if not wanted:
         return information
     progress.stage(f"intervals of {len(wanted)} parameters by profile likelihood")
-    return identifiability(problem, solution, start=asked.start, grasp_std=asked.grasp_std, intervals=wanted)
+    return judged(intervals=wanted)
 
 
 def _ranking(
@@ -174,22 +183,16 @@ def _ranking(
         solution,
         start=asked.start,
         grasp_std=asked.grasp_std,
-        second_arm=None if other is None else _nuisanced(other, asked),
+        second_arm=None if other is None else with_grasp_offsets(other),
         progress=progress.stage,
     )
 
 
-def _wanted(information: Identifiability, asked: Question) -> Sequence[str]:
+def _wanted(problem: EstimationProblem, information: Identifiability, asked: Question) -> Sequence[str]:
     """Parameters whose intervals are worked out."""
     if asked.intervals not in ("auto", "all"):
         return asked.intervals
-    count = len(information.names)
-    small = count <= MOST_INTERVALS and count + len(information.nuisances) <= MOST_UNKNOWNS
-    return information.names if small or asked.intervals == "all" else ()
-
-
-def _nuisanced(system: System, asked: Question) -> System:
-    return system if asked.grasp_std is None else with_grasp_offsets(system)
+    return information.names if asked.intervals == "all" or small(problem) else ()
 
 
 def second_arm(run: Run, system: System) -> System | None:
@@ -224,7 +227,7 @@ def identifiability_result(
     problem: EstimationProblem,
     solution: Solution | None,
     information: Identifiability | None,
-    known: Identifiability | None,
+    unknown: Identifiability | None,
     ranking: WhatIf | None,
     asked: Question,
 ) -> dict[str, Any]:
@@ -240,15 +243,15 @@ def identifiability_result(
         "correlations": {"names": [], "matrix": []},
         "directions": [],
         "nuisances": 0,
-        "chi2_per_dof": None if solution is None else solution.chi2_per_dof,
+        "fit": None if solution is None else asdict(solution.fit),
         "profiles": {},
         "what_if": None,
     }
-    if information is None or known is None:
+    if information is None or unknown is None:
         return result
     for name, entry in information.parameters.items():
-        sure = known.parameters[name]
-        own = {"std_relative_known": sure.std_relative, "verdict_known": sure.verdict}
+        unsure = unknown.parameters[name]
+        own = {"std_relative_unknown": unsure.std_relative, "verdict_unknown": unsure.verdict}
         result["parameters"][name] = asdict(entry) | own
     result["correlations"] = {"names": information.names, "matrix": information.correlations}
     result["directions"] = [asdict(direction) for direction in information.directions]

@@ -17,6 +17,7 @@ from yid_ocp.errors import YidError
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.solvers import Solution, Status
+from yid_ocp.solvers.judgement import typical_sizes
 from yid_ocp.workflow.build import build_step, build_system, finer_factor
 from yid_ocp.workflow.progress import SILENT, Progress
 
@@ -110,7 +111,8 @@ def discretisation(
 
 def counted(solution: Solution, found: Discretisation) -> Solution:
     """The solution with standard deviations and verdicts that count how far discretisation moves its estimates."""
-    return replace(solution, parameters=counting(solution.parameters, found.moves))
+    sizes = {} if solution.problem is None else typical_sizes(solution.problem, solution.x)
+    return replace(solution, parameters=counting(solution.parameters, found.moves, sizes))
 
 
 def _with_twice_the_links(run: Run, problem: EstimationProblem) -> Refined:

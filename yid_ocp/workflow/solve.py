@@ -8,6 +8,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from yid_ocp.analysis.profile import with_intervals
+from yid_ocp.analysis.start_in_motion import safe_start
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import Run
 from yid_ocp.model.cable import Cable
@@ -22,7 +24,7 @@ from yid_ocp.solvers import Iterate, Solution, Status, solve
 from yid_ocp.workflow.build import build_cable, build_problem
 from yid_ocp.workflow.command import DONE, FAILED, carry_out
 from yid_ocp.workflow.folder import new_run_folder
-from yid_ocp.workflow.held_out import held_out_entry
+from yid_ocp.workflow.held_out import held_out_entry, worse_than_guess
 from yid_ocp.workflow.progress import SILENT, Progress
 from yid_ocp.workflow.refine import Discretisation, counted, discretisation, steadied, wanted
 from yid_ocp.workflow.trajectories import write_trajectories
@@ -92,8 +94,11 @@ def run_solve(run: Run, out: str | Path | None = None, progress: Progress = SILE
             folder.log("iterate", iteration=entry.iteration, cost=entry.cost, gradient=entry.gradient, x=values)
             progress.iterate(entry)
 
-        solution = solve(problem, run.solver, callback=iterate)
-        solution, stability = steadied(problem, solution)
+        solution = solve(problem, run.solver, callback=iterate, limits=run.diagnosis.of_a_fit)
+        safe = safe_start(problem, run.solver, solution, run.diagnosis.of_a_fit)
+        solution, stability = steadied(safe.problem, safe.solution)
+        problem = solution.problem or safe.problem
+        solution = with_intervals(problem, solution, progress.stage)
         finer = Discretisation({})
         if solution.evaluation is not None:
             finer = discretisation(run, problem, solution.x, solution.evaluation, wanted(run), progress)
@@ -104,6 +109,7 @@ def run_solve(run: Run, out: str | Path | None = None, progress: Progress = SILE
         folder.log("end", status=solution.status.value, message=solution.message, seconds_solving=solution.seconds)
         write_trajectories(folder.path / "trajectories.h5", problem, solution, held_out)
         more = {
+            "safeguard": safe.message,
             "discretisation": finer.result(data_std),
             "discretisation_notes": list(finer.notes),
             "stability": stability,
@@ -124,8 +130,13 @@ def solve_result(
 ) -> dict[str, Any]:
     """`yid-solve/1` without inputs and versions; a cable has baselines of its own."""
     residuals: Mapping[str, Any] = {}
+    fitted: list[dict[str, Any]] = []
     if solution.evaluation is not None:
-        residuals = channel_errors(solution.evaluation.episodes, problem.episodes)
+        done = solution.evaluation.episodes
+        residuals = channel_errors(done, problem.episodes)
+        fitted = [held_out_entry(problem, *pair, cable) for pair in zip(problem.episodes, done, strict=True)]
+    predicted = [held_out_entry(problem, episode, outcome, cable) for episode, outcome in held_out]
+    units = {channel: entry["unit"] for channel, entry in residuals.items()}
     return {
         "format": FORMAT,
         "status": solution.status.value,
@@ -135,6 +146,7 @@ def solve_result(
         "iterations": solution.iterations,
         "evaluations": solution.evaluations,
         "seconds": solution.seconds,
+        "fit": asdict(solution.fit) | {"worse_than_guess": worse_than_guess([*predicted, *fitted], units)},
         "residuals": residuals,
-        "held_out": [held_out_entry(problem, episode, outcome, cable) for episode, outcome in held_out],
+        "held_out": predicted,
     }

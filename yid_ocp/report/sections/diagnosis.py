@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.diagnosis import Finding, residual_series
+from yid_ocp.diagnosis import Finding
 from yid_ocp.diagnosis.localise import informed_map, units
 from yid_ocp.diagnosis.smoother import Smoothed
 from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.null_test import residual_series
 from yid_ocp.problem.prediction import EpisodeResult
 from yid_ocp.report import figures
 from yid_ocp.report.figures import Change, Curve, Ranked, Row

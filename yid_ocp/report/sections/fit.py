@@ -13,6 +13,7 @@ from yid_ocp.report import figures
 from yid_ocp.report.sections.base import Findings, section
 from yid_ocp.report.tables import held_out_rows, medians
 from yid_ocp.sensors import Sensor
+from yid_ocp.solvers.words import fit_words
 
 MOST_PICTURES = 24  # a page with more is too heavy to open; result.json and trajectories.h5 have them all
 WORDS = {
@@ -49,7 +50,7 @@ def prepare(findings: Findings) -> Mapping[str, Any] | None:
         "pictures": pictures,
         "left": left,
         "histogram": figures.html(figures.residual_histogram(residuals)) if residuals else None,
-        "chi2": None if findings.solution is None else findings.solution.chi2_per_dof,
+        "fit": None if "fit" not in result else fit_words(result["fit"]["chi2_per_dof"], result["fit"]["explains"]),
     }
 
 

@@ -1,4 +1,4 @@
-"""Steps one and two: the noise floor, and whether the residual is larger or less random than noise alone would be.
+"""The noise floor, and whether a residual is larger or less random than noise alone would be.
 
 Under the null hypothesis the whitened residual r is noise of unit standard deviation whose colour rho is known (white,
 or that of the smoothing filter). Then r'r/n has the variance 2/n (1 + 2 sum rho_l^2), which is that of a chi-squared
@@ -14,11 +14,63 @@ import numpy as np
 import scipy.stats
 from numpy.typing import NDArray
 
-from yid_ocp.diagnosis.hypotheses import Series
-from yid_ocp.diagnosis.thresholds import DEFAULTS
-from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.low_pass import LowPass
+from yid_ocp.problem.measurements import Measurements
+from yid_ocp.problem.problem import EstimationProblem
 
 Array = NDArray[np.float64]
+
+WINDOW = 0.5
+"""Length of the windows in which a residual is looked at [s]."""
+
+
+@dataclass(frozen=True)
+class GapLimits:
+    """What makes a residual more than noise, for all that judge one.
+
+    Attributes
+    ----------
+    level : float
+        Significance below which a residual is more than noise.
+    smallest_gap : float
+        chi2/n - 1 below which an excess is not worth a word, however sure.
+    noise_fraction : float
+        Part of the sensors' stated standard deviations that is noise, where the rest stands for the model's error.
+    """
+
+    level: float = 0.01
+    smallest_gap: float = 0.1
+    noise_fraction: float = 1.0
+
+
+USUAL = GapLimits()
+
+
+@dataclass(frozen=True)
+class Series:
+    """One scalar output of one recording, as it stands in the residual of a problem.
+
+    Attributes
+    ----------
+    recording, channel : str
+    group : str
+    unit : str
+    t : ndarray, shape (M,)
+        Times since the start of the recording [s].
+    rows : ndarray of int, shape (M,)
+        Places in the residual.
+    colour : ndarray, shape (L + 1,)
+        Autocorrelation of the noise at lags 0 to L samples.
+    """
+
+    recording: str
+    channel: str
+    group: str
+    unit: str
+    t: Array
+    rows: NDArray[np.int64]
+    colour: Array
 
 
 @dataclass(frozen=True)
@@ -110,8 +162,8 @@ def null_test(
     series: Sequence[Series],
     residual: Array,
     parameters: int,
-    level: float = DEFAULTS.level,
-    window: float = DEFAULTS.window,
+    level: float = USUAL.level,
+    window: float = WINDOW,
 ) -> NullTest:
     """Compare a whitened residual with noise.
 
@@ -138,6 +190,21 @@ def null_test(
         channels[channel] = float(np.mean(np.concatenate([residual[s.rows] for s in own]) ** 2))
         whiteness[channel] = _whiteness([residual[s.rows] for s in own]) if len(own[0].colour) == 1 else float("nan")
     return NullTest(ratio, effective, p_value, channels, whiteness, _windows(series, residual, level, window))
+
+
+def more_than_noise(tests: Sequence[NullTest], limits: GapLimits = USUAL) -> bool:
+    """Whether residuals of one model are more than noise, by enough to be worth a word.
+
+    The smallest p-value counts as the best of so many tests (Bonferroni).
+
+    Parameters
+    ----------
+    tests : sequence of NullTest
+        Of the recordings that were fitted, of those held out, or of both.
+    limits : GapLimits
+    """
+    p = min(1.0, len(tests) * min(test.p_value for test in tests))
+    return p < limits.level and max(test.chi2_per_dof for test in tests) > 1 + limits.smallest_gap
 
 
 def _whiteness(parts: Sequence[Array], lags: int = 10) -> float:
@@ -182,3 +249,46 @@ def _windows(series: Sequence[Series], residual: Array, level: float, length: fl
     if len(passed):
         flagged[order[: passed[-1] + 1]] = True
     return tuple(Window(*entry[:5], bool(flag)) for entry, flag in zip(raw, flagged, strict=True))
+
+
+def sample_times(episode: Episode, samples: Measurements) -> Array:
+    """Times of samples since the start of their recording, shape (M,) [s]."""
+    return np.asarray((samples.node + samples.fraction) * episode.grid.time_step)
+
+
+def residual_series(problem: EstimationProblem) -> tuple[Series, ...]:
+    """How the residual of a problem is made up, output by output."""
+    series: list[Series] = []
+    for episode, groups in zip(problem.episodes, problem.rows.measurements, strict=True):
+        for samples, rows in zip(episode.samples, groups, strict=True):
+            t = sample_times(episode, samples)
+            place = np.full(samples.seen.shape, -1)
+            place[samples.seen] = np.arange(rows.start, rows.stop)
+            colour = noise_colour(problem, episode, samples)
+            for column, channel in enumerate(samples.channel_of_column):
+                seen = samples.seen[:, column]
+                if seen.any():
+                    text = (episode.name, channel, samples.sensor.group, samples.sensor.unit)
+                    series.append(Series(*text, t[seen], place[seen, column], colour))
+    return tuple(series)
+
+
+def noise_colour(problem: EstimationProblem, episode: Episode, samples: Measurements) -> Array:
+    """Autocorrelation of a sensor's noise at lags 0, 1, ... samples: white, but for efforts, which are smoothed."""
+    if not samples.sensor.efforts:
+        return np.ones(1)
+    stride = LowPass(problem.options.path_cutoff).stride(episode.grid.time_step)
+    return smoothed_colour(problem.options.path_cutoff, episode.grid.time_step)[::stride]
+
+
+def smoothed_colour(cutoff: float, step: float) -> Array:
+    """Autocorrelation of white noise after the zero-phase filter of paths and efforts."""
+    if not np.isfinite(cutoff):
+        return np.ones(1)
+    half = int(2 / (cutoff * step)) + 10
+    impulse = np.zeros((2 * half + 1, 1))
+    impulse[half] = 1.0
+    times = step * np.arange(2 * half + 1, dtype=float)
+    response = LowPass(cutoff)(times, impulse)[:, 0]
+    full = np.correlate(response, response, "full")[2 * half :]
+    return np.asarray(full[:half] / full[0])

@@ -9,9 +9,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import scipy.stats
-from factories import samples, series
+from made_series import samples, series
 
-from yid_ocp.diagnosis.null_test import noise_floor, null_test, spread
+from yid_ocp.problem.null_test import noise_floor, null_test, spread
 
 CHI2 = scipy.stats.chi2
 

@@ -1,0 +1,32 @@
+"""Outputs and samples, as far as rules that look at residuals need them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import SimpleNamespace
+
+import numpy as np
+
+from yid_ocp.problem.null_test import Series
+
+WHITE = (1.0,)
+
+
+def series(rows, t=None, recording="run", channel="points.tip", colour=WHITE, period=0.01) -> Series:
+    """One output of one recording; times at even intervals unless given."""
+    rows = np.asarray(rows)
+    t = period * np.arange(len(rows)) if t is None else np.asarray(t, float)
+    return Series(recording, channel, "points", "m", t, rows, np.asarray(colour, float))
+
+
+def samples(channels: Sequence[str], std, unit="m", width=1, **more):
+    """What one sensor measured, as far as rules look at it."""
+    columns = tuple(channel for channel in channels for _ in range(width))
+    return SimpleNamespace(
+        sensor=seeing(channels, unit, width), channel_of_column=columns, std=np.asarray(std, float), **more
+    )
+
+
+def seeing(channels: Sequence[str], unit="m", width=1, efforts=()):
+    """A sensor, as far as rules look at it."""
+    return SimpleNamespace(channels=tuple(channels), unit=unit, width=width, group="points", efforts=tuple(efforts))

@@ -1,0 +1,132 @@
+"""When a search has come to its end, rule by rule: steep rows, damping, bounds, methods that stop short."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from made_problems import MadeUp, Steps, linear
+
+from yid_ocp.errors import DataError, SolverError
+from yid_ocp.problem.unknowns import soft_logarithm
+from yid_ocp.solvers import GaussNewton, Status, solve
+from yid_ocp.solvers.linear_model import promised, settled
+
+
+def with_weak_prior(target, std=0.1, start=3.0):
+    """One stiffness that the data want at a value, with the weak prior of a problem."""
+
+    def rows(x, duration):
+        value, slope = soft_logarithm(x / start)
+        spread = math.log(10.0)
+        residual = np.concatenate([(x - target) / std, value / spread])
+        return residual, np.array([[1 / std], [slope[0] / (spread * start)]])
+
+    return MadeUp(rows, (start,), weak=1)
+
+
+def test_an_unknown_clipped_to_its_bound_at_zero_comes_back():
+    problem = with_weak_prior(2.0)
+    found = GaussNewton().run(problem, np.zeros(1), None)
+    assert found.status == Status.CONVERGED
+    assert found.x[0] == pytest.approx(2.0, abs=1e-2)
+
+
+def test_a_short_step_beside_a_steep_row_is_no_end():
+    """A row of slope 1e9 allows no step but a short one; the cost falls along it all the same."""
+
+    def rows(x, duration):
+        wall = 1e9 * (x[1] - 1e-9 * (x[0] - 3.0))
+        return np.array([10 * (x[0] - 1.0), wall]), np.array([[10.0, 0.0], [-1.0, 1e9]])
+
+    problem = MadeUp(rows, (3.0, 1.0), lower=-np.inf)
+    assert not settled(problem, np.array([3.0, 0.0]), problem.evaluate([3.0, 0.0]))
+    end = np.array([1.0, -2e-9])
+    assert settled(problem, end, problem.evaluate(end))
+    found = GaussNewton(iterations=3).run(problem, np.array([3.0, 0.0]), None)
+    assert found.status != Status.CONVERGED
+
+
+@pytest.mark.parametrize(
+    ("x", "residual", "expected"),
+    [
+        ((1.0, 1.0), (0.0, 0.0), True),
+        ((1.0, 1.0), (0.1, 0.0), True),
+        ((1.0, 1.0), (0.2, 0.0), False),
+        # pushed against its bound an unknown is at its end
+        ((0.0, 1.0), (5.0, 0.0), True),
+        ((0.0, 1.0), (-5.0, 0.0), False),
+        ((9.0, 1.0), (-5.0, 0.0), True),
+        ((9.0, 1.0), (5.0, 0.0), False),
+    ],
+)
+def test_a_point_is_an_end_where_no_step_within_the_bounds_promises_much(x, residual, expected):
+    problem = MadeUp(lambda at, duration: (np.array(residual), np.eye(2)), (1.0, 1.0), upper=9.0, count=2)
+    assert settled(problem, np.array(x), problem.evaluate(x)) is expected
+
+
+def test_what_nothing_informs_keeps_no_search_from_its_end():
+    problem = MadeUp(lambda x, duration: (np.array([50.0]), np.array([[1e-9]])), (1.0,))
+    assert settled(problem, np.ones(1), problem.evaluate([1.0]))
+    none = MadeUp(linear(np.zeros((2, 0)), [3.0, 3.0]), ())
+    assert settled(none, np.zeros(0), none.evaluate(np.zeros(0)))
+
+
+def test_a_part_of_a_large_cost_is_as_little_as_a_part_of_the_noise():
+    def rows(x, duration):
+        return np.array([1.0, 100.0]), np.array([[1.0], [0.0]])
+
+    problem = MadeUp(rows, (1.0,), lower=-np.inf)
+    assert settled(problem, np.ones(1), problem.evaluate([1.0]))
+
+
+def test_the_promise_of_a_step_is_the_fall_of_a_linear_models_cost():
+    jacobian, residual, step = np.array([[1.0, 2.0], [0.5, -1.0]]), np.array([3.0, -1.0]), np.array([0.2, -0.4])
+    after = residual + jacobian @ step
+    assert promised(jacobian, residual, step) == pytest.approx(0.5 * (residual @ residual - after @ after))
+
+
+def test_a_method_that_stops_short_has_not_converged_whatever_it_says():
+    problem = MadeUp(linear([[1.0], [1.0]], [-3.0, -3.0]), (1.0,))
+    stopped = solve(problem, Steps([[2.0]]))
+    assert stopped.status == Status.STALLED
+    assert "a further step would lower the cost (run 1)" in stopped.message
+    assert solve(problem, Steps([[3.0]])).status == Status.CONVERGED
+    limited = solve(problem, Steps([[2.0]], status=Status.ITERATION_LIMIT))
+    assert (limited.status, limited.message) == (Status.ITERATION_LIMIT, "run 1")
+
+
+# -- what never ends a run --------------------------------------------------------------------------------------------
+
+
+def failing_beyond(limit):
+    return lambda x, duration: None if duration > limit and x[0] < 2 else (np.full(10, 0.1), np.zeros((10, 1)))
+
+
+def test_a_horizon_too_short_for_a_filter_is_left_out():
+    problem = MadeUp(failing_beyond(3.0), count=10)
+    whole = problem.shortened
+
+    def shortened(duration):
+        if duration < 2.0:
+            raise DataError("0.6 s of efforts are too short for a filter of 8 Hz")
+        return whole(duration)
+
+    problem.shortened = shortened
+    solver = Steps([[2.0]], [[2.0]])
+    solution = solve(problem, solver)
+    assert [duration for _, duration in solver.runs] == [2.5, 10.0]
+    assert solution.status == Status.CONVERGED
+
+
+def test_another_start_that_cannot_even_begin_loses_nothing():
+    class Fragile(Steps):
+        def run(self, problem, start, callback):
+            if start[0] > 3.0:
+                raise SolverError("no transcription from here")
+            return super().run(problem, start, callback)
+
+    problem = MadeUp(lambda x, duration: (9.0 * (-1.0) ** np.arange(10), np.ones((10, 1))))
+    solution = solve(problem, Fragile())
+    assert (solution.status, solution.x.tolist()) == (Status.CONVERGED, [1.0])

@@ -1,0 +1,380 @@
+"""How sure a fit is and what may be said of it, rule by rule: the null test, misfit, bounds, verdicts."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from made_problems import MadeUp, linear
+
+from yid_ocp.problem.null_test import GapLimits
+from yid_ocp.solvers.judgement import (
+    MOST_ASKED,
+    NO_FIT,
+    Fit,
+    bound_side,
+    counting_misfit,
+    estimates,
+    judge_fit,
+    one_sided,
+    parameter_names,
+    standing_std,
+    typical_sizes,
+    uncertainty,
+    verdict,
+)
+
+GOOD, BAD = Fit(1.0, 0.5, True), Fit(9.0, 0.0, False)
+
+# -- verdicts ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "said"),
+    [
+        (10.0, 0.5, "identifiable"),
+        (10.0, 1.0, "identifiable"),
+        (10.0, 1.01, "weak"),
+        (10.0, 3.0, "weak"),
+        (10.0, 40.0, "weak"),
+        (10.0, 40.1, "not_identifiable"),
+        (-10.0, 0.5, "identifiable"),
+        (-10.0, 3.0, "weak"),
+        (10.0, math.inf, "not_identifiable"),
+        (10.0, math.nan, "not_identifiable"),
+        (0.0, 0.0, "identifiable"),
+        (0.0, 1e-14, "identifiable"),
+        (0.0, 1e-3, "not_identifiable"),
+    ],
+)
+def test_a_verdict_goes_by_the_relative_standard_deviation(value, std, said):
+    assert verdict(value, std) == said
+
+
+# -- uncertainty ------------------------------------------------------------------------------------------------------
+
+
+def judged(problem, at=None):
+    return uncertainty(problem, problem.evaluate(np.zeros(len(problem.start)) if at is None else np.array(at)))
+
+
+def test_the_covariance_is_the_inverse_of_the_information():
+    matrix = np.array([[3.0, 1.0], [0.0, 2.0], [1.0, 1.0], [2.0, -1.0]])
+    covariance, chi2 = judged(MadeUp(linear(matrix, [0.1, 0.2, 0.3, 0.4]), (5.0, 70.0)))
+    np.testing.assert_allclose(covariance, np.linalg.inv(matrix.T @ matrix), rtol=1e-9)
+    assert chi2 == pytest.approx(0.3 / 2)
+
+
+def test_a_misfit_beyond_the_noise_widens_the_covariance():
+    matrix = np.eye(2)[[0, 1, 0, 1]]
+    covariance, chi2 = judged(MadeUp(linear(matrix, [3.0, 4.0, 3.0, 4.0]), (1.0, 1.0)))
+    assert chi2 == pytest.approx(25.0)
+    np.testing.assert_allclose(covariance, 25.0 * np.eye(2) / 2)
+
+
+def test_stated_priors_inform_and_weak_ones_do_not():
+    matrix = np.array([[1.0], [1.0], [2.0], [9.0]])
+    rows = linear(matrix, [1.0, 2.0, 5.0, 7.0])
+    covariance, chi2 = judged(MadeUp(rows, stated=1, weak=1))
+    # two measurements and a prior, which counts as an observation but whose misfit says nothing of the noise
+    assert chi2 == pytest.approx((1.0 + 4.0) / (3 - 1))
+    assert covariance == pytest.approx(2.5 / (1 + 1 + 4))
+    _, without = judged(MadeUp(rows, stated=0, weak=1))
+    assert without == pytest.approx((1.0 + 4.0 + 25.0) / 2)
+
+
+def test_residuals_that_are_not_whitened_count_in_units_of_their_noise():
+    matrix = np.array([[1.0], [2.0], [2.0]])
+    covariance, chi2 = judged(MadeUp(linear(matrix, [0.02, 0.02, 0.5]), stated=1, noise=0.01, weighting="paper"))
+    assert chi2 == pytest.approx((4.0 + 4.0) / 2)
+    assert covariance == pytest.approx(4.0 / (1e4 + 4e4 + 4))
+
+
+@pytest.mark.parametrize(("rows", "degrees"), [(5, 4), (2, 1), (1, 1)])
+def test_degrees_of_freedom_are_at_least_one(rows, degrees):
+    _, chi2 = judged(MadeUp(linear(np.ones((rows, 1)), np.full(rows, 2.0))))
+    assert chi2 == pytest.approx(4.0 * rows / degrees)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "known"),
+    [
+        ([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]], (1.0, 1.0)),
+        ([[1.0, 0.0], [1.0, 0.0], [0.0, 0.0]], (0.5, None)),
+        ([[2.0, 0.0]], (0.25, None)),
+        ([[0.0, 2.0]], (None, 0.25)),
+        (np.zeros((0, 2)), (None, None)),
+    ],
+    ids=["both", "one", "fewer rows than unknowns", "fewer rows, the other one", "no rows"],
+)
+def test_what_the_data_do_not_inform_gets_a_huge_variance_in_units_of_its_size(matrix, known):
+    problem = MadeUp(linear(matrix), (3.0, 50.0))
+    covariance, _ = judged(problem)
+    for i, (variance, size) in enumerate(zip(known, (3.0, 50.0), strict=True)):
+        assert covariance[i, i] == pytest.approx(variance if variance is not None else (1e8 * size) ** 2, rel=1e-9)
+    assert covariance[0, 1] == pytest.approx(0.0, abs=1e-6 * np.sqrt(covariance[0, 0] * covariance[1, 1]))
+
+
+def test_a_direction_between_two_unknowns_is_known_though_neither_is():
+    covariance, _ = judged(MadeUp(linear([[1.0, 1.0]]), (1.0, 1.0)))
+    assert covariance[0, 0] > 1e15
+    assert covariance[0, 1] / covariance[0, 0] == pytest.approx(-1.0)
+
+
+@pytest.mark.parametrize("ok", [True, False])
+def test_without_a_jacobian_nothing_is_known(ok):
+    problem = MadeUp(linear(np.eye(2)) if ok else lambda x, duration: None, (1.0, 1.0), count=2)
+    covariance, chi2 = uncertainty(problem, problem.evaluate(np.zeros(2), derivatives=False))
+    assert covariance.shape == (2, 2)
+    assert np.all(np.isnan(covariance))
+    assert math.isnan(chi2)
+
+
+# -- verdicts beyond the relative size ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "scale", "explains", "at_bound", "said"),
+    [
+        (10.0, 0.5, 0.0, True, False, "identifiable"),
+        (10.0, 0.5, 0.0, False, False, "not_trusted"),
+        (10.0, 0.5, 0.0, False, True, "not_trusted"),
+        (10.0, 0.5, 0.0, True, True, "at_bound"),
+        (10.0, 3.0, 0.0, False, False, "not_trusted"),
+        (10.0, 41.0, 0.0, False, True, "not_identifiable"),
+        (10.0, math.inf, 0.0, True, True, "not_identifiable"),
+        # near zero the size that the parameter might have counts
+        (0.0, 0.1, 10.0, True, False, "identifiable"),
+        (0.2, 0.39, 10.0, True, False, "identifiable"),
+        (0.2, 0.41, 10.0, True, False, "weak"),
+        (0.0, 4.9, 10.0, True, False, "weak"),
+        (0.0, 5.1, 10.0, True, False, "not_identifiable"),
+        (0.0, 0.1, 10.0, True, True, "at_bound"),
+        (0.0, 5.1, 10.0, True, True, "not_identifiable"),
+        (0.0, 0.1, 10.0, False, False, "not_trusted"),
+        # what is surely not zero is judged by itself, however large the others are
+        (0.5, 0.2, 1000.0, True, False, "weak"),
+        (0.0, 0.1, 0.0, True, False, "not_identifiable"),
+    ],
+)
+def test_what_may_be_said_of_a_parameter(value, std, scale, explains, at_bound, said):
+    assert verdict(value, std, scale=scale, explains=explains, at_bound=at_bound) == said
+
+
+# -- does the model explain the data ----------------------------------------------------------------------------------
+
+
+def of_size(square, count=400, **more):
+    """A problem of one unknown whose residual has this mean square at one."""
+    return MadeUp(lambda x, duration: (np.full(count, math.sqrt(square)) * x[0], np.full((count, 1), 1.0)), **more)
+
+
+@pytest.mark.parametrize(
+    ("square", "count", "explains"),
+    [(0.2, 400, True), (1.0, 400, True), (1.09, 40000, True), (1.12, 400, True), (1.2, 400, False), (9.0, 5, False)],
+    ids=["too good", "noise", "sure and negligible", "chance", "more than noise", "few and far off"],
+)
+def test_a_fit_explains_what_is_not_surely_and_relevantly_more_than_noise(square, count, explains):
+    problem = of_size(square, count)
+    assert judge_fit(problem, problem.evaluate([1.0])).explains is explains
+
+
+def test_a_fit_is_judged_by_the_limits_of_a_diagnosis():
+    problem = of_size(1.2)
+    found = problem.evaluate([1.0])
+    assert judge_fit(problem, found, GapLimits(level=1e-6)).explains
+    assert judge_fit(problem, found, GapLimits(smallest_gap=0.5)).explains
+    half = judge_fit(problem, found, GapLimits(noise_fraction=0.5))
+    assert half.chi2_per_dof == pytest.approx(4 * judge_fit(problem, found).chi2_per_dof)
+
+
+def test_a_cost_that_is_not_whitened_is_judged_in_units_of_noise():
+    problem = of_size(9.0 * 0.01**2, weighting="paper", noise=0.01)
+    assert judge_fit(problem, problem.evaluate([1.0])).chi2_per_dof == pytest.approx(9.0, rel=0.01)
+
+
+def test_without_a_rollout_nothing_is_explained():
+    problem = MadeUp(lambda x, duration: None, count=3)
+    assert judge_fit(problem, problem.evaluate([1.0])) is NO_FIT
+
+
+# -- misfit -----------------------------------------------------------------------------------------------------------
+
+
+def constant(residual):
+    """A constant seen by every sample."""
+    return MadeUp(linear(np.ones((len(residual), 1)), residual))
+
+
+def widened(problem):
+    found = problem.evaluate([0.0])
+    covariance, _ = uncertainty(problem, found)
+    return math.sqrt(counting_misfit(problem, found, covariance)[0, 0] / covariance[0, 0])
+
+
+def test_a_misfit_that_stays_for_long_counts_as_one_and_one_that_alternates_as_many():
+    t = np.linspace(0, 1, 480)
+    slow, quick = 5 * np.sign(np.sin(4 * np.pi * t)), 5 * (-1.0) ** np.arange(480)
+    # each of the eight blocks of 60 samples counts about as one
+    assert widened(constant(slow)) == pytest.approx(math.sqrt(60 * 8 / 7), rel=0.1)
+    assert widened(constant(quick)) == 1.0
+
+
+def test_a_misfit_of_one_block_or_of_none_widens_nothing():
+    for problem in (
+        MadeUp(linear(np.ones((3, 1)), [5.0, 5.0, 5.0]), duration=0.2),
+        MadeUp(linear(np.zeros((3, 0))), ()),
+    ):
+        found = problem.evaluate(np.zeros(len(problem.start)))
+        covariance, _ = uncertainty(problem, found)
+        np.testing.assert_array_equal(counting_misfit(problem, found, covariance), covariance)
+
+
+def test_noise_alone_is_counted_about_once():
+    rng = np.random.default_rng(1)
+    assert 1.0 <= widened(constant(rng.normal(size=4800))) < 1.5
+
+
+# -- what the cost bears out ------------------------------------------------------------------------------------------
+
+
+def saturating(top):
+    """One sample whose prediction saturates: seen where it is small, not where it is large."""
+    return lambda x, duration: (
+        np.array([top * np.tanh(x[0] / top)]),
+        np.array([[1.0 / np.cosh(x[0] / top) ** 2]]),
+    )
+
+
+@pytest.mark.parametrize(("top", "kept"), [(1e6, True), (20.0, True), (0.5, False)])
+def test_a_standard_deviation_that_the_cost_does_not_bear_out_grows(top, kept):
+    problem = MadeUp(saturating(top), lower=-np.inf, scales=(1.0,))
+    x = np.zeros(1)
+    found = problem.evaluate(x)
+    std = standing_std(problem, x, found, uncertainty(problem, found)[0])[0]
+    # at 1.96 standard deviations the cost is that of a saturated prediction: 0.5^2 in place of 3.84
+    assert std == pytest.approx(1.0 if kept else 1.96 / 0.5, rel=0.01)
+
+
+def test_a_well_known_parameter_is_not_asked_again():
+    problem = MadeUp(linear([[100.0]]), (1.0,))
+    found = problem.evaluate([1.0])
+    before = len(problem.asked)
+    standing_std(problem, np.ones(1), found, uncertainty(problem, found)[0] * 1e-8)
+    assert len(problem.asked) == before
+
+
+# -- bounds -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("value", "side"), [(0.0, -1), (1e-5, -1), (1e-3, 0), (5.0, 0), (10.0 - 1e-5, 1), (10.0, 1)])
+def test_a_value_near_its_bound_lies_at_it(value, side):
+    assert bound_side(value, 0.0, 10.0, 1.0) == side
+
+
+def test_the_interval_of_a_parameter_at_its_bound_has_one_side():
+    assert one_sided(0.0, 2.0, -1, 0.0) == pytest.approx((0.0, 1.645 * 2.0), abs=1e-3)
+    assert one_sided(9.0, 2.0, 1, 0.0) == pytest.approx((9.0 - 1.645 * 2.0, 9.0), abs=1e-3)
+    # far beyond the bound only the slope counts: slope d = 2.71/2
+    steep = one_sided(0.0, 2.0, -1, 100.0)
+    assert steep[1] == pytest.approx(1.353 / 100.0, rel=0.01)
+
+
+# -- estimates --------------------------------------------------------------------------------------------------------
+
+
+def estimated(problem, x, covariance, fit=GOOD):
+    x = np.asarray(x, float)
+    return estimates(problem, x, problem.evaluate(x), np.asarray(covariance, float), fit)
+
+
+def test_every_parameter_has_its_estimate_and_fixed_ones_are_said_to_be():
+    problem = MadeUp(linear(np.diag([2.5, 0.02]), [-12.5, -1.2]), (4.0, 50.0), fixed=(7.0,), upper=99.0)
+    found = estimated(problem, [5.0, 60.0], np.diag([0.16, 2500.0]))
+    assert list(found) == ["k2", "k1", "k0"]
+    first, second, fixed = found["k0"], found["k1"], found["k2"]
+    assert (first.value, first.std, first.initial, first.verdict) == (5.0, pytest.approx(0.4), 4.0, "identifiable")
+    assert (second.value, second.std, second.initial, second.verdict) == (60.0, pytest.approx(50.0), 50.0, "weak")
+    assert (fixed.value, fixed.std, fixed.initial, fixed.verdict) == (7.0, 0.0, 7.0, "fixed")
+    assert [entry.free for entry in (first, second, fixed)] == [True, True, False]
+    assert (first.unit, first.lower, first.upper, first.interval) == ("N m/rad", 0.0, 99.0, None)
+
+
+def test_of_what_nothing_informs_no_standard_deviation_is_said():
+    problem = MadeUp(linear([[0.02]], [-0.02]), (1.0,))
+    lost = estimated(problem, [1.0], [[2500.0]])["k0"]
+    assert (lost.verdict, lost.std, lost.interval) == ("not_identifiable", math.inf, None)
+    without = estimated(problem, [1.0], [[math.nan]])["k0"]
+    assert (without.verdict, without.std) == ("not_identifiable", math.inf)
+
+
+def test_misfit_takes_the_trust_from_every_parameter_that_is_informed():
+    problem = MadeUp(linear(np.diag([2.5, 1e-9]), [-12.5, 0.0]), (4.0, 50.0))
+    found = estimated(problem, [5.0, 50.0], np.diag([0.16, 1e18]), BAD)
+    assert {name: entry.verdict for name, entry in found.items()} == {"k0": "not_trusted", "k1": "not_identifiable"}
+    assert found["k0"].std == pytest.approx(0.4)
+
+
+def test_a_parameter_at_its_bound_has_an_interval_on_one_side():
+    # the data ask for -1 with a standard deviation of 0.5; the bound is at zero, the other parameter tells the size
+    rows = np.vstack([np.diag([2.0, 50.0]), np.zeros((40, 2))])
+    problem = MadeUp(linear(rows, [2.0, -500.0, *np.zeros(40)]), (3.0, 10.0))
+    at = estimated(problem, [0.0, 10.0], np.diag([0.25, 4e-4]))["k0"]
+    assert at.verdict == "at_bound"
+    pull = 2.0 * 2.0
+    assert at.interval[0] == 0.0
+    assert pull * at.interval[1] + at.interval[1] ** 2 / (2 * 0.25) == pytest.approx(2.706 / 2, rel=1e-3)
+
+
+def test_a_point_that_is_no_fit_says_nothing_of_bounds_and_misfit():
+    problem = MadeUp(linear([[2.0]]), (3.0,), upper=3.0)
+    assert estimated(problem, [3.0], [[0.01]], None)["k0"].verdict == "identifiable"
+
+
+def test_a_stiffness_well_known_to_be_near_zero_is_found():
+    problem = MadeUp(linear(np.diag([10.0, 10.0, 10.0]), [-0.5, -100.0, -200.0]), (3.0, 10.0, 20.0))
+    found = estimated(problem, [0.05, 10.0, 20.0], 0.01 * np.eye(3))
+    assert found["k0"].verdict == "identifiable"
+    alone = MadeUp(linear([[10.0]], [-0.5]), (3.0,))
+    assert estimated(alone, [0.05], [[0.01]])["k0"].verdict == "identifiable", "beside where it started"
+    assert estimated(alone, [0.05], [[0.04]])["k0"].verdict == "weak"
+
+
+def test_the_size_that_a_parameter_might_have():
+    assert typical_sizes(MadeUp(linear(np.eye(1)), (3.0,)), np.ones(1))["k0"] == 3.0
+    assert typical_sizes(MadeUp(linear(np.eye(1)), (3.0,), upper=8.0), np.ones(1))["k0"] == 4.0
+    assert typical_sizes(MadeUp(linear(np.eye(1)), (3.0,), upper=8.0, priors={"k0": 0.5}), np.ones(1))["k0"] == 0.5
+    three = MadeUp(linear(np.eye(2)), (3.0, 5.0), fixed=(9.0,))
+    assert typical_sizes(three, np.array([1.0, 5.0]))["k0"] == 7.0
+    assert typical_sizes(three, np.array([1.0, 0.0]))["k0"] == 9.0
+
+
+@pytest.mark.parametrize(("scale", "expected"), [(1e-7, "not_identifiable"), (1.0, "identifiable")])
+def test_a_standard_deviation_of_a_million_times_value_and_size_is_none(scale, expected):
+    problem = MadeUp(linear([[1.0]]), (0.0,), lower=-np.inf, priors={"k0": 100.0}, scales=(scale,))
+    assert estimated(problem, [0.0], [[0.5**2]])["k0"].verdict == expected
+
+
+def test_rounding_below_zero_is_no_variance_and_no_unknowns_need_none():
+    problem = MadeUp(linear([[1.0]]), (1.0,))
+    assert estimated(problem, [1.0], [[-1e-20]])["k0"].std == 0.0
+    none = MadeUp(linear(np.zeros((1, 0))), (), fixed=(3.0,))
+    assert estimated(none, np.zeros(0), np.zeros((0, 0)))["k0"].verdict == "fixed"
+
+
+def test_initial_states_are_no_parameters_and_a_parameter_of_the_start_is_one():
+    names = ("k", "start.speed_scale", "rest[run]", "start.q.elbow[run]", "start.p.elbow[run]")
+    problem = SimpleNamespace(names=names, shared=("k", "start.speed_scale"), local=("rest",))
+    assert parameter_names(problem) == names[:3]
+
+
+@pytest.mark.parametrize(("count", "asked"), [(MOST_ASKED, True), (MOST_ASKED + 1, False)])
+def test_of_many_parameters_none_is_asked(count, asked):
+    problem = MadeUp(linear(np.eye(count)), np.ones(count))
+    x = np.ones(count)
+    found = problem.evaluate(x)
+    before = len(problem.asked)
+    standing_std(problem, x, found, np.eye(count))
+    assert (len(problem.asked) > before) is asked

@@ -1,0 +1,109 @@
+"""Whether a cable's memory of its start holds for recordings that start in motion: asked of recordings left out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.model.cable import SPEED_SCALE, START_SPEED
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.null_test import USUAL, GapLimits
+from yid_ocp.solvers import Solution, solve
+from yid_ocp.solvers.base import Solver
+from yid_ocp.solvers.linear_model import bounded_step
+
+Array = NDArray[np.float64]
+
+MEMORY = ".memory"
+# A recording whose points move more slowly at its start starts at rest [m/s].
+AT_REST = 0.01
+# Recordings that start in motion, of which one is left out at a time: fewer than that cannot agree.
+FEWEST = 2
+
+
+@dataclass(frozen=True)
+class SafeStart:
+    """A problem and its solution, with memory or without, and why in words; empty where nothing was in question."""
+
+    problem: EstimationProblem
+    solution: Solution
+    message: str = ""
+
+
+def safe_start(problem: EstimationProblem, solver: Solver, solution: Solution, limits: GapLimits = USUAL) -> SafeStart:
+    """The solution, or that without a memory where recordings that start in motion do not bear the memory out.
+
+    Where a cable moves when its recording begins, the load that it bears there is not known, and what it seems to
+    remember may be that motion. Each recording that starts so is predicted from the others alone (one Gauss-Newton
+    step away from the fit of all), with memory and with none; it is kept where that is the smaller error in sum.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    solver : Solver
+        For the fit without memory.
+    solution : Solution
+        Of this problem.
+    limits : GapLimits, optional
+        What makes a residual more than noise.
+    """
+    memory = [name for name in problem.shared if name.endswith(MEMORY)]
+    moving = _moving(problem)
+    if not memory or not moving or solution.evaluation is None:
+        return SafeStart(problem, solution)
+    free = tuple(name for name in problem.free if name not in (*memory, SPEED_SCALE))
+    without = problem.freeing(free).at(dict.fromkeys(memory, 0.0))
+    known = dict(zip(solution.names, solution.x, strict=True))
+    other = solve(without, solver, without.vector(known).tolist(), limits=limits)
+    if other.evaluation is None:
+        return SafeStart(problem, solution)
+    if len(moving) >= FEWEST:
+        kept, dropped = (_left_out(p, s, moving) for p, s in ((problem, solution), (without, other)))
+        if kept < dropped:
+            return SafeStart(problem, solution, f"memory is kept: {_words(kept, dropped)}")
+        return SafeStart(without, other, f"memory is not kept: {_words(kept, dropped)}")
+    return SafeStart(without, other, "memory is not kept: too few recordings start in motion to bear it out")
+
+
+def _words(kept: float, dropped: float) -> str:
+    return (
+        "recordings that start in motion, each predicted from the others, have the root mean square error "
+        f"{kept:.3g} with it and {dropped:.3g} without, in standard deviations"
+    )
+
+
+def _moving(problem: EstimationProblem) -> list[int]:
+    """Recordings that start in motion."""
+    return [
+        i
+        for i, episode in enumerate(problem.episodes)
+        if episode.start is not None and episode.start.values.get(START_SPEED, 0.0) > AT_REST
+    ]
+
+
+def _left_out(problem: EstimationProblem, solution: Solution, moving: list[int]) -> float:
+    """Root mean square of the whitened residuals of recordings, each predicted by parameters from the others."""
+    evaluation = problem.evaluate(solution.x, warm=None if solution.evaluation is None else solution.evaluation.warm)
+    assert evaluation.jacobian is not None
+    total, count = 0.0, 0
+    for i in moving:
+        own = np.concatenate([np.arange(rows.start, rows.stop) for rows in problem.rows.measurements[i]])
+        kept = np.setdiff1d(np.arange(len(evaluation.residual)), own)
+        x = _stepped(problem, solution.x, evaluation.residual[kept], evaluation.jacobian[kept])
+        found = problem.predictor.run(problem.episodes[i], *problem.split(x, i), False)
+        if isinstance(found, str):
+            return np.inf
+        for samples, predicted in zip(problem.episodes[i].samples, found.predicted, strict=True):
+            total += float(np.sum(samples.whitened(predicted) ** 2))
+            count += samples.count
+    return float(np.sqrt(total / max(count, 1)))
+
+
+def _stepped(problem: EstimationProblem, x: Array, residual: Array, jacobian: Array) -> Array:
+    """One Gauss-Newton step within the bounds, of at most the unknowns' size."""
+    lower, upper = problem.bounds
+    size = np.maximum(np.abs(x), problem.scales)
+    low, high = np.maximum((lower - x) / size, -1.0), np.minimum((upper - x) / size, 1.0)
+    return np.asarray(np.clip(x + bounded_step(jacobian * size, residual, 1e-10, low, high) * size, lower, upper))

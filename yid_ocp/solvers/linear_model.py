@@ -1,0 +1,72 @@
+"""The linear model of a residual about a point: its bounded step, and what that step still promises."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.linalg
+import scipy.optimize
+from numpy.typing import NDArray
+
+from yid_ocp.problem.evaluation import Evaluation
+from yid_ocp.problem.problem import EstimationProblem
+
+Array = NDArray[np.float64]
+
+# A fit is at its end where no step promises more than this part of the cost, or this much of it in units of the noise.
+SETTLED, NEGLIGIBLE = 1e-3, 1e-2
+
+
+def bounded_step(jacobian: Array, residual: Array, mu: float, lower: Array, upper: Array) -> Array:
+    """Solve min |J d + r|^2 + mu c |d|^2 with lower <= d <= upper, c the largest squared column norm."""
+    count = jacobian.shape[1]
+    factor = scipy.linalg.qr(np.column_stack([jacobian, residual]), mode="r", check_finite=False)[0][: count + 1]
+    small = np.zeros((count + 1, count + 1))
+    small[: len(factor)] = factor
+    weight = np.sqrt(mu * max(float(np.max(np.sum(jacobian**2, axis=0), initial=0.0)), 1e-300))
+    matrix = np.vstack([small[:, :count], weight * np.eye(count)])
+    target = np.concatenate([-small[:, count], np.zeros(count)])
+    plain = np.linalg.lstsq(matrix, target, rcond=None)[0]
+    if np.all(plain >= lower) and np.all(plain <= upper):
+        return plain
+    low, high = np.minimum(lower, 0.0), np.maximum(upper, 0.0)
+    # the bounded solver wants room between the bounds
+    closed = high - low < 1e-14
+    step = np.zeros(count)
+    if np.all(closed):
+        return step
+    free = ~closed
+    result = scipy.optimize.lsq_linear(matrix[:, free], target, bounds=(low[free], high[free]), method="bvls")
+    step[free] = result.x
+    return step
+
+
+def promised(jacobian: Array, residual: Array, step: Array) -> float:
+    """Fall of 1/2 |r|^2 that the linear model promises for a step."""
+    return -float((jacobian.T @ residual) @ step) - 0.5 * float(np.sum((jacobian @ step) ** 2))
+
+
+def settled(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> bool:
+    """Whether a point is an end of the search: no step of up to the unknowns' size promises a cost worth the name.
+
+    The step is that of the linear model, undamped and within the bounds, so that neither a short step nor a wall of
+    the cost beside a steep row can pass for an end. What holds the unknowns' size is measured by their value or their
+    typical size, whichever is larger.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    x : ndarray, shape (nx,)
+    evaluation : Evaluation
+        At `x`, with its Jacobian.
+    """
+    if evaluation.jacobian is None:
+        return False
+    if not len(x):
+        return True
+    lower, upper = problem.bounds
+    size = np.maximum(np.abs(x), problem.scales)
+    scaled = evaluation.jacobian * size
+    low, high = np.maximum((lower - x) / size, -1.0), np.minimum((upper - x) / size, 1.0)
+    step = bounded_step(scaled, evaluation.residual, 1e-14, low, high)
+    worth = max(SETTLED * evaluation.cost, NEGLIGIBLE * problem.noise**2)
+    return promised(scaled, evaluation.residual, step) <= worth
