@@ -9,7 +9,7 @@ from virtual_examples import SEEDS, SYSTEMS, TRUTH, Runs
 
 import yid_ocp
 from yid_ocp.data.hdf5 import read_recording
-from yid_ocp.data.recording import Recording
+from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.errors import ConfigError
 from yid_ocp.virtual.engine import Simulation, simulate_in_mujoco
 from yid_ocp.virtual.experiment import ArmNoise, PointCamera, VirtualExperiment, paper_system, virtual_experiment
@@ -71,10 +71,41 @@ def test_sensors_have_their_own_noise() -> None:
     assert np.isnan(first.points[1].position).any()
 
 
+def test_torques_are_off_by_a_constant_and_by_white_noise() -> None:
+    system = SYSTEMS[1]
+    motion = multisine(system, TRUTH, seed=1)
+    white = (0.02, 0.04, 0.06, 0.08, 0.1, 0.12, 0.14)
+
+    def joints(noise: ArmNoise, seed: int = 1) -> JointGroup:
+        simulation = Simulation(2.0, time_step=1e-3, controller_rate=200.0, effort_kind="sample")
+        experiment = VirtualExperiment(motion, None, simulation, noise, None, seed=seed)
+        group = virtual_experiment(system, TRUTH, experiment).joints
+        assert group is not None
+        return group
+
+    clean, noisy = joints(ArmNoise()), joints(ArmNoise(effort=white, effort_bias=0.3))
+    other, unstated = joints(ArmNoise(effort_bias=0.3), 2), joints(ArmNoise(effort_bias=0.3, stated=False))
+    assert (clean.effort_kind, clean.effort_std, clean.effort_bias_std) == ("sample", 0.0, 0.0)
+    assert noisy.effort_bias_std == 0.3
+    np.testing.assert_array_equal(noisy.effort_std, white)
+    assert (unstated.effort_std, unstated.effort_bias_std, unstated.position_std) == (None, None, 2e-4)
+    error = noisy.effort - clean.effort
+    offset = (unstated.effort - clean.effort)[0]
+    np.testing.assert_allclose(unstated.effort - clean.effort, np.tile(offset, (201, 1)), rtol=0, atol=1e-12)
+    np.testing.assert_allclose((error - offset).std(0), white, rtol=0.2)
+    assert 0.1 < offset.std() < 0.6
+    assert len(np.unique(offset)) == 7
+    assert not np.allclose((other.effort - clean.effort)[0], offset, atol=0.1)
+    np.testing.assert_array_equal(noisy.position, clean.position)
+
+
 def test_experiments_that_do_not_fit_are_refused() -> None:
     experiment = VirtualExperiment(multisine(SYSTEMS[1], seed=0), camera=PointCamera(("w_T9",)))
     with pytest.raises(ConfigError, match="w_T9"):
         virtual_experiment(SYSTEMS[1], None, experiment)
+    brief = Simulation(0.1, time_step=1e-3)
+    with pytest.raises(ConfigError, match="2 standard deviations for 7 joints"):
+        virtual_experiment(SYSTEMS[1], None, VirtualExperiment(None, None, brief, ArmNoise(effort=(0.1, 0.2))))
     with pytest.raises(ConfigError, match="arms = 3"):
         paper_system(3)
 
