@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 import scipy.stats
-from make_recordings import OFFSETS, TRUTH
+from make_recordings import OFFSETS, ROUGH, SNAP, TRUTH, within_limits
 
 import yid_ocp
 from yid_ocp.config.reader import load_config
@@ -39,7 +39,7 @@ from yid_ocp.files import content_hash, file_sha256, write_json
 from yid_ocp.model.system import System
 from yid_ocp.parallel import Task, TaskResult, process_pool, run_tasks
 from yid_ocp.report.terminal import solve_summary, table
-from yid_ocp.virtual.engine import SimulatedRun, Simulation, simulate_in_mujoco
+from yid_ocp.virtual.engine import Simulation, simulate_in_mujoco
 from yid_ocp.virtual.experiment import ArmNoise, VirtualExperiment, paper_system, virtual_experiment
 from yid_ocp.virtual.motion import Excitation, Motion, multisine
 from yid_ocp.virtual.posture import initial_posture
@@ -52,9 +52,8 @@ DURATION = 5.0  # [s]
 INNER_STEP = 5e-5  # [s]
 TRIAL_STEP = 2.5e-4  # of the run that shows whether a motion will do [s]
 TRAVEL = {False: 0.11, True: 0.05}  # by whether the Y starts undeformed, where two arms soon bring it to snap [m]
-SHAKE = 0.6  # [N m]
+SHAKE = ROUGH.shake  # [N m]
 SPREAD = 0.25  # of the logarithm of the true stiffnesses, either way
-SNAP = 1.5  # a joint of the object that is faster has snapped or is about to [rad/s]
 ATTEMPTS = 50
 
 JUDGED = ("identifiable", "weak")
@@ -179,16 +178,6 @@ def _gentle_enough(
         if within_limits(system, simulate_in_mujoco(system, truth, motion, trial, posture=posture)):
             return motion, seed
     raise ModelError(f"none of {ATTEMPTS} motions stays within the limits", hint="let the arms travel less")
-
-
-def within_limits(system: System, run: SimulatedRun) -> bool:
-    """Whether no arm joint exceeds its torque or velocity, and no joint of the object is as fast as in a snap."""
-    driven = list(system.driven_indices)
-    torque = np.array([system.mechanism.joints[j].effort_limit for j in driven])
-    speed = np.array([system.mechanism.joints[j].velocity_limit for j in driven])
-    of_object = np.setdiff1d(np.arange(system.size), driven)
-    strong = np.all(np.abs(run.effort) <= torque) and np.all(np.abs(run.v[:, driven]) <= speed)
-    return bool(strong and np.abs(run.v[:, of_object]).max() <= SNAP)
 
 
 # -- solutions --------------------------------------------------------------------------------------------------------

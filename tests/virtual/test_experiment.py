@@ -1,7 +1,10 @@
 from __future__ import annotations
 
 import importlib.util
+import sys
+from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -125,19 +128,45 @@ def test_default_recordings() -> None:
         assert {group.name for group in recording.points} == expected
 
 
-def test_default_recordings_are_reproducible() -> None:
+def recipe() -> ModuleType:
+    """The module benchmarks/make_recordings.py."""
     script = Path(__file__).resolve().parents[2] / "benchmarks" / "make_recordings.py"
     spec = importlib.util.spec_from_file_location("make_recordings", script)
     assert spec is not None
     assert spec.loader is not None
     made = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = made  # dataclasses look their module up
     spec.loader.exec_module(made)
+    return made
+
+
+def test_default_recordings_are_reproducible() -> None:
+    made = recipe()
     system = SYSTEMS[2]
     posture = initial_posture(system, made.TRUTH, offsets=made.OFFSETS[2])
-    seed, travel = made.MOTION_SEEDS[2, "estimate"], made.TRAVEL[2]
+    seed, travel = made.CLEAN.motion_seeds[2, "estimate"], made.CLEAN.travel[2]
     motion = multisine(system, made.TRUTH, seed=seed, posture=posture, excitation=Excitation(travel=travel))
     simulation = Simulation(1.0, time_step=made.INNER_STEP)
     run = simulate_in_mujoco(system, made.TRUTH, motion, simulation, posture=posture)
     joints = read_recording(DEFAULTS / "dual_arm_no_vision_estimate.h5").joints
     assert joints is not None
     np.testing.assert_allclose(joints.effort[:101], run.effort, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("arms", [1, 2])
+@pytest.mark.parametrize("purpose", ["estimate", "held_out"])
+def test_rough_recordings_are_as_rough_as_a_real_arm_and_within_its_limits(arms: int, purpose: str) -> None:
+    made, system = recipe(), SYSTEMS[arms]
+    rough = made.ROUGH
+    posture = initial_posture(system, made.TRUTH, offsets=made.OFFSETS[arms])
+    excitation = Excitation(travel=rough.travel[arms], shake=rough.shake)
+    motion = multisine(
+        system, made.TRUTH, seed=rough.motion_seeds[arms, purpose], posture=posture, excitation=excitation
+    )
+    simulation = replace(rough.simulation, time_step=2.5e-4)
+    run = simulate_in_mujoco(system, made.TRUTH, motion, simulation, posture=posture)
+    assert made.within_limits(system, run)
+    second = np.diff(run.effort, 2, axis=0).std(0)
+    assert np.all((second > 0.03) & (second < 0.35))
+    assert not made.within_limits(system, replace(run, v=10 * run.v))
+    assert not made.within_limits(system, replace(run, effort=2 * run.effort))

@@ -1,0 +1,139 @@
+"""Scores of `benchmarks/coverage.py`, and a small part of what it does."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco", reason="twins are made in MuJoCo: pip install 'yid-ocp[blind]'")
+
+
+@pytest.fixture(scope="module")
+def coverage(repository: Path) -> ModuleType:
+    """The module benchmarks/coverage.py, under a name of its own."""
+    path, folder = list(sys.path), repository / "benchmarks"
+    spec = importlib.util.spec_from_file_location("benchmark_coverage", folder / "coverage.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    sys.path.insert(0, str(folder))
+    try:
+        spec.loader.exec_module(module)
+    finally:
+        sys.path[:] = path
+    return module
+
+
+def twin(coverage: ModuleType, z: dict[str, float | None], verdict: str = "identifiable", **found: Any) -> Any:
+    """A twin whose estimates are off by so many standard deviations of 0.5; None for a std that is not known."""
+    parameters = {
+        name: {"value": 10.0 + 0.5 * (value or 0.0), "std": None if value is None else 0.5, "verdict": verdict}
+        for name, value in z.items()
+    }
+    common = {"status": "converged", "seconds": 1.0, "chi2_per_dof": 1.0, "diagnose": False}
+    return coverage.Twin(dict.fromkeys(z, 10.0), {**common, "parameters": parameters, **found})
+
+
+def drawn(coverage: ModuleType, scale: float, count: int = 100) -> list[Any]:
+    """Twins whose z are normal quantiles times a scale."""
+    quantiles = coverage.scipy.stats.norm.ppf((np.arange(count) + 0.5) / count)
+    return [twin(coverage, {"T1.bend": scale * value, "T2.bend": -scale * value}) for value in quantiles]
+
+
+def test_only_parameters_that_are_called_found_or_weak_count(coverage: ModuleType) -> None:
+    assert twin(coverage, {"T1.bend": 2.0, "T3.twist": None}).z == {"T1.bend": pytest.approx(2.0)}
+    assert twin(coverage, {"T1.bend": -2.0}, "weak").z == {"T1.bend": pytest.approx(-2.0)}
+    for verdict in ("fixed", "not_identifiable", "at_bound", "not_trusted"):
+        assert twin(coverage, {"T1.bend": 2.0}, verdict).z == {}
+    assert twin(coverage, {"T1.bend": 2.0}, status="failed").z == {}
+    assert coverage.Twin(error="none of 50 motions").z == {}
+
+
+def test_a_group_has_four_hundred_values_of_the_right_size(coverage: ModuleType) -> None:
+    pools = {scale: coverage.pooled("white_0.1", drawn(coverage, scale, 200)) for scale in (0.7, 1.0, 1.3)}
+    assert {scale: pool.honest for scale, pool in pools.items()} == {0.7: False, 1.0: True, 1.3: False}
+    assert pools[1.0].rms == pytest.approx(1.0, abs=0.01)
+    assert pools[1.0].covered == pytest.approx(0.95, abs=0.005)
+    assert not coverage.pooled("white_0.1", drawn(coverage, 1.0, 100)).honest
+
+
+def test_intervals_are_judged_beside_the_size(coverage: ModuleType) -> None:
+    always = [twin(coverage, {"T1.bend": 1.0 if k % 2 else -1.0}) for k in range(400)]
+    pool = coverage.pooled("white_0.1", always)
+    assert (pool.rms, pool.covered) == (pytest.approx(1.0), 1.0)
+    assert not pool.honest
+
+
+def test_a_parameter_lies_in_the_band_of_chi_squared(coverage: ModuleType) -> None:
+    # 40 degrees of freedom: the central 99.9 % is 16.906 to 76.095
+    assert [coverage.in_band(total, 40) for total in (16.0, 17.0, 76.0, 77.0)] == [False, True, True, False]
+    twins = [twin(coverage, {"T1.bend": 1.5, "T2.bend": 1.0}) for _ in range(40)]
+    assert coverage.pooled("white_0.1", twins).outside == ("T1.bend",)
+
+
+def test_cells_are_joined_until_there_are_enough_values(coverage: ModuleType) -> None:
+    names = ("no_torque_error", "white_0.1", "white_0.5", "offsets_0.3", "mean_2khz")
+    pools = [coverage.pooled(name, drawn(coverage, 1.0)) for name in names]
+    groups = coverage.grouped(pools)
+    assert [group.cells for group in groups] == [names[:2], names[2:]]
+    assert [len(group.values) for group in groups] == [400, 600]
+    assert [group.cells for group in coverage.grouped(pools[:1])] == [names[:1]]
+
+
+def test_what_is_not_as_it_should_be_is_said(coverage: ModuleType) -> None:
+    good = {"white_0.1": drawn(coverage, 1.0, 200)}
+    assert coverage.shortcomings(good) == []
+    bad = coverage.shortcomings({"white_0.1": [*drawn(coverage, 2.0, 200), coverage.Twin(error="no motion")]})
+    assert bad[0] == "white_0.1: 1 of 201 twins have no estimate"
+    assert bad[1:3] == [f"white_0.1: {name} lies outside its band" for name in ("T1.bend", "T2.bend")]
+    assert "rms 1.99, 67.0 % covered" in bad[3]
+    assert "too few to judge" in coverage.shortcomings({"white_0.1": drawn(coverage, 1.0, 10)})[0]
+
+
+def test_errors_that_nobody_states_must_not_pass_for_findings(coverage: ModuleType) -> None:
+    def entries(silent: int, **changed: Any) -> list[Any]:
+        warned = twin(coverage, {"T1.bend": 9.0}, "not_trusted", diagnose=True)
+        other = twin(coverage, {"T1.bend": 9.0}, **{"verdict": "not_trusted", "diagnose": True, **changed})
+        return [warned] * silent + [other] * (40 - silent)
+
+    for changed in ({"verdict": "identifiable"}, {"verdict": "weak"}, {"diagnose": False}, {"status": "failed"}):
+        lines = coverage.shortcomings({"offsets_unstated": entries(37, **changed)})
+        assert any("37 of 40 twins warn" in line for line in lines)
+        assert not any(
+            "twins warn" in line for line in coverage.shortcomings({"offsets_unstated": entries(38, **changed)})
+        )
+    assert "white_0.1" in coverage.CELLS
+    assert not coverage.CELLS["offsets_unstated"].stated
+
+
+def test_every_cell_has_its_row(coverage: ModuleType) -> None:
+    twins = {"white_0.1": drawn(coverage, 1.0), "offsets_unstated": [coverage.Twin(error="no motion")]}
+    lines = coverage.report(twins)
+    assert [line.split()[0] for line in lines[2:4]] == list(twins)
+    assert "offsets_unstated: no motion" in lines
+
+
+def test_recipes_and_code_decide_what_is_kept(coverage: ModuleType, tmp_path: Path) -> None:
+    recipes = [cell.recipe for cell in coverage.CELLS.values()]
+    steps, base = coverage.CELLS["steps_5ms"], coverage.CELLS["no_torque_error"]
+    assert steps.recipe == base.recipe  # how a twin is solved does not change its recording
+    assert len({coverage.content_hash(recipe) for recipe in recipes}) == len(recipes) - 1
+    (tmp_path / "a.py").write_text("a = 1\n")
+    first = coverage.code_hash(tmp_path)
+    (tmp_path / "a.pyc").write_text("compiled")
+    assert coverage.code_hash(tmp_path) == first
+    (tmp_path / "a.py").write_text("a = 2\n")
+    assert coverage.code_hash(tmp_path) != first
+
+
+@pytest.mark.slow
+def test_twins_without_torque_error(coverage: ModuleType, tmp_path: Path) -> None:
+    """Six twins of one arm: what is called found lies within the band of chi-squared for all of them together."""
+    ...
