@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 import scipy.stats
-from make_recordings import OFFSETS, ROUGH, SNAP, TRUTH, within_limits
+from make_recordings import OFFSETS, SNAP, TRUTH, within_limits
 
 import yid_ocp
 from yid_ocp.config.reader import load_config
@@ -52,7 +52,7 @@ DURATION = 5.0  # [s]
 INNER_STEP = 5e-5  # [s]
 TRIAL_STEP = 2.5e-4  # of the run that shows whether a motion will do [s]
 TRAVEL = {False: 0.11, True: 0.05}  # by whether the Y starts undeformed, where two arms soon bring it to snap [m]
-SHAKE = ROUGH.shake  # [N m]
+SHAKE = 0.6  # gives second differences as large as a real arm's without any noise [N m]
 SPREAD = 0.25  # of the logarithm of the true stiffnesses, either way
 ATTEMPTS = 50
 

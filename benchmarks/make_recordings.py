@@ -5,9 +5,9 @@
 The motions (seeds) are such that no torque exceeds Baxter's limits and the Y does not snap from one shape to another.
 
 `clean` torques are held over each sample and recorded without an error. `rough` ones are like those of the real arm, as
-`torque_noise.py` finds them: a controller at 1 kHz of which every tenth torque is recorded, arms that shake until
-torques differ as much from sample to sample, white noise and a constant offset for each joint. Their files begin with
-`rough_`.
+`torque_noise.py` finds them: a controller at 1 kHz of which every tenth torque is recorded, white noise, a constant
+offset for each joint, and arms that shake until torques differ as much from sample to sample, noise included. Their
+files begin with `rough_`.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ ROUGH = Torques(
     prefix="rough_",
     motion_seeds={(1, "estimate"): 7, (1, "held_out"): 2, (2, "estimate"): 7, (2, "held_out"): 2},
     travel={1: 0.11, 2: 0.13},
-    shake=0.6,
+    shake=0.3,
     simulation=Simulation(time_step=INNER_STEP, controller_rate=1000.0, effort_kind="sample"),
     white=WHITE,
     offset=OFFSET,

@@ -166,7 +166,10 @@ def test_rough_recordings_are_as_rough_as_a_real_arm_and_within_its_limits(arms:
     simulation = replace(rough.simulation, time_step=2.5e-4)
     run = simulate_in_mujoco(system, made.TRUTH, motion, simulation, posture=posture)
     assert made.within_limits(system, run)
-    second = np.diff(run.effort, 2, axis=0).std(0)
-    assert np.all((second > 0.03) & (second < 0.35))
+    noise = np.sqrt(6) * np.array(arms * rough.white)  # of the second difference
+    second = np.hypot(np.diff(run.effort, 2, axis=0).std(0), noise)
+    measured = np.array(arms * [0.274, 0.206, 0.293, 0.174, 0.109, 0.123, 0.035])
+    last = np.arange(7 * arms) % 7 == 6  # the light last wrist shakes more than the real one
+    assert np.all((second > 0.65 * measured) & (second < np.where(last, 2.5, 1.4) * measured))
     assert not made.within_limits(system, replace(run, v=10 * run.v))
     assert not made.within_limits(system, replace(run, effort=2 * run.effort))
