@@ -392,7 +392,7 @@ def run(names: Sequence[str], number: int, jobs: int, out: Path) -> dict[str, li
             )
             for name, k in twins
         ]
-        made = run_tasks(make_twin, tasks, out / "made", pool, _progress)
+        made = run_tasks(make_twin, tasks, out / "made", pool, print_progress)
         whole = [i for i, entry in enumerate(made) if not entry.error]
         tasks = [
             Task(
@@ -406,7 +406,7 @@ def run(names: Sequence[str], number: int, jobs: int, out: Path) -> dict[str, li
             )
             for i in whole
         ]
-        solved = dict(zip(whole, run_tasks(solve_twin, tasks, out / "solved", pool, _progress), strict=True))
+        solved = dict(zip(whole, run_tasks(solve_twin, tasks, out / "solved", pool, print_progress), strict=True))
     found: dict[str, list[Twin]] = {name: [] for name in names}
     for i, (name, _) in enumerate(twins):
         found[name].append(_twin(made[i], solved.get(i)))
@@ -419,7 +419,7 @@ def _twin(made: TaskResult, solved: TaskResult | None) -> Twin:
     return Twin(made.value["truth"], solved.value or {}, solved.error)
 
 
-def _progress(done: int, total: int, text: str) -> None:
+def print_progress(done: int, total: int, text: str) -> None:
     print(f"{done} of {total}: {text}", file=sys.stderr, flush=True)
 
 
