@@ -22,6 +22,7 @@ from make_recordings import OFFSET, OFFSETS, ROUGH, TRUTH, WHITE
 
 from yid_ocp.analysis.compare import PUBLISHED
 from yid_ocp.data.hdf5 import write_recording
+from yid_ocp.errors import ModelError
 from yid_ocp.files import content_hash, write_json
 from yid_ocp.parallel import Task, process_pool, run_tasks
 from yid_ocp.report.terminal import table
@@ -85,6 +86,9 @@ def run(
             for experiment, errors, k in keys
         ]
         made = run_tasks(make_member, tasks, out / "made", pool, print_progress)
+        lost = [entry for entry in made if entry.error]
+        if lost:
+            raise ModelError(f"{lost[0].name} failed: {lost[0].error}")
         tasks = [
             Task(
                 f"solution {k} of {experiment}, {errors}",

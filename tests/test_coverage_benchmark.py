@@ -1,4 +1,4 @@
-"""Scores of `benchmarks/coverage.py`, and a small part of what it does."""
+"""Scores of `benchmarks/coverage.py` and a small part of what it does; the arithmetic of its neighbours on torques."""
 
 from __future__ import annotations
 
@@ -11,24 +11,40 @@ from typing import Any
 import numpy as np
 import pytest
 
+from yid_ocp.data import JointGroup, Recording
+
 pytest.importorskip("mujoco", reason="twins are made in MuJoCo: pip install 'yid-ocp[blind]'")
 
 
-@pytest.fixture(scope="module")
-def coverage(repository: Path) -> ModuleType:
-    """The module benchmarks/coverage.py, under a name of its own."""
-    path, folder = list(sys.path), repository / "benchmarks"
-    spec = importlib.util.spec_from_file_location("benchmark_coverage", folder / "coverage.py")
+def loaded(folder: Path, name: str) -> ModuleType:
+    """A module of the benchmarks, and those that it imports from there."""
+    path = list(sys.path)
+    spec = importlib.util.spec_from_file_location(name, folder / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
+    before = sys.modules.get(name)
+    sys.modules[name] = module  # dataclasses look their module up, and neighbours import it
     sys.path.insert(0, str(folder))
     try:
         spec.loader.exec_module(module)
     finally:
         sys.path[:] = path
+        if before is not None:
+            sys.modules[name] = before
     return module
+
+
+@pytest.fixture(scope="module")
+def coverage(repository: Path) -> ModuleType:
+    """The module benchmarks/coverage.py; a package of the same name may be loaded already."""
+    return loaded(repository / "benchmarks", "coverage")
+
+
+@pytest.fixture(scope="module")
+def torque_noise(repository: Path) -> ModuleType:
+    """The module benchmarks/torque_noise.py."""
+    return loaded(repository / "benchmarks", "torque_noise")
 
 
 def twin(coverage: ModuleType, z: dict[str, float | None], verdict: str = "identifiable", **found: Any) -> Any:
@@ -134,6 +150,29 @@ def test_recipes_and_code_decide_what_is_kept(coverage: ModuleType, tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_twins_without_torque_error(coverage: ModuleType, tmp_path: Path) -> None:
-    """Six twins of one arm: what is called found lies within the band of chi-squared for all of them together."""
-    ...
+@pytest.mark.parametrize("cell", ["no_torque_error"])
+def test_standard_deviations_of_a_few_twins(coverage: ModuleType, tmp_path: Path, cell: str) -> None:
+    """Six twins of a cell that holds: all z values together lie within the 99.9 % band of chi-squared."""
+    chosen, twins = coverage.CELLS[cell], []
+    for number in range(6):
+        made = coverage.make_twin(cell, chosen.recipe, number, str(tmp_path), "test")
+        assert min(made["roughness"][:6]) > 0.03
+        found = coverage.solve_twin(chosen.config, Path(made["file"]), list(chosen.settings), "test")
+        twins.append(coverage.Twin(made["truth"], found))
+    assert len({tuple(twin.truth.values()) for twin in twins}) == 6
+    assert not any(twin.failed for twin in twins)
+    values = coverage.pooled(cell, twins).values
+    assert len(values) >= 18
+    assert coverage.in_band(float(values @ values), len(values))
+
+
+def test_white_noise_is_told_from_a_motion(torque_noise: ModuleType) -> None:
+    rng, t = np.random.default_rng(0), np.arange(5000) / 100
+    std = np.array([0.02, 0.1])
+    motion = 5.0 * np.sin(2 * np.pi * 1.3 * t)[:, None] + 8.0
+    effort = motion + std * rng.standard_normal((5000, 2))
+    recording = Recording(JointGroup(("a", "b"), t, np.zeros((5000, 2)), effort=effort))
+    np.testing.assert_allclose(torque_noise.white_std(recording), std, rtol=0.1)
+    smooth = Recording(JointGroup(("a", "b"), t, np.zeros((5000, 2)), effort=np.hstack([motion, motion])))
+    expected = 5.0 / np.sqrt(2) * (2 - 2 * np.cos(2 * np.pi * 1.3 / 100))
+    np.testing.assert_allclose(torque_noise.roughness(smooth), expected, rtol=1e-2)
