@@ -1,6 +1,6 @@
 """Whether the standard deviations of `solve` are true: cells of MuJoCo twins whose truth is known.
 
-    python benchmarks/coverage.py --out FOLDER [CELL ...] [--twins 40] [--jobs 2]
+    python benchmarks/coverage.py --out FOLDER [CELL ...] [--twins 40] [--jobs 2] [--record-only]
 
 A cell is a kind of experiment: arms, noise of the torques, controller, start, sensors, time step. Each of its twins
 has a motion, noise and stiffnesses of its own, drawn around those of the embedded recordings, and is solved as a user
@@ -22,6 +22,7 @@ import sys
 import tempfile
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -378,39 +379,45 @@ def _median(values: Sequence[float]) -> str:
 # -- the run ----------------------------------------------------------------------------------------------------------
 
 
-def run(names: Sequence[str], number: int, jobs: int, out: Path) -> dict[str, list[Twin]]:
-    """Record and solve the twins of some cells, in `jobs` processes; what stands in the folder is not done again."""
+def record(names: Sequence[str], number: int, pool: Executor, out: Path) -> dict[str, list[TaskResult]]:
+    """Record so many twins of some cells; what stands in the folder is not done again."""
     recordings = out.resolve() / "recordings"
     recordings.mkdir(parents=True, exist_ok=True)
-    maker, estimator = code_hash(PACKAGE / "virtual"), code_hash(PACKAGE)
-    twins = [(name, k) for name in names for k in range(number)]
-    with process_pool(jobs) as pool:
-        tasks = [
-            Task(
-                f"recording {k} of {name}",
-                {"cell": name, "recipe": CELLS[name].recipe, "number": k, "folder": str(recordings), "code": maker},
-            )
-            for name, k in twins
-        ]
-        made = run_tasks(make_twin, tasks, out / "made", pool, print_progress)
-        whole = [i for i, entry in enumerate(made) if not entry.error]
-        tasks = [
-            Task(
-                f"solution {twins[i][1]} of {twins[i][0]}",
-                {
-                    "config": CELLS[twins[i][0]].config,
-                    "recording": Path(made[i].value["file"]),
-                    "settings": list(CELLS[twins[i][0]].settings),
-                    "code": estimator,
-                },
-            )
-            for i in whole
-        ]
-        solved = dict(zip(whole, run_tasks(solve_twin, tasks, out / "solved", pool, print_progress), strict=True))
-    found: dict[str, list[Twin]] = {name: [] for name in names}
-    for i, (name, _) in enumerate(twins):
-        found[name].append(_twin(made[i], solved.get(i)))
-    return found
+    code = code_hash(PACKAGE / "virtual")
+    tasks = [
+        Task(
+            f"recording {k} of {name}",
+            {"cell": name, "recipe": CELLS[name].recipe, "number": k, "folder": str(recordings), "code": code},
+        )
+        for name in names
+        for k in range(number)
+    ]
+    made = run_tasks(make_twin, tasks, out / "made", pool, print_progress)
+    return {name: made[i * number : (i + 1) * number] for i, name in enumerate(names)}
+
+
+def solve(made: Mapping[str, Sequence[TaskResult]], pool: Executor, out: Path) -> dict[str, list[Twin]]:
+    """Solve the twins that were recorded; what stands in the folder is not done again."""
+    code = code_hash(PACKAGE)
+    whole = [(name, entry) for name, entries in made.items() for entry in entries if not entry.error]
+    tasks = [
+        Task(
+            f"solution of {entry.name}",
+            {
+                "config": CELLS[name].config,
+                "recording": Path(entry.value["file"]),
+                "settings": list(CELLS[name].settings),
+                "code": code,
+            },
+        )
+        for name, entry in whole
+    ]
+    solved = run_tasks(solve_twin, tasks, out / "solved", pool, print_progress)
+    done = {entry.value["file"]: result for (_, entry), result in zip(whole, solved, strict=True)}
+    return {
+        name: [_twin(entry, None if entry.error else done[entry.value["file"]]) for entry in entries]
+        for name, entries in made.items()
+    }
 
 
 def _twin(made: TaskResult, solved: TaskResult | None) -> Twin:
@@ -429,12 +436,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--twins", type=int, default=40, help="of each cell")
     parser.add_argument("--jobs", type=int, default=None, help="processes; as many as there are processors when absent")
     parser.add_argument("--out", type=Path, required=True, help="folder of recordings and solutions")
+    parser.add_argument("--record-only", action="store_true", help="make the recordings, to be solved later")
     chosen = parser.parse_args(arguments)
     unknown = sorted(set(chosen.cells) - set(CELLS))
     if unknown:
         parser.error(f"there is no cell '{unknown[0]}'; choose from {', '.join(CELLS)}")
     names = [name for name in CELLS if name in chosen.cells or not chosen.cells]
-    twins = run(names, chosen.twins, chosen.jobs, chosen.out)
+    with process_pool(chosen.jobs) as pool:
+        made = record(names, chosen.twins, pool, chosen.out)
+        if chosen.record_only:
+            return 1 if any(entry.error for entries in made.values() for entry in entries) else 0
+        twins = solve(made, pool, chosen.out)
     write_json(
         chosen.out / "coverage.json", {cell: [asdict(twin) for twin in entries] for cell, entries in twins.items()}
     )
