@@ -73,8 +73,8 @@ class Torques:
     shake : float
         [N m]
     simulation : Simulation
-    white, offset : tuple of float, length 7
-        Standard deviations of the noise of one arm's torques [N m].
+    white, offset : tuple of float, length 7 or none
+        Standard deviations of the noise of one arm's torques [N m]; empty where there is none.
     """
 
     prefix: str
@@ -87,7 +87,7 @@ class Torques:
 
     def noise(self, arms: int) -> ArmNoise:
         """What the arms measure."""
-        return ArmNoise(effort=arms * self.white, effort_bias=arms * self.offset)
+        return ArmNoise(effort=arms * self.white or 0.0, effort_bias=arms * self.offset or 0.0)
 
 
 CLEAN = Torques(
@@ -96,8 +96,8 @@ CLEAN = Torques(
     travel=TRAVEL,
     shake=0.0,
     simulation=Simulation(time_step=INNER_STEP),
-    white=(0.0,) * 7,
-    offset=(0.0,) * 7,
+    white=(),
+    offset=(),
 )
 ROUGH = Torques(
     prefix="rough_",

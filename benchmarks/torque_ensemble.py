@@ -31,12 +31,12 @@ from yid_ocp.virtual.motion import Excitation, multisine
 from yid_ocp.virtual.posture import initial_posture
 
 ERRORS: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
-    "none": ((0.0,) * 7, (0.0,) * 7),
-    "white": (WHITE, (0.0,) * 7),
-    "offsets": ((0.0,) * 7, (0.3,) * 7),
+    "none": ((), ()),
+    "white": (WHITE, ()),
+    "offsets": ((), (0.3,) * 7),
     "both": (WHITE, OFFSET),
 }
-"""White noise and constant offset of one arm's torques, standard deviations [N m]."""
+"""White noise and constant offset of one arm's torques, standard deviations [N m]; empty for none."""
 METHOD = ("solver={name: steepest_descent, iterations: 200}", "problem.weighting=paper", "compare.published=null")
 
 

@@ -415,7 +415,16 @@ class LayoutBuilder:
         motion = multisine(system, values, seed=seed, posture=posture, excitation=excitation)
         run = simulate_in_mujoco(system, values, motion, Simulation(duration), posture=posture)
         driven = list(system.driven_indices)
-        joints = JointGroup(system.driven, run.t, run.q[:, driven], effort=run.effort, position_std=0.0, effort_std=0.0)
+        joints = JointGroup(
+            system.driven,
+            run.t,
+            run.q[:, driven],
+            effort=run.effort,
+            position_std=0.0,
+            effort_std=0.0,
+            effort_bias_std=0.0,
+            effort_kind="command",
+        )
         beyond: dict[str, list[str]] = {"range": [], "torque": []}
         for k, name in enumerate(system.driven):
             joint = system.mechanism.joints[driven[k]]

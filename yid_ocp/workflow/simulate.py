@@ -199,6 +199,7 @@ def _joints(
         effort=_noisy(effort, np.broadcast_to(0.0 if effort_std is None else own(effort_std), effort.shape), rng),
         position_std=own(position_std),
         effort_std=own(effort_std),
+        effort_kind="command",  # the model holds it over a step
     )
 
 
