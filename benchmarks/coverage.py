@@ -52,7 +52,7 @@ CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 DURATION = 5.0  # [s]
 INNER_STEP = 5e-5  # [s]
 TRIAL_STEP = 2.5e-4  # of the run that shows whether a motion will do [s]
-TRAVEL = {False: 0.11, True: 0.05}  # by whether the Y starts undeformed, where two arms soon bring it to snap [m]
+TRAVEL = {False: 0.11, True: 0.08}  # by whether the Y starts undeformed, where two arms soon bring it to snap [m]
 SHAKE = 0.6  # gives second differences as large as a real arm's without any noise [N m]
 SPREAD = 0.25  # of the logarithm of the true stiffnesses, either way
 ATTEMPTS = 50
@@ -116,10 +116,10 @@ CELLS: Mapping[str, Cell] = {
     "offsets_0.3": Cell(effort_bias=0.3),
     "mean_2khz": Cell(controller_rate=2000.0, effort_kind="mean"),
     "sample_2khz": Cell(controller_rate=2000.0, effort_kind="sample"),
-    "undeformed_start": Cell(undeformed=True),
+    "undeformed_start": Cell(controller_rate=2000.0, effort_kind="sample", undeformed=True),
     "encoders_only": Cell(effort=0.1, sees=()),
     "prescribed_one_grasp": Cell(arms=1, effort=0.1, sees=("points_camera",), settings=PRESCRIBED),
-    "prescribed_two_grasps": Cell(effort=0.1, sees=("points_camera",), settings=PRESCRIBED),
+    "prescribed_two_grasps": Cell(effort=0.1, undeformed=True, sees=("points_camera",), settings=PRESCRIBED),
     "steps_5ms": Cell(settings=("problem.time_step=0.005",)),
     "both_noises_one_arm": Cell(arms=1, effort=0.1, effort_bias=0.3),
     "both_noises_two_arms": Cell(effort=0.1, effort_bias=0.3),
