@@ -123,14 +123,17 @@ def report(found: Mapping[str, Mapping[str, Any]]) -> list[str]:
         rows: list[Sequence[str]] = [(experiment, "truth", "published", *by_errors)]
         for name, truth in TRUTH.items():
             published = PUBLISHED[experiment][name]
-            cells = []
-            for values in (entry[name] for entry in by_errors.values()):
-                mark = "*" if values and explained(published, values) else ""
-                low, middle, high = np.quantile(values, [0.0, 0.5, 1.0]) if values else (np.nan,) * 3
-                cells.append(f"{low:.3g} .. {middle:.3g} .. {high:.3g}{mark}")
+            cells = [_range(entry[name], published) for entry in by_errors.values()]
             rows.append((name, f"{truth:g}", f"{published:g}", *cells))
         lines += [*table(rows), ""]
     return [*lines, "smallest .. median .. largest value; * holds the published one"]
+
+
+def _range(values: Sequence[float], published: float) -> str:
+    if not values:
+        return "-"
+    low, middle, high = np.quantile(values, [0.0, 0.5, 1.0])
+    return f"{low:.3g} .. {middle:.3g} .. {high:.3g}{'*' if explained(published, values) else ''}"
 
 
 def main() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -45,6 +46,14 @@ def coverage(repository: Path) -> ModuleType:
 def torque_noise(repository: Path) -> ModuleType:
     """The module benchmarks/torque_noise.py."""
     return loaded(repository / "benchmarks", "torque_noise")
+
+
+@pytest.fixture(scope="module")
+def torque_ensemble(repository: Path, coverage: ModuleType) -> Iterator[ModuleType]:
+    """The module benchmarks/torque_ensemble.py, which imports coverage.py beside it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, "coverage", coverage)
+        yield loaded(repository / "benchmarks", "torque_ensemble")
 
 
 def twin(coverage: ModuleType, z: dict[str, float | None], verdict: str = "identifiable", **found: Any) -> Any:
@@ -176,3 +185,29 @@ def test_white_noise_is_told_from_a_motion(torque_noise: ModuleType) -> None:
     smooth = Recording(JointGroup(("a", "b"), t, np.zeros((5000, 2)), effort=np.hstack([motion, motion])))
     expected = 5.0 / np.sqrt(2) * (2 - 2 * np.cos(2 * np.pi * 1.3 / 100))
     np.testing.assert_allclose(torque_noise.roughness(smooth), expected, rtol=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("published", "values", "expected"),
+    [
+        (3.2, [1.0, 5.0], True),
+        (3.2, [3.3, 5.0], False),
+        (3.2, [1.0, 3.1], False),
+        (0.0, [1e-7, 5.0], True),  # driven to the bound
+        (0.0, [0.04, 5.0], True),
+        (0.0, [0.06, 5.0], False),
+    ],
+)
+def test_a_published_value_is_explained_by_members_around_it(
+    torque_ensemble: ModuleType, published: float, values: list[float], expected: bool
+) -> None:
+    assert torque_ensemble.explained(published, values) is expected
+
+
+def test_the_ensemble_stands_beside_what_was_published(torque_ensemble: ModuleType) -> None:
+    members = {name: [0.5 * value, value, 2 * value] for name, value in torque_ensemble.TRUTH.items()}
+    none = {name: [] for name in members}
+    lines = torque_ensemble.report({"single_arm_no_vision": {"offsets": members, "both": none}})
+    bend = next(line for line in lines if line.startswith("T1.bend"))
+    assert bend.split() == ["T1.bend", "22", "23.78", "11", "..", "22", "..", "44*", "-"]
+    assert "*" not in next(line for line in lines if line.startswith("T1.twist"))
