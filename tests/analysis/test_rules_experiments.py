@@ -224,7 +224,9 @@ def test_another_motion_starts_where_the_recording_does_and_goes_as_far(moving, 
     assert (recording.name, notes, recording.points) == ("run", [], ())
     assert recording.joints.names == ("shoulder", "elbow")
     np.testing.assert_array_equal(recording.joints.position, np.zeros((3, 2)))
-    assert (recording.joints.position_std, recording.joints.effort_std) == (0.0, 0.0)
+    joints = recording.joints
+    assert (joints.position_std, joints.effort_std, joints.effort_bias_std) == (0.0, 0.0, 0.0)
+    assert joints.effort_kind == "command"
 
 
 @pytest.mark.parametrize(

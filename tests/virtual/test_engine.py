@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -11,7 +12,7 @@ from virtual_examples import SYSTEMS, TRUTH, Runs
 from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.model.kinematics import forward_kinematics, rigid_body
 from yid_ocp.model.system import Grasp
-from yid_ocp.virtual.engine import Simulation, simulate_in_mujoco
+from yid_ocp.virtual.engine import SimulatedRun, Simulation, simulate_in_mujoco
 from yid_ocp.virtual.motion import multisine
 from yid_ocp.virtual.posture import initial_posture
 
@@ -85,11 +86,47 @@ def test_other_grasps_hold(kind: str) -> None:
     assert np.abs(residual).max() < 1e-4
 
 
+def test_what_a_slow_recording_keeps_of_a_fast_controller() -> None:
+    motion = multisine(SYSTEMS[1], TRUTH, seed=1)
+
+    def run(**choices: Any) -> SimulatedRun:
+        return simulate_in_mujoco(SYSTEMS[1], TRUTH, motion, Simulation(0.4, time_step=2.5e-4, **choices))
+
+    finely = run(rate=1000.0)
+    sample = run(rate=100.0, controller_rate=1000.0, effort_kind="sample")
+    mean = run(rate=100.0, controller_rate=1000.0, effort_kind="mean")
+    for coarse in (sample, mean):
+        assert len(coarse.t) == 41
+        np.testing.assert_array_equal(coarse.q, finely.q[::10])
+        np.testing.assert_array_equal(coarse.points, finely.points[::10])
+    np.testing.assert_array_equal(sample.effort, finely.effort[::10])
+    np.testing.assert_allclose(mean.effort[:-1], finely.effort[:-1].reshape(40, 10, -1).mean(1), rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(mean.effort[-1], finely.effort[-1])
+    assert np.abs(mean.effort - sample.effort)[:-1].max() > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("choices", "match"),
+    [
+        ({"time_step": 3e-4}, "does not divide the period of 100 Hz"),
+        (
+            {"time_step": 3e-4, "controller_rate": 1000.0, "effort_kind": "mean"},
+            "does not divide the period of 1000 Hz",
+        ),
+        ({"controller_rate": 150.0, "effort_kind": "mean"}, "150 Hz is no multiple of the recording's 100 Hz"),
+        ({"controller_rate": 50.0}, "50 Hz is no multiple"),
+        ({"controller_rate": 1000.0}, "1000 Hz is not held over a sample of 100 Hz"),
+        ({"effort_kind": "average"}, "effort_kind = 'average'"),
+    ],
+)
+def test_rates_that_do_not_fit_are_refused(choices: dict[str, Any], match: str) -> None:
+    with pytest.raises(ConfigError, match=match):
+        Simulation(**choices)
+
+
 def test_simulations_that_do_not_fit_are_refused() -> None:
     system = SYSTEMS[1]
     motion = multisine(system, seed=0)
-    with pytest.raises(ConfigError, match="does not divide"):
-        Simulation(time_step=3e-4)
     with pytest.raises(ModelError, match="driven joints"):
         simulate_in_mujoco(replace(system, driven=system.driven[:3], prescribed=system.driven[3:]), None, motion)
 

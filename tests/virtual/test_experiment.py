@@ -1,7 +1,10 @@
 from __future__ import annotations
 
 import importlib.util
+import sys
+from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -9,7 +12,7 @@ from virtual_examples import SEEDS, SYSTEMS, TRUTH, Runs
 
 import yid_ocp
 from yid_ocp.data.hdf5 import read_recording
-from yid_ocp.data.recording import Recording
+from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.errors import ConfigError
 from yid_ocp.virtual.engine import Simulation, simulate_in_mujoco
 from yid_ocp.virtual.experiment import ArmNoise, PointCamera, VirtualExperiment, paper_system, virtual_experiment
@@ -71,10 +74,41 @@ def test_sensors_have_their_own_noise() -> None:
     assert np.isnan(first.points[1].position).any()
 
 
+def test_torques_are_off_by_a_constant_and_by_white_noise() -> None:
+    system = SYSTEMS[1]
+    motion = multisine(system, TRUTH, seed=1)
+    white = (0.02, 0.04, 0.06, 0.08, 0.1, 0.12, 0.14)
+
+    def joints(noise: ArmNoise, seed: int = 1) -> JointGroup:
+        simulation = Simulation(2.0, time_step=1e-3, controller_rate=200.0, effort_kind="sample")
+        experiment = VirtualExperiment(motion, None, simulation, noise, None, seed=seed)
+        group = virtual_experiment(system, TRUTH, experiment).joints
+        assert group is not None
+        return group
+
+    clean, noisy = joints(ArmNoise()), joints(ArmNoise(effort=white, effort_bias=0.3))
+    other, unstated = joints(ArmNoise(effort_bias=0.3), 2), joints(ArmNoise(effort_bias=0.3, stated=False))
+    assert (clean.effort_kind, clean.effort_std, clean.effort_bias_std) == ("sample", 0.0, 0.0)
+    assert noisy.effort_bias_std == 0.3
+    np.testing.assert_array_equal(noisy.effort_std, white)
+    assert (unstated.effort_std, unstated.effort_bias_std, unstated.position_std) == (None, None, 2e-4)
+    error = noisy.effort - clean.effort
+    offset = (unstated.effort - clean.effort)[0]
+    np.testing.assert_allclose(unstated.effort - clean.effort, np.tile(offset, (201, 1)), rtol=0, atol=1e-12)
+    np.testing.assert_allclose((error - offset).std(0), white, rtol=0.2)
+    assert 0.1 < offset.std() < 0.6
+    assert len(np.unique(offset)) == 7
+    assert not np.allclose((other.effort - clean.effort)[0], offset, atol=0.1)
+    np.testing.assert_array_equal(noisy.position, clean.position)
+
+
 def test_experiments_that_do_not_fit_are_refused() -> None:
     experiment = VirtualExperiment(multisine(SYSTEMS[1], seed=0), camera=PointCamera(("w_T9",)))
     with pytest.raises(ConfigError, match="w_T9"):
         virtual_experiment(SYSTEMS[1], None, experiment)
+    brief = Simulation(0.1, time_step=1e-3)
+    with pytest.raises(ConfigError, match="2 standard deviations for 7 joints"):
+        virtual_experiment(SYSTEMS[1], None, VirtualExperiment(None, None, brief, ArmNoise(effort=(0.1, 0.2))))
     with pytest.raises(ConfigError, match="arms = 3"):
         paper_system(3)
 
@@ -94,19 +128,48 @@ def test_default_recordings() -> None:
         assert {group.name for group in recording.points} == expected
 
 
-def test_default_recordings_are_reproducible() -> None:
+def recipe() -> ModuleType:
+    """The module benchmarks/make_recordings.py."""
     script = Path(__file__).resolve().parents[2] / "benchmarks" / "make_recordings.py"
     spec = importlib.util.spec_from_file_location("make_recordings", script)
     assert spec is not None
     assert spec.loader is not None
     made = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = made  # dataclasses look their module up
     spec.loader.exec_module(made)
+    return made
+
+
+def test_default_recordings_are_reproducible() -> None:
+    made = recipe()
     system = SYSTEMS[2]
     posture = initial_posture(system, made.TRUTH, offsets=made.OFFSETS[2])
-    seed, travel = made.MOTION_SEEDS[2, "estimate"], made.TRAVEL[2]
+    seed, travel = made.CLEAN.motion_seeds[2, "estimate"], made.CLEAN.travel[2]
     motion = multisine(system, made.TRUTH, seed=seed, posture=posture, excitation=Excitation(travel=travel))
     simulation = Simulation(1.0, time_step=made.INNER_STEP)
     run = simulate_in_mujoco(system, made.TRUTH, motion, simulation, posture=posture)
     joints = read_recording(DEFAULTS / "dual_arm_no_vision_estimate.h5").joints
     assert joints is not None
     np.testing.assert_allclose(joints.effort[:101], run.effort, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("arms", [1, 2])
+@pytest.mark.parametrize("purpose", ["estimate", "held_out"])
+def test_rough_recordings_are_as_rough_as_a_real_arm_and_within_its_limits(arms: int, purpose: str) -> None:
+    made, system = recipe(), SYSTEMS[arms]
+    rough = made.ROUGH
+    posture = initial_posture(system, made.TRUTH, offsets=made.OFFSETS[arms])
+    excitation = Excitation(travel=rough.travel[arms], shake=rough.shake)
+    motion = multisine(
+        system, made.TRUTH, seed=rough.motion_seeds[arms, purpose], posture=posture, excitation=excitation
+    )
+    simulation = replace(rough.simulation, time_step=2.5e-4)
+    run = simulate_in_mujoco(system, made.TRUTH, motion, simulation, posture=posture)
+    assert made.within_limits(system, run)
+    noise = np.sqrt(6) * np.array(arms * rough.white)  # of the second difference
+    second = np.hypot(np.diff(run.effort, 2, axis=0).std(0), noise)
+    measured = np.array(arms * [0.274, 0.206, 0.293, 0.174, 0.109, 0.123, 0.035])
+    last = np.arange(7 * arms) % 7 == 6  # the light last wrist shakes more than the real one
+    assert np.all((second > 0.65 * measured) & (second < np.where(last, 2.5, 1.4) * measured))
+    assert not made.within_limits(system, replace(run, v=10 * run.v))
+    assert not made.within_limits(system, replace(run, effort=2 * run.effort))

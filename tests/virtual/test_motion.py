@@ -1,10 +1,13 @@
 from __future__ import annotations
 
+import casadi as ca
 import numpy as np
 import pytest
 from virtual_examples import SYSTEMS
 
-from yid_ocp.virtual.motion import multisine
+from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body
+from yid_ocp.virtual.motion import Excitation, multisine
+from yid_ocp.virtual.posture import initial_posture
 
 mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
 
@@ -20,3 +23,25 @@ def test_motion_starts_smoothly_and_is_drawn_from_the_seed() -> None:
         np.testing.assert_allclose((after[1] - before[1]) / (2 * h), now[2], atol=1e-4)
     np.testing.assert_array_equal(multisine(SYSTEMS[1], seed=3).amplitude, motion.amplitude)
     assert not np.array_equal(multisine(SYSTEMS[1], seed=4).amplitude, motion.amplitude)
+
+
+def test_shaking_takes_the_torque_that_was_asked_for_and_leaves_the_travel_alone() -> None:
+    system = SYSTEMS[1]
+    calm = multisine(system, seed=3)
+    rough = multisine(system, seed=3, excitation=Excitation(shake=0.5, shake_band=(5.0, 8.0), shake_speed=0.2))
+    for part in ("amplitude", "frequency", "phase"):
+        np.testing.assert_array_equal(getattr(rough, part)[:, :3], getattr(calm, part))
+    omega = 2 * np.pi * rough.frequency[:, 3:]
+    assert np.all((omega >= 2 * np.pi * 5.0) & (omega <= 2 * np.pi * 8.0))
+    q = ca.SX.sym("q", system.size)
+    tree, zero = system.mechanism.numeric(), ca.SX(ca.DM.zeros(system.size))
+    mass = mass_matrix(rigid_body(forward_kinematics(tree, q), zero, zero[:3]), tree)
+    posture = initial_posture(system)
+    start = [posture.get(name, 0.0) for name in system.mechanism.joint_names]
+    inertia = np.diag(np.array(ca.densify(ca.Function("M", [q], [mass])(start))))[list(system.driven_indices)]
+    torque = inertia[:, None] * rough.amplitude[:, 3:] * omega**2
+    np.testing.assert_allclose(np.sqrt((torque[:4] ** 2).sum(1) / 2), 0.5, rtol=1e-9)
+    speed = rough.amplitude[:, 3:] * omega
+    assert speed.max() == pytest.approx(0.2)
+    np.testing.assert_allclose(speed[6], 0.2)
+    assert torque[6].max() < 0.5

@@ -422,6 +422,7 @@ class LayoutBuilder:
             effort=run.effort,
             position_std=0.0,
             effort_std=0.0,
+            effort_bias_std=0.0,
             effort_kind="command",
         )
         beyond: dict[str, list[str]] = {"range": [], "torque": []}

@@ -12,11 +12,12 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Any, Protocol
+from typing import Any, Protocol, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from yid_ocp.data.recording import EffortKind
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model.system import System
 from yid_ocp.virtual.mjcf import compiled_model, mujoco_module, mujoco_xml
@@ -64,31 +65,60 @@ class Simulation:
     duration : float
         [s]
     rate : float
-        Of controller and samples [Hz].
+        Of the samples that are recorded [Hz].
     time_step : float
-        Of the simulator [s]; must divide 1 / rate.
+        Of the simulator [s]; must divide the controller's period.
+    controller_rate : float, optional
+        Torques are computed so often and held in between [Hz], a multiple of `rate`; `rate` where absent.
+    effort_kind : {'sample', 'mean', 'command'}
+        What is recorded of the torque, as in `JointGroup`: a `command` is held from sample to sample, so it needs a
+        controller that is no faster than the recording.
     """
 
     duration: float = 5.0
     rate: float = 100.0
     time_step: float = INNER_STEP
+    controller_rate: float | None = None
+    effort_kind: EffortKind = "command"
 
     def __post_init__(self) -> None:
-        inner = self.inner_steps
-        if inner < 1 or abs(inner * self.time_step * self.rate - 1.0) > 1e-9:
+        controller, periods, inner = self._controller_rate, self.controller_periods, self.inner_steps
+        if periods < 1 or abs(periods * self.rate / controller - 1.0) > 1e-9:
             raise ConfigError(
-                f"time_step = {self.time_step:g} s does not divide the period of {self.rate:g} Hz",
-                allowed="1/(rate k), k whole",
+                f"controller_rate = {controller:g} Hz is no multiple of the recording's {self.rate:g} Hz",
+                allowed="rate k, k whole",
+            )
+        if inner < 1 or abs(inner * self.time_step * controller - 1.0) > 1e-9:
+            raise ConfigError(
+                f"time_step = {self.time_step:g} s does not divide the period of {controller:g} Hz",
+                allowed="1/(controller's rate k), k whole",
+            )
+        if self.effort_kind not in get_args(EffortKind):
+            raise ConfigError(f"effort_kind = '{self.effort_kind}'", allowed=", ".join(get_args(EffortKind)))
+        if self.effort_kind == "command" and periods > 1:
+            raise ConfigError(
+                f"a command of a controller at {controller:g} Hz is not held over a sample of {self.rate:g} Hz",
+                where="effort_kind",
+                allowed="sample or mean, or a controller as fast as the recording",
             )
 
     @property
+    def _controller_rate(self) -> float:
+        return self.rate if self.controller_rate is None else self.controller_rate
+
+    @property
+    def controller_periods(self) -> int:
+        """Periods of the controller from sample to sample."""
+        return round(self._controller_rate / self.rate)
+
+    @property
     def inner_steps(self) -> int:
-        """Steps of the simulator from sample to sample."""
-        return round(1.0 / (self.rate * self.time_step))
+        """Steps of the simulator in a period of the controller."""
+        return round(1.0 / (self._controller_rate * self.time_step))
 
     @property
     def samples(self) -> int:
-        """Periods of the controller, N."""
+        """Recorded periods, N."""
         return round(self.duration * self.rate)
 
 
@@ -103,7 +133,8 @@ class SimulatedRun:
     q, v : ndarray, shape (N + 1, n)
         In configuration order [rad or m].
     effort : ndarray, shape (N + 1, nu)
-        Torque held from t_k to t_{k+1} [N m]; the last row was computed and not applied.
+        Torque at t_k, or its mean from t_k to t_{k+1}, as `effort_kind` says [N m]; the last row was computed and not
+        applied.
     points : ndarray, shape (N + 1, np, 3)
         Of `system.points` in the world [m].
     frame_t : ndarray, shape (M,)
@@ -295,33 +326,37 @@ class _Controller:
 
 
 def _play(scene: _Scene, controller: _Controller, simulation: Simulation, frames: Integers) -> SimulatedRun:
-    """Simulate sample by sample, the torque held in between; `frames` count the simulator's steps."""
+    """Simulate period by period of the controller, the torque held in each; `frames` count the simulator's steps."""
     mujoco, model, data = scene.mujoco, scene.model, scene.data
-    inner, steps = simulation.inner_steps, simulation.samples
-    q, v, effort, points, error, seen = [], [], [], [], [], []
-    for k in range(steps + 1):
+    inner, steps, periods = simulation.inner_steps, simulation.samples, simulation.controller_periods
+    q, v, torques, points, error, seen = [], [], [], [], [], []
+    for tick in range(steps * periods + 1):
         mujoco.mj_kinematics(model, data)
-        torque = controller.torque(k / simulation.rate)
-        q.append(data.qpos[scene.order])
-        v.append(data.qvel[scene.order])
-        effort.append(torque)
-        points.append(data.site_xpos[scene.sites])
-        error.append([np.linalg.norm(data.site_xpos[a] - data.site_xpos[b]) for a, b in scene.ends])
+        torque = controller.torque(tick / (simulation.rate * periods))
+        torques.append(torque)
+        if tick % periods == 0:
+            q.append(data.qpos[scene.order])
+            v.append(data.qvel[scene.order])
+            points.append(data.site_xpos[scene.sites])
+            error.append([np.linalg.norm(data.site_xpos[a] - data.site_xpos[b]) for a, b in scene.ends])
         data.qfrc_applied[scene.driven] = torque
-        done = k * inner
+        done = tick * inner
         for frame in frames[(frames >= done) & (frames < done + inner)]:
             if frame > done:
                 mujoco.mj_step(model, data, nstep=int(frame - done))
                 mujoco.mj_kinematics(model, data)
             seen.append(data.site_xpos[scene.sites])
             done = int(frame)
-        if k < steps:
-            mujoco.mj_step(model, data, nstep=(k + 1) * inner - done)
+        if tick < steps * periods:
+            mujoco.mj_step(model, data, nstep=(tick + 1) * inner - done)
+    effort = np.array(torques[::periods])
+    if simulation.effort_kind == "mean":
+        effort[:-1] = np.array(torques[:-1]).reshape(steps, periods, -1).mean(1)
     return SimulatedRun(
         np.arange(steps + 1) / simulation.rate,
         np.array(q),
         np.array(v),
-        np.array(effort),
+        effort,
         np.array(points),
         np.asarray(frames[: len(seen)] * simulation.time_step),
         np.array(seen).reshape(len(seen), len(scene.sites), 3),

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 Generators = Mapping[str, np.random.Generator]
 
 # every sensor draws from a stream of its own, so that leaving one out changes no other; the order is part of the seed
-_STREAMS = ("position", "velocity", "effort", "arm_points", "frames", "camera_points")
+_STREAMS = ("position", "velocity", "effort", "arm_points", "frames", "camera_points", "effort_bias")
 _TRUE_QUANTITIES = ("bend", "twist", "damping", "twist_damping", "mass")
 
 
@@ -56,22 +56,27 @@ def paper_system(arms: int) -> System:
 
 @dataclass(frozen=True)
 class ArmNoise:
-    """Standard deviations of the white noise on what the arm measures.
+    """Standard deviations of the noise on what the arm measures, drawn anew for every sample but for the bias.
 
     Attributes
     ----------
     position, velocity : float
         Of a joint [rad], [rad/s].
-    effort : float
-        Of a recorded, not of the applied, torque [N m].
+    effort, effort_bias : float or tuple of float, length nj
+        Of a recorded, not of the applied, torque, and of what is added to a joint's torque in the whole recording alike
+        [N m].
     points : float
         Of each coordinate of a grasped point [m].
+    stated : bool
+        Whether the recording says the noise of the torques; it says all other noise in any case.
     """
 
     position: float = 2e-4
     velocity: float = 5e-3
-    effort: float = 0.0
+    effort: float | tuple[float, ...] = 0.0
+    effort_bias: float | tuple[float, ...] = 0.0
     points: float = 1e-3
+    stated: bool = True
 
 
 @dataclass(frozen=True)
@@ -113,7 +118,7 @@ class VirtualExperiment:
     posture : mapping of str to float, optional
         Initial angles [rad or m]; `initial_posture` where absent.
     simulation : Simulation
-        Duration, rate of controller, joints and arm points, step of the simulator.
+        Duration, rate of joints and arm points, rate of the controller, step of the simulator.
     noise : ArmNoise
     camera : PointCamera, optional
         None for no camera.
@@ -151,13 +156,13 @@ def virtual_experiment(
     Returns
     -------
     Recording
-        `joints`: index k is node k, `effort[k]` is held from t_k to t_{k+1}. `points_arm` at the same times, for the
+        `joints`: index k is node k, `effort[k]` is what `effort_kind` says. `points_arm` at the same times, for the
         grasped points; `points_camera` with its own clock. `truth` holds all stiffness, damping and mass parameters.
 
     Raises
     ------
     ConfigError
-        The camera is to see a point that the system does not have.
+        The camera is to see a point that the system does not have, or the torques' noise is that of other joints.
     ModelError, DataError
         As `simulate_in_mujoco`.
     """
@@ -193,7 +198,7 @@ def virtual_experiment(
     names = system.parameters.names
     truth = {n: float(theta[i]) for i, n in enumerate(names) if n.rpartition(".")[2] in _TRUE_QUANTITIES}
     made = _how_it_was_made(chosen, len(system.driven), seen=len(run.frame_t) > 0)
-    joints = _joints(system, run, chosen.noise, streams)
+    joints = _joints(system, run, chosen, streams)
     text = f"{chosen.description} {made}".strip()
     source = "yid_ocp virtual experiment"
     return validate(Recording(joints, tuple(groups), text, source, chosen.name, truth=truth))
@@ -208,19 +213,31 @@ def _visible(system: System, held: tuple[str, ...], camera: PointCamera) -> tupl
     return tuple(camera.points)
 
 
-def _joints(system: System, run: SimulatedRun, noise: ArmNoise, streams: Generators) -> JointGroup:
-    driven = list(system.driven_indices)
+def _joints(system: System, run: SimulatedRun, experiment: VirtualExperiment, streams: Generators) -> JointGroup:
+    driven, noise = list(system.driven_indices), experiment.noise
+    white, bias = (
+        _by_joint(std, len(driven), f"ArmNoise.{name}")
+        for name, std in (("effort", noise.effort), ("effort_bias", noise.effort_bias))
+    )
+    offset = bias * streams["effort_bias"].standard_normal(len(driven))
     return JointGroup(
         names=tuple(system.driven),
         t=run.t,
         position=_noisy(run.q[:, driven], noise.position, streams["position"]),
         velocity=_noisy(run.v[:, driven], noise.velocity, streams["velocity"]),
-        effort=_noisy(run.effort, noise.effort, streams["effort"]),
+        effort=_noisy(run.effort, white, streams["effort"]) + offset,
         position_std=noise.position,
         velocity_std=noise.velocity,
-        effort_std=noise.effort,
-        effort_kind="command",
+        effort_std=white if noise.stated else None,
+        effort_bias_std=bias if noise.stated else None,
+        effort_kind=experiment.simulation.effort_kind,
     )
+
+
+def _by_joint(std: float | tuple[float, ...], joints: int, where: str) -> Array:
+    if np.ndim(std) and np.size(std) != joints:
+        raise ConfigError(f"{np.size(std)} standard deviations for {joints} joints", where=where, allowed="one or each")
+    return np.asarray(std, dtype=float)
 
 
 def _arm_points(
@@ -248,17 +265,23 @@ def _how_it_was_made(experiment: VirtualExperiment, joints: int, seen: bool) -> 
     made = (
         f"Virtual experiment in MuJoCo {mujoco_module().__version__} "
         f"(implicitfast, {1e3 * simulation.time_step:g} ms inner step): multi-sine motion of {joints} joints "
-        f"from static equilibrium, torque held over each {1e3 / simulation.rate:g} ms, "
+        f"from static equilibrium, torque held over each {1e3 / (simulation.rate * simulation.controller_periods):g} ms"
+        f" and recorded as {simulation.effort_kind} every {1e3 / simulation.rate:g} ms, "
         f"seed {experiment.seed}. White noise: "
         f"joint position {noise.position:g} rad, velocity {noise.velocity:g} rad/s, "
-        f"effort {noise.effort:g} N m, arm points {1e3 * noise.points:g} mm"
+        f"effort {_listed(noise.effort)} N m, arm points {1e3 * noise.points:g} mm; "
+        f"constant offset of the effort {_listed(noise.effort_bias)} N m"
     )
     if camera is None or not seen:
         return made + "; no camera."
     return made + f", camera {1e3 * camera.std:g} mm at about {camera.rate:g} Hz."
 
 
-def _noisy(clean: Array, std: float, rng: np.random.Generator) -> Array:
+def _listed(std: float | tuple[float, ...]) -> str:
+    return ", ".join(f"{value:g}" for value in np.atleast_1d(std))
+
+
+def _noisy(clean: Array, std: float | Array, rng: np.random.Generator) -> Array:
     return np.array(clean + std * rng.standard_normal(clean.shape))
 
 

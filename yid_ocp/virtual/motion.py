@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.model.kinematics import forward_kinematics
+from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body
 from yid_ocp.model.system import System
 from yid_ocp.virtual.posture import initial_posture
 
@@ -62,13 +62,20 @@ class Excitation:
         Largest distance of a gripper from its start [m]; every arm is scaled to it by itself. Much more than the
         default, on two arms, lets the foam Y snap from one shape to another.
     speed : float
-        No joint is asked to be faster [rad/s]; an arm that would be is slowed by travelling less.
+        No joint is asked to travel faster [rad/s]; an arm that would be is slowed by travelling less.
     components : int
-        Sines per joint, one in each of as many equal parts (in log frequency) of `band`.
+        Sines per joint, one in each of as many equal parts (in log frequency) of `band`, and as many that shake.
     band : (float, float)
         Lowest and highest frequency [Hz].
     ramp, duration : float
         [s]
+    shake : float
+        Root mean square of the torque that each joint's own inertia takes beside its travel [N m], in sines of equal
+        torque of the band `shake_band`, none faster than `shake_speed`. Zero leaves torques as gentle as the travel.
+    shake_band : (float, float)
+        [Hz]; well below half the rate of what records the torque.
+    shake_speed : float
+        Largest velocity of one of these sines [rad/s]; what light wrists reach first.
     """
 
     travel: float = 0.11
@@ -77,6 +84,9 @@ class Excitation:
     band: tuple[float, float] = (0.2, 2.0)
     ramp: float = 1.0
     duration: float = 5.0
+    shake: float = 0.0
+    shake_band: tuple[float, float] = (4.0, 9.0)
+    shake_speed: float = 0.15
 
 
 def multisine(
@@ -106,7 +116,8 @@ def multisine(
         Amplitudes fall in inverse proportion to the frequency and towards the base.
     """
     chosen = excitation or Excitation()
-    motion = _drawn(system, chosen, np.random.default_rng(seed))
+    rng = np.random.default_rng(seed)
+    motion = _drawn(system, chosen, rng)
     times = np.linspace(0.0, chosen.duration, 251)
     start = initial_posture(system, values) if posture is None else posture
     tree = replace(system.mechanism, parameters=system.parameters).numeric(values)
@@ -127,7 +138,11 @@ def multisine(
         fastest = max(float(np.abs(motion.at(t)[1]).max()) for t in times)
         joints = range(len(motion.joints))
         motion = _scaled(motion, joints, np.full(len(joints), chosen.speed / fastest))
-    return motion
+    if chosen.shake == 0.0:
+        return motion
+    rigid = rigid_body(kinematics, ca.SX(ca.DM.zeros(system.size)), ca.SX(ca.DM.zeros(3)))
+    inertia = np.diag(np.array(ca.densify(ca.Function("M", [q], [mass_matrix(rigid, tree)])(q0))))
+    return _shaken(motion, chosen, inertia[list(system.driven_indices)], rng)
 
 
 def _scaled(motion: Motion, joints: Sequence[int], factors: Array) -> Motion:
@@ -145,6 +160,24 @@ def _drawn(system: System, excitation: Excitation, rng: np.random.Generator) -> 
     phase = rng.uniform(0.0, 2 * math.pi, (nj, components))
     amplitude = rng.uniform(0.7, 1.3, (nj, components)) / frequency
     return Motion(system.driven, amplitude, frequency, phase, excitation.ramp)
+
+
+def _shaken(motion: Motion, excitation: Excitation, inertia: Array, rng: np.random.Generator) -> Motion:
+    """The motion with fast sines added; `inertia` of the driven joints, shape (nj,) [kg m^2]."""
+    nj, components = motion.frequency.shape
+    lowest, highest = excitation.shake_band
+    edges = np.linspace(math.log(lowest), math.log(highest), components + 1)
+    frequency = np.exp(rng.uniform(edges[:-1], edges[1:], (nj, components)))
+    omega = 2 * math.pi * frequency
+    torque = excitation.shake * math.sqrt(2.0 / components)
+    amplitude = np.minimum(torque / (inertia[:, None] * omega**2), excitation.shake_speed / omega)
+    phase = rng.uniform(0.0, 2 * math.pi, (nj, components))
+    return replace(
+        motion,
+        amplitude=np.hstack([motion.amplitude, amplitude]),
+        frequency=np.hstack([motion.frequency, frequency]),
+        phase=np.hstack([motion.phase, phase]),
+    )
 
 
 def _scale(excitation: Excitation, tip: ca.Function, q0: Array, columns: Sequence[int], waves: Array) -> float:
