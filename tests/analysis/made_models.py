@@ -57,6 +57,7 @@ class Formula:
             ((slice(0, data),),), slice(0, data), slice(data, data + stated), slice(data + stated, data + stated + weak)
         )
         self.noise, self._fails = noise, fails or (lambda values: False)
+        self.innovations, self.disturbed = (None,), False
         self.options = SimpleNamespace(
             weighting="paper" if noise != 1 else "whitened",
             initial_state="equilibrium",
@@ -94,6 +95,10 @@ class Formula:
     @property
     def positive(self) -> np.ndarray:
         return (self.bounds[0] >= 0) & (self.start > 0)
+
+    def weighted_at(self, x, warm=None, rounds=1):
+        """Itself: nothing drives its motion wrong."""
+        return self
 
     def evaluate(self, x: np.ndarray, derivatives: bool = True, warm: object = None) -> Evaluation:
         x = np.asarray(x, float)

@@ -73,23 +73,21 @@ def test_changes_of_mechanics_that_make_sense(settings, possible):
 
 
 @pytest.mark.parametrize(
-    ("joints", "std", "position_std"),
+    ("joints", "std"),
     [
-        (None, 0.7, 0.0),
-        ({}, 0.7, 0.0),
-        ({"effort_std": 0.2}, None, 0.0),
-        ({"effort_std": np.array([0.2, 0.3])}, None, 0.0),
-        ({"effort_std": np.array([0.2, 0.0])}, 0.7, 0.0),
-        ({"effort_std": 0.0}, 0.7, 0.0),
-        ({"position_std": 1e-3}, 0.7, None),
-        ({"effort_std": 0.2, "position_std": 0.0}, None, None),
+        (None, 0.7),
+        ({}, 0.7),
+        ({"effort_std": 0.2}, None),
+        ({"effort_std": np.array([0.2, 0.3])}, None),
+        ({"effort_std": np.array([0.2, 0.0])}, 0.7),
+        ({"effort_std": 0.0}, 0.7),
     ],
 )
-def test_noise_of_torques_is_what_is_stated_or_typical(joints, std, position_std):
+def test_noise_of_torques_is_what_is_stated_or_typical(joints, std):
     made = None if joints is None else JointGroup(("a", "b"), np.arange(2.0), np.zeros((2, 2)), **joints)
     problem = SimpleNamespace(episodes=(SimpleNamespace(recording=SimpleNamespace(joints=made)),))
     found = LayoutBuilder(Setting(problem, np.zeros(1), torque_std=0.7))._torque_options()
-    assert (found.std, found.position_std) == (std, position_std)
+    assert found.std == std
 
 
 def test_a_layout_is_built_once_and_says_what_takes_time(monkeypatch):

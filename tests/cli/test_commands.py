@@ -248,7 +248,8 @@ def test_simulate_is_a_recording_that_solve_reads(pendulum_data):
     recording = read_recording(pendulum_data.folder / "estimate.h5")
     assert recording.joint_names == ("shoulder", "elbow")
     assert abs(recording.joints.effort).max() > 0.5
-    assert recording.joints.effort_kind == "command"
+    # of prescribed joints: what they need at the nodes
+    assert recording.joints.effort_kind == "sample"
     assert recording.truth["shoulder.stiffness"] == pendulum_data.truth["shoulder.stiffness"]
 
 

@@ -142,7 +142,9 @@ def test_no_two_commands_give_two_verdicts_for_one_parameter(cli, repository, pe
         said = {entry[name]["verdict"] for entry in (solved["parameters"], judged["parameters"], reference)}
         assert len(said) == 1, (name, said)
         if solved["parameters"][name]["verdict"] == "identifiable":
-            assert judged["parameters"][name]["std"] == pytest.approx(solved["parameters"][name]["std"], rel=0.05)
+            # `solve` adds how far the discretisation moves it
+            alone = solved["discretisation"].get(name, solved["parameters"][name])["std"]
+            assert judged["parameters"][name]["std"] == pytest.approx(alone, rel=0.05)
 
 
 def test_a_model_that_does_not_explain_its_recordings_is_said_first_by_all(cli, pendulum, tmp_path):

@@ -39,7 +39,7 @@ def test_written_back_every_setting_is_there(written):
     }
     assert told["compare"]["methods"] == {
         "lifted": {name: value for name, value in told["solver"].items() if name != "name"}
-        | {"node_interval": 10, "iterations": 2}
+        | {"node_interval": 20, "iterations": 2}
     }
     assert told["problem"]["time_step"] == 0.01
     assert told["track"]["options"]["filters"]["behind"] is None

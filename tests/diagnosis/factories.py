@@ -308,6 +308,7 @@ class Recorded:
             held_out=(held,),
             vector=lambda values: asked.append(dict(values)),
             validate=lambda x: [(held, result)],
+            held_out_rows=lambda i, episode, found: self._samples.rows(found.predicted[0]),
             on=lambda episodes, held_out: SimpleNamespace(
                 episodes=episodes,
                 held_out=held_out,

@@ -63,6 +63,10 @@ def nominal(monkeypatch):
     return made
 
 
+CALM = SimpleNamespace(disturbed=False)
+"""Nothing but the sensors' noise."""
+
+
 def solution(value=2.0, evaluated=True):
     return SimpleNamespace(
         names=("k",), x=np.array([value]), evaluation=evaluation([1.0]) if evaluated else None, message="it snaps"
@@ -81,7 +85,7 @@ def solution(value=2.0, evaluated=True):
 )
 def test_the_nominal_fit_begins_at_the_solution_of_all_data(nominal, blocks, given, solved, start):
     nominal.found = solution(3.0)
-    composed, limits = SimpleNamespace(blocks=blocks), Thresholds(poor=2.0)
+    composed, limits = SimpleNamespace(blocks=blocks, problem=CALM), Thresholds(poor=2.0)
     assert module.nominal_fit("problem", composed, given, "store", limits) is nominal.outcome
     assert nominal.starts == [(composed, (), start, "store", limits)]
     assert nominal.solved == [("problem", GaussNewton(iterations=30))][:solved]
@@ -89,17 +93,17 @@ def test_the_nominal_fit_begins_at_the_solution_of_all_data(nominal, blocks, giv
 
 def test_a_nominal_fit_that_is_known_is_not_repeated(nominal):
     nominal.known = fit(cost=7.0)
-    assert module.nominal_fit("problem", SimpleNamespace(blocks=False)) is nominal.known
+    assert module.nominal_fit("problem", SimpleNamespace(blocks=False, problem=CALM)) is nominal.known
     assert nominal.starts == nominal.solved == []
 
 
 def test_a_nominal_model_that_cannot_be_rolled_out_is_said(nominal):
     nominal.found = solution(evaluated=False)
     with pytest.raises(SolverError, match="cannot be fitted: it snaps"):
-        module.nominal_fit("problem", SimpleNamespace(blocks=False))
+        module.nominal_fit("problem", SimpleNamespace(blocks=False, problem=CALM))
     nominal.outcome = None
     with pytest.raises(SolverError, match="at its fit"):
-        module.nominal_fit("problem", SimpleNamespace(blocks=True))
+        module.nominal_fit("problem", SimpleNamespace(blocks=True, problem=CALM))
 
 
 def test_the_largest_angles_are_those_of_a_segments_joints_in_all_recordings():

@@ -369,7 +369,15 @@ def predicting(monkeypatch):
         return {"a": {"rmse": np.float64(0.25), "unit": "m", "n": 3}}
 
     monkeypatch.setattr(module, "channel_errors", channel_errors)
-    return lambda *pairs: (SimpleNamespace(held_out=[e for e, _ in pairs], validate=lambda x: list(pairs)), told)
+
+    def rows(i, there, result):
+        parts = [group.rows(values).residual for group, values in zip(there.samples, result.predicted, strict=True)]
+        return SimpleNamespace(residual=np.concatenate(parts))
+
+    return lambda *pairs: (
+        SimpleNamespace(held_out=[e for e, _ in pairs], validate=lambda x: list(pairs), held_out_rows=rows),
+        told,
+    )
 
 
 def test_a_held_out_loss_sums_whitened_squares_block_by_block(predicting):

@@ -48,7 +48,16 @@ def made(seed: int, parameters=2, recording="run", size=None, loose=0.3) -> Line
     edges = 0.1 * np.arange(COUNT + 1)
     names = tuple(f"u{i}" for i in range(len(SOURCES)))
     model = Linear(
-        recording, tuple(intervals), edges, names, SOURCES, np.ones(3), at_rest, np.full(STATES, loose), DECAY
+        recording,
+        tuple(intervals),
+        edges,
+        names,
+        SOURCES,
+        np.ones(3),
+        at_rest,
+        np.full(STATES, loose),
+        DECAY,
+        np.zeros(3),
     )
     if size is not None:
         design, _ = dense(model)

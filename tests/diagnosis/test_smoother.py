@@ -18,7 +18,7 @@ from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.problem import EstimationProblem, ProblemOptions
+from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.solvers import GaussNewton, solve
 
 FORCE, BIAS = Source("here", "force"), Source("camera", "bias")
@@ -49,6 +49,7 @@ def random_model(seed: int, states=3, unknowns=2, parameters=2, count=4, rows=5)
         rng.standard_normal((states, unknowns)),
         0.3 * np.ones(states),
         0.7,
+        np.zeros(unknowns),
     )
 
 
@@ -137,7 +138,12 @@ def recorded(system: System, pushed: dict[int, tuple[float, float, float]], seed
     noise = np.random.default_rng(seed).standard_normal(position.shape)
     points = PointGroup("points", tuple(known), t, position + 1e-3 * noise, std=np.full(position.shape, 1e-3))
     joints = JointGroup(
-        ("shoulder", "elbow"), t, swept.state[:, :2], effort=np.vstack([torque, torque[-1:]]), effort_kind="command"
+        ("shoulder", "elbow"),
+        t,
+        swept.state[:, :2],
+        effort=np.vstack([torque, torque[-1:]]),
+        effort_std=0.0,
+        effort_kind="command",
     )
     return Recording(joints, (points,), name="push")
 
@@ -147,7 +153,9 @@ def problem_of(system: System, recording: Recording) -> EstimationProblem:
         compile_step(system, TIME_STEP),
         [recording],
         ("shoulder.damping",),
-        ProblemOptions(initial_state="equilibrium", feedback="none"),
+        ProblemOptions(
+            initial_state="equilibrium", feedback="none", sensors={"joints.position": SensorOptions(use=False)}
+        ),
     )
 
 

@@ -18,7 +18,11 @@ from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.workflow.diagnose import in_units_of_noise
 
 SHARE = 0.25
-SENSORS = {"points": SensorOptions(std=0.02), "joints.effort": SensorOptions(std={"shoulder": 0.3}, position_std=1e-3)}
+SENSORS = {
+    "points": SensorOptions(std=0.02),
+    "joints.effort": SensorOptions(std={"shoulder": 0.3}),
+    "joints.position": SensorOptions(std=1e-3),
+}
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +85,7 @@ def test_a_whole_fraction_and_no_weak_prior_stay_as_they_are(step):
     [
         ({"joints.effort": SENSORS["joints.effort"], "points": SensorOptions()}, None, "noise in the std of 'points'"),
         ({"points": SENSORS["points"]}, None, "noise in the std of 'joints.effort'"),
-        ({**SENSORS, "joints.effort": SensorOptions(std=0.3)}, 1e-3, "encoders' std is only in the recordings"),
+        ({**SENSORS, "joints.position": SensorOptions()}, 1e-3, "noise in the std of 'joints.position'"),
     ],
 )
 def test_a_fraction_of_what_is_not_stated_is_refused(step, sensors, recorded, words):
@@ -96,6 +100,6 @@ def test_a_fraction_of_what_is_not_stated_is_refused(step, sensors, recorded, wo
 
 @pytest.mark.parametrize("recorded", [None, 0.0])
 def test_encoders_without_noise_need_none(step, recorded):
-    sensors = {**SENSORS, "joints.effort": SensorOptions(std=0.3)}
+    sensors = {"points": SENSORS["points"], "joints.effort": SensorOptions(std=0.3)}
     shrunk = in_units_of_noise(problem_of(step, recorded, sensors=sensors), settings())
     assert shrunk.options.sensors["joints.effort"] == SensorOptions(std=0.3 * SHARE)

@@ -43,7 +43,8 @@ def test_too_few_links_are_told_and_counted(folder, tmp_path):
     assert error > 0.15
     assert alone < 0.02
     assert error < 2 * counted
-    assert entry["verdict"] == "weak"
+    # the data show it as well: the model does not explain them
+    assert entry["verdict"] == "not_trusted"
     # with twice the links it is nearer to the truth by what is said
     moved = result["discretisation"]["north.bend"]["links"] / TRUTH["north.bend"]
     assert -error < moved < -0.4 * error
@@ -61,7 +62,7 @@ def test_settings_say_what_is_refined(folder, tmp_path):
     assert result["discretisation"] == {}
     _, alone, *_ = result["parameters"]["north.bend"], result["parameters"]["north.bend"]["std"]
     assert alone < 0.02 * TRUTH["north.bend"]
-    assert result["parameters"]["north.bend"]["verdict"] == "identifiable"
+    assert result["parameters"]["north.bend"]["verdict"] == "not_trusted"
 
 
 def test_check_says_it_before_anything_is_solved(folder, tmp_path):
