@@ -77,10 +77,13 @@ def test_command(repository, tmp_path, capsys):
     text = capsys.readouterr().out
     assert "published" in text
     assert "truth" in text
+    assert "all noise" in text.splitlines()[0]
+    assert "T2.twist = 11.1 of the paper: not informed; in such an experiment it cannot be found" in text
     result = json.loads((tmp_path / "run" / "result.json").read_text(encoding="utf-8"))
     assert result["format"] == "yid-compare/1"
     assert set(result["methods"]) == {"gauss_newton", "single_shooting"}
-    assert result["methods"]["gauss_newton"]["format"] == "yid-solve/1"
+    assert result["methods"]["gauss_newton"]["format"] == result["judged"]["format"] == "yid-solve/1"
+    assert len(result["published_explained"]) == 6
     assert (tmp_path / "run" / "convergence.png").stat().st_size > 1000
 
 

@@ -31,7 +31,6 @@ OFFSET = 0.3  # standard deviation of the constant error of a joint's torque in 
 START, ITERATIONS = 3.0, 200  # of steepest descent in the ensemble [N m/rad]
 ROUNDED = 0.02  # a truth so near a published value, relatively, was made of it by rounding
 ZERO = 0.01  # a bound at zero is reached within this fraction of the largest of an ensemble's values
-FARTHER = 0.1  # how much farther than the twin's a search may have come that is slow, as a fraction of its value
 
 
 @dataclass(frozen=True)
@@ -100,7 +99,8 @@ def reason(published: float, entry: Estimate, truth: float | None, ends: Ends) -
     ============  ======================================================================================================
     not_informed  such recordings do not find the parameter, or only so weakly that their interval holds the value
     near_truth    the value is within 10 % of the twin's truth
-    slow          it lies between the start and where the paper's method stops without torque errors, far from the truth
+    slow          it lies between the start and where the paper's method stops without torque errors, far from the
+                  truth, or within 10 % of the latter
     torque_error  it lies within what constant errors of the torques lead the paper's method to
     unexplained   anything else
     ============  ======================================================================================================
@@ -112,8 +112,8 @@ def reason(published: float, entry: Estimate, truth: float | None, ends: Ends) -
     if truth is not None and _near(published, truth):
         return "near_truth"
     if truth is not None and not _near(ends.stopped, truth):
-        low, high = sorted((ends.start, ends.stopped + FARTHER * (ends.stopped - ends.start)))
-        if low <= published <= high:
+        low, high = sorted((ends.start, ends.stopped))
+        if low <= published <= high or _near(published, ends.stopped):
             return "slow"
     return "torque_error" if explained(published, ends.offsets) else "unexplained"
 
