@@ -136,7 +136,7 @@ def compare(
 
         wall, cpu = time.perf_counter(), time.process_time()
         with _Memory() as memory:
-            solution = solve(own, solver, callback=progress, limits=limits)
+            solution = solve(own, solver, callback=progress, limits=limits, restarts=not whole.disturbed)
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         cost = problem.evaluate(solution.x, derivatives=False).cost
         runs.append(MethodRun(solver.name, solution, cost, own.validate(solution.x), wall, cpu, memory.peak))
