@@ -74,6 +74,8 @@ def test_command(repository, clean, tmp_path, capsys):
     settings = [
         "problem.duration=0.5",
         "compare.methods={gauss_newton: {}, single_shooting: {}}",
+        "parameters={T1.bend: {free: true, initial: 15}, T1.twist: {initial: 13.6}, T2.bend: {initial: 10.7}, "
+        "T2.twist: {initial: 8.2}, T3.bend: {initial: 11.5}, T3.twist: {initial: 9.7}}",
         *(f"recordings.{purpose}=[{clean}/single_arm_no_vision_{purpose}.h5]" for purpose in ("estimate", "held_out")),
     ]
     arguments = [part for setting in settings for part in ("--set", setting)]
@@ -82,13 +84,13 @@ def test_command(repository, clean, tmp_path, capsys):
     assert "published" in text
     assert "truth" in text
     assert "all noise" not in text
-    assert "T2.twist = 11.1 of the paper: not informed; in such an experiment it cannot be found" in text
+    assert "\nT1.bend = 23.78 of the paper: " in text
     result = json.loads((tmp_path / "run" / "result.json").read_text(encoding="utf-8"))
     assert result["format"] == "yid-compare/1"
     assert set(result["methods"]) == {"gauss_newton", "single_shooting"}
     assert result["methods"]["gauss_newton"]["format"] == "yid-solve/1"
     assert result["judged"]["parameters"] == result["methods"][result["reference"]]["parameters"]
-    assert len(result["published_explained"]) == 6
+    assert [said.split(" = ")[0] for said in result["published_explained"]] == ["T1.bend"]
     assert (tmp_path / "run" / "convergence.png").stat().st_size > 1000
 
 
