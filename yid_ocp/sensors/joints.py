@@ -15,7 +15,7 @@ import scipy.special
 from yid_ocp.errors import ConfigError, DataError, nearest
 from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import NodeState
-from yid_ocp.sensors.base import SENSORS, Array, Choice, JointData, SensorData, Surroundings, joint_columns
+from yid_ocp.sensors.base import SENSORS, Array, Choice, JointData, PointData, SensorData, Surroundings, joint_columns
 
 log = logging.getLogger(__name__)
 
@@ -130,6 +130,11 @@ class EffortSensor:
         return ca.vertcat(*(state.effort[state.system.mechanism.joint_index(joint)] for joint in self.joints))
 
 
+def of_arm(group: PointData) -> bool:
+    """Whether the arm itself measured these points, which as a rule follow from its encoders."""
+    return "arm" in (group.sensor, group.name.rpartition("_")[2])
+
+
 @SENSORS.register(POSITION)
 def measured_angles(around: Surroundings) -> list[SensorData]:
     """Recorded angles of driven joints, as they are; the first is left out, from which the posture at rest is taken.
@@ -141,7 +146,7 @@ def measured_angles(around: Surroundings) -> list[SensorData]:
     """
     joints, choice, system = around.recording.joints, around.choice(POSITION), around.system
     names = system.driven if joints is not None else ()
-    arm = [group.name for group in around.recording.points if "arm" in (group.sensor, group.name.rpartition("_")[2])]
+    arm = [group.name for group in around.recording.points if of_arm(group)]
     arm = [name for name in arm if around.choice(name).use is not False]
     if joints is None or not names or choice.use is False or (choice.use is None and arm):
         return []
