@@ -193,6 +193,9 @@ def test_jacobians_of_innovations_are_those_of_differences(urdf_folder):
         ends = [weighted.evaluate(x + sign * step, warm=found.warm).residual for sign in (1, -1)]
         numeric = (ends[0] - ends[1]) / (2 * step[i])
         np.testing.assert_allclose(numeric, found.jacobian[:, i], atol=2e-5 * np.abs(found.jacobian[:, i]).max())
+    cost, gradient, again = weighted.gradient(x)
+    assert (cost, again.jacobian) == (pytest.approx(found.cost), None)
+    np.testing.assert_allclose(gradient, found.jacobian.T @ found.residual, rtol=1e-9)
 
 
 # -- which encoders are measurements, and what is known of noise -------------------------------------------------------

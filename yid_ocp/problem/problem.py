@@ -340,7 +340,7 @@ class EstimationProblem:
     def gradient(
         self, x: ArrayLike, evaluation: Evaluation | None = None, warm: WarmStart | None = None
     ) -> tuple[float, Array, Evaluation]:
-        """Cost and its gradient by the adjoint sweep.
+        """Cost and its gradient by the adjoint sweep; of innovations by forward sensitivities.
 
         Parameters
         ----------
@@ -358,11 +358,14 @@ class EstimationProblem:
             Without a Jacobian.
         """
         x = np.asarray(x, float)
-        if evaluation is None:
-            evaluation = self.evaluate(x, False, warm)
+        weighted = any(own is not None for own in self.innovations)
+        if evaluation is None or (weighted and evaluation.jacobian is None):
+            evaluation = self.evaluate(x, weighted, warm)
         gradient = np.zeros(len(x))
         if not evaluation.ok:
             return evaluation.cost, gradient, evaluation
+        if weighted and evaluation.jacobian is not None:
+            return evaluation.cost, evaluation.jacobian.T @ evaluation.residual, replace(evaluation, jacobian=None)
         for i, result in enumerate(evaluation.episodes):
             pulls = []
             for k, samples in enumerate(self.episodes[i].samples):
