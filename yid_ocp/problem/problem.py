@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,15 @@ from yid_ocp.problem.measurements import Rows, huber
 from yid_ocp.problem.noise import Innovations
 from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.problem.prediction import EpisodeResult, Predictor, Start
-from yid_ocp.problem.unknowns import START, Unknowns, check_bounds, check_free, replaced, soft_logarithm, start_names
+from yid_ocp.problem.unknowns import (
+    Unknowns,
+    check_bounds,
+    check_free,
+    replaced,
+    soft_logarithm,
+    start_names,
+    stated_std,
+)
 
 Array = NDArray[np.float64]
 HELD_OUT_START = 0.2
@@ -136,7 +145,8 @@ class EstimationProblem:
             tuple(episode.name for episode in episodes),
         )
         self.predictor = Predictor(functions, options, self.unknowns)
-        self._prior_std = self._stated_std()
+        inertia = partial(apparent_inertia, functions.step, theta)
+        self._prior_std = stated_std(self.unknowns, options, inertia)
         bare = options.weighting == "paper" or options.weak_prior_factor <= 1
         weak = np.zeros(len(self.names), bool) if bare else self.positive & ~np.isfinite(self._prior_std)
         self._weak: NDArray[np.int64] = np.flatnonzero(weak)
@@ -594,17 +604,3 @@ class EstimationProblem:
             "held_out": [episode.recording for episode in self.held_out],
         }
         return EstimationProblem(**{**same, **changes})
-
-    def _stated_std(self) -> Array:
-        """Standard deviation of every unknown's stated Gaussian prior about its start, infinite where there is none."""
-        options, stds = self.options, []
-        for name in self.unknowns.names:
-            base = name.split("[")[0]
-            if base.startswith(f"{START}q."):
-                stds.append(options.configuration_std)
-            elif base.startswith(f"{START}p."):
-                inertia = float(apparent_inertia(self.step, self.theta, (base.removeprefix(f"{START}p."),))[0])
-                stds.append(options.velocity_std * max(inertia, 1e-9))
-            else:
-                stds.append(float(options.priors.get(base, np.inf)))
-        return np.array(stds)
