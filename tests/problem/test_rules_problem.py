@@ -117,12 +117,12 @@ def test_an_estimated_start_has_a_prior_in_angles_and_momenta(make, momentum, fr
     np.testing.assert_allclose(problem.start_std, [0.07, 0.07, 0.3 * inertia[0], 0.3 * inertia[1]], rtol=1e-9)
     np.testing.assert_allclose(apparent_inertia(free_step, theta, ("elbow", "shoulder")), inertia[::-1], rtol=1e-9)
     assert problem.names[3:] == tuple(f"start.{kind}.{joint}[run_1]" for kind in "qp" for joint in PENDULUM)
-    assert problem.start_rows == (0, 1, 2, 3)
+    assert problem.predictor.start_rows == (0, 1, 2, 3)
 
 
 def test_without_estimated_starts_there_are_none(make):
     problem = make()
-    assert problem.start_rows == ()
+    assert problem.predictor.start_rows == ()
     assert problem.start_std.shape == (0,)
     assert problem.names == FREE
 

@@ -227,11 +227,6 @@ class EstimationProblem:
         return float(np.sqrt(np.mean(np.concatenate(found) ** 2)))
 
     @property
-    def start_rows(self) -> tuple[int, ...]:
-        """Rows of the initial state that are estimated: q and p of coordinates neither driven nor prescribed."""
-        return self.predictor.start_rows
-
-    @property
     def start_std(self) -> Array:
         """Standard deviation of the prior of every estimated row of an initial state."""
         at = len(self.unknowns.parameters)
@@ -332,9 +327,9 @@ class EstimationProblem:
         return Rows(cost, columns[:, 0], None if plain.jacobian is None else columns[:, 1:], factor)
 
     def torque_offsets(self, x: ArrayLike) -> list[tuple[Array, Array] | None]:
-        """Constant error of every driven joint's torque in every recording, at `x`: value and standard deviation [N m].
+        """Constant error of driven joints' torques at `x`, of every recording: values and standard deviations [N m].
 
-        None for a recording whose torques are taken as true, and where nothing is frozen (`weighted_at`).
+        None where torques are taken as true, and where nothing is frozen (`weighted_at`).
         """
         x = np.asarray(x, float)
         found: list[tuple[Array, Array] | None] = []
@@ -517,7 +512,7 @@ class EstimationProblem:
         """The same problem with residuals weighted by all noise, that which drives the motion too, frozen at `x`.
 
         The problem itself where nothing is wrong with its torques and angles, or where it cannot be rolled out at `x`.
-        Of a problem that is weighted already, the new weights are about the torque offsets that the old ones see.
+        If it is weighted already, the new weights are about the torque offsets that the old ones see.
 
         Parameters
         ----------
@@ -547,8 +542,7 @@ class EstimationProblem:
 
     def without_input_errors(self) -> EstimationProblem:
         """The same problem with torques and angles that drive the motion taken as they were recorded."""
-        parts = (tuple(replace(e, errors=None) for e in group) for group in (self.episodes, self.held_out))
-        return self.on(*parts)
+        return self.on(*([replace(e, errors=None) for e in group] for group in (self.episodes, self.held_out)))
 
     def held_out_weighted_at(self, x: ArrayLike) -> EstimationProblem:
         """The same problem with the residuals of held-out recordings weighted like this as well, for `held_out_rows`.
