@@ -1,13 +1,13 @@
-"""Make the recordings that ship as embedded defaults, in MuJoCo, the same every time.
+"""Make the paper's four experiments, in MuJoCo, the same every time.
 
-    python benchmarks/make_recordings.py [FOLDER] [--torques clean | rough]
+    python benchmarks/make_recordings.py [FOLDER] [--torques rough | clean]
 
 The motions (seeds) are such that no torque exceeds Baxter's limits and the Y does not snap from one shape to another.
 
-`clean` torques are held over each sample and recorded without an error. `rough` ones are like those of the real arm, as
-`torque_noise.py` finds them: a controller at 1 kHz of which every tenth torque is recorded, white noise, a constant
-offset for each joint, and arms that shake until torques differ as much from sample to sample, noise included. Their
-files begin with `rough_`.
+`rough` torques are like those of the real arm, as `torque_noise.py` finds them: a controller at 1 kHz of which every
+tenth torque is recorded, white noise, a constant offset for each joint, and arms that shake until torques differ as
+much from sample to sample, noise included. These recordings ship as the embedded defaults. `clean` torques are held
+over each sample and recorded without an error; those are for tests, in `tests/data/clean`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-import yid_ocp
 from yid_ocp.data.hdf5 import write_recording
 from yid_ocp.files import new_file
 from yid_ocp.model.system import System
@@ -65,8 +64,6 @@ class Torques:
 
     Attributes
     ----------
-    prefix : str
-        Of the files.
     motion_seeds : mapping of (arms, purpose) to int
     travel : mapping of arms to float
         [m]
@@ -77,7 +74,6 @@ class Torques:
         Standard deviations of the noise of one arm's torques [N m]; empty where there is none.
     """
 
-    prefix: str
     motion_seeds: Mapping[tuple[int, str], int]
     travel: Mapping[int, float]
     shake: float
@@ -91,7 +87,6 @@ class Torques:
 
 
 CLEAN = Torques(
-    prefix="",
     motion_seeds={(1, "estimate"): 1, (1, "held_out"): 7, (2, "estimate"): 7, (2, "held_out"): 2},
     travel=TRAVEL,
     shake=0.0,
@@ -100,7 +95,6 @@ CLEAN = Torques(
     offset=(),
 )
 ROUGH = Torques(
-    prefix="rough_",
     motion_seeds={(1, "estimate"): 7, (1, "held_out"): 2, (2, "estimate"): 7, (2, "held_out"): 2},
     travel={1: 0.11, 2: 0.13},
     shake=0.3,
@@ -143,7 +137,7 @@ def make(folder: Path, torques: Torques) -> None:
             excitation = Excitation(travel=torques.travel[arms], shake=torques.shake)
             motion = multisine(system, TRUTH, seed=seed, posture=posture, excitation=excitation)
             for vision in (False, True):
-                name = f"{torques.prefix}{word}_arm_{'vision' if vision else 'no_vision'}_{purpose}"
+                name = f"{word}_arm_{'vision' if vision else 'no_vision'}_{purpose}"
                 experiment = VirtualExperiment(
                     motion=motion,
                     posture=posture,
@@ -162,10 +156,13 @@ def make(folder: Path, torques: Torques) -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description="Make the recordings that ship as embedded defaults.")
-    default = Path(yid_ocp.__file__).parent / "data" / "defaults"
-    parser.add_argument("folder", nargs="?", type=Path, default=default)
-    parser.add_argument("--torques", choices=("clean", "rough"), default="clean")
+    repository = Path(__file__).resolve().parents[1]
+    kinds = {"rough": (ROUGH, repository / "yid_ocp/data/defaults"), "clean": (CLEAN, repository / "tests/data/clean")}
+    parser = argparse.ArgumentParser(description="Make the recordings of the paper's four experiments.")
+    parser.add_argument("folder", nargs="?", type=Path, help="the package's defaults or the tests' when absent")
+    parser.add_argument("--torques", choices=list(kinds), default="rough")
     arguments = parser.parse_args()
-    arguments.folder.mkdir(parents=True, exist_ok=True)
-    make(arguments.folder, {"clean": CLEAN, "rough": ROUGH}[arguments.torques])
+    chosen, usual = kinds[arguments.torques]
+    folder = arguments.folder or usual
+    folder.mkdir(parents=True, exist_ok=True)
+    make(folder, chosen)

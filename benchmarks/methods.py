@@ -12,9 +12,8 @@ from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
-from workloads import STIFFNESSES, TIME_STEP
+from workloads import CLEAN, STIFFNESSES, TIME_STEP
 
-import yid_ocp
 from yid_ocp.analysis.compare import compare
 from yid_ocp.data.hdf5 import read_recording
 from yid_ocp.integrator.step import compile_step
@@ -31,7 +30,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--arms", type=int, choices=(1, 2), default=1)
     parser.add_argument("--json", type=Path, metavar="FILE", help="store the ratios of CPU time")
     options = parser.parse_args(arguments)
-    recording = read_recording(Path(yid_ocp.__file__).parent / "data" / "defaults" / RECORDINGS[options.arms])
+    recording = read_recording(CLEAN / RECORDINGS[options.arms])
     step = compile_step(paper_system(options.arms), TIME_STEP)
     problem = EstimationProblem(step, [recording], STIFFNESSES)
     problem.evaluate(problem.start * 4.0)  # compiles what is compiled once

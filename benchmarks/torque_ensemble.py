@@ -20,7 +20,7 @@ import numpy as np
 from coverage import CONFIGS, PACKAGE, code_hash, print_progress, solve_twin
 from make_recordings import OFFSET, OFFSETS, ROUGH, TRUTH, WHITE
 
-from yid_ocp.analysis.compare import PUBLISHED
+from yid_ocp.analysis.published import PUBLISHED, explained
 from yid_ocp.data.hdf5 import write_recording
 from yid_ocp.errors import ModelError
 from yid_ocp.files import content_hash, write_json
@@ -109,11 +109,6 @@ def run(
             for name in TRUTH:
                 values[name].append(entry.value["parameters"][name]["value"])
     return found
-
-
-def explained(published: float, values: Sequence[float]) -> bool:
-    """Whether a published value lies within what the members found; a bound at zero reaches 1 % of the largest."""
-    return min(values) - 0.01 * max(values) <= published <= max(values)
 
 
 def report(found: Mapping[str, Mapping[str, Any]]) -> list[str]:

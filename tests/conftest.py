@@ -44,6 +44,12 @@ def repository() -> Path:
 
 
 @pytest.fixture(scope="session")
+def clean(repository) -> Path:
+    """The paper's four experiments with exact torques, held over each sample: `benchmarks/make_recordings.py`."""
+    return repository / "tests" / "data" / "clean"
+
+
+@pytest.fixture(scope="session")
 def urdf_folder(repository) -> Path:
     return repository / "models" / "urdf"
 

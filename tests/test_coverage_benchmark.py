@@ -187,23 +187,6 @@ def test_white_noise_is_told_from_a_motion(torque_noise: ModuleType) -> None:
     np.testing.assert_allclose(torque_noise.roughness(smooth), expected, rtol=1e-2)
 
 
-@pytest.mark.parametrize(
-    ("published", "values", "expected"),
-    [
-        (3.2, [1.0, 5.0], True),
-        (3.2, [3.3, 5.0], False),
-        (3.2, [1.0, 3.1], False),
-        (0.0, [1e-7, 5.0], True),  # driven to the bound
-        (0.0, [0.04, 5.0], True),
-        (0.0, [0.06, 5.0], False),
-    ],
-)
-def test_a_published_value_is_explained_by_members_around_it(
-    torque_ensemble: ModuleType, published: float, values: list[float], expected: bool
-) -> None:
-    assert torque_ensemble.explained(published, values) is expected
-
-
 def test_the_ensemble_stands_beside_what_was_published(torque_ensemble: ModuleType) -> None:
     members = {name: [0.5 * value, value, 2 * value] for name, value in torque_ensemble.TRUTH.items()}
     none = {name: [] for name in members}

@@ -27,7 +27,8 @@ def holds(interval: tuple[float | None, float | None], truth: float) -> bool:
 
 def judged(config: Path, seed: int) -> dict[str, Any]:
     """Of a twin: which of the intervals hold the truth, and which parameters are called identifiable."""
-    made = load_problem(config, ["problem.duration=3.0"])
+    exact = config.parents[1] / "tests" / "data" / "clean" / "single_arm_vision_estimate.h5"
+    made = load_problem(config, ["problem.duration=3.0", f"recordings.estimate=[{exact}]"])
     recording = twin_recording(made, np.array([TRUTH[name] for name in made.names]), seed)
     problem = EstimationProblem(made.step, [recording], made.free, made.options, dict.fromkeys(TRUTH, 10.0))
     info = identifiability(problem, solve(problem, GaussNewton()), start="known", intervals=list(SEEN))

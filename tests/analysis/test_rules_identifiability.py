@@ -84,6 +84,21 @@ def test_a_misfit_counts_at_a_fit_and_not_at_the_start():
     assert judged(good, [2.0]).parameters["a"].std == pytest.approx(2 / (30 * math.sqrt(5.0)))
 
 
+class Weighed(Formula):
+    """Far too large a residual until it is weighed by the noise that drives the motion."""
+
+    def weighted_at(self, x, warm=None, rounds=1):
+        return Formula(lambda x: [300 * (x["a"] / 2 - 1) + (-1) ** k for k in range(60)], {"a": 2.0})
+
+
+def test_a_fit_is_judged_by_the_noise_that_drives_the_motion_too(monkeypatch):
+    problem = Weighed(lambda x: [300 * (x["a"] / 2 - 1) + 20.0 * (-1) ** k for k in range(60)], {"a": 2.0})
+    assert judged(problem, [2.0]).parameters["a"].verdict == "identifiable"
+    # of a problem with more unknowns the fit is still that of the problem as it was solved
+    monkeypatch.setattr(module, "with_nuisances", lambda *given: Weighed.weighted_at(problem, None))
+    assert judged(problem, [2.0]).parameters["a"].verdict == "identifiable"
+
+
 def test_a_parameter_at_zero_is_as_large_as_its_scale():
     problem = Formula(lambda x: [30 * x["a"]], {"a": 0.0}, bounds={"a": (-9.0, 9.0)}, scales={"a": 0.5})
     entry = judged(problem).parameters["a"]

@@ -146,10 +146,21 @@ def at_truth(problem: EstimationProblem) -> np.ndarray:
     return np.array([TRUTH[name] for name in problem.names])
 
 
+@pytest.fixture
+def exact(repository, clean):
+    """exact(name): one of the paper's experiments with exact torques."""
+
+    def load(name: str) -> EstimationProblem:
+        files = (f"recordings.{purpose}=[{clean / name}_{purpose}.h5]" for purpose in ("estimate", "held_out"))
+        return load_problem(repository / "configs" / f"{name}.yaml", tuple(files))
+
+    return load
+
+
 @pytest.mark.slow
-def test_two_arms_need_welds_and_no_camera(repository):
+def test_two_arms_need_welds_and_no_camera(exact):
     for name in ("dual_arm_vision", "dual_arm_no_vision"):
-        problem = load_problem(repository / "configs" / f"{name}.yaml")
+        problem = exact(name)
         ranking = what_if(problem, at_truth(problem))
         assert {n for n, v in ranking.base.verdicts.items() if v == "not_identifiable"} == {"T2.twist", "T3.twist"}
         assert [entry.changes for entry in ranking.smallest] == [("weld",)]
@@ -157,17 +168,17 @@ def test_two_arms_need_welds_and_no_camera(repository):
 
 
 @pytest.mark.slow
-def test_one_arm_needs_another_arm_and_welds(repository):
-    problem = load_problem(repository / "configs" / "single_arm_vision.yaml")
+def test_one_arm_needs_another_arm_and_welds(exact):
+    problem = exact("single_arm_vision")
     ranking = what_if(problem, at_truth(problem), second_arm=paper_system(2))
     assert [set(entry.changes) for entry in ranking.smallest] == [{"weld", "second_arm"}]
     assert ranking.singles[0].changes == ("second_arm",)
 
 
 @pytest.mark.slow
-def test_the_smallest_set_finds_all_six_in_another_engine(repository):
+def test_the_smallest_set_finds_all_six_in_another_engine(exact):
     """Two arms with welds and no camera, MuJoCo's motion and noise, from a start of 3 N m/rad each."""
-    made = load_problem(repository / "configs" / "dual_arm_no_vision.yaml")
+    made = exact("dual_arm_no_vision")
     layout = LayoutBuilder(Setting(made, at_truth(made))).layout(frozenset({"weld"}))
     assert not isinstance(layout, str), layout
     system = layout.problem.system

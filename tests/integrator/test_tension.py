@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from importlib import resources
-
 import casadi as ca
 import numpy as np
 import pytest
@@ -18,11 +16,10 @@ TRUTH = {"T1.bend": 22.0, "T1.twist": 13.6, "T2.bend": 10.7, "T2.twist": 8.2, "T
 
 
 @pytest.fixture(scope="module")
-def two_arms(paper_systems):
+def two_arms(paper_systems, clean):
     """two_arms(time_step, constraint_force): five seconds of another engine's motion, rolled out at its parameters."""
     system = paper_systems["dual"]
-    folder = resources.files("yid_ocp.data") / "defaults"
-    joints = read_recording(folder / "dual_arm_no_vision_estimate.h5").joints
+    joints = read_recording(clean / "dual_arm_no_vision_estimate.h5").joints
     theta = system.parameters.vector(TRUTH)
 
     def roll(every, constraint_force):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from importlib import resources
 
 import hypothesis.strategies as st
 import numpy as np
@@ -34,11 +33,10 @@ def pendulum(urdf_folder):
 
 
 @pytest.fixture(scope="module")
-def arm(single_arm):
+def arm(single_arm, clean):
     """Makes problems on one arm under its tracking filter, at rest in a shape that depends on the stiffness."""
     step = compile_step(single_arm, H)
-    folder = resources.files("yid_ocp.data") / "defaults"
-    recordings = [read_recording(folder / f"single_arm_vision_{name}.h5") for name in ("estimate", "held_out")]
+    recordings = [read_recording(clean / f"single_arm_vision_{name}.h5") for name in ("estimate", "held_out")]
 
     def make(kind):
         options = ProblemOptions(initial_state=kind, duration=0.15)

@@ -56,7 +56,7 @@ def test_a_verdict_reads_alike_in_every_command(said):
     assert words in line_of(terminal.solve_summary(solved()), name)
     compared = {
         "methods": {"gauss_newton": solved()}, "reference": "gauss_newton", "published": {}, "truth": {},
-        "explained": [], "agree": True,
+        "explained": [], "agree": True, "judged": solved(), "disturbed": False, "published_explained": [],
     }  # fmt: skip
     assert words in line_of(terminal.compare_summary(compared), name)
     information = {
@@ -99,7 +99,7 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said_bu
     assert lines[4:6] == ["and so for 2 more channels, in result.json", first]
     compared = {
         "methods": {"gauss_newton": said}, "reference": "gauss_newton", "published": {}, "truth": {}, "explained": [],
-        "agree": True,
+        "agree": True, "judged": said, "disturbed": False, "published_explained": [],
     }  # fmt: skip
     lines = terminal.compare_summary(compared)
     assert first in lines[:6]
@@ -144,16 +144,33 @@ def test_a_comparison_without_a_parameter_that_is_found_has_nothing_to_agree_on(
     compared = {
         "methods": {"lifted": weak, "other": weak | {"status": "failed", "whitened_cost": None}},
         "reference": "lifted", "published": {"a": 1.0}, "truth": {}, "explained": [], "agree": True,
+        "judged": weak, "disturbed": False, "published_explained": ["a = 1 of the paper: unexplained"],
     }  # fmt: skip
     lines = terminal.compare_summary(compared)
     assert "no parameter can be found from these recordings, so there is nothing to agree on" in lines
     assert line_of(lines, "cost (whitened)").split()[-2:] == ["5", "failed"]
     assert "published" in lines[0]
     assert "truth" not in lines[0]
-    found = compared | {"methods": {"lifted": solved()}}
+    assert "a = 1 of the paper: unexplained" in lines
+    found = compared | {"methods": {"lifted": solved()}, "judged": solved()}
     assert "all methods agree within their uncertainty on the parameters that are found" in terminal.compare_summary(
         found
     )
+
+
+def test_verdicts_of_a_comparison_weigh_all_noise():
+    """The methods themselves do not, so that nothing of theirs is to be trusted."""
+    doubtful = solved(parameters={"a": parameter("not_trusted", 7.0)}, fit=BAD)
+    compared = {
+        "methods": {"lifted": doubtful}, "reference": "lifted", "published": {}, "truth": {}, "explained": [],
+        "agree": True, "judged": solved(parameters={"a": parameter("identifiable", 9.0)}), "disturbed": True,
+        "published_explained": [],
+    }  # fmt: skip
+    lines = terminal.compare_summary(compared)
+    assert lines[0].split()[:3] == ["parameter", "lifted", "all"]
+    assert line_of(lines, "a").split() == ["a", "7", "±", "0.1", "9", "±", "0.1", "found"]
+    assert not any("does not explain" in line for line in lines)
+    assert any("compared by the sensors' noise alone" in line for line in lines)
 
 
 def test_what_if_names_the_fewest_changes_or_that_there_are_none():

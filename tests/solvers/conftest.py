@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from importlib import resources
-
 import pytest
 
 from yid_ocp.data import read_recording
@@ -19,9 +17,9 @@ def one_arm(paper_systems):
 
 
 @pytest.fixture(scope="session")
-def recording():
+def recording(clean):
     """One arm and a camera, five seconds, from MuJoCo."""
-    return read_recording(resources.files("yid_ocp.data") / "defaults" / "single_arm_vision_estimate.h5")
+    return read_recording(clean / "single_arm_vision_estimate.h5")
 
 
 @pytest.fixture(scope="session")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from importlib import resources
 
 import numpy as np
 import pytest
@@ -80,10 +79,10 @@ def test_lifted_agrees(short, reference):
 
 
 @pytest.fixture(scope="module")
-def two_arms(paper_systems):
+def two_arms(paper_systems, clean):
     """50 variables, 500 steps, six parameters from 3 N m/rad; two of the twists leave no trace in the data."""
     step = compile_step(paper_systems["dual"], 0.01)
-    recording = read_recording(resources.files("yid_ocp.data") / "defaults" / "dual_arm_vision_estimate.h5")
+    recording = read_recording(clean / "dual_arm_vision_estimate.h5")
     return EstimationProblem(step, [recording], FREE)
 
 

@@ -94,6 +94,12 @@ def test_a_poor_fit_is_started_again_from_multiples_of_the_start_and_the_best_is
     assert len(told) == 4
 
 
+def test_a_poor_fit_is_left_alone_where_that_is_asked_for():
+    solver = Steps()
+    assert solve(MadeUp(misfit(lambda x: 9.0)), solver, restarts=False).message == "run 1"
+    assert [start for start, _ in solver.runs] == [[1.0]]
+
+
 def test_starting_again_ends_with_the_first_good_fit():
     at = {1.0: 9.0, 4.0: 4.0}
     solver = Steps()

@@ -113,8 +113,9 @@ def test_experiments_that_do_not_fit_are_refused() -> None:
         paper_system(3)
 
 
-def test_default_recordings() -> None:
-    files = sorted(DEFAULTS.glob("*_arm_*.h5"))
+@pytest.mark.parametrize("rough", [True, False], ids=["embedded", "clean"])
+def test_recordings_of_the_papers_experiments(rough: bool, clean: Path) -> None:
+    files = sorted((DEFAULTS if rough else clean).glob("*_arm_*.h5"))
     assert len(files) == 8
     assert sum(path.stat().st_size for path in files) < 2.5e6
     for path in files:
@@ -126,6 +127,16 @@ def test_default_recordings() -> None:
         assert "MuJoCo" in recording.description
         expected = {"points_arm"} | ({"points_camera"} if "_no_vision" not in path.name else set())
         assert {group.name for group in recording.points} == expected
+        joints = recording.joints
+        assert joints is not None
+        if rough:
+            made = recipe().ROUGH
+            assert joints.effort_kind == "sample"
+            np.testing.assert_array_equal(joints.effort_std, arms * made.white)
+            np.testing.assert_array_equal(joints.effort_bias_std, arms * made.offset)
+        else:
+            assert not np.any(joints.effort_std)
+            assert not np.any(joints.effort_bias_std)
 
 
 def recipe() -> ModuleType:
@@ -140,17 +151,26 @@ def recipe() -> ModuleType:
     return made
 
 
-def test_default_recordings_are_reproducible() -> None:
+@pytest.mark.parametrize("kind", ["ROUGH", "CLEAN"])
+def test_recordings_are_reproducible(kind: str, clean: Path) -> None:
     made = recipe()
-    system = SYSTEMS[2]
+    torques, system = getattr(made, kind), SYSTEMS[2]
     posture = initial_posture(system, made.TRUTH, offsets=made.OFFSETS[2])
-    seed, travel = made.CLEAN.motion_seeds[2, "estimate"], made.CLEAN.travel[2]
-    motion = multisine(system, made.TRUTH, seed=seed, posture=posture, excitation=Excitation(travel=travel))
-    simulation = Simulation(1.0, time_step=made.INNER_STEP)
-    run = simulate_in_mujoco(system, made.TRUTH, motion, simulation, posture=posture)
-    joints = read_recording(DEFAULTS / "dual_arm_no_vision_estimate.h5").joints
+    excitation = Excitation(travel=torques.travel[2], shake=torques.shake)
+    motion = multisine(
+        system, made.TRUTH, seed=torques.motion_seeds[2, "estimate"], posture=posture, excitation=excitation
+    )
+    run = simulate_in_mujoco(system, made.TRUTH, motion, replace(torques.simulation, duration=1.0), posture=posture)
+    joints = read_recording((DEFAULTS if torques.white else clean) / "dual_arm_no_vision_estimate.h5").joints
     assert joints is not None
-    np.testing.assert_allclose(joints.effort[:101], run.effort, rtol=0, atol=1e-6)
+    if not torques.white:
+        np.testing.assert_allclose(joints.effort[:101], run.effort, rtol=0, atol=1e-6)
+    # noise and offsets as stated lie on the effort of the rough ones, noise alone on the angles of both
+    error = joints.effort[:101] - run.effort
+    white, offset = np.array(2 * torques.white or (1e-6,)), np.array(2 * torques.offset or (1e-6,))
+    assert np.all(error.std(axis=0) < 1.5 * white)
+    assert np.all(np.abs(error.mean(axis=0)) < 4 * offset)
+    np.testing.assert_allclose(joints.position[:101], run.q[:, list(system.driven_indices)], rtol=0, atol=1.5e-3)
 
 
 @pytest.mark.parametrize("arms", [1, 2])

@@ -16,26 +16,18 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.null_test import USUAL, GapLimits
 from yid_ocp.problem.prediction import EpisodeResult
-from yid_ocp.solvers import Iterate, Solution, Status, solve
-from yid_ocp.solvers.base import Solver
-from yid_ocp.solvers.judgement import IDENTIFIABLE
+from yid_ocp.solvers import GaussNewton, Iterate, Solution, Status, solve
+from yid_ocp.solvers.base import Solver, carries_covariance
+from yid_ocp.solvers.judgement import IDENTIFIABLE, Estimate
 from yid_ocp.solvers.words import PREDICATES, VERDICT_WORDS
 
 Array = NDArray[np.float64]
-
-NAMES = ("T1.bend", "T1.twist", "T2.bend", "T2.twist", "T3.bend", "T3.twist")
-PUBLISHED: dict[str, dict[str, float]] = {
-    "single_arm_no_vision": dict(zip(NAMES, (23.780, 0.000, 18.357, 11.103, 3.200, 3.059), strict=True)),
-    "single_arm_vision": dict(zip(NAMES, (22.270, 13.593, 10.735, 8.202, 11.511, 9.692), strict=True)),
-    "dual_arm_no_vision": dict(zip(NAMES, (19.559, 4.965, 8.575, 10.374, 0.000, 11.287), strict=True)),
-    "dual_arm_vision": dict(zip(NAMES, (24.840, 0.000, 12.373, 30.775, 1.406, 24.900), strict=True)),
-}
-"""The source paper's answers for its four experiments [N m/rad]; its data are not public."""
 
 SAMPLING_PERIOD = 0.02
 # Two estimates agree when they differ by less than this many of the larger standard deviation, or by this fraction of
 # the value: below that the methods' own stopping rules show.
 STDS, FRACTION = 2.0, 0.005
+WHOLE = "all noise"  # what the run is called that weighs residuals by the noise that drives the motion too
 
 
 @dataclass(frozen=True)
@@ -72,6 +64,12 @@ class Comparison:
     runs : tuple of MethodRun
     reference : str
         Method of the lowest cost, with which the others are compared.
+    disturbed : bool
+        Whether noise drives the motion, which the methods are compared without.
+    judged : Solution
+        That whose verdicts count: the reference's, or, where noise drives the motion, of a method that weighs it.
+    judged_held_out : list of (Episode, EpisodeResult or str)
+        What it predicts.
     agreement : mapping of method to list of str
         One sentence for each identifiable parameter on which the method differs, with the likely reason; empty where
         it agrees.
@@ -82,6 +80,9 @@ class Comparison:
 
     runs: tuple[MethodRun, ...]
     reference: str
+    disturbed: bool
+    judged: Solution
+    judged_held_out: list[tuple[Episode, EpisodeResult | str]]
     agreement: Mapping[str, list[str]]
     explained: tuple[str, ...]
 
@@ -101,7 +102,8 @@ def compare(
     """Run several methods from the same start and say whether they agree.
 
     Steepest descent gets the paper's cost (points in metres, no noise levels, no weak prior), the others the problem's,
-    weighted by the sensors' noise alone where more drives the motion: not every method can carry its covariance.
+    weighted by the sensors' noise alone where more drives the motion: not every method can carry its covariance. What
+    may be said of the parameters then comes from one more run, of a method that can.
 
     Parameters
     ----------
@@ -118,34 +120,46 @@ def compare(
     -------
     Comparison
     """
-    runs, problem = [], problem.without_input_errors()
+    runs, whole, problem = [], problem, problem.without_input_errors()
+
+    def told(name: str, entry: Iterate) -> None:
+        if callback is not None:
+            callback(name, entry)
+
     for solver in solvers:
         own = problem
         if solver.name == "steepest_descent" and problem.options.weighting != "paper":
             own = problem.with_options(replace(problem.options, weighting="paper"))
 
         def progress(entry: Iterate, name: str = solver.name) -> None:
-            if callback is not None:
-                callback(name, entry)
+            told(name, entry)
 
         wall, cpu = time.perf_counter(), time.process_time()
         with _Memory() as memory:
-            solution = solve(own, solver, callback=progress, limits=limits)
+            solution = solve(own, solver, callback=progress, limits=limits, restarts=not whole.disturbed)
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         cost = problem.evaluate(solution.x, derivatives=False).cost
         runs.append(MethodRun(solver.name, solution, cost, own.validate(solution.x), wall, cpu, memory.peak))
     best = min(runs, key=lambda run: run.whitened_cost)
     if best.method != "steepest_descent":
-        judged = replace(best, solution=with_intervals(problem, best.solution))
-        runs[runs.index(best)] = best = judged
-    agreement = {run.method: _differences(run, best) for run in runs}
-    return Comparison(tuple(runs), best.method, agreement, tuple(_explanations(runs, best, truth or {})))
+        shown = replace(best, solution=with_intervals(problem, best.solution))
+        runs[runs.index(best)] = best = shown
+    judged, held_out = best.solution, best.held_out
+    if whole.disturbed:
+        able: Solver = next((solver for solver in solvers if carries_covariance(solver)), GaussNewton())
+        judged = solve(whole, able, callback=lambda entry: told(WHOLE, entry), limits=limits)
+        weighted = judged.problem or whole
+        judged, held_out = with_intervals(weighted, judged), weighted.validate(judged.x)
+    agreement = {run.method: _differences(run, best, judged.parameters) for run in runs}
+    explained = tuple(_explanations(runs, judged.parameters, truth or {}, whole.disturbed))
+    return Comparison(tuple(runs), best.method, whole.disturbed, judged, held_out, agreement, explained)
 
 
-def _differences(run: MethodRun, best: MethodRun) -> list[str]:
+def _differences(run: MethodRun, best: MethodRun, judged: Mapping[str, Estimate]) -> list[str]:
+    """Where a method is not where the best one is, of the parameters that are found."""
     sentences = []
     for name, reference in best.solution.parameters.items():
-        if reference.verdict != "identifiable":
+        if judged[name].verdict != "identifiable":
             continue
         entry = run.solution.parameters[name]
         gap = abs(entry.value - reference.value)
@@ -162,23 +176,27 @@ def _differences(run: MethodRun, best: MethodRun) -> list[str]:
     return sentences
 
 
-def _explanations(runs: Sequence[MethodRun], best: MethodRun, truth: Mapping[str, float]) -> list[str]:
+def _explanations(
+    runs: Sequence[MethodRun], judged: Mapping[str, Estimate], truth: Mapping[str, float], disturbed: bool
+) -> list[str]:
     """Where methods sent the parameters that are not found, and where the paper's method went wrong."""
     sentences = []
-    for name, reference in best.solution.parameters.items():
+    for name, reference in judged.items():
         if not reference.free or reference.verdict == "identifiable":
             continue
         known = f" (truth {truth[name]:g})" if name in truth else ""
         places = ", ".join(f"{run.method} {run.solution.parameters[name].value:.3g}" for run in runs)
         said = PREDICATES[reference.verdict]
         sentences.append(f"{name}{known} {said}: where it ends is the method's choice ({places})")
-    sentences += [_descent_errors(run, best, truth) for run in runs if run.method == "steepest_descent" and truth]
+    sentences += [
+        _descent_errors(run, judged, truth, disturbed) for run in runs if run.method == "steepest_descent" and truth
+    ]
     return sentences
 
 
-def _descent_errors(run: MethodRun, best: MethodRun, truth: Mapping[str, float]) -> str:
+def _descent_errors(run: MethodRun, judged: Mapping[str, Estimate], truth: Mapping[str, float], disturbed: bool) -> str:
     """Which parameters a method left far from the truth, and whether these are the ones that the data do not tell."""
-    known = {name: entry for name, entry in best.solution.parameters.items() if entry.free and name in truth}
+    known = {name: entry for name, entry in judged.items() if entry.free and name in truth}
     found = {name: run.solution.parameters[name].value for name in known}
     # the same limit makes a standard deviation too large for an identifiable parameter
     wrong = [name for name in known if abs(found[name] - truth[name]) > IDENTIFIABLE * abs(truth[name])]
@@ -193,7 +211,10 @@ def _descent_errors(run: MethodRun, best: MethodRun, truth: Mapping[str, float])
         return f"{text}; these are exactly the parameters that are not found"
     seen, lucky = [name for name in wrong if name not in hidden], [name for name in hidden if name not in wrong]
     if seen:
-        text += f"; {', '.join(seen)} could be found: the method stopped short ({run.solution.status.value})"
+        why = "it takes the recorded torques as true" if disturbed else "its cost weighs the measurements otherwise"
+        if run.solution.status != Status.CONVERGED:
+            why = f"the method stopped short ({run.solution.status.value})"
+        text += f"; {', '.join(seen)} could be found: {why}"
     if lucky:
         text += f"; {', '.join(f'{name} ({verdicts[name]})' for name in lucky)} came out near the truth all the same"
     return text

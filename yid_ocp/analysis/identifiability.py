@@ -209,7 +209,7 @@ def _information(
     given = unknown_vector(problem, solution)
     wide = with_nuisances(problem, given, start, grasp_std)
     x = carried(given, problem.names, wide)
-    wide = wide.weighted_at(x, rounds=2)
+    as_solved, wide = wide is problem, wide.weighted_at(x, rounds=2)
     evaluation = wide.evaluate(x)
     if not evaluation.ok or evaluation.jacobian is None:
         raise SolverError(
@@ -223,7 +223,8 @@ def _information(
         # far from the data chi2 says nothing of the noise
         covariance, inflation = covariance / inflation**2, 1.0
     else:
-        fit = judge_fit(problem, evaluation if wide is problem else problem.evaluate(given), limits)
+        own = wide if as_solved else problem.weighted_at(given, rounds=2)
+        fit = judge_fit(own, evaluation if as_solved else own.evaluate(given), limits)
         covariance = covariance_of_fit(wide, evaluation, fit)
     chosen = np.array([wide.names.index(name) for name in names], int)
     scale = np.where(x[chosen] != 0, np.abs(x[chosen]), wide.scales[chosen])

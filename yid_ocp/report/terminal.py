@@ -112,26 +112,34 @@ def track_summary(result: Mapping[str, Any]) -> list[str]:
 def compare_summary(result: Mapping[str, Any]) -> list[str]:
     """Lines that tell a person what a `yid-compare/1` result says."""
     methods: dict[str, Any] = result["methods"]
-    free = [name for name, entry in methods[result["reference"]]["parameters"].items() if entry["free"]]
+    judged, disturbed = result["judged"], result["disturbed"]
+    free = [name for name, entry in judged["parameters"].items() if entry["free"]]
+    runs = methods | ({"all noise": judged} if disturbed else {})
     beside = [key for key in ("published", "truth") if result[key]]
-    rows: Rows = [("parameter", *methods, *beside, "verdict")]
+    rows: Rows = [("parameter", *runs, *beside, "verdict")]
     for name in free:
         cells = []
-        for entry in methods.values():
+        for entry in runs.values():
             found = entry["parameters"][name]
             cells.append(parameter_words(found["value"], found["std"], found["interval"]))
         known = [f"{result[key][name]:.4g}" if name in result[key] else "" for key in beside]
-        rows.append((name, *cells, *known, VERDICT_WORDS[methods[result["reference"]]["parameters"][name]["verdict"]]))
-    fit = methods[result["reference"]]["fit"]
+        rows.append((name, *cells, *known, VERDICT_WORDS[judged["parameters"][name]["verdict"]]))
+    fit = judged["fit"]
     lines = [*_misfit(fit), *table(rows), "", *table(_efforts(methods)), ""]
     for name, entry in methods.items():
         if entry["status"] != "converged":
             lines.append(f"{name} did not converge: {entry['message']}")
         lines += [f"{name} differs: {sentence}" for sentence in entry["disagreements"]]
     lines += result["explained"]
+    if disturbed:
+        lines.append(
+            "the methods are compared by the sensors' noise alone; the column 'all noise' and the verdicts weigh the "
+            "noise that drives the motion as well"
+        )
+    lines += result["published_explained"]
     if not fit["explains"]:
         lines.append("the model does not explain the recordings, so agreement of methods says nothing of the truth")
-    elif not any(methods[result["reference"]]["parameters"][name]["verdict"] == "identifiable" for name in free):
+    elif not any(judged["parameters"][name]["verdict"] == "identifiable" for name in free):
         lines.append("no parameter can be found from these recordings, so there is nothing to agree on")
         lines.append("`yid-ocp identifiability CONFIG --what-if` says what would have to be measured")
     elif result["agree"]:

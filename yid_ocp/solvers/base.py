@@ -187,6 +187,7 @@ def solve(
     start: Sequence[float] | None = None,
     callback: Callback | None = None,
     limits: GapLimits = USUAL,
+    restarts: bool = True,
 ) -> Solution:
     """Run a solver on a problem and say what was found, how sure, and what was not.
 
@@ -206,6 +207,8 @@ def solve(
         Called with every `Iterate`.
     limits : GapLimits, optional
         What makes a residual more than noise.
+    restarts : bool
+        Whether a poor fit is started again; in vain where the noise that makes it poor is left out on purpose.
 
     Returns
     -------
@@ -214,7 +217,7 @@ def solve(
     """
     # the matrices are small: threads of the linear algebra library cost more than they give
     with threadpoolctl.threadpool_limits(1):
-        return _solved(problem, solver, start, callback, limits)
+        return _solved(problem, solver, start, callback, limits, RESTARTS if restarts else ())
 
 
 def _solved(
@@ -223,13 +226,14 @@ def _solved(
     start: Sequence[float] | None,
     callback: Callback | None,
     limits: GapLimits,
+    restarts: Sequence[float],
 ) -> Solution:
     begun = time.perf_counter()
     lower, upper = problem.bounds
     first = off_neutral(problem, problem.start) if start is None else np.clip(np.asarray(start, float), lower, upper)
     best, evaluations, history = _attempt(problem, solver, first, callback)
     tried = 1
-    for factor in RESTARTS:
+    for factor in restarts:
         if _good_fit(problem, best[1]):
             break
         x = np.where(problem.positive, np.clip(first * factor, lower, upper), first)

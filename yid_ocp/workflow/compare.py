@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from yid_ocp.analysis.compare import PUBLISHED, Comparison, compare
+from yid_ocp.analysis.compare import Comparison, compare
+from yid_ocp.analysis.published import PUBLISHED, published_sentences
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import Run
 from yid_ocp.problem import EstimationProblem
@@ -94,14 +95,18 @@ def run_compare(run: Run, out: str | Path | None = None, progress: Progress = SI
 
         comparison = compare(problem, solvers, truth, iterate, run.diagnosis.of_a_fit)
         draw_convergence(folder.path / "convergence.png", comparison)
-        written = folder.finish(compare_result(problem, comparison, published, truth))
+        experiment = run.compare.published
+        said = published_sentences(experiment, comparison.judged.parameters, truth) if experiment else ()
+        about = {"published": published, "published_explained": list(said), "truth": truth}
+        written = folder.finish(compare_result(problem, comparison) | about)
     return CompareOutcome(folder.path, written, comparison)
 
 
-def compare_result(
-    problem: EstimationProblem, comparison: Comparison, published: dict[str, float], truth: dict[str, float]
-) -> dict[str, Any]:
-    """`yid-compare/1` without inputs and versions: one `yid-solve/1` for each method, with its cost in time."""
+def compare_result(problem: EstimationProblem, comparison: Comparison) -> dict[str, Any]:
+    """`yid-compare/1` without inputs, versions and what is known beside.
+
+    One `yid-solve/1` for each method, with its cost in time, and for the run whose verdicts count, `judged`.
+    """
     methods = {}
     for run in comparison.runs:
         methods[run.method] = solve_result(problem, run.solution, run.held_out) | {
@@ -117,8 +122,8 @@ def compare_result(
         "reference": comparison.reference,
         "agree": comparison.agree,
         "explained": list(comparison.explained),
-        "published": published,
-        "truth": truth,
+        "disturbed": comparison.disturbed,
+        "judged": solve_result(comparison.judged.problem or problem, comparison.judged, comparison.judged_held_out),
     }
 
 

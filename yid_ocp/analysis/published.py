@@ -1,0 +1,154 @@
+"""What the source paper found in its four experiments, and what is known of why.
+
+Its recordings are not public. What is said of a value rests on twins of its experiments in MuJoCo, whose truth was
+chosen: what their recordings inform, where steepest descent with the paper's cost and step lengths stands after 200
+iterations, and where constant errors of the torques lead it (`benchmarks/torque_ensemble.py`).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+
+from yid_ocp.solvers.judgement import IDENTIFIABLE, Estimate
+from yid_ocp.solvers.words import PREDICATES, interval_words
+
+NAMES = ("T1.bend", "T1.twist", "T2.bend", "T2.twist", "T3.bend", "T3.twist")
+PUBLISHED: dict[str, dict[str, float]] = {
+    "single_arm_no_vision": dict(zip(NAMES, (23.780, 0.000, 18.357, 11.103, 3.200, 3.059), strict=True)),
+    "single_arm_vision": dict(zip(NAMES, (22.270, 13.593, 10.735, 8.202, 11.511, 9.692), strict=True)),
+    "dual_arm_no_vision": dict(zip(NAMES, (19.559, 4.965, 8.575, 10.374, 0.000, 11.287), strict=True)),
+    "dual_arm_vision": dict(zip(NAMES, (24.840, 0.000, 12.373, 30.775, 1.406, 24.900), strict=True)),
+}
+"""The source paper's answers for its four experiments [N m/rad]; its data are not public."""
+CHOSEN = "single_arm_vision"
+"""The answer whose rounded values are the truth of the embedded recordings: the only one without a zero."""
+
+OFFSET = 0.3  # standard deviation of the constant error of a joint's torque in the ensemble [N m]
+START, ITERATIONS = 3.0, 200  # of steepest descent in the ensemble [N m/rad]
+ROUNDED = 0.02  # a truth so near a published value, relatively, was made of it by rounding
+ZERO = 0.01  # a bound at zero is reached within this fraction of the largest of an ensemble's values
+
+
+@dataclass(frozen=True)
+class Ends:
+    """Where steepest descent with the paper's step lengths ends in the twins.
+
+    Attributes
+    ----------
+    start : float
+        [N m/rad]
+    stopped : float
+        After 200 iterations with torques that are exact.
+    offsets : tuple of float
+        With torques that are off by a constant, one for each member of the ensemble.
+    """
+
+    start: float
+    stopped: float
+    offsets: tuple[float, ...]
+
+
+@cache
+def ensemble() -> Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]]:
+    """Experiment, errors of the torques (none, offsets) and parameter to the members' values [N m/rad]."""
+    text = (resources.files("yid_ocp.data") / "defaults" / "torque_ensemble.json").read_text(encoding="utf-8")
+    found: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]] = json.loads(text)
+    return found
+
+
+def published_sentences(
+    experiment: str, estimates: Mapping[str, Estimate], truth: Mapping[str, float]
+) -> tuple[str, ...]:
+    """One sentence for each published value of an experiment, on what is known of why it is what it is.
+
+    Parameters
+    ----------
+    experiment : str
+        A key of `PUBLISHED`.
+    estimates : mapping of str to Estimate
+        What recordings of such an experiment tell, of the free parameters.
+    truth : mapping of str to float
+        Of these recordings, where it is known.
+
+    Returns
+    -------
+    tuple of str
+        None where the recordings are not explained, so that nothing can be said of what they inform.
+    """
+    judged = {name: estimates[name] for name in NAMES if name in estimates and estimates[name].free}
+    if any(entry.verdict == "not_trusted" for entry in judged.values()):
+        return ()
+    found = ensemble()[experiment]
+    sentences = []
+    for name, entry in judged.items():
+        ends = Ends(START, found["none"][name][0], tuple(found["offsets"][name]))
+        value = PUBLISHED[experiment][name]
+        why = reason(value, entry, truth.get(name), ends)
+        words = _words(why, value, entry, truth.get(name), ends, experiment)
+        sentences.append(f"{name} = {value:.4g} of the paper: {words}")
+    return tuple(sentences)
+
+
+def reason(published: float, entry: Estimate, truth: float | None, ends: Ends) -> str:
+    """Why a published value is what it is, as far as twins can tell.
+
+    ============  ======================================================================================================
+    not_informed  such recordings do not find the parameter, or only so weakly that their interval holds the value
+    near_truth    the value is within 10 % of the twin's truth
+    slow          it lies between the start and where the paper's method stops without torque errors, far from the
+                  truth, or within 10 % of the latter
+    torque_error  it lies within what constant errors of the torques lead the paper's method to
+    unexplained   anything else
+    ============  ======================================================================================================
+
+    The first one that holds is said.
+    """
+    if entry.verdict == "not_identifiable" or (entry.verdict != "identifiable" and _holds(entry, published)):
+        return "not_informed"
+    if truth is not None and _near(published, truth):
+        return "near_truth"
+    if truth is not None and not _near(ends.stopped, truth):
+        low, high = sorted((ends.start, ends.stopped))
+        if low <= published <= high or _near(published, ends.stopped):
+            return "slow"
+    return "torque_error" if explained(published, ends.offsets) else "unexplained"
+
+
+def explained(published: float, values: Sequence[float]) -> bool:
+    """Whether a published value lies within what an ensemble's members found; see `ZERO` for a bound."""
+    return min(values) - ZERO * max(values) <= published <= max(values)
+
+
+def _near(value: float, truth: float) -> bool:
+    return abs(value - truth) <= IDENTIFIABLE * abs(truth)
+
+
+def _holds(entry: Estimate, value: float) -> bool:
+    lower, upper = entry.interval or (entry.value - 2 * entry.std, entry.value + 2 * entry.std)
+    return (lower is None or lower <= value) and (upper is None or value <= upper)
+
+
+def _words(why: str, value: float, entry: Estimate, truth: float | None, ends: Ends, experiment: str) -> str:
+    if why == "not_informed":
+        known = PREDICATES[entry.verdict]
+        if entry.verdict == "weak" and entry.interval not in (None, (None, None)):
+            known += f" ({interval_words(*entry.interval)})"
+        return f"not informed; in such an experiment it {known}"
+    if why == "near_truth":
+        assert truth is not None
+        chosen = experiment == CHOSEN and abs(value - truth) <= ROUNDED * abs(truth)
+        return f"near the truth of these recordings, {truth:.4g}" + (", which was chosen from it" if chosen else "")
+    many = f"{min(ends.offsets):.3g} to {max(ends.offsets):.3g} in {len(ends.offsets)} twins"
+    led = f"constant torque errors of {OFFSET:g} N m lead the paper's method to {many}"
+    if why == "slow":
+        return (
+            f"slow; without torque errors the paper's method goes from {ends.start:.3g} to {ends.stopped:.3g} "
+            f"in {ITERATIONS} iterations"
+        )
+    if why == "torque_error":
+        return f"torque error; {led}"
+    return f"unexplained; it is neither for want of information nor slow, and {led}"
