@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,8 +15,6 @@ from yid_ocp.errors import ConfigError, DataError, nearest
 from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import NodeState
 from yid_ocp.sensors.base import SENSORS, Array, Choice, JointData, PointData, SensorData, Surroundings, joint_columns
-
-log = logging.getLogger(__name__)
 
 EFFORT = "joints.effort"
 POSITION = "joints.position"
@@ -208,6 +205,12 @@ def measured_efforts(around: Surroundings) -> list[SensorData]:
 # -- noise levels -----------------------------------------------------------------------------------------------------
 
 
+def is_stated(joints: JointData, group: str, choice: Choice) -> bool:
+    """Whether the recording or the settings say the noise of `joints.effort` or `joints.position`; else see below."""
+    recorded = joints.effort_std if group == EFFORT else joints.position_std
+    return choice.std is not None or recorded is not None
+
+
 def angle_std(joints: JointData, names: Sequence[str], choice: Choice, where: str) -> Array:
     """Standard deviation of the encoders of driven joints, shape (len(names),) [rad]."""
     given = choice.std if choice.std is not None else joints.position_std
@@ -232,7 +235,7 @@ def torque_bias_std(joints: JointData, names: Sequence[str], choice: Choice) -> 
 
 
 def estimated_std(values: Array, where: str, group: str, unit: str) -> Array:
-    """White noise of evenly sampled channels that nobody stated, from differences of high order; said in the log.
+    """White noise of evenly sampled channels that nobody stated, from differences of high order.
 
     Parameters
     ----------
@@ -254,14 +257,6 @@ def estimated_std(values: Array, where: str, group: str, unit: str) -> Array:
         )
     size = math.sqrt(scipy.special.comb(2 * DIFFERENCES, DIFFERENCES))
     found = np.sqrt(np.mean(np.diff(values, DIFFERENCES, axis=0) ** 2, axis=0)) / size
-    log.warning(
-        "%s: the noise of %s is neither recorded nor configured; %.2g to %.2g %s estimated from its fastest changes",
-        where,
-        group,
-        found.min(),
-        found.max(),
-        unit,
-    )
     return np.asarray(found)
 
 
