@@ -237,8 +237,9 @@ def _levels(problem: EstimationProblem, episode: Episode, names: tuple[str, ...]
     torque[at] = torque_std(joints, driven, effort, episode.name)
     bias[at] = torque_bias_std(joints, driven, effort)
     if other:
-        angle[rest] = by_joint(0.0 if joint_angles is None else joint_angles, joints.names, other, f"sensors.{POSITION}.std")
-        torque[rest] = by_joint(0.0 if torques is None else torques, joints.names, other, f"sensors.{EFFORT}.std")
+        stated = ((angle, joint_angles, POSITION), (torque, torques, EFFORT))
+        for target, std, group in stated:
+            target[rest] = by_joint(0.0 if std is None else std, joints.names, other, f"sensors.{group}.std")
     return _Levels(angle, torque, bias)
 
 
