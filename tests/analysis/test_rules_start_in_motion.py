@@ -117,5 +117,11 @@ def test_a_recording_is_predicted_from_the_others_alone():
     expected = np.sqrt(((4.0 - 1.0) ** 2 + (1.5 - 6.0) ** 2) / 2)
     for at in (3.0, 10.0):
         assert module._left_out(problem, solution((at, 0.5)), [0, 2]) == pytest.approx(expected, rel=1e-6)
+    problem.bounds = np.array([-np.inf, 0.0]), np.array([3.0, 1.0])
+    bounded = np.sqrt(((3.0 - 1.0) ** 2 + (1.5 - 6.0) ** 2) / 2)
+    assert module._left_out(problem, solution((2.5, 0.5)), [0, 2]) == pytest.approx(bounded, rel=1e-6)
+    problem.bounds = np.array([2.0, 0.0]), np.array([np.inf, 1.0])
+    bounded = np.sqrt(((4.0 - 1.0) ** 2 + (2.0 - 6.0) ** 2) / 2)
+    assert module._left_out(problem, solution((2.5, 0.5)), [0, 2]) == pytest.approx(bounded, rel=1e-6)
     problem.predictor = SimpleNamespace(run=lambda *_: "it snaps")
     assert module._left_out(problem, solution((3.0, 0.5)), [0, 2]) == np.inf
