@@ -14,7 +14,7 @@ PAPER = ("single_arm_no_vision", "single_arm_vision", "dual_arm_no_vision", "dua
 COARSE = (
     "model.object.links=2",
     "problem.duration=0.3",
-    "solver.iterations=3",
+    "solver.iterations=2",
     "problem.compiler=false",
     # one stiffness: the others are hardly seen in so short a time, and their profile likelihoods take many refits
     "parameters={T*.bend: {initial: 15}, T1.bend: {free: true, initial: 15}, T*.twist: {initial: 10}}",
