@@ -149,6 +149,26 @@ def test_a_verdict_is_lowered_by_moves_and_never_raised(move, before, after):
     assert replace(found["a"], std=0.02, verdict=before) == said["a"]
 
 
+@pytest.mark.parametrize(
+    ("interval", "expected"),
+    [
+        ((9.0, 12.0), (9.0 - 1.96 * 0.6, 12.0 + 1.96 * 0.6)),
+        ((None, 12.0), (None, 12.0 + 1.96 * 0.6)),
+        ((9.0, None), (9.0 - 1.96 * 0.6, None)),
+        ((0.2, 19.5), (0.0, 20.0)),
+        (None, None),
+    ],
+    ids=["both", "open below", "open above", "to the bounds", "none"],
+)
+def test_an_interval_grows_at_its_ends_by_what_the_move_adds(interval, expected):
+    said = replace(estimate(10.0, 0.2), interval=interval, lower=0.0, upper=20.0)
+    found = counting({"a": said}, {"a": Moves(0.3)})["a"].interval
+    if expected is None:
+        assert found is None
+    else:
+        assert [None if end is None else pytest.approx(end, rel=1e-4) for end in expected] == list(found)
+
+
 def test_what_nothing_informs_stays_unknown():
     said = {"a": estimate(10.0, math.inf, verdict="not_identifiable")}
     assert counting(said, {"a": Moves(5.0, 5.0)}) == said
