@@ -71,7 +71,11 @@ def test_nothing_to_agree_on(repository, tmp_path, capsys):
 
 def test_command(repository, tmp_path, capsys):
     config = repository / "configs" / "single_arm_no_vision.yaml"
-    settings = ["problem.duration=0.5", "compare.methods={gauss_newton: {}, single_shooting: {}}"]
+    settings = [
+        "problem.duration=0.5",
+        "compare.methods={gauss_newton: {}, single_shooting: {}}",
+        "parameters={T1.bend: {free: true, initial: 15}}",
+    ]
     arguments = [part for setting in settings for part in ("--set", setting)]
     assert main(["compare", str(config), "--out", str(tmp_path / "run"), *arguments]) == 0
     text = capsys.readouterr().out

@@ -172,6 +172,14 @@ def test_a_constant_error_is_seen_and_its_spread_said(urdf_folder):
     assert problem.torque_offsets(problem.start) == [None]
 
 
+def test_what_cannot_be_rolled_out_has_no_constant_error(point, monkeypatch):
+    problem, x = point
+    weighted = problem.weighted_at(x)
+    assert len(weighted.torque_offsets(x)[0]) == 2
+    monkeypatch.setattr(type(weighted.predictor), "run", lambda *_: "it snaps")
+    assert weighted.torque_offsets(x) == [None]
+
+
 def test_weights_are_frozen_until_they_are_asked_for_again(point):
     problem, x = point
     weighted = problem.weighted_at(x)

@@ -202,11 +202,14 @@ def test_the_residual_is_made_of_measurements_then_priors(make):
     assert ResidualRows.of((), 2, 3) == ResidualRows((), slice(0, 0), slice(0, 2), slice(2, 5))
 
 
-def test_the_papers_rows_are_metres_and_inform_in_units_of_the_noise(make):
-    problem = make(weighting="paper", priors={"elbow.stiffness": 1.0})
+@pytest.mark.parametrize("stated", [None, 2.0], ids=["small", "more than a metre"])
+def test_the_papers_rows_are_metres_and_inform_in_units_of_the_noise(make, stated):
+    names = () if stated is None else sorted({s.sensor.group for s in make().episodes[0].samples})
+    sensors = {name: SensorOptions(std=stated) for name in names}
+    problem = make(weighting="paper", priors={"elbow.stiffness": 1.0}, sensors=sensors)
     evaluation = problem.evaluate(problem.start + np.array([0.0, 2.0, 0.0]))
     # 75 coordinates of 2 cm and 39 of 5 cm in each recording
-    noise = math.sqrt((75 * 0.02**2 + 39 * 0.05**2) / 114)
+    noise = stated or math.sqrt((75 * 0.02**2 + 39 * 0.05**2) / 114)
     assert problem.noise == pytest.approx(noise)
     residual, jacobian = problem.informing(evaluation)
     data = problem.rows.data
