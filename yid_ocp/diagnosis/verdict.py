@@ -33,7 +33,7 @@ def has_gap(before: NullTest, held_out: NullTest, limits: Thresholds, ranked: Se
 
 
 def shapeless(
-    smoothed: Smoothed, ranked: Sequence[Score], before: NullTest, held_out: NullTest, limits: Thresholds
+    smoothed: Smoothed | None, ranked: Sequence[Score], before: NullTest, held_out: NullTest, limits: Thresholds
 ) -> bool:
     """Whether an excess is barely significant and neither any unknown nor any candidate explains it: chance, then.
 
@@ -41,7 +41,7 @@ def shapeless(
     """
     best = _best_of(ranked)
     barely = min(before.p_value, held_out.p_value) > limits.shapeless * limits.level
-    return barely and best >= limits.level and smoothed.side == "none"
+    return barely and best >= limits.level and (smoothed is None or smoothed.side == "none")
 
 
 def _best_of(ranked: Sequence[Score]) -> float:
@@ -78,7 +78,7 @@ def decide(
         return "insufficient_data"
     if not gap:
         return "no_gap"
-    if not added or not total.low > limits.closure or explained < limits.explained:
+    if not added or not (total.low > limits.closure or total.sure) or explained < limits.explained:
         return "unknown"
     return "confusable" if len(added[0].rivals) > 1 else "effect"
 
@@ -86,7 +86,7 @@ def decide(
 def explained_part(nominal: Fit, added: Sequence[Added], smoothed: Smoothed | None) -> float:
     """Fall of r'r by the effects over that by the smoother, each less what it takes of the noise.
 
-    Both are on the recordings to estimate on, so that the same noise stands in both.
+    Both are on the recordings to estimate on, so that the same noise stands in both. One where nothing was smoothed.
     """
     if smoothed is None or not added:
         return 1.0

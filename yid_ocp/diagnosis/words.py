@@ -134,6 +134,9 @@ def _effects(finding: Finding) -> list[str]:
     text = [
         f"{names} {verb} {100 * total.value:.3g} % of it on held-out motions "
         f"(95 % interval {100 * total.low:.3g} to {100 * total.high:.3g} %)."
+        if total.low > finding.limits.closure
+        else f"With {names} the held-out motions are far more likely (more than {math.exp(finding.limits.worth):.0f} "
+        "times), although so little of chi2 tells of it that no part of the gap can be given."
     ]
     for entry in finding.added:
         others = [r.label for r in entry.rivals if r.label != entry.effect.label]

@@ -237,7 +237,9 @@ def _levels(problem: EstimationProblem, episode: Episode, names: tuple[str, ...]
     torque[at] = torque_std(joints, driven, effort, episode.name)
     bias[at] = torque_bias_std(joints, driven, effort)
     if other:
-        angle[rest] = by_joint(0.0 if joint_angles is None else joint_angles, joints.names, other, f"sensors.{POSITION}.std")
+        angle[rest] = by_joint(
+            0.0 if joint_angles is None else joint_angles, joints.names, other, f"sensors.{POSITION}.std"
+        )
         torque[rest] = by_joint(0.0 if torques is None else torques, joints.names, other, f"sensors.{EFFORT}.std")
     return _Levels(angle, torque, bias)
 
