@@ -87,12 +87,13 @@ def _diagnosed(problem: EstimationProblem, search: Search, solution: Solution | 
     search, before, held, screened = _tested(search, nominal)
     clock.lap("screening")
     enough = before.degrees >= limits.samples_per_unknown * len(nominal.values)
-    smoothed, trusted, gap = None, None, has_gap(before, held, limits, screened.scores)
+    offsets = _offsets_stated(nominal.problem)
+    smoothed, trusted, gap = None, None, has_gap(before, held, limits, screened.scores, offsets)
     other = elsewhere(search, nominal) if gap and enough and before.chi2_per_dof < limits.poor else None
     if other is not None:
         nominal = other
         search, before, held, screened = _tested(search, nominal)
-        gap = has_gap(before, held, limits, screened.scores)
+        gap = has_gap(before, held, limits, screened.scores, offsets)
     clock.lap("other_starts")
     if gap and enough:
         progress("locating the gap")
@@ -150,6 +151,10 @@ def _tested(search: Search, nominal: Fit) -> tuple[Search, NullTest, NullTest, S
     return replace(search, problem=composed), before, held, screened
 
 
+def _offsets_stated(problem: EstimationProblem) -> bool:
+    return problem.disturbed and any(e.errors is not None and np.any(e.errors.bias_std > 0) for e in problem.episodes)
+
+
 def elsewhere(search: Search, nominal: Fit) -> Fit | None:
     """The nominal model fitted from other starts, where one of them ends far likelier; None where none does.
 
@@ -177,7 +182,8 @@ def _settled(
 ) -> Fit | None:
     """The nominal model fitted from a start, under weights that were frozen near its end."""
     if composed.problem.disturbed:
-        first = refit(composed.weighted_at(start), (), start, limits=limits)
+        composed = composed.weighted_at(start)
+        first = refit(composed, (), start, limits=limits)
         start = start if first is None else first.values
         composed = composed.weighted_at(start)
     return refit(composed, (), start, store, name, limits)

@@ -12,11 +12,14 @@ from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.problem.null_test import NullTest, more_than_noise
 
 
-def has_gap(before: NullTest, held_out: NullTest, limits: Thresholds, ranked: Sequence[Score] = ()) -> bool:
+def has_gap(
+    before: NullTest, held_out: NullTest, limits: Thresholds, ranked: Sequence[Score] = (), offsets: bool = False
+) -> bool:
     """Whether the residual is more than noise, by enough to be worth a name.
 
     Either as a whole, or along what a candidate would do to it with some channel above noise: the sum over all channels
-    does not notice what only a few samples show.
+    does not notice what only a few samples show. An offset of a torque beyond what was stated needs no such channel: it
+    is one number among thousands, and all others follow it.
 
     Parameters
     ----------
@@ -24,8 +27,13 @@ def has_gap(before: NullTest, held_out: NullTest, limits: Thresholds, ranked: Se
     limits : Thresholds
     ranked : sequence of Score
         Of all visible candidates; their smallest p-value counts as the best of that many tries.
+    offsets : bool
+        Whether the size of torque offsets is stated.
     """
     if more_than_noise((before, held_out), limits.gap):
+        return True
+    stated = [score.p_value for score in ranked if score.effect.kind == "effort_offset"] if offsets else []
+    if stated and min(stated) * len(ranked) < limits.level:
         return True
     best = _best_of(ranked)
     largest = max((*before.channels.values(), *held_out.channels.values()), default=1.0)

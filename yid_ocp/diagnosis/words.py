@@ -114,8 +114,12 @@ def _gap(finding: Finding) -> str:
             f"There is no gap to speak of (chi2 per degree of freedom {first.chi2_per_dof:.3g}, held out "
             f"{held.chi2_per_dof:.3g}; p = {p:.2g})."
         )
+    best = min(finding.scores, key=lambda score: score.p_value, default=None)
+    along = ""
+    if p >= finding.limits.level and best is not None:
+        p, along = min(1.0, best.p_value * len(finding.scores)), f" along what {best.effect.label} would do"
     small = f"= {p:.2g}" if p > 1e-12 else "< 1e-12"
-    return f"The gap is real (held-out chi2 per degree of freedom {held.chi2_per_dof:.3g}, p {small})."
+    return f"The gap is real (held-out chi2 per degree of freedom {held.chi2_per_dof:.3g}, p {small}{along})."
 
 
 def _places(finding: Finding) -> str:
