@@ -278,9 +278,7 @@ def test_a_method_that_cannot_carry_the_noise_says_so_and_runs_once():
     assert len(solver.runs) == 1
     assert problem.frozen == []
     assert solution.problem is problem
-    assert solution.message == (
-        "run 1; weighted by the sensors' noise alone, without the noise that drives the motion"
-    )
+    assert solution.message == ("run 1; weighted by the sensors' noise alone, without the noise that drives the motion")
 
 
 def test_without_noise_that_drives_the_motion_there_is_one_pass():
