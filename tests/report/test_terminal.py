@@ -171,6 +171,7 @@ def test_verdicts_of_a_comparison_weigh_all_noise():
     assert line_of(lines, "a").split() == ["a", "7", "±", "0.1", "9", "±", "0.1", "found"]
     assert not any("does not explain" in line for line in lines)
     assert any("compared by the sensors' noise alone" in line for line in lines)
+    assert lines[-1].endswith("the torques' errors have misled them all alike")
 
 
 def test_what_if_names_the_fewest_changes_or_that_there_are_none():

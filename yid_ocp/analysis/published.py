@@ -54,7 +54,10 @@ class Ends:
 
 @cache
 def ensemble() -> Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]]:
-    """Experiment, errors of the torques (none, offsets) and parameter to the members' values [N m/rad]."""
+    """Experiment, errors of the torques (none, offsets) and parameter to the members' values [N m/rad].
+
+    What `benchmarks/torque_ensemble.py` leaves.
+    """
     text = (resources.files("yid_ocp.data") / "defaults" / "torque_ensemble.json").read_text(encoding="utf-8")
     found: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]] = json.loads(text)
     return found

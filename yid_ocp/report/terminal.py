@@ -150,6 +150,8 @@ def compare_summary(result: Mapping[str, Any]) -> list[str]:
         lines.append("`yid-ocp identifiability CONFIG --what-if` says what would have to be measured")
     elif result["agree"]:
         lines.append("all methods agree within their uncertainty on the parameters that are found")
+        if disturbed:
+            lines.append("where the column 'all noise' is elsewhere, the torques' errors have misled them all alike")
     return lines
 
 
