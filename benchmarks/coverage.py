@@ -142,7 +142,7 @@ def make_twin(cell: str, recipe: Mapping[str, Any], number: int, folder: str, co
         DURATION, time_step=INNER_STEP, controller_rate=made.controller_rate, effort_kind=made.effort_kind
     )
     noise_seed = int(rng.integers(2**31))
-    motion, motion_seed = _gentle_enough(system, truth, posture, simulation, made.undeformed, rng)
+    motion, motion_seed = gentle_enough(system, truth, posture, simulation, made.undeformed, rng)
     experiment = VirtualExperiment(
         motion=motion,
         posture=posture,
@@ -162,7 +162,7 @@ def make_twin(cell: str, recipe: Mapping[str, Any], number: int, folder: str, co
     return {"file": str(path), "truth": truth, "motion_seed": motion_seed, "roughness": rough.tolist()}
 
 
-def _gentle_enough(
+def gentle_enough(
     system: System,
     truth: Mapping[str, float],
     posture: Mapping[str, float],

@@ -3,9 +3,9 @@
     python benchmarks/mutation [--mutants N] [--seed S] [--in PACKAGE] [--file NAME] [--jobs N] [--rules] [--again]
 
 First the named breaks of `breaks.yaml`, each against the tests named beside it; then so many mutants, drawn by the seed
-over diagnosis/, analysis/, problem/ and solvers/base.py (see `places.py`), each against those tests of its package's
-folder that run the changed statement, tests of rules first, then file by file, the quickest first, up to the first
-failure or three times the time that they take without a change. Tests marked `slow` stay out.
+over diagnosis/, analysis/, problem/ and what all solvers share (see `PACKAGES` and `places.py`), each against those
+tests of its package's folder that run the changed statement, tests of rules first, then file by file, the quickest
+first, up to the first failure or three times the time that they take without a change. Tests marked `slow` stay out.
 
 What was found goes to a JSON file as it is found; an interrupted run goes on from there as long as sources and tests
 are the same. `--again` is for the time in which tests are being written: what was killed counts as killed, whatever was
@@ -34,8 +34,10 @@ from places import Mutant, drawn
 from ruamel.yaml import YAML
 
 ROOT = Path(__file__).resolve().parents[2]
-PACKAGES = {"diagnosis": "diagnosis", "analysis": "analysis", "problem": "problem", "solvers": "solvers.base"}
-"""Folder of tests, and the package that is broken."""
+PACKAGES: dict[str, tuple[str, ...]] = {name: (name,) for name in ("diagnosis", "analysis", "problem")} | {
+    "solvers": ("solvers.base", "solvers.judgement", "solvers.linear_model", "solvers.words"),
+}
+"""Package, whose tests stand in the folder of the same name, and what of it is broken."""
 WANTED = 0.85
 
 
@@ -145,8 +147,8 @@ def breaks(chosen: Sequence[str]) -> list[Job]:
     jobs, wrong = [], []
     for entry in entries:
         file = f"yid_ocp/{entry['file']}"
-        package = ".".join(Path(entry["file"]).with_suffix("").parts[:2])
-        if chosen and package.split(".")[0] not in chosen:
+        package = Path(entry["file"]).with_suffix("").parts[0]
+        if chosen and package not in chosen:
             continue
         path = ROOT / file
         source = path.read_text(encoding="utf-8") if path.is_file() else ""
@@ -161,9 +163,9 @@ def breaks(chosen: Sequence[str]) -> list[Job]:
     return jobs
 
 
-def files_of(package: str) -> list[str]:
-    """Files of a package, below the repository."""
-    place = ROOT / "yid_ocp" / Path(*package.split("."))
+def files_of(module: str) -> list[str]:
+    """Files of a package or module, below the repository."""
+    place = ROOT / "yid_ocp" / Path(*module.split("."))
     found = sorted(place.rglob("*.py")) if place.is_dir() else [place.with_suffix(".py")]
     return [str(file.relative_to(ROOT)) for file in found if file.name != "__init__.py"]
 
@@ -275,15 +277,15 @@ def run(jobs: Sequence[tuple[str, Job]], workers: Sequence[Worker], results: Res
     results.write()
 
 
-def covering(worker: Worker, folder: str, package: str, store: Path, digest: str) -> dict[str, Any]:
-    """Which tests of a folder run which lines; from an earlier run where sources and tests are the same."""
-    file = store / f"covered_{folder}.json"
+def covering(worker: Worker, package: str, store: Path, digest: str) -> dict[str, Any]:
+    """Which tests of a package run which lines; from an earlier run where sources and tests are the same."""
+    file = store / f"covered_{package}.json"
     if file.is_file():
         known = json.loads(file.read_text(encoding="utf-8"))
         if known["digest"] == digest:
             return dict(known)
-    print(f"running tests/{folder} as they are", flush=True)
-    found = worker.ask(package, {"cover": f"tests/{folder}"}) | {"digest": digest}
+    print(f"running tests/{package} as they are", flush=True)
+    found = worker.ask(package, {"cover": f"tests/{package}", "of": PACKAGES[package]}) | {"digest": digest}
     file.write_text(json.dumps(found), encoding="utf-8")
     return found
 
@@ -319,14 +321,14 @@ def jobs_of(given: argparse.Namespace, worker: Worker, store: Path, tree: str) -
         yield from (("named breaks", job) for job in named)
     if not given.mutants:
         return
-    packages = {folder: package for folder, package in PACKAGES.items() if not given.chosen or folder in given.chosen}
-    owner = {file: folder for folder, package in packages.items() for file in files_of(package)}
+    packages = [package for package in PACKAGES if not given.chosen or package in given.chosen]
+    owner = {file: package for package in packages for module in PACKAGES[package] for file in files_of(module)}
     files = [file for file in owner if not given.file or Path(file).name in given.file]
-    covered = {folder: covering(worker, folder, package, store, tree) for folder, package in packages.items()}
+    covered = {package: covering(worker, package, store, tree) for package in packages}
     print(f"drawing {given.mutants} mutants", flush=True)
     for mutant in drawn(ROOT, files, given.seed, given.mutants):
-        folder = owner[mutant.file]
-        yield "mutants", job_of(mutant, packages[folder], covered[folder], given.rules)
+        package = owner[mutant.file]
+        yield "mutants", job_of(mutant, package, covered[package], given.rules)
 
 
 def main() -> int:

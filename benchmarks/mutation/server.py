@@ -6,7 +6,7 @@ TREE is a copy of the repository that belongs to this process alone. Everything 
 (libraries, packages to its left) is imported once, so that a child only imports the package itself and runs its tests.
 Jobs come as lines of JSON, answers go out as such:
 
-- `{"cover": FOLDER}`: the tests of a folder as they are, with the lines that each one runs;
+- `{"cover": FOLDER, "of": [...]}`: the tests of a folder as they are, with the lines of these modules that each runs;
 - `{"file": ..., "text": ..., "tests": [...], "seconds": ...}`: tests against a file with that text, up to the first
   failure, and no longer than so.
 """
@@ -127,15 +127,16 @@ def forked(work: Callable[[], int], seconds: float) -> int | None:
     return status
 
 
-def cover(tree: Path, package: str, folder: str) -> dict[str, Any]:
+def cover(tree: Path, folder: str, modules: list[str]) -> dict[str, Any]:
     """Tests of a folder: `tests` {name: seconds and fixtures} and `lines` {file: {line: who runs it}}."""
     import coverage
 
     target = tree / "covered.json"
 
     def work() -> int:
-        own = tree / "yid_ocp" / Path(*package.split("."))
-        measured = coverage.Coverage(data_file=None, include=[f"{own}/*", f"{own}.py"], concurrency="thread")
+        own = [tree / "yid_ocp" / Path(*module.split(".")) for module in modules]
+        include = [pattern for place in own for pattern in (f"{place}/*", f"{place}.py")]
+        measured = coverage.Coverage(data_file=None, include=include, concurrency="thread")
         plugin = Covering(measured)
         measured.start()
         status = pytest.main([*ARGUMENTS, folder], plugins=[plugin])
@@ -199,16 +200,15 @@ def main() -> None:
     os.chdir(tree)
     sys.path.insert(0, str(tree))
     sys.dont_write_bytecode = True
-    top = package.split(".")[0]
-    for name in (*LIBRARIES, *(f"yid_ocp.{layer}" for layer in LAYERS[: LAYERS.index(top)])):
+    for name in (*LIBRARIES, *(f"yid_ocp.{layer}" for layer in LAYERS[: LAYERS.index(package)])):
         try:
             importlib.import_module(name)
         except ImportError:
             continue
-    assert f"yid_ocp.{top}" not in sys.modules
+    assert f"yid_ocp.{package}" not in sys.modules
     for line in sys.stdin:
         job = json.loads(line)
-        answer = cover(tree, package, job["cover"]) if "cover" in job else judged(tree, **job)
+        answer = cover(tree, job["cover"], job["of"]) if "cover" in job else judged(tree, **job)
         print(json.dumps(answer), file=answers, flush=True)
 
 

@@ -89,7 +89,7 @@ def test_divided_links_share_their_angle():
         "T1_1_x": ("T1_2_x", "T1_3_x"),
         "T1_1_y": ("T1_2_y", "T1_3_y"),
     }
-    assert divided_joints(coarse, coarse) == {}
+    assert divided_joints(coarse, coarse) == divided_joints(fine, coarse) == {}
     made = problem(lambda x: [x["a"]], {"a": 1.0})
     made.system = fine
     [warm] = Refined(made, divided=divided).warm(coarse, (np.array([0.2, -0.4, 0.6, 0.8]),))
@@ -141,12 +141,32 @@ def test_a_move_larger_than_the_standard_deviation_widens_it_to_where_the_limit_
 def test_a_verdict_is_lowered_by_moves_and_never_raised(move, before, after):
     """Of a value of 10 and a standard deviation of 0.02: ten percent are reached by a move of half of them."""
     said = {"a": estimate(10.0, 0.02, verdict=before), "b": estimate(10.0, 0.02), "c": estimate(3.0, 0.0, free=False)}
-    found = counting(said, {"a": Moves(move), "c": Moves(9.0)})
+    found = counting(said, {"c": Moves(9.0), "a": Moves(move)})
     assert found["a"].verdict == after
     assert found["a"].std == (0.02 if move < 0.02 else pytest.approx(math.hypot(0.02, 2 * move)))
     assert found["b"] == said["b"]
     assert found["c"] == said["c"]
     assert replace(found["a"], std=0.02, verdict=before) == said["a"]
+
+
+@pytest.mark.parametrize(
+    ("interval", "expected"),
+    [
+        ((9.0, 12.0), (9.0 - 1.96 * 0.6, 12.0 + 1.96 * 0.6)),
+        ((None, 12.0), (None, 12.0 + 1.96 * 0.6)),
+        ((9.0, None), (9.0 - 1.96 * 0.6, None)),
+        ((0.2, 19.5), (0.0, 20.0)),
+        (None, None),
+    ],
+    ids=["both", "open below", "open above", "to the bounds", "none"],
+)
+def test_an_interval_grows_at_its_ends_by_what_the_move_adds(interval, expected):
+    said = replace(estimate(10.0, 0.2), interval=interval, lower=0.0, upper=20.0)
+    found = counting({"a": said}, {"a": Moves(0.3)})["a"].interval
+    if expected is None:
+        assert found is None
+    else:
+        assert [None if end is None else pytest.approx(end, rel=1e-4) for end in expected] == list(found)
 
 
 def test_what_nothing_informs_stays_unknown():

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
 import pytest
 from made_models import Formula
 
-from yid_ocp.analysis.profile import LEVEL, best_fit, profile_likelihood
+from yid_ocp.analysis.profile import LEVEL, best_fit, profile_likelihood, small
 
 OPEN = {"a": (-math.inf, math.inf), "b": (-math.inf, math.inf)}
 HALF = math.sqrt(LEVEL)
@@ -401,3 +402,13 @@ def test_the_best_fit_is_the_optimum_nearby():
     np.testing.assert_allclose(x, [3.0, 2.0], rtol=1e-4)
     assert evaluation.cost == pytest.approx(0.0, abs=1e-6)
     assert evaluation.jacobian is not None
+
+
+@pytest.mark.parametrize(
+    ("parameters", "unknowns", "expected"),
+    [(12, 300, True), (13, 13, False), (1, 301, False), (13, 301, False), (1, 1, True)],
+)
+def test_intervals_are_worked_out_unasked_where_they_take_no_time(parameters, unknowns, expected):
+    names = tuple(f"k{i}" for i in range(parameters))
+    starts = tuple(f"start.q.joint[{i}]" for i in range(unknowns - parameters))
+    assert small(SimpleNamespace(names=names + starts, shared=names, local=())) is expected

@@ -117,5 +117,20 @@ def test_a_recording_is_predicted_from_the_others_alone():
     expected = np.sqrt(((4.0 - 1.0) ** 2 + (1.5 - 6.0) ** 2) / 2)
     for at in (3.0, 10.0):
         assert module._left_out(problem, solution((at, 0.5)), [0, 2]) == pytest.approx(expected, rel=1e-6)
+    problem.bounds = np.array([-np.inf, 0.0]), np.array([3.0, 1.0])
+    bounded = np.sqrt(((3.0 - 1.0) ** 2 + (1.5 - 6.0) ** 2) / 2)
+    assert module._left_out(problem, solution((2.5, 0.5)), [0, 2]) == pytest.approx(bounded, rel=1e-6)
+    problem.bounds = np.array([2.0, 0.0]), np.array([np.inf, 1.0])
+    bounded = np.sqrt(((4.0 - 1.0) ** 2 + (2.0 - 6.0) ** 2) / 2)
+    assert module._left_out(problem, solution((2.5, 0.5)), [0, 2]) == pytest.approx(bounded, rel=1e-6)
     problem.predictor = SimpleNamespace(run=lambda *_: "it snaps")
     assert module._left_out(problem, solution((3.0, 0.5)), [0, 2]) == np.inf
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0], ids=["above", "below"])
+def test_where_one_unknown_meets_its_bound_the_other_takes_the_rest(side):
+    near, far = np.array([10.0 + 0.5 * side, 10.0 + 9.0 * side]), np.array([10.0 - 9.0 * side, 10.0 - 9.0 * side])
+    problem = SimpleNamespace(bounds=(np.minimum(near, far), np.maximum(near, far)), scales=np.ones(2))
+    jacobian, residual = np.array([[1.0, 1.0], [0.0, 0.1]]), np.array([-2.0 * side, 0.0])
+    found = module._stepped(problem, np.array([10.0, 10.0]), residual, jacobian)
+    np.testing.assert_allclose(found, 10.0 + side * np.array([0.5, 1.5 / 1.01]), rtol=1e-6)

@@ -12,7 +12,16 @@ from factories import alike, amplitude, effect, fit, loss, score, shape
 from yid_ocp.diagnosis import select
 from yid_ocp.diagnosis.refit import Loss, Search
 from yid_ocp.diagnosis.screening import Screened
-from yid_ocp.diagnosis.select import closure, compose, gain, out_of_shape, oversized, shortlist, within_reach
+from yid_ocp.diagnosis.select import (
+    closure,
+    compose,
+    far_likelier,
+    gain,
+    out_of_shape,
+    oversized,
+    shortlist,
+    within_reach,
+)
 from yid_ocp.diagnosis.thresholds import Thresholds
 
 LIMITS = Thresholds()
@@ -390,17 +399,43 @@ def test_a_rest_below_the_smallest_gap_is_left(monkeypatch):
         ((3.0, 3.0, 3.0), (2.91, 2.91, 2.91), []),
         ((3.0, 3.0, 3.0), (2.89, 2.89, 2.89), ["a"]),
         ((3.0, 5.0, 3.0), (4.4, 2.5, 2.9), []),
-        ((1.0, 1.0, 1.0), (0.9, 0.9, 0.9), []),
-        ((0.9, 0.9, 0.9), (0.5, 0.5, 0.5), []),
+        ((0.9, 1.0, 1.0), (0.88, 0.98, 0.98), []),
+        ((0.9, 0.9, 0.9), (0.88, 0.88, 0.88), []),
+        ((1.0, 1.0, 1.0), (0.9, 0.99, 1.0), ["a"]),
+        ((1.2, 1.0, 1.0), (1.0, 1.01, 1.02), ["a"]),
         ((2.0, 2.0, 2.0), (2.0, 2.0, 2.0), []),
     ],
-    ids=["too little", "enough", "not sure", "no gap", "below noise", "nothing"],
+    ids=["too little", "enough", "not sure", "no gap", "below noise", "likelier", "likelier in one block", "nothing"],
 )
 def test_an_effect_must_close_a_sure_part_of_the_gap(monkeypatch, nominal, best, chosen):
     worse = tuple(9.0 for _ in nominal)
     rounds = Rounds(monkeypatch, {"": nominal, "a": best, "b": worse, "c": worse})
     first, found, _ = rounds.compose(effects=1)
     assert (found, first[0]) == (chosen, "a")
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "sure"),
+    [
+        ((1.05, 1.0), (0.9, 1.0), True),
+        ((1.05, 1.0), (0.96, 1.0), False),
+        ((1.3, 1.0), (1.0, 1.0), True),
+        ((1.6, 1.3), (1.2, 1.0), False),
+        ((1.6, 1.3), (math.inf, 1.0), False),
+    ],
+    ids=["a fall by 15", "a fall by 9", "a fall by 30", "what is left is no noise", "failed"],
+)
+def test_held_out_recordings_are_far_likelier_with_an_effect_that_leaves_noise(before, after, sure):
+    assert far_likelier(loss(*before), loss(*after)) is sure
+    assert closure(loss(*before), loss(*after)).sure is sure
+    assert not far_likelier(loss(*before), loss(*after), Thresholds(worth=20.0))
+
+
+def test_an_effect_far_less_likely_than_the_best_is_not_within_reach():
+    one, other = fit([effect("one@elbow")], loss(0.9, 1.0)), fit([effect("other@elbow")], loss(1.01, 1.0))
+    assert within_reach([one, other]) == [one]
+    near = fit([effect("other@elbow")], loss(0.98, 1.0))
+    assert within_reach([one, near]) == [one, near]
 
 
 def test_nothing_is_added_where_no_refit_succeeds(monkeypatch):

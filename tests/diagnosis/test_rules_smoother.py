@@ -10,7 +10,7 @@ import pytest
 import threadpoolctl
 from factories import BIAS, FORCE, OTHER_FORCE
 
-from yid_ocp.diagnosis import smoother
+from yid_ocp.diagnosis import smoother, smoother_model
 from yid_ocp.diagnosis.smoother_model import Interval, Linear
 from yid_ocp.diagnosis.thresholds import Thresholds
 
@@ -301,3 +301,23 @@ def test_what_would_be_noticed_comes_from_the_model_alone(monkeypatch):
         assert found.detectable[source] == pytest.approx(expected, rel=1e-8)
     more = smoothed(monkeypatch, models, noticed=40.0)
     assert more.detectable == {s: pytest.approx(2 * v) for s, v in found.detectable.items()}
+
+
+def test_known_noise_of_torques_is_as_strong_at_low_frequencies_as_the_unknown_force_for_it():
+    held, span, decay = 3 * 0.005, 0.1, 0.7
+    errors = SimpleNamespace(sample=np.repeat(np.arange(20), 3), torque_std=np.array([0.4, 0.2]))
+    errors.bias_std = np.array([0.0, 0.3])
+    course = SimpleNamespace(
+        episode=SimpleNamespace(errors=errors),
+        system=SimpleNamespace(driven=("a", "b")),
+        problem=SimpleNamespace(step=SimpleNamespace(time_step=0.005)),
+    )
+    reference = np.array([2.0, 5.0, 4.0])
+    unknowns = SimpleNamespace(names=("b", "free", "a", "encoder.a"), forced=(1, 2, 0), reference=reference)
+    known = smoother_model._torque_noise(course, unknowns, span, decay)
+    # autocovariances of a force with memory, summed over all lags, are those of held white noise
+    lags = 1 + 2 * sum(decay**k for k in range(1, 200))
+    white = np.array([0.4, 0.2]) ** 2 * held / (span * lags)
+    np.testing.assert_allclose(known, [(white[1] + 0.3**2) / 4.0, 0.0, white[0] / 16.0, 0.0], rtol=1e-9)
+    course.episode.errors = None
+    np.testing.assert_array_equal(smoother_model._torque_noise(course, unknowns, span, decay), np.zeros(4))

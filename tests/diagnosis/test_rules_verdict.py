@@ -85,6 +85,21 @@ def test_a_gap_along_a_candidate_needs_a_channel_above_noise(p_values, before, h
     assert has_gap(*tests, LIMITS, scored(*p_values)) is gap
 
 
+@pytest.mark.parametrize(
+    ("label", "p", "stated", "gap"),
+    [
+        ("effort_offset@elbow", 0.004, True, True),
+        ("effort_offset@elbow", 0.005, True, False),
+        ("effort_offset@elbow", 0.004, False, False),
+        ("joint_viscous@elbow", 0.004, True, False),
+    ],
+    ids=["beyond", "within", "nobody stated any", "another effect"],
+)
+def test_an_offset_beyond_what_was_stated_needs_no_channel_above_noise(label, p, stated, gap):
+    ranked = (score(effect(label), p=p), score(effect("friction@wrist"), p=0.9))
+    assert has_gap(outcome(), outcome(), LIMITS, ranked, stated) is gap
+
+
 def test_the_level_and_the_smallest_gap_are_thresholds():
     tests = (outcome(p=0.02, chi2=1.2), outcome())
     assert has_gap(*tests, Thresholds(level=0.05))

@@ -172,6 +172,14 @@ def test_a_constant_error_is_seen_and_its_spread_said(urdf_folder):
     assert problem.torque_offsets(problem.start) == [None]
 
 
+def test_what_cannot_be_rolled_out_has_no_constant_error(point, monkeypatch):
+    problem, x = point
+    weighted = problem.weighted_at(x)
+    assert len(weighted.torque_offsets(x)[0]) == 2
+    monkeypatch.setattr(type(weighted.predictor), "run", lambda *_: "it snaps")
+    assert weighted.torque_offsets(x) == [None]
+
+
 def test_weights_are_frozen_until_they_are_asked_for_again(point):
     problem, x = point
     weighted = problem.weighted_at(x)
@@ -193,6 +201,9 @@ def test_jacobians_of_innovations_are_those_of_differences(urdf_folder):
         ends = [weighted.evaluate(x + sign * step, warm=found.warm).residual for sign in (1, -1)]
         numeric = (ends[0] - ends[1]) / (2 * step[i])
         np.testing.assert_allclose(numeric, found.jacobian[:, i], atol=2e-5 * np.abs(found.jacobian[:, i]).max())
+    cost, gradient, again = weighted.gradient(x)
+    assert (cost, again.jacobian) == (pytest.approx(found.cost), None)
+    np.testing.assert_allclose(gradient, found.jacobian.T @ found.residual, rtol=1e-9)
 
 
 # -- which encoders are measurements, and what is known of noise -------------------------------------------------------

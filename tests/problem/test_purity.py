@@ -93,9 +93,9 @@ def test_an_answer_does_not_depend_on_earlier_questions(kind, pendulum):
 
 def test_an_answer_at_rest_does_not_depend_on_earlier_questions(arm):
     fresh, asked = arm("equilibrium"), arm("equilibrium")
-    for x in points(asked, [3, 1, 2]):
+    for x in points(asked, [2, 1]):
         said(asked, x)
-    for x in points(asked, [1, 2, 3]):
+    for x in points(asked, [1, 2]):
         assert_same(said(arm("equilibrium"), x), said(asked, x))
     # a warm start leads to the same equilibrium, to the tolerance of the statics
     x, near = points(fresh, [1, 2])

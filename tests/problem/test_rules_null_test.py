@@ -11,7 +11,7 @@ import pytest
 import scipy.stats
 from made_series import samples, series
 
-from yid_ocp.problem.null_test import noise_floor, null_test, spread
+from yid_ocp.problem.null_test import GapLimits, NullTest, more_than_noise, noise_floor, null_test, spread
 
 CHI2 = scipy.stats.chi2
 
@@ -51,6 +51,47 @@ def test_several_series_add_and_rows_of_no_series_do_not_count():
     assert found.degrees == pytest.approx(2 + 2 / 1.5 - 1)
     assert found.chi2_per_dof == pytest.approx((1 + 4 + 9 + 16) / 3)
     assert found.channels == {"points.tip": pytest.approx(2.5), "points.other": pytest.approx(12.5)}
+
+
+# -- more than noise --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("tests", "said"),
+    [
+        ([(1.5, 0.009)], True),
+        ([(1.5, 0.01)], False),
+        ([(1.11, 1e-9)], True),
+        ([(1.1, 1e-9)], False),
+        ([(1.5, 0.004), (1.0, 0.5)], True),
+        ([(1.5, 0.006), (1.0, 0.5)], False),
+        ([(1.0, 0.5), (1.5, 0.006)], False),
+        ([(1.0, 0.5), (1.5, 0.003), (1.0, 0.6)], True),
+        ([(1.05, 1e-9), (1.2, 0.3)], True),
+        ([(1.05, 1e-9), (1.0, 0.3)], False),
+    ],
+    ids=[
+        "sure",
+        "at the level",
+        "just worth a word",
+        "not worth a word",
+        "the best of two",
+        "not among two",
+        "in whatever order",
+        "the best of three",
+        "size by the largest",
+        "all small",
+    ],
+)
+def test_more_than_noise_is_sure_among_all_tests_and_worth_a_word(tests, said):
+    made = [NullTest(ratio, 10.0, p, {}, {}, ()) for ratio, p in tests]
+    assert more_than_noise(made) is said
+
+
+def test_the_limits_of_the_gap_are_those_given():
+    found = [NullTest(1.5, 10.0, 0.02, {}, {}, ())]
+    assert more_than_noise(found, GapLimits(level=0.05))
+    assert not more_than_noise(found, GapLimits(level=0.05, smallest_gap=0.5))
 
 
 # -- is it white ------------------------------------------------------------------------------------------------------

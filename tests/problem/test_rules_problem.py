@@ -117,12 +117,12 @@ def test_an_estimated_start_has_a_prior_in_angles_and_momenta(make, momentum, fr
     np.testing.assert_allclose(problem.start_std, [0.07, 0.07, 0.3 * inertia[0], 0.3 * inertia[1]], rtol=1e-9)
     np.testing.assert_allclose(apparent_inertia(free_step, theta, ("elbow", "shoulder")), inertia[::-1], rtol=1e-9)
     assert problem.names[3:] == tuple(f"start.{kind}.{joint}[run_1]" for kind in "qp" for joint in PENDULUM)
-    assert problem.start_rows == (0, 1, 2, 3)
+    assert problem.predictor.start_rows == (0, 1, 2, 3)
 
 
 def test_without_estimated_starts_there_are_none(make):
     problem = make()
-    assert problem.start_rows == ()
+    assert problem.predictor.start_rows == ()
     assert problem.start_std.shape == (0,)
     assert problem.names == FREE
 
@@ -202,11 +202,14 @@ def test_the_residual_is_made_of_measurements_then_priors(make):
     assert ResidualRows.of((), 2, 3) == ResidualRows((), slice(0, 0), slice(0, 2), slice(2, 5))
 
 
-def test_the_papers_rows_are_metres_and_inform_in_units_of_the_noise(make):
-    problem = make(weighting="paper", priors={"elbow.stiffness": 1.0})
+@pytest.mark.parametrize("stated", [None, 2.0], ids=["small", "more than a metre"])
+def test_the_papers_rows_are_metres_and_inform_in_units_of_the_noise(make, stated):
+    names = () if stated is None else sorted({s.sensor.group for s in make().episodes[0].samples})
+    sensors = {name: SensorOptions(std=stated) for name in names}
+    problem = make(weighting="paper", priors={"elbow.stiffness": 1.0}, sensors=sensors)
     evaluation = problem.evaluate(problem.start + np.array([0.0, 2.0, 0.0]))
     # 75 coordinates of 2 cm and 39 of 5 cm in each recording
-    noise = math.sqrt((75 * 0.02**2 + 39 * 0.05**2) / 114)
+    noise = stated or math.sqrt((75 * 0.02**2 + 39 * 0.05**2) / 114)
     assert problem.noise == pytest.approx(noise)
     residual, jacobian = problem.informing(evaluation)
     data = problem.rows.data

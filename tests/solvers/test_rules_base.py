@@ -224,3 +224,64 @@ def test_a_solver_that_needs_no_rollout_is_not_given_shorter_horizons(needs):
     assert len(whole) == 4
     assert (len(solver.runs) > 4) is needs
     assert isinstance(solution, Solution)
+
+
+# -- passes, where noise drives the motion ----------------------------------------------------------------------------
+
+
+class Disturbed(MadeUp):
+    """A problem whose weights are frozen where it is asked for them; remembers where that was."""
+
+    def __init__(self, *arguments, asked=None, **more):
+        super().__init__(*arguments, **more)
+        self.disturbed, self.frozen = True, [] if asked is None else asked
+
+    def weighted_at(self, x, warm=None):
+        self.frozen.append((np.asarray(x).tolist(), warm))
+        made = Disturbed(self._rows, self.start, asked=self.frozen)
+        made.frozen_at = np.asarray(x).tolist()
+        return made
+
+
+class Carrying(Steps):
+    """A method that weighs residuals by noise that drives the motion."""
+
+    carries_covariance = True
+
+
+def test_passes_begin_where_the_last_one_ended_and_end_when_one_changes_nothing():
+    solver = Carrying([[1.0], [2.0]], [[2.0], [2.5]], [[2.5]], [[99.0]])
+    problem = Disturbed(linear(np.eye(1), [-2.5]))
+    solution = solve(problem, solver)
+    assert [start for start, _ in solver.runs] == [[1.0], [2.0], [2.5]]
+    assert problem.frozen == [([1.0], None), ([2.0], "warm"), ([2.5], "warm")]
+    assert solution.x.tolist() == [2.5]
+    assert solution.problem.frozen_at == [2.5]
+    assert solution.evaluations == 5
+    assert len(solution.history) == 5
+    assert "sensors' noise alone" not in solution.message
+
+
+def test_the_first_pass_is_never_the_last_and_their_number_has_an_end():
+    still = Carrying([[1.0]], [[1.0]])
+    solve(Disturbed(misfit(lambda x: 1.0)), still)
+    assert len(still.runs) == 2
+    restless = Carrying(*[[[k], [k + 1.0]] for k in range(9)])
+    solve(Disturbed(misfit(lambda x: 1.0)), restless)
+    assert len(restless.runs) == 6
+
+
+def test_a_method_that_cannot_carry_the_noise_says_so_and_runs_once():
+    solver = Steps([[1.0], [2.0]], [[3.0]])
+    problem = Disturbed(linear(np.eye(1), [-2.0]))
+    solution = solve(problem, solver)
+    assert len(solver.runs) == 1
+    assert problem.frozen == []
+    assert solution.problem is problem
+    assert solution.message == ("run 1; weighted by the sensors' noise alone, without the noise that drives the motion")
+
+
+def test_without_noise_that_drives_the_motion_there_is_one_pass():
+    solver = Carrying([[1.0], [2.0]], [[3.0]])
+    solve(MadeUp(linear(np.eye(1), [-2.0])), solver)
+    assert len(solver.runs) == 1

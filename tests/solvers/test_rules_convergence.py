@@ -66,6 +66,16 @@ def test_a_point_is_an_end_where_no_step_within_the_bounds_promises_much(x, resi
     assert settled(problem, np.array(x), problem.evaluate(x)) is expected
 
 
+@pytest.mark.parametrize(
+    ("size", "slope", "residual", "expected"),
+    [(100.0, 0.01, -5.0, False), (1.0, 1e-3, -5.0, True), (1e-3, 10.0, -0.5, True), (1.0, 10.0, -0.5, False)],
+    ids=["large", "a small one is not worth it", "small", "a large one is worth it"],
+)
+def test_no_step_longer_than_the_unknowns_size_counts(size, slope, residual, expected):
+    problem = MadeUp(linear([[slope]], [residual]), lower=-np.inf, scales=(size,))
+    assert settled(problem, np.zeros(1), problem.evaluate([0.0])) is expected
+
+
 def test_what_nothing_informs_keeps_no_search_from_its_end():
     problem = MadeUp(lambda x, duration: (np.array([50.0]), np.array([[1e-9]])), (1.0,))
     assert settled(problem, np.ones(1), problem.evaluate([1.0]))

@@ -11,11 +11,11 @@ from yid_ocp.virtual.motion import multisine
 
 @pytest.fixture(scope="session")
 def runs() -> Runs:
-    """runs(arms, time step [s]): five seconds of the paper's system."""
+    """runs(arms, time step [s], duration [s]): the paper's system, five seconds where nothing else is said."""
 
     @cache
-    def run(arms: int, step: float) -> SimulatedRun:
+    def run(arms: int, step: float, duration: float = 5.0) -> SimulatedRun:
         motion = multisine(SYSTEMS[arms], TRUTH, seed=SEEDS[arms])
-        return simulate_in_mujoco(SYSTEMS[arms], TRUTH, motion, Simulation(time_step=step))
+        return simulate_in_mujoco(SYSTEMS[arms], TRUTH, motion, Simulation(duration, time_step=step))
 
     return run

@@ -25,9 +25,10 @@ DEFAULTS = Path(yid_ocp.__file__).parent / "data" / "defaults"
 
 
 def test_recording_has_what_the_sensors_saw(runs: Runs) -> None:
-    system, run = SYSTEMS[1], runs(1, 1e-4)
+    system, run = SYSTEMS[1], runs(1, 2e-4)
     motion = multisine(system, TRUTH, seed=SEEDS[1])
-    recording = virtual_experiment(system, TRUTH, VirtualExperiment(motion=motion, seed=5))
+    simulation = Simulation(time_step=2e-4)
+    recording = virtual_experiment(system, TRUTH, VirtualExperiment(motion=motion, simulation=simulation, seed=5))
     joints = recording.joints
     assert joints is not None
     assert joints.velocity is not None

@@ -16,7 +16,7 @@ from yid_ocp.virtual.experiment import paper_system
 TRUTH = {"T1.bend": 22.0, "T1.twist": 13.6, "T2.bend": 10.7, "T2.twist": 8.2, "T3.bend": 11.5, "T3.twist": 9.7}
 SYSTEMS = {arms: paper_system(arms) for arms in (1, 2)}
 SEEDS = {1: 7, 2: 7}
-Runs = Callable[[int, float], SimulatedRun]
+Runs = Callable[..., SimulatedRun]
 
 
 def clamped_beam() -> System:

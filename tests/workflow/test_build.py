@@ -11,7 +11,15 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import SegmentedObject, YObject, dump_config
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model import forward_kinematics
-from yid_ocp.workflow.build import build_problem, build_system, load_problem, load_system, problem_options
+from yid_ocp.workflow.build import (
+    build_problem,
+    build_system,
+    load_problem,
+    load_system,
+    problem_options,
+    read_recordings,
+    tracked,
+)
 
 
 @pytest.mark.parametrize(("name", "size", "constraints"), [("single_arm_vision", 43, 3), ("dual_arm_vision", 50, 6)])
@@ -241,3 +249,28 @@ def test_a_problem_has_the_options_of_its_section(written):
     with pytest.raises(ConfigError, match=r"there is no parameter 'T1.mas'") as caught:
         problem_options(wrong, build_system(wrong).parameters)
     assert "line 2: problem.start_parameters" in caught.value.where
+
+
+@pytest.mark.parametrize(
+    ("file", "overrides", "expected"),
+    [
+        ("dual_arm_vision", ["model.arms.mode=prescribed"], True),
+        ("dual_arm_vision", [], False),
+        ("single_arm_vision", ["model.arms.mode=prescribed"], False),
+        ("dual_arm_vision", ["model.arms.mode=prescribed", "recordings.estimate=[]"], False),
+    ],
+    ids=["two grasps", "driven", "one grasp", "without recordings"],
+)
+def test_prescribed_arms_whose_grasps_close_a_loop_are_states(repository, file, overrides, expected):
+    run = load_config(repository / "configs" / f"{file}.yaml", overrides)
+    assert tracked(run) is expected
+    system = build_system(run)
+    assert bool(system.driven) == (expected or run.model.arms.mode == "driven")
+
+
+def test_their_encoders_are_measurements_and_the_points_of_the_arm_are_not(repository):
+    file = repository / "configs" / "dual_arm_vision.yaml"
+    run = load_config(file, ["model.arms.mode=prescribed", "recordings.held_out=[]", "problem.compiler=false"])
+    options = problem_options(run, build_system(run).parameters, read_recordings(run, "estimate"))
+    used = {group: said.use for group, said in options.sensors.items()}
+    assert used == {"joints.position": True, "points_arm": False}

@@ -137,7 +137,13 @@ class ArmSettings:
     """Which joints of the robot move, and what is known of them."""
 
     joints: Annotated[tuple[str, ...] | None, About("in configuration order; all movable ones when absent")] = None
-    mode: Annotated[ArmMode, About("driven by measured effort, moved as measured, or passive")] = "driven"
+    mode: Annotated[
+        ArmMode,
+        About(
+            "driven by measured effort, prescribed (moved as measured) or passive; where several grasps close loops, "
+            "and torques are recorded, prescribed arms are states that their encoders correct"
+        ),
+    ] = "driven"
     passive: Annotated[tuple[str, ...], About("joints among them that nothing drives, whatever the mode")] = ()
     locked: Annotated[Mapping[str, float], About("value of joints that do not move", "rad or m")] = field(
         default_factory=dict

@@ -15,7 +15,7 @@ from yid_ocp.diagnosis.finding import Finding, absorption
 from yid_ocp.diagnosis.hypotheses import CandidateProblem, Choice, chosen_effects
 from yid_ocp.diagnosis.localise import Place, attributed, localise, merged
 from yid_ocp.diagnosis.refit import Fit, Progress, Search, Store, recalled, refit
-from yid_ocp.diagnosis.screening import screen
+from yid_ocp.diagnosis.screening import Screened, screen
 from yid_ocp.diagnosis.select import Added, Closure, closure, compose
 from yid_ocp.diagnosis.smoother import Smoothed, smooth
 from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
@@ -25,6 +25,7 @@ from yid_ocp.errors import DataError, SolverError
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.null_test import NullTest, noise_floor, null_test, residual_series
 from yid_ocp.solvers import GaussNewton, Solution, solve
+from yid_ocp.solvers.base import RESTARTS
 
 log = logging.getLogger(__name__)
 
@@ -82,31 +83,32 @@ def _diagnosed(problem: EstimationProblem, search: Search, solution: Solution | 
     limits, progress = search.limits, search.progress
     progress("fitting the nominal model")
     nominal = nominal_fit(problem, search.problem, solution, search.store, limits)
-    angles = largest_angles(nominal)
-    # what all hypotheses are weighted by is frozen at the nominal fit
-    effects = tuple(effect.expected(angles) for effect in search.problem.effects)
-    composed = replace(search.problem, problem=nominal.problem, effects=effects)
-    search = replace(search, problem=composed)
     clock.lap("nominal")
-    before, held = fitted_test(nominal, limits), held_out_test(nominal, limits)
-    clock.lap("null_test")
-    progress(f"screening {len(composed.effects)} candidates")
-    screened = screen(composed, (), nominal.values, limits)
+    search, before, held, screened = _tested(search, nominal)
     clock.lap("screening")
     enough = before.degrees >= limits.samples_per_unknown * len(nominal.values)
-    smoothed, gap = None, has_gap(before, held, limits, screened.scores)
+    offsets = _offsets_stated(nominal.problem)
+    smoothed, trusted, gap = None, None, has_gap(before, held, limits, screened.scores, offsets)
+    other = elsewhere(search, nominal) if gap and enough and before.chi2_per_dof < limits.poor else None
+    if other is not None:
+        nominal = other
+        search, before, held, screened = _tested(search, nominal)
+        gap = has_gap(before, held, limits, screened.scores, offsets)
+    clock.lap("other_starts")
     if gap and enough:
         progress("locating the gap")
         smoothed = smooth_fit(nominal, limits)
-        gap = not shapeless(smoothed, screened.scores, before, held, limits)
+        # it knows noise of torques by its spectrum only: too little for a verdict to rest on what it explains
+        trusted = None if nominal.problem.disturbed else smoothed
+        gap = not shapeless(trusted, screened.scores, before, held, limits)
     clock.lap("localisation")
     fits: tuple[Fit, ...] = ()
     added: tuple[Added, ...] = ()
     if gap and enough and screened.scores:
         fits, added = compose(search, nominal, screened)
     clock.lap("refits")
-    total = closure(nominal.loss, added[-1].fit.loss) if added else Closure(np.nan, np.nan, np.nan)
-    explained = explained_part(nominal, added, smoothed)
+    total = closure(nominal.loss, added[-1].fit.loss, limits=limits) if added else Closure(np.nan, np.nan, np.nan)
+    explained = explained_part(nominal, added, trusted)
     verdict = decide(gap, screened.visible, added, total, limits, enough, explained)
     accepted = added if verdict in ("effect", "confusable") else ()
     remaining, where, rest_where = _after(nominal, accepted, smoothed, before, held, limits)
@@ -130,12 +132,61 @@ def _diagnosed(problem: EstimationProblem, search: Search, solution: Solution | 
         absorbed=absorption(nominal, accepted[-1].fit if accepted else nominal),
         next_experiment=next_experiment(verdict, accepted, where, screened.unseen),
         held_out=tuple(episode.name for episode in nominal.problem.held_out),
-        in_blocks=composed.blocks,
+        in_blocks=search.problem.blocks,
         message=shortage(verdict, before, len(nominal.values), screened.visible, limits),
         limits=limits,
         seconds=clock.laps,
     )
     return replace(finding, summary=sentences(finding))
+
+
+def _tested(search: Search, nominal: Fit) -> tuple[Search, NullTest, NullTest, Screened]:
+    """Null tests and screening at a nominal fit, at which the weights of all hypotheses are frozen."""
+    angles, limits = largest_angles(nominal), search.limits
+    effects = tuple(effect.expected(angles) for effect in search.problem.effects)
+    composed = replace(search.problem, problem=nominal.problem, effects=effects)
+    before, held = fitted_test(nominal, limits), held_out_test(nominal, limits)
+    search.progress(f"screening {len(composed.effects)} candidates")
+    screened = screen(composed, (), nominal.values, limits)
+    return replace(search, problem=composed), before, held, screened
+
+
+def _offsets_stated(problem: EstimationProblem) -> bool:
+    return problem.disturbed and any(e.errors is not None and np.any(e.errors.bias_std > 0) for e in problem.episodes)
+
+
+def elsewhere(search: Search, nominal: Fit) -> Fit | None:
+    """The nominal model fitted from other starts, where one of them ends far likelier; None where none does.
+
+    A parameter that few samples tell of has several valleys, and a wrong one of them costs too little to be noticed in
+    chi2: what candidates gain there, they gain from the parameter's error.
+    """
+    search.progress("fitting the nominal model from other starts")
+    problem, limits = search.problem.problem, search.limits
+    best = nominal
+    for factor in RESTARTS:
+        start = problem.named(
+            np.where(problem.positive, np.clip(factor * problem.start, *problem.bounds), problem.start)
+        )
+        name = f"the nominal model from {factor:g} times its start"
+        found = refit(search.problem, (), start, search.store, name, limits)
+        if found is not None and found.cost < best.cost - limits.worth:
+            best = found
+    if best is nominal:
+        return None
+    return _settled(search.problem, best.values, search.store, "the nominal model from a better start", limits)
+
+
+def _settled(
+    composed: CandidateProblem, start: Mapping[str, float], store: Store | None, name: str, limits: Thresholds
+) -> Fit | None:
+    """The nominal model fitted from a start, under weights that were frozen near its end."""
+    if composed.problem.disturbed:
+        composed = composed.weighted_at(start)
+        first = refit(composed, (), start, limits=limits)
+        start = start if first is None else first.values
+        composed = composed.weighted_at(start)
+    return refit(composed, (), start, store, name, limits)
 
 
 def _composed(
@@ -212,11 +263,7 @@ def nominal_fit(
         start = dict(zip(found.names, map(float, found.x), strict=True))
     elif solution is not None:
         start = dict(zip(solution.names, map(float, solution.x), strict=True))
-    if composed.problem.disturbed:
-        first = refit(composed.weighted_at(start), (), start, limits=limits)
-        start = start if first is None else first.values
-        composed = composed.weighted_at(start)
-    fit = refit(composed, (), start, store, limits=limits)
+    fit = _settled(composed, start, store, "", limits)
     if fit is None:
         raise SolverError("the nominal model cannot be rolled out at its fit", where="diagnosis")
     return fit

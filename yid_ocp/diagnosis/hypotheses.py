@@ -129,9 +129,12 @@ class CandidateProblem:
         return self.problem.free
 
     def weighted_at(self, values: Mapping[str, float]) -> CandidateProblem:
-        """The same with residuals weighted by all noise, that which drives the motion too, frozen at these unknowns."""
+        """The same with residuals weighted by all noise, that which drives the motion too, frozen at these unknowns.
+
+        Twice in a row, so that what is frozen is about the offsets that the torques have there.
+        """
         x = self.problem.vector(values)
-        return replace(self, problem=self.problem.weighted_at(x).held_out_weighted_at(x))
+        return replace(self, problem=self.problem.weighted_at(x, rounds=2).held_out_weighted_at(x))
 
     def freeing(self, effects: Sequence[EffectBase]) -> EstimationProblem:
         """The problem with the parameters of some effects free beside the nominal ones."""

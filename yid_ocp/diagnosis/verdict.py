@@ -12,11 +12,14 @@ from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.problem.null_test import NullTest, more_than_noise
 
 
-def has_gap(before: NullTest, held_out: NullTest, limits: Thresholds, ranked: Sequence[Score] = ()) -> bool:
+def has_gap(
+    before: NullTest, held_out: NullTest, limits: Thresholds, ranked: Sequence[Score] = (), offsets: bool = False
+) -> bool:
     """Whether the residual is more than noise, by enough to be worth a name.
 
     Either as a whole, or along what a candidate would do to it with some channel above noise: the sum over all channels
-    does not notice what only a few samples show.
+    does not notice what only a few samples show. An offset of a torque beyond what was stated needs no such channel: it
+    is one number among thousands, and all others follow it.
 
     Parameters
     ----------
@@ -24,8 +27,13 @@ def has_gap(before: NullTest, held_out: NullTest, limits: Thresholds, ranked: Se
     limits : Thresholds
     ranked : sequence of Score
         Of all visible candidates; their smallest p-value counts as the best of that many tries.
+    offsets : bool
+        Whether the size of torque offsets is stated.
     """
     if more_than_noise((before, held_out), limits.gap):
+        return True
+    stated = [score.p_value for score in ranked if score.effect.kind == "effort_offset"] if offsets else []
+    if stated and min(stated) * len(ranked) < limits.level:
         return True
     best = _best_of(ranked)
     largest = max((*before.channels.values(), *held_out.channels.values()), default=1.0)
@@ -33,7 +41,7 @@ def has_gap(before: NullTest, held_out: NullTest, limits: Thresholds, ranked: Se
 
 
 def shapeless(
-    smoothed: Smoothed, ranked: Sequence[Score], before: NullTest, held_out: NullTest, limits: Thresholds
+    smoothed: Smoothed | None, ranked: Sequence[Score], before: NullTest, held_out: NullTest, limits: Thresholds
 ) -> bool:
     """Whether an excess is barely significant and neither any unknown nor any candidate explains it: chance, then.
 
@@ -41,7 +49,7 @@ def shapeless(
     """
     best = _best_of(ranked)
     barely = min(before.p_value, held_out.p_value) > limits.shapeless * limits.level
-    return barely and best >= limits.level and smoothed.side == "none"
+    return barely and best >= limits.level and (smoothed is None or smoothed.side == "none")
 
 
 def _best_of(ranked: Sequence[Score]) -> float:
@@ -78,7 +86,7 @@ def decide(
         return "insufficient_data"
     if not gap:
         return "no_gap"
-    if not added or not total.low > limits.closure or explained < limits.explained:
+    if not added or not (total.low > limits.closure or total.sure) or explained < limits.explained:
         return "unknown"
     return "confusable" if len(added[0].rivals) > 1 else "effect"
 
@@ -86,7 +94,7 @@ def decide(
 def explained_part(nominal: Fit, added: Sequence[Added], smoothed: Smoothed | None) -> float:
     """Fall of r'r by the effects over that by the smoother, each less what it takes of the noise.
 
-    Both are on the recordings to estimate on, so that the same noise stands in both.
+    Both are on the recordings to estimate on, so that the same noise stands in both. One where nothing was smoothed.
     """
     if smoothed is None or not added:
         return 1.0

@@ -114,8 +114,12 @@ def _gap(finding: Finding) -> str:
             f"There is no gap to speak of (chi2 per degree of freedom {first.chi2_per_dof:.3g}, held out "
             f"{held.chi2_per_dof:.3g}; p = {p:.2g})."
         )
+    best = min(finding.scores, key=lambda score: score.p_value, default=None)
+    along = ""
+    if p >= finding.limits.level and best is not None:
+        p, along = min(1.0, best.p_value * len(finding.scores)), f" along what {best.effect.label} would do"
     small = f"= {p:.2g}" if p > 1e-12 else "< 1e-12"
-    return f"The gap is real (held-out chi2 per degree of freedom {held.chi2_per_dof:.3g}, p {small})."
+    return f"The gap is real (held-out chi2 per degree of freedom {held.chi2_per_dof:.3g}, p {small}{along})."
 
 
 def _places(finding: Finding) -> str:
@@ -134,6 +138,9 @@ def _effects(finding: Finding) -> list[str]:
     text = [
         f"{names} {verb} {100 * total.value:.3g} % of it on held-out motions "
         f"(95 % interval {100 * total.low:.3g} to {100 * total.high:.3g} %)."
+        if total.low > finding.limits.closure
+        else f"With {names} the held-out motions are far more likely (more than {math.exp(finding.limits.worth):.0f} "
+        "times), although so little of chi2 tells of it that no part of the gap can be given."
     ]
     for entry in finding.added:
         others = [r.label for r in entry.rivals if r.label != entry.effect.label]

@@ -22,6 +22,7 @@ Anderson and Moore (1979), Optimal Filtering, chapters 3 and 5. Ljung (1999), Sy
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -37,8 +38,9 @@ from yid_ocp.problem.functions import ModelFunctions
 from yid_ocp.problem.grid import Grid
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.options import SensorOptions
-from yid_ocp.sensors.joints import EFFORT, POSITION, PositionSensor, angle_std, torque_bias_std, torque_std
+from yid_ocp.sensors.joints import EFFORT, POSITION, PositionSensor, angle_std, is_stated, torque_bias_std, torque_std
 
+log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
@@ -101,6 +103,11 @@ def input_errors(
     encoders = any(isinstance(entry.sensor, PositionSensor) for entry in samples)
     if not encoders and not np.any(std > 0) and not np.any(bias > 0):
         return None
+    angle = angle_std(joints, driven, position, recording.name)
+    for group, choice, level, unit in ((EFFORT, effort, std, "N m"), (POSITION, position, angle, "rad")):
+        if not is_stated(joints, group, choice):
+            words = "%s: the noise of %s is neither recorded nor configured; %.2g to %.2g %s estimated from its fastest"
+            log.warning(words + " changes", recording.name, group, level.min(), level.max(), unit)
     if encoders:
         columns = [joints.names.index(name) for name in driven]
         std = np.maximum(std, TORQUE_FLOOR * np.maximum(np.std(joints.effort[:, columns], axis=0), 1e-3))
@@ -111,7 +118,7 @@ def input_errors(
         # a step that spans several samples averages them
         std * min(1.0, np.sqrt(period / grid.time_step)),
         bias,
-        angle_std(joints, driven, position, recording.name),
+        angle,
         sample.astype(np.int64),
         max(1.0, period / grid.time_step),
         encoders,

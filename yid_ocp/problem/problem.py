@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,15 @@ from yid_ocp.problem.measurements import Rows, huber
 from yid_ocp.problem.noise import Innovations
 from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.problem.prediction import EpisodeResult, Predictor, Start
-from yid_ocp.problem.unknowns import START, Unknowns, check_bounds, check_free, replaced, soft_logarithm, start_names
+from yid_ocp.problem.unknowns import (
+    Unknowns,
+    check_bounds,
+    check_free,
+    replaced,
+    soft_logarithm,
+    start_names,
+    stated_std,
+)
 
 Array = NDArray[np.float64]
 HELD_OUT_START = 0.2
@@ -136,7 +145,8 @@ class EstimationProblem:
             tuple(episode.name for episode in episodes),
         )
         self.predictor = Predictor(functions, options, self.unknowns)
-        self._prior_std = self._stated_std()
+        inertia = partial(apparent_inertia, functions.step, theta)
+        self._prior_std = stated_std(self.unknowns, options, inertia)
         bare = options.weighting == "paper" or options.weak_prior_factor <= 1
         weak = np.zeros(len(self.names), bool) if bare else self.positive & ~np.isfinite(self._prior_std)
         self._weak: NDArray[np.int64] = np.flatnonzero(weak)
@@ -215,11 +225,6 @@ class EstimationProblem:
             return 1.0
         found = [s.std[np.isfinite(s.std)] for episode in self.episodes for s in episode.samples]
         return float(np.sqrt(np.mean(np.concatenate(found) ** 2)))
-
-    @property
-    def start_rows(self) -> tuple[int, ...]:
-        """Rows of the initial state that are estimated: q and p of coordinates neither driven nor prescribed."""
-        return self.predictor.start_rows
 
     @property
     def start_std(self) -> Array:
@@ -322,9 +327,9 @@ class EstimationProblem:
         return Rows(cost, columns[:, 0], None if plain.jacobian is None else columns[:, 1:], factor)
 
     def torque_offsets(self, x: ArrayLike) -> list[tuple[Array, Array] | None]:
-        """Constant error of every driven joint's torque in every recording, at `x`: value and standard deviation [N m].
+        """Constant error of driven joints' torques at `x`, of every recording: values and standard deviations [N m].
 
-        None for a recording whose torques are taken as true, and where nothing is frozen (`weighted_at`).
+        None where torques are taken as true, and where nothing is frozen (`weighted_at`).
         """
         x = np.asarray(x, float)
         found: list[tuple[Array, Array] | None] = []
@@ -340,7 +345,7 @@ class EstimationProblem:
     def gradient(
         self, x: ArrayLike, evaluation: Evaluation | None = None, warm: WarmStart | None = None
     ) -> tuple[float, Array, Evaluation]:
-        """Cost and its gradient by the adjoint sweep.
+        """Cost and its gradient by the adjoint sweep; of innovations by forward sensitivities.
 
         Parameters
         ----------
@@ -358,11 +363,14 @@ class EstimationProblem:
             Without a Jacobian.
         """
         x = np.asarray(x, float)
-        if evaluation is None:
-            evaluation = self.evaluate(x, False, warm)
+        weighted = any(own is not None for own in self.innovations)
+        if evaluation is None or (weighted and evaluation.jacobian is None):
+            evaluation = self.evaluate(x, weighted, warm)
         gradient = np.zeros(len(x))
         if not evaluation.ok:
             return evaluation.cost, gradient, evaluation
+        if weighted and evaluation.jacobian is not None:
+            return evaluation.cost, evaluation.jacobian.T @ evaluation.residual, replace(evaluation, jacobian=None)
         for i, result in enumerate(evaluation.episodes):
             pulls = []
             for k, samples in enumerate(self.episodes[i].samples):
@@ -504,7 +512,7 @@ class EstimationProblem:
         """The same problem with residuals weighted by all noise, that which drives the motion too, frozen at `x`.
 
         The problem itself where nothing is wrong with its torques and angles, or where it cannot be rolled out at `x`.
-        Of a problem that is weighted already, the new weights are about the torque offsets that the old ones see.
+        If it is weighted already, the new weights are about the torque offsets that the old ones see.
 
         Parameters
         ----------
@@ -534,8 +542,7 @@ class EstimationProblem:
 
     def without_input_errors(self) -> EstimationProblem:
         """The same problem with torques and angles that drive the motion taken as they were recorded."""
-        parts = (tuple(replace(e, errors=None) for e in group) for group in (self.episodes, self.held_out))
-        return self.on(*parts)
+        return self.on(*([replace(e, errors=None) for e in group] for group in (self.episodes, self.held_out)))
 
     def held_out_weighted_at(self, x: ArrayLike) -> EstimationProblem:
         """The same problem with the residuals of held-out recordings weighted like this as well, for `held_out_rows`.
@@ -591,17 +598,3 @@ class EstimationProblem:
             "held_out": [episode.recording for episode in self.held_out],
         }
         return EstimationProblem(**{**same, **changes})
-
-    def _stated_std(self) -> Array:
-        """Standard deviation of every unknown's stated Gaussian prior about its start, infinite where there is none."""
-        options, stds = self.options, []
-        for name in self.unknowns.names:
-            base = name.split("[")[0]
-            if base.startswith(f"{START}q."):
-                stds.append(options.configuration_std)
-            elif base.startswith(f"{START}p."):
-                inertia = float(apparent_inertia(self.step, self.theta, (base.removeprefix(f"{START}p."),))[0])
-                stds.append(options.velocity_std * max(inertia, 1e-9))
-            else:
-                stds.append(float(options.priors.get(base, np.inf)))
-        return np.array(stds)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -77,6 +77,24 @@ class Unknowns:
 def replaced(x: Array, names: Sequence[str], values: Mapping[str, float]) -> Array:
     """An unknown vector with named entries replaced."""
     return np.array([values.get(name, value) for name, value in zip(names, x, strict=True)], float)
+
+
+def stated_std(unknowns: Unknowns, options: ProblemOptions, inertia: Callable[[tuple[str, ...]], Array]) -> Array:
+    """Standard deviation of every unknown's stated Gaussian prior about its start, infinite where there is none.
+
+    `inertia` gives the diagonal of the mass matrix for named joints, by which a start's velocity becomes a momentum.
+    """
+    stds = []
+    for name in unknowns.names:
+        base = name.split("[")[0]
+        if base.startswith(f"{START}q."):
+            stds.append(options.configuration_std)
+        elif base.startswith(f"{START}p."):
+            mass = float(inertia((base.removeprefix(f"{START}p."),))[0])
+            stds.append(options.velocity_std * max(mass, 1e-9))
+        else:
+            stds.append(float(options.priors.get(base, np.inf)))
+    return np.array(stds)
 
 
 def start_names(system: System) -> tuple[str, ...]:

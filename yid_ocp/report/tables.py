@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+MOST_OFFSETS = 4  # recordings side by side
 MOST_POINTS = 4  # a group of more points is shown as a whole; result.json has every point
 
 
@@ -58,6 +59,24 @@ def medians(rows: Sequence[HeldOutRow]) -> list[HeldOutRow]:
             median = statistics.median(row.rmse for row in own)
             result.append(HeldOutRow(f"median of {len(own)}", channel, median, own[0].unit, baselines))
     return result
+
+
+def offset_rows(result: Mapping[str, Any]) -> list[Sequence[str]]:
+    """Head and rows of the torque offsets of a result, joints below each other; empty where they are no part of it."""
+    offsets: Mapping[str, Mapping[str, Any]] = result.get("torque_offsets", {})
+    if not offsets:
+        return []
+    shown = dict(list(offsets.items())[:MOST_OFFSETS])
+    rows: list[Sequence[str]] = [("torque offset [N m]", *shown, "expected")]
+    for joint in dict.fromkeys(joint for entry in shown.values() for joint in entry):
+        own = [entry.get(joint) for entry in shown.values()]
+        cells = ["" if known is None else f"{known['value']:.2f} ± {known['std']:.2f}" for known in own]
+        priors = dict.fromkeys(f"± {known['prior_std']:.2g}" for known in own if known is not None)
+        rows.append((joint, *cells, ", ".join(priors)))
+    left = len(offsets) - len(shown)
+    if left:
+        rows.append((f"{left} more recordings are in result.json", *("" for _ in shown), ""))
+    return rows
 
 
 def guess_sentences(worse: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from yid_ocp.data import Recording
-from yid_ocp.report.tables import blind_table, guess_sentences, held_out_rows, medians
+from yid_ocp.report.tables import blind_table, guess_sentences, held_out_rows, medians, offset_rows
 from yid_ocp.solvers.words import VERDICT_WORDS, fit_words, interval_words, parameter_words
 
 Rows = list[Sequence[str]]
@@ -39,6 +39,7 @@ def solve_summary(result: Mapping[str, Any]) -> list[str]:
         without = ", ".join(f"{error:.3g} ({name})" for name, error in row.baselines.items())
         rows.append((row.recording, row.channel, f"{row.rmse:.3g}", row.unit, without))
     lines += [*table(rows), ""] if len(rows) > 1 else []
+    lines += _offset_lines(result)
     lines += [*_moved_lines(result), *result.get("discretisation_notes", ())]
     if failed:
         lines.append("the values are the best point that was reached; nothing can be said about how sure they are")
@@ -89,6 +90,11 @@ def _moved_lines(result: Mapping[str, Any]) -> list[str]:
         elif tried:
             lines.append(f"with {words} no estimate moves by more than its standard deviation")
     return lines
+
+
+def _offset_lines(result: Mapping[str, Any]) -> list[str]:
+    rows = offset_rows(result)
+    return [*table(rows), ""] if rows else []
 
 
 def track_summary(result: Mapping[str, Any]) -> list[str]:
@@ -228,6 +234,7 @@ def diagnose_summary(result: Mapping[str, Any]) -> list[str]:
         p = f"{entry['p_value']:.2g}" if entry["p_value"] > 1e-12 else "< 1e-12"
         rows.append((label, values, closed, f"{entry['score']:.3g}", p))
     lines += [*table(rows), ""] if len(rows) > 1 else []
+    lines += _offset_lines(result)
     return [*lines, f"verdict: {result['verdict']} ({sum(result['seconds'].values()):.1f} s)"]
 
 
@@ -242,8 +249,7 @@ def check_summary(result: Mapping[str, Any]) -> list[str]:
     rows: Rows = [("recording", "use", "group", "samples", "rate", "longest gap", "noise (median)")]
     for entry in result["recordings"]:
         for name, group in entry["groups"].items():
-            noise = entry["noise"].get(name) or entry["noise"].get(f"{name}.effort")
-            shown = "" if noise is None or noise["std"] is None else f"{noise['std']:.3g} {noise['unit']}"
+            shown = _noise_words(entry["noise"], name)
             rows.append(
                 (
                     entry["recording"],
@@ -272,6 +278,19 @@ def check_summary(result: Mapping[str, Any]) -> list[str]:
         "nothing stands in the way of a run" if not result["warnings"] else "a run is possible; see the warnings"
     )
     return lines
+
+
+def _noise_words(noise: Mapping[str, Any], name: str) -> str:
+    """Noise of a recorded group, or of what it holds; with the offset that is expected and whether it was estimated."""
+    said = []
+    for part in ("", ".effort", ".position"):
+        known = noise.get(f"{name}{part}")
+        if known is None or known["std"] is None:
+            continue
+        words = f"{known['std']:.3g} {known['unit']}"
+        words += f", offset {known['bias_std']:.3g}" if known.get("bias_std") else ""
+        said.append(words + (" (estimated)" if known.get("estimated") else ""))
+    return "; ".join(said)
 
 
 def _convergence_lines(convergence: Mapping[str, Any]) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,9 +14,7 @@ import scipy.special
 from yid_ocp.errors import ConfigError, DataError, nearest
 from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import NodeState
-from yid_ocp.sensors.base import SENSORS, Array, Choice, JointData, SensorData, Surroundings, joint_columns
-
-log = logging.getLogger(__name__)
+from yid_ocp.sensors.base import SENSORS, Array, Choice, JointData, PointData, SensorData, Surroundings, joint_columns
 
 EFFORT = "joints.effort"
 POSITION = "joints.position"
@@ -130,6 +127,11 @@ class EffortSensor:
         return ca.vertcat(*(state.effort[state.system.mechanism.joint_index(joint)] for joint in self.joints))
 
 
+def of_arm(group: PointData) -> bool:
+    """Whether the arm itself measured these points, which as a rule follow from its encoders."""
+    return "arm" in (group.sensor, group.name.rpartition("_")[2])
+
+
 @SENSORS.register(POSITION)
 def measured_angles(around: Surroundings) -> list[SensorData]:
     """Recorded angles of driven joints, as they are; the first is left out, from which the posture at rest is taken.
@@ -141,7 +143,7 @@ def measured_angles(around: Surroundings) -> list[SensorData]:
     """
     joints, choice, system = around.recording.joints, around.choice(POSITION), around.system
     names = system.driven if joints is not None else ()
-    arm = [group.name for group in around.recording.points if "arm" in (group.sensor, group.name.rpartition("_")[2])]
+    arm = [group.name for group in around.recording.points if of_arm(group)]
     arm = [name for name in arm if around.choice(name).use is not False]
     if joints is None or not names or choice.use is False or (choice.use is None and arm):
         return []
@@ -203,6 +205,12 @@ def measured_efforts(around: Surroundings) -> list[SensorData]:
 # -- noise levels -----------------------------------------------------------------------------------------------------
 
 
+def is_stated(joints: JointData, group: str, choice: Choice) -> bool:
+    """Whether the recording or the settings say the noise of `joints.effort` or `joints.position`; else see below."""
+    recorded = joints.effort_std if group == EFFORT else joints.position_std
+    return choice.std is not None or recorded is not None
+
+
 def angle_std(joints: JointData, names: Sequence[str], choice: Choice, where: str) -> Array:
     """Standard deviation of the encoders of driven joints, shape (len(names),) [rad]."""
     given = choice.std if choice.std is not None else joints.position_std
@@ -227,7 +235,7 @@ def torque_bias_std(joints: JointData, names: Sequence[str], choice: Choice) -> 
 
 
 def estimated_std(values: Array, where: str, group: str, unit: str) -> Array:
-    """White noise of evenly sampled channels that nobody stated, from differences of high order; said in the log.
+    """White noise of evenly sampled channels that nobody stated, from differences of high order.
 
     Parameters
     ----------
@@ -249,14 +257,6 @@ def estimated_std(values: Array, where: str, group: str, unit: str) -> Array:
         )
     size = math.sqrt(scipy.special.comb(2 * DIFFERENCES, DIFFERENCES))
     found = np.sqrt(np.mean(np.diff(values, DIFFERENCES, axis=0) ** 2, axis=0)) / size
-    log.warning(
-        "%s: the noise of %s is neither recorded nor configured; %.2g to %.2g %s estimated from its fastest changes",
-        where,
-        group,
-        found.min(),
-        found.max(),
-        unit,
-    )
     return np.asarray(found)
 
 

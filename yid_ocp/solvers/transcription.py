@@ -260,7 +260,7 @@ class Transcription:
 
     def _start_rows(self, w: Array, i: int, derivatives: bool) -> tuple[Array, Sparse | None]:
         episode, layout = self.problem.episodes[i], self.layouts[i]
-        loose = self.problem.start_rows if self.free_start else ()
+        loose = self.problem.predictor.start_rows if self.free_start else ()
         keep = np.setdiff1d(np.arange(self.nx), [*self.problem.system.prescribed_indices, *loose])
         theta = self._theta(w, i)
         start = self.problem.start_state(episode, theta, guess=self.warm[i])
@@ -277,7 +277,7 @@ class Transcription:
 
     def _start_prior(self, w: Array, i: int, derivatives: bool) -> tuple[Array, Sparse | None]:
         """Offset of an estimated start from rest, over its prior's standard deviation."""
-        layout, rows = self.layouts[i], np.array(self.problem.start_rows)
+        layout, rows = self.layouts[i], np.array(self.problem.predictor.start_rows)
         start = self.problem.start_state(self.problem.episodes[i], self._theta(w, i), guess=self.warm[i])
         weight = 1.0 / self.problem.start_std
         value = weight * (w[layout.state[0]] - start.state)[rows]
@@ -293,10 +293,10 @@ class Transcription:
         """The problem's unknown vector that belongs to a point of the NLP."""
         x = self._unknowns(w[: len(self.problem.shared)])
         if self.free_start:
-            at, size = len(self.problem.shared), len(self.problem.start_rows)
+            at, size = len(self.problem.shared), len(self.problem.predictor.start_rows)
             for i, (episode, layout) in enumerate(zip(self.problem.episodes, self.layouts, strict=True)):
                 start = self.problem.start_state(episode, self._theta(w, i), guess=self.warm[i]).state
-                x[at : at + size] = (w[layout.state[0]] - start)[list(self.problem.start_rows)]
+                x[at : at + size] = (w[layout.state[0]] - start)[list(self.problem.predictor.start_rows)]
                 at += size
         return x
 

@@ -30,6 +30,7 @@ from yid_ocp.model.urdf import read_urdf, robot_description_file
 from yid_ocp.model.y_object import Y_FOOT, y_segments
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import Episode
+from yid_ocp.sensors.joints import POSITION, of_arm
 
 GIVEN_FRAMES = 2  # of a cable's free points, from which every prediction starts
 LARGEST_GAP = 0.01  # what encoder noise and a slightly wrong length of the object can make of a grasp [m]
@@ -83,7 +84,7 @@ def build_system(run: Run, finer: int = 1) -> System:
             damping[name] = spring.damping
     with located(run, "model", "object"):
         objects = _objects(run, of_object, finer)
-    mode = model.arms.mode
+    mode = "driven" if tracked(run) else model.arms.mode
     for i, name in enumerate(model.arms.passive):
         if name not in joints:
             raise run.refuse(f"there is no joint '{name}'", "model", "arms", "passive", i, hint=nearest(name, joints))
@@ -107,6 +108,18 @@ def build_system(run: Run, finer: int = 1) -> System:
             springs={name: Spring(s.stiffness, s.rest) for name, s in model.springs.items()},
         )
     return _completed(run, system, finer)
+
+
+def tracked(run: Run) -> bool:
+    """Whether prescribed arms are states that their encoders correct, driven by the torques that they measured.
+
+    So it is where several grasps close loops through the object: angles that are a little wrong then ask for what the
+    object's geometry does not allow, and no motion fits. It takes recorded torques.
+    """
+    if run.model.arms.mode != "prescribed" or len(run.model.grasp) < 2:
+        return False
+    recordings = read_recordings(run, "estimate")
+    return bool(recordings) and all(r.joints is not None and r.joints.effort is not None for r in recordings)
 
 
 def _dampings(run: Run, joints: Sequence[str]) -> tuple[dict[str, float], float]:
@@ -402,6 +415,11 @@ def problem_options(run: Run, parameters: Parameters, recordings: Sequence[Recor
                 f"there is no parameter '{name}'", "problem", "start_parameters", hint=nearest(name, parameters.names)
             )
     sensors = dict(run.sensors)
+    if tracked(run):
+        # what the encoders say is what counts of the arms, as it does where they are prescribed
+        sensors[POSITION] = replace(sensors.get(POSITION, SensorOptions()), use=True)
+        for group in {group.name for recording in recordings for group in recording.points if of_arm(group)}:
+            sensors[group] = replace(sensors.get(group, SensorOptions()), use=False)
     cable = build_cable(run)
     own: dict[str, dict[str, float]] = {}
     if cable is not None and isinstance(run.model.object, CableObject):

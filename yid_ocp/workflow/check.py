@@ -15,7 +15,9 @@ from yid_ocp.config.settings import Run
 from yid_ocp.data.recording import Recording
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.options import SensorOptions
 from yid_ocp.report.terminal import check_summary
+from yid_ocp.sensors.joints import EFFORT, POSITION, angle_std, is_stated, torque_std
 from yid_ocp.solvers.base import estimates, uncertainty
 from yid_ocp.workflow.build import build_problem, build_step, first_gaps
 from yid_ocp.workflow.command import DONE, carry_out
@@ -107,7 +109,7 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
             "std": float(np.median(known)) if known.size else None,
             "unit": samples.sensor.unit,
         }
-    entry["noise"] = noise
+    entry["noise"] = _input_noise(problem, episode) | noise
     rate = 1.0 / problem.step.time_step
     joints = recording.joints
     if joints is not None:
@@ -130,6 +132,30 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
             warnings.append(f"{episode.name}: {rest.message} with the initial parameters")
     entry["grasp_gaps"] = first_gaps(problem, episode)
     return entry
+
+
+def _input_noise(problem: EstimationProblem, episode: Episode) -> dict[str, Any]:
+    """Noise of what drives the motion, and whether nobody stated it; medians over the driven joints."""
+    joints, errors = episode.recording.joints, episode.errors
+    if joints is None or errors is None:
+        return {}
+    effort, position = (problem.options.sensors.get(group, SensorOptions()) for group in (EFFORT, POSITION))
+    driven, where = problem.system.driven, episode.name
+    levels = {
+        EFFORT: (torque_std(joints, driven, effort, where), effort, "N m"),
+        POSITION: (angle_std(joints, driven, position, where), position, "rad"),
+    }
+    noise: dict[str, Any] = {
+        group: {
+            "samples": len(joints.t),
+            "std": float(np.median(std)),
+            "unit": unit,
+            "estimated": not is_stated(joints, group, choice),
+        }
+        for group, (std, choice, unit) in levels.items()
+    }
+    noise[EFFORT]["bias_std"] = float(np.median(errors.bias_std))
+    return noise
 
 
 def _moves(run: Run, problem: EstimationProblem, warnings: list[str], progress: Progress) -> dict[str, Any]:

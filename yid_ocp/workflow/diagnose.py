@@ -26,6 +26,7 @@ from yid_ocp.workflow.command import DONE, carry_out
 from yid_ocp.workflow.folder import new_run_folder, versions
 from yid_ocp.workflow.progress import SILENT, Progress
 from yid_ocp.workflow.refits import Refits
+from yid_ocp.workflow.torque_offsets import torque_offsets
 from yid_ocp.workflow.trajectories import Prediction, write_diagnosis_trajectories
 
 log = logging.getLogger(__name__)
@@ -93,7 +94,10 @@ def run_diagnose(run: Run, out: str | Path | None = None, progress: Progress = S
         folder.log("end", verdict=finding.verdict, effects=[effect.label for effect in finding.effects])
         predicted = predictions(finding)
         write_diagnosis_trajectories(folder.path / "trajectories.h5", finding, predicted)
-        written = folder.finish(finding.to_dict() | {"command": reproducing(run, folder.target)})
+        last = finding.last
+        offsets = torque_offsets(last.problem, last.problem.vector(last.values))
+        own = {"torque_offsets": offsets, "command": reproducing(run, folder.target)}
+        written = folder.finish(finding.to_dict() | own)
         if run.output.report:
             progress.stage("writing the report")
             more = {"finding": finding, "predictions": predicted}

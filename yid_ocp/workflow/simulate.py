@@ -16,8 +16,10 @@ from yid_ocp.data.hdf5 import write_recording
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.options import SensorOptions
 from yid_ocp.problem.prediction import EpisodeResult
 from yid_ocp.report.terminal import simulate_summary
+from yid_ocp.sensors.joints import EFFORT, POSITION, angle_std, by_joint, torque_bias_std, torque_std
 from yid_ocp.workflow.build import build_step, build_system, problem_options, read_recordings
 from yid_ocp.workflow.command import DONE, FAILED, carry_out
 from yid_ocp.workflow.folder import new_run_folder
@@ -148,7 +150,8 @@ def as_recording(
     episode : Episode
     outcome : EpisodeResult
     seed : int, optional
-        Of noise with the recorded standard deviations; none when absent.
+        Of noise as the estimation takes it: by recorded or configured standard deviations, of driven joints also those
+        of torques that nobody states and of their constant offsets; none when absent.
     """
     rng = None if seed is None else np.random.default_rng(seed)
     system, source = problem.system, episode.recording
@@ -185,23 +188,59 @@ def _joints(
     held = {name: outcome.rollout.torque[:, i] for i, name in enumerate(system.driven)}
     held |= {name: outcome.rollout.effort[:, i] for i, name in enumerate(system.prescribed)}
     effort = np.stack([np.append(held[name], held[name][-1]) for name in names], axis=1)
-    position_std = source.position_std
-    effort_std = source.effort_std
-    columns = [source.names.index(name) for name in names]
-
-    def own(std: Any) -> Any:
-        return std if std is None or np.ndim(std) == 0 else np.asarray(std)[columns]
-
+    levels = _levels(problem, episode, names)
+    position, effort = (
+        _noisy(values, np.broadcast_to(0.0 if std is None else std, values.shape), rng)
+        for values, std in ((position, levels.angle), (effort, levels.torque))
+    )
+    # constant over the recording, for every joint one draw
+    bias = np.zeros(len(names)) if levels.bias is None else np.asarray(levels.bias)
     return JointGroup(
         names,
         episode.grid.times,
-        _noisy(position, np.broadcast_to(0.0 if position_std is None else own(position_std), position.shape), rng),
-        effort=_noisy(effort, np.broadcast_to(0.0 if effort_std is None else own(effort_std), effort.shape), rng),
-        position_std=own(position_std),
-        effort_std=own(effort_std),
+        position,
+        effort=effort + _noisy(np.zeros(len(names)), bias, rng),
+        position_std=levels.angle,
+        effort_std=levels.torque,
+        effort_bias_std=levels.bias,
         # of prescribed joints it is the effort at the nodes
         effort_kind="command" if system.driven else "sample",
     )
+
+
+@dataclass(frozen=True)
+class _Levels:
+    """Standard deviations of what joints record, (nj,) each [rad], [N m]; None where nothing says so."""
+
+    angle: Array | None
+    torque: Array | None
+    bias: Array | None
+
+
+def _levels(problem: EstimationProblem, episode: Episode, names: tuple[str, ...]) -> _Levels:
+    """Noise as the estimation takes it: of driven joints that of what drives the motion, else what is stated."""
+    joints, driven = episode.recording.joints, problem.system.driven
+    assert joints is not None
+    effort, position = (problem.options.sensors.get(group, SensorOptions()) for group in (EFFORT, POSITION))
+    joint_angles = joints.position_std if position.std is None else position.std
+    torques = joints.effort_std if effort.std is None else effort.std
+    if episode.errors is None:
+        angle, torque = (
+            None if given is None else by_joint(given, joints.names, names, f"sensors.{group}.std")
+            for group, given in ((POSITION, joint_angles), (EFFORT, torques))
+        )
+        return _Levels(angle, torque, None)
+    at, rest = [names.index(name) for name in driven], [i for i, name in enumerate(names) if name not in driven]
+    other = tuple(names[i] for i in rest)
+    angle, torque, bias = np.zeros((3, len(names)))
+    angle[at] = angle_std(joints, driven, position, episode.name)
+    torque[at] = torque_std(joints, driven, effort, episode.name)
+    bias[at] = torque_bias_std(joints, driven, effort)
+    if other:
+        stated = ((angle, joint_angles, POSITION), (torque, torques, EFFORT))
+        for target, std, group in stated:
+            target[rest] = by_joint(0.0 if std is None else std, joints.names, other, f"sensors.{group}.std")
+    return _Levels(angle, torque, bias)
 
 
 def _noisy(values: Array, std: Array, rng: np.random.Generator | None) -> Array:

@@ -27,6 +27,7 @@ from yid_ocp.workflow.folder import new_run_folder
 from yid_ocp.workflow.held_out import held_out_entry, worse_than_guess
 from yid_ocp.workflow.progress import SILENT, Progress
 from yid_ocp.workflow.refine import Discretisation, counted, discretisation, steadied, wanted
+from yid_ocp.workflow.torque_offsets import torque_offsets
 from yid_ocp.workflow.trajectories import write_trajectories
 
 FORMAT = "yid-solve/1"
@@ -113,6 +114,7 @@ def run_solve(run: Run, out: str | Path | None = None, progress: Progress = SILE
             "discretisation": finer.result(data_std),
             "discretisation_notes": list(finer.notes),
             "stability": stability,
+            "torque_offsets": {} if solution.evaluation is None else torque_offsets(problem, solution.x),
         }
         written = folder.finish(solve_result(problem, solution, held_out, build_cable(run)) | more)
         if run.output.report:

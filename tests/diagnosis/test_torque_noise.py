@@ -1,0 +1,143 @@
+"""A diagnosis weighs recordings by the noise that drives the motion, and the smoother knows of it."""
+
+from __future__ import annotations
+
+import math
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.diagnosis import diagnose
+from yid_ocp.diagnosis.diagnose import held_out_test, nominal_fit
+from yid_ocp.diagnosis.hypotheses import CandidateProblem, chosen_effects
+from yid_ocp.diagnosis.smoother_model import INTERVAL, MEMORY, linear_model
+from yid_ocp.integrator.rollout import simulate
+from yid_ocp.integrator.step import Step, compile_step
+from yid_ocp.model import System
+from yid_ocp.model.kinematics import forward_kinematics
+from yid_ocp.model.system import Spring
+from yid_ocp.model.urdf import read_urdf
+from yid_ocp.problem import EstimationProblem, ProblemOptions
+
+TIME_STEP, STEPS = 0.01, 300
+WHITE, OFFSET, ANGLE, POINT = 0.05, 0.1, 2e-4, 1e-3
+FREE = ("elbow.stiffness", "elbow.damping")
+
+
+@pytest.fixture(scope="module")
+def step(urdf_folder) -> Step:
+    tree = read_urdf(urdf_folder / "double_pendulum.urdf")
+    springs = {"elbow": Spring(3.0)}
+    system = System.build(tree, driven=("shoulder",), springs=springs, damping={"shoulder": 0.3, "elbow": 0.05})
+    return compile_step(system, TIME_STEP)
+
+
+def recorded(step: Step, seed: int, offset: float | None = None, friction: float = 0.0) -> Recording:
+    """A pendulum that swings from rest, seen by an encoder and a camera; its torque is wrong as the recording says."""
+    rng = np.random.default_rng(seed)
+    system, t = step.system, TIME_STEP * np.arange(STEPS + 1)
+    torque = sum(rng.uniform(0.3, 0.8) * np.sin(2 * np.pi * f * t) for f in rng.uniform([0.3, 0.7, 1.5], [0.5, 1, 2]))
+    theta = system.parameters.vector({"shoulder.damping": 0.3 + friction})
+    swept = simulate(step, theta, np.zeros(step.sizes["nx"]), STEPS, torque[:-1, None])
+    assert swept.status.ok
+    off = OFFSET * rng.standard_normal() if offset is None else offset
+    noise = rng.standard_normal
+    joints = JointGroup(
+        ("shoulder",),
+        t,
+        swept.state[:, :1] + ANGLE * noise((STEPS + 1, 1)),
+        effort=torque[:, None] + WHITE * noise((STEPS + 1, 1)) + off,
+        position_std=ANGLE,
+        effort_std=WHITE,
+        effort_bias_std=OFFSET,
+        effort_kind="command",
+    )
+    q = ca.SX.sym("q", system.size)
+    place = ca.Function("p", [q], [forward_kinematics(system.mechanism, q).position("tip")])
+    tip = np.array([np.array(place(x[: system.size])).T for x in swept.state]) + POINT * noise((STEPS + 1, 1, 3))
+    points = PointGroup("points_camera", ("tip",), t, tip, std=np.full(tip.shape, POINT))
+    return Recording(joints, (points,), name=f"run_{seed}")
+
+
+def problem_of(step: Step, recordings: list[Recording], held_out: list[Recording] | None = None) -> EstimationProblem:
+    options = ProblemOptions(initial_state="equilibrium", feedback="proportional", gains=(9.0,))
+    return EstimationProblem(step, recordings, FREE, options, None, held_out or [])
+
+
+def composed(step: Step, held_out: bool, *candidates: str) -> CandidateProblem:
+    problem = problem_of(step, [recorded(step, 1)])
+    effects = chosen_effects(step.system, [problem.episodes[0].recording], list(candidates) or ["joint_viscous"])
+    return CandidateProblem.of(problem, effects, [recorded(step, 2)] if held_out else [])
+
+
+@pytest.mark.parametrize("held_out", [True, False], ids=["held_out", "in_blocks"])
+def test_all_hypotheses_share_weights_frozen_at_one_point(step, held_out):
+    made = composed(step, held_out)
+    weighted = made.weighted_at({"elbow.stiffness": 2.5})
+    assert (weighted.effects, weighted.blocks) == (made.effects, made.blocks)
+    own = weighted.problem
+    extended = weighted.freeing(weighted.effects)
+    assert all(x is y is not None for x, y in zip(own.innovations, extended.innovations, strict=True))
+    held = zip(own.held_out_innovations, extended.held_out_innovations, strict=True)
+    assert all(x is y is not None for x, y in held)
+    assert made.problem.innovations == made.problem.held_out_innovations == (None,)
+    there = own.evaluate(own.vector({"elbow.stiffness": 2.5}), False)
+    again = own.weighted_at(own.vector({"elbow.stiffness": 2.5})).evaluate(own.vector({"elbow.stiffness": 2.5}), False)
+    assert there.cost == pytest.approx(again.cost, rel=0.02)
+
+
+def test_noise_that_drives_the_motion_is_no_gap(step):
+    """With weights by the sensors' noise alone the same fit leaves several times what noise would."""
+    made = composed(step, True)
+    fit = nominal_fit(problem_of(step, [recorded(step, 1)]), made)
+    bare = made.problem.without_input_errors()
+    plain = bare.evaluate(bare.vector(fit.values), False)
+    assert 2 * plain.cost > 2 * len(plain.residual)
+    test = held_out_test(fit)
+    assert 0.8 < test.chi2_per_dof < 1.2
+    assert test.p_value > 1e-3
+
+
+def test_offsets_are_named_where_they_leave_what_was_expected(step):
+    """Within their prior they are no gap; six times as large they are, and named."""
+    library = ["joint_viscous", "effort_offset@shoulder"]
+    within = diagnose(problem_of(step, [recorded(step, 1)], [recorded(step, 2)]), library)
+    assert within.verdict == "no_gap"
+    far = [recorded(step, seed, 6 * OFFSET) for seed in (3, 4)]
+    beyond = diagnose(problem_of(step, far[:1], far[1:]), library)
+    assert [effect.label for effect in beyond.effects] == ["effort_offset@shoulder"]
+    found = beyond.last.values["effort_offset@shoulder.offset"]
+    assert found == pytest.approx(6 * OFFSET, abs=4 * OFFSET)
+
+
+def test_an_effect_is_found_beside_the_noise_of_torques(step):
+    """A gear whose friction is ten times what could be noticed."""
+    library = ["joint_viscous", "effort_offset@shoulder"]
+    clean = problem_of(step, [recorded(step, 5)], [recorded(step, 6)])
+    seen = diagnose(clean, library).visibility
+    detectable = next(e.detectable for e in seen if e.effect.label == "joint_viscous@shoulder")
+    more = 10 * detectable["joint_viscous@shoulder.b"]
+    rubbing = [recorded(step, seed, friction=more) for seed in (5, 6)]
+    finding = diagnose(problem_of(step, rubbing[:1], rubbing[1:]), library)
+    assert [effect.label for effect in finding.effects] == ["joint_viscous@shoulder"]
+    found = finding.last
+    assert found.values["joint_viscous@shoulder.b"] == pytest.approx(
+        more, abs=4 * found.std["joint_viscous@shoulder.b"]
+    )
+
+
+def test_the_smoother_expects_forces_as_large_as_the_torques_noise(step):
+    problem = problem_of(step, [recorded(step, 1)])
+    weighted = problem.weighted_by_sensors()
+    x = problem.start
+    model = linear_model(weighted, x, weighted.evaluate(x))[0]
+    decay = math.exp(-INTERVAL / MEMORY)
+    column = model.unknowns.index("shoulder")
+    # the integral over a long time has the variance of white noise that is held over each sample
+    lasting = (model.known[column] * model.reference[column] ** 2 - OFFSET**2) * INTERVAL * (1 + decay) / (1 - decay)
+    assert lasting == pytest.approx(WHITE**2 * TIME_STEP, rel=0.02)
+    assert np.count_nonzero(model.known) == 1
+    calm = problem.without_input_errors()
+    assert not linear_model(calm, x, calm.evaluate(x))[0].known.any()

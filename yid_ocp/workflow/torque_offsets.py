@@ -1,0 +1,56 @@
+"""Constant errors of recorded torques, recording by recording, as a result holds them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.episodes import Episode
+
+Array = NDArray[np.float64]
+Offsets = dict[str, dict[str, dict[str, float]]]
+
+
+def torque_offsets(problem: EstimationProblem, x: Array) -> Offsets:
+    """By recording and joint the `value` of the offset, its `std` and its `prior_std` [N m], held-out ones included.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+        With weights frozen near `x` (`weighted_at`); where it has none, or offsets are no part of the model, there is
+        nothing to say.
+    x : ndarray, shape (nx,)
+    """
+    found: Offsets = {}
+    if all(whitening is None for whitening in problem.innovations):
+        return found
+    for episode, own in zip(problem.episodes, problem.torque_offsets(x), strict=True):
+        found |= _entry(problem, episode, own)
+    apart = [e for e in problem.held_out if e.errors is not None and e.shares_start_of is None]
+    if not any(np.any(e.errors.bias_std > 0) for e in apart if e.errors is not None):
+        return found
+    held = problem if any(problem.held_out_innovations) else problem.held_out_weighted_at(x)
+    for (episode, result), whitening in zip(held.validate(x), held.held_out_innovations, strict=True):
+        if whitening is not None and not isinstance(result, str) and episode.shares_start_of is None:
+            value = held.predictor.torque_offset(episode, result, whitening)
+            found |= _entry(held, episode, (value, whitening.bias_std))
+    return found
+
+
+def _entry(
+    problem: EstimationProblem, episode: Episode, own: Sequence[Array] | None
+) -> Mapping[str, dict[str, dict[str, float]]]:
+    """One recording's part; empty where none of its torques may be off."""
+    if own is None or episode.errors is None or not np.any(episode.errors.bias_std > 0):
+        return {}
+    rows = zip(problem.system.driven, *own, episode.errors.bias_std, strict=True)
+    return {
+        episode.name: {
+            joint: {"value": float(value), "std": float(std), "prior_std": float(prior)}
+            for joint, value, std, prior in rows
+            if prior > 0
+        }
+    }
