@@ -419,11 +419,19 @@ def test_an_effect_must_close_a_sure_part_of_the_gap(monkeypatch, nominal, best,
     [
         ((1.05, 1.0), (0.9, 1.0), True),
         ((1.05, 1.0), (0.96, 1.0), False),
-        ((1.3, 1.0), (1.0, 1.0), True),
+        ((1.19, 1.0), (1.0, 1.0), True),
+        ((1.2, 1.0), (1.0, 1.0), False),
         ((1.6, 1.3), (1.2, 1.0), False),
         ((1.6, 1.3), (math.inf, 1.0), False),
     ],
-    ids=["a fall by 15", "a fall by 9", "a fall by 30", "what is left is no noise", "failed"],
+    ids=[
+        "a fall by 15",
+        "a fall by 9",
+        "a fall by 19",
+        "chi2 tells enough of it",
+        "what is left is no noise",
+        "failed",
+    ],
 )
 def test_held_out_recordings_are_far_likelier_with_an_effect_that_leaves_noise(before, after, sure):
     assert far_likelier(loss(*before), loss(*after)) is sure

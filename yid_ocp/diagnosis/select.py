@@ -71,13 +71,13 @@ def closure(before: Loss, after: Loss, seed: int = 0, limits: Thresholds = DEFAU
 
 
 def far_likelier(before: Loss, after: Loss, limits: Thresholds = DEFAULTS) -> bool:
-    """Whether held-out recordings are likelier with `after` by the odds of `worth`, where it leaves noise alone.
+    """Whether held-out recordings are likelier with `after` by the odds of `worth`, where both leave little but noise.
 
     Innovations that are noise are independent, and half the fall of their squares is a log likelihood ratio. What shows
     in a few of them only, as a constant error of a torque does at the start, differs too much from block to block for
     `gain` to be sure, and hardly moves chi2/n.
     """
-    if not after.mean < 1 + limits.smallest_gap:
+    if not max(before.mean, after.mean) < 1 + limits.smallest_gap:
         return False
     return float(np.sum(before.squares) - np.sum(after.squares)) > 2 * limits.worth
 
