@@ -252,7 +252,7 @@ class Carrying(Steps):
 def test_passes_begin_where_the_last_one_ended_and_end_when_one_changes_nothing():
     solver = Carrying([[1.0], [2.0]], [[2.0], [2.5]], [[2.5]], [[99.0]])
     problem = Disturbed(linear(np.eye(1), [-2.5]))
-    solution = solve(problem, solver)
+    solution = solve(problem, solver, restarts=False)
     assert [start for start, _ in solver.runs] == [[1.0], [2.0], [2.5]]
     assert problem.frozen == [([1.0], None), ([2.0], "warm"), ([2.5], "warm")]
     assert solution.x.tolist() == [2.5]
@@ -264,11 +264,28 @@ def test_passes_begin_where_the_last_one_ended_and_end_when_one_changes_nothing(
 
 def test_the_first_pass_is_never_the_last_and_their_number_has_an_end():
     still = Carrying([[1.0]], [[1.0]])
-    solve(Disturbed(misfit(lambda x: 1.0)), still)
+    solve(Disturbed(misfit(lambda x: 1.0)), still, restarts=False)
     assert len(still.runs) == 2
     restless = Carrying(*[[[k], [k + 1.0]] for k in range(9)])
-    solve(Disturbed(misfit(lambda x: 1.0)), restless)
+    solve(Disturbed(misfit(lambda x: 1.0)), restless, restarts=False)
     assert len(restless.runs) == 6
+
+
+@pytest.mark.parametrize(
+    ("slope", "target", "tried"),
+    [(20.0, 2.5, False), (2.0, 2.5, True), (1e-4, 2.5, False), (1e4, 0.01, True), (1e4, 0.03, False)],
+    ids=["well known", "loosely known", "not informed", "nearly vanished", "small and well known"],
+)
+def test_beside_noise_that_drives_the_motion_doubtful_estimates_have_another_start(slope, target, tried):
+    """A start four times as large, in passes of its own."""
+    there = [[1.0], [target]], [[target]]
+    solver = Carrying(*there, [[4.0], [target]], [[target]])
+    solution = solve(Disturbed(linear(slope * np.eye(1), [-slope * target])), solver)
+    assert ([4.0] in [start for start, _ in solver.runs]) is tried
+    assert ("best of 2 starts" in solution.message) is tried
+    calm = Carrying(*there, [[4.0], [target]], [[target]])
+    solve(MadeUp(linear(slope * np.eye(1), [-slope * target])), calm)
+    assert [4.0] not in [start for start, _ in calm.runs]
 
 
 def test_a_method_that_cannot_carry_the_noise_says_so_and_runs_once():

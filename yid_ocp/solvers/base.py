@@ -176,6 +176,9 @@ CONTINUATION = (0.06, 0.12, 0.25, 0.5)
 # it is started again from these multiples of the initial values, and the best is kept.
 POOR_FIT = 5.0
 RESTARTS = (4.0, 2.0, 10.0)
+# Beside noise that drives the motion a wrong valley may hide in chi2 per degree of freedom of 1.03: what is known worse
+# than this part of its value, or has fallen below that part of its start, is tried from RESTARTS[0] times its start.
+DOUBTFUL, COLLAPSED = 0.1, 0.02
 # Noise that drives the motion is linearised where a pass begins; passes end when one changes nothing.
 PASSES = 6
 REMEDY = "start nearer, widen the bounds, or use gauss_newton"
@@ -233,21 +236,29 @@ def _solved(
     first = off_neutral(problem, problem.start) if start is None else np.clip(np.asarray(start, float), lower, upper)
     best, evaluations, history = _attempt(problem, solver, first, callback)
     tried = 1
-    for factor in restarts:
-        if _good_fit(problem, best[1]):
-            break
-        x = np.where(problem.positive, np.clip(first * factor, lower, upper), first)
-        log.info("starting again from %g times the initial values", factor)
+
+    def try_from(x: Array, note: str) -> None:
+        nonlocal best, evaluations, tried
+        log.info("starting again: %s", note)
         try:
             again, more, steps = _attempt(problem, solver, x, callback)
         except YidError as error:
             # another start is a chance, never a reason to lose what is there
             log.info("no fit from there: %s", error)
-            continue
+            return
         tried, evaluations = tried + 1, evaluations + more
-        history += [replace(entry, note=f"start x {factor:g}") for entry in steps]
+        history.extend(replace(entry, note=note) for entry in steps)
         if again[1].cost < best[1].cost:
             best = again
+
+    for factor in restarts:
+        if _good_fit(problem, best[1]):
+            break
+        try_from(np.where(problem.positive, np.clip(first * factor, lower, upper), first), f"start x {factor:g}")
+    doubtful = _doubtful(best[2], best[1], best[0].x, first)
+    if restarts and problem.disturbed and carries_covariance(solver) and np.any(doubtful):
+        far = np.clip(RESTARTS[0] * first, lower, upper)
+        try_from(np.where(doubtful, far, best[0].x), f"doubtful ones from start x {RESTARTS[0]:g}")
     outcome, finish, weighted = best
     if problem.disturbed and not carries_covariance(solver):
         remark = "; weighted by the sensors' noise alone, without the noise that drives the motion"
@@ -315,6 +326,15 @@ def _attempt(
         if number and len(outcome.history) < 2:
             break
     return (outcome, weighted.evaluate(outcome.x, warm=outcome.warm), weighted), evaluations, history
+
+
+def _doubtful(problem: EstimationProblem, finish: Evaluation, x: Array, first: Array) -> NDArray[np.bool_]:
+    """Positive unknowns that the data inform, but loosely, and those that have all but vanished."""
+    if not finish.ok or finish.jacobian is None:
+        return np.zeros(len(x), bool)
+    std = np.sqrt(np.maximum(np.diag(uncertainty(problem, finish)[0]), 0.0))
+    loose = (std > DOUBTFUL * np.abs(x)) & (std < 100 * np.abs(first))
+    return problem.positive & (loose | (x < COLLAPSED * first))
 
 
 def carries_covariance(solver: Solver) -> bool:
