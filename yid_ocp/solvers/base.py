@@ -176,8 +176,8 @@ CONTINUATION = (0.06, 0.12, 0.25, 0.5)
 # it is started again from these multiples of the initial values, and the best is kept.
 POOR_FIT = 5.0
 RESTARTS = (4.0, 2.0, 10.0)
-# Beside noise that drives the motion a wrong valley may hide in chi2 per degree of freedom of 1.03: what is known worse
-# than this part of its value, or has fallen below that part of its start, is tried from RESTARTS[0] times its start.
+# Beside noise that drives the motion a wrong valley may hide in chi2 per degree of freedom of 1.03. Where anything is
+# known worse than this part of its value, or has fallen below that part of its start, another start is tried.
 DOUBTFUL, COLLAPSED = 0.1, 0.02
 # Noise that drives the motion is linearised where a pass begins; passes end when one changes nothing.
 PASSES = 6
@@ -255,10 +255,10 @@ def _solved(
         if _good_fit(problem, best[1]):
             break
         try_from(np.where(problem.positive, np.clip(first * factor, lower, upper), first), f"start x {factor:g}")
-    doubtful = _doubtful(best[2], best[1], best[0].x, first)
-    if restarts and problem.disturbed and carries_covariance(solver) and np.any(doubtful):
-        far = np.clip(RESTARTS[0] * first, lower, upper)
-        try_from(np.where(doubtful, far, best[0].x), f"doubtful ones from start x {RESTARTS[0]:g}")
+    if tried == 1 and restarts and problem.disturbed and carries_covariance(solver):
+        if np.any(_doubtful(best[2], best[1], best[0].x, first)):
+            factor = RESTARTS[0]
+            try_from(np.where(problem.positive, np.clip(first * factor, lower, upper), first), f"start x {factor:g}")
     outcome, finish, weighted = best
     if problem.disturbed and not carries_covariance(solver):
         remark = "; weighted by the sensors' noise alone, without the noise that drives the motion"
