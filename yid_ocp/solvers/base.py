@@ -255,10 +255,10 @@ def _solved(
         if _good_fit(problem, best[1]):
             break
         try_from(np.where(problem.positive, np.clip(first * factor, lower, upper), first), f"start x {factor:g}")
-    if tried == 1 and restarts and problem.disturbed and carries_covariance(solver):
-        if np.any(_doubtful(best[2], best[1], best[0].x, first)):
-            factor = RESTARTS[0]
-            try_from(np.where(problem.positive, np.clip(first * factor, lower, upper), first), f"start x {factor:g}")
+    once = tried == 1 and restarts and problem.disturbed and carries_covariance(solver)
+    if once and np.any(_doubtful(best[2], best[1], best[0].x, first)):
+        factor = RESTARTS[0]
+        try_from(np.where(problem.positive, np.clip(first * factor, lower, upper), first), f"start x {factor:g}")
     outcome, finish, weighted = best
     if problem.disturbed and not carries_covariance(solver):
         remark = "; weighted by the sensors' noise alone, without the noise that drives the motion"
