@@ -52,6 +52,14 @@ class EpisodeResult:
     correction: Array | None = None
     by_correction: Array | None = None
 
+    @property
+    def push(self) -> Array | None:
+        """`correction` and, after it, its derivative where that is known, shape (N, nu, 1 + d)."""
+        if self.correction is None:
+            return None
+        known = self.correction[:, :, None]
+        return known if self.by_correction is None else np.concatenate([known, self.by_correction], axis=2)
+
 
 @dataclass(frozen=True)
 class Start:
@@ -308,9 +316,8 @@ class Predictor:
 
     def torque_offset(self, episode: Episode, result: EpisodeResult, whitening: Innovations) -> Array:
         """Constant error of every driven joint's torque, as all measurements of an episode have it, (nu,) [N m]."""
-        push = None if result.correction is None else result.correction[:, :, None]
         rows = [s.rows(y).residual for s, y in zip(episode.samples, result.predicted, strict=True)]
-        return whitening.whitened(np.concatenate(rows)[:, None], push)[1][:, 0]
+        return whitening.whitened(np.concatenate(rows)[:, None], result.push)[1][:, 0]
 
     def _course(self, episode: Episode, result: EpisodeResult, theta: Array) -> Course:
         own, rollout = self.own_theta(episode, theta), result.rollout

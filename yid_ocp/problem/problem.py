@@ -296,7 +296,7 @@ class EstimationProblem:
         done = tuple(result for result in results if isinstance(result, EpisodeResult))
         cost, residuals, jacobians = 0.0, [], []
         for i, result in enumerate(done):
-            part = self._rows(self.episodes[i], self.innovations[i], result)
+            part = _rows(self.episodes[i], self.innovations[i], result, self.options.huber_threshold)
             cost += part.cost
             residuals.append(part.residual)
             if part.jacobian is not None:
@@ -309,22 +309,6 @@ class EstimationProblem:
         if not np.isfinite(cost):
             return Evaluation(np.inf, residual, None, False, "the cost is not finite", done)
         return Evaluation(cost, residual, jacobian, True, "", done)
-
-    def _rows(self, episode: Episode, whitening: Innovations | None, result: EpisodeResult) -> Rows:
-        """One episode's part of the residual: in units of the sensors' noise, or innovations where they are frozen."""
-        if whitening is None:
-            return joined(episode.samples, result, self.options.huber_threshold)
-        plain = joined(episode.samples, result)
-        columns, push = plain.residual[:, None], result.correction
-        push = None if push is None else push[:, :, None]
-        if plain.jacobian is not None:
-            columns = np.hstack([columns, plain.jacobian])
-            if push is not None and result.by_correction is not None:
-                push = np.concatenate([push, result.by_correction], axis=2)
-        columns = whitening.whitened(columns, push)[0]
-        cost, factor = huber(columns[:, 0], self.options.huber_threshold)
-        columns = factor[:, None] * columns
-        return Rows(cost, columns[:, 0], None if plain.jacobian is None else columns[:, 1:], factor)
 
     def torque_offsets(self, x: ArrayLike) -> list[tuple[Array, Array] | None]:
         """Constant error of driven joints' torques at `x`, of every recording: values and standard deviations [N m].
@@ -566,8 +550,7 @@ class EstimationProblem:
 
         Without a robust loss, in the order of its measurements; innovations where they are frozen.
         """
-        plain = replace(self.options, huber_threshold=np.inf)
-        return self._changed(options=plain)._rows(episode, self.held_out_innovations[i], result)
+        return _rows(episode, self.held_out_innovations[i], result, np.inf)
 
     def shortened(self, duration: float) -> EstimationProblem:
         """The same problem over the first seconds of every recording, prepared anew, without held-out ones."""
@@ -598,3 +581,17 @@ class EstimationProblem:
             "held_out": [episode.recording for episode in self.held_out],
         }
         return EstimationProblem(**{**same, **changes})
+
+
+def _rows(episode: Episode, whitening: Innovations | None, result: EpisodeResult, threshold: float) -> Rows:
+    """One episode's part of the residual: in units of the sensors' noise, or innovations where they are frozen."""
+    if whitening is None:
+        return joined(episode.samples, result, threshold)
+    plain = joined(episode.samples, result)
+    columns = plain.residual[:, None]
+    if plain.jacobian is not None:
+        columns = np.hstack([columns, plain.jacobian])
+    columns = whitening.whitened(columns, result.push)[0]
+    cost, factor = huber(columns[:, 0], threshold)
+    columns = factor[:, None] * columns
+    return Rows(cost, columns[:, 0], None if plain.jacobian is None else columns[:, 1:], factor)

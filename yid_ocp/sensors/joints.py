@@ -24,21 +24,16 @@ sampling."""
 
 
 @dataclass(frozen=True)
-class PositionSensor:
-    """Encoders of the named joints, which are driven."""
+class _JointSensor:
+    """Sensors of named joints: one output a joint, no places."""
 
     joints: tuple[str, ...]
-    group: str = POSITION
+    group: str
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """`joints.position.JOINT` for every joint."""
+        """`joints.QUANTITY.JOINT` for every joint."""
         return tuple(f"{self.group}.{joint}" for joint in self.joints)
-
-    @property
-    def unit(self) -> str:
-        """Radians."""
-        return "rad"
 
     @property
     def width(self) -> int:
@@ -56,14 +51,26 @@ class PositionSensor:
         return ()
 
     @property
-    def efforts(self) -> tuple[str, ...]:
-        """No efforts."""
-        return ()
-
-    @property
     def camera(self) -> Placement | None:
         """No camera."""
         return None
+
+
+@dataclass(frozen=True)
+class PositionSensor(_JointSensor):
+    """Encoders of the named joints, which are driven."""
+
+    group: str = POSITION
+
+    @property
+    def unit(self) -> str:
+        """Radians."""
+        return "rad"
+
+    @property
+    def efforts(self) -> tuple[str, ...]:
+        """No efforts."""
+        return ()
 
     @property
     def baseline(self) -> Literal["zero", "stays"]:
@@ -76,16 +83,10 @@ class PositionSensor:
 
 
 @dataclass(frozen=True)
-class EffortSensor:
+class EffortSensor(_JointSensor):
     """Effort of the named joints, which are prescribed: what the discrete inverse dynamics says they needed."""
 
-    joints: tuple[str, ...]
     group: str = EFFORT
-
-    @property
-    def channels(self) -> tuple[str, ...]:
-        """`joints.effort.JOINT` for every joint."""
-        return tuple(f"{self.group}.{joint}" for joint in self.joints)
 
     @property
     def unit(self) -> str:
@@ -93,29 +94,9 @@ class EffortSensor:
         return "N m"
 
     @property
-    def width(self) -> int:
-        """One output a joint."""
-        return 1
-
-    @property
-    def frames(self) -> tuple[str, ...]:
-        """No points."""
-        return ()
-
-    @property
-    def points(self) -> tuple[str, ...]:
-        """No points."""
-        return ()
-
-    @property
     def efforts(self) -> tuple[str, ...]:
         """All its joints."""
         return self.joints
-
-    @property
-    def camera(self) -> Placement | None:
-        """No camera."""
-        return None
 
     @property
     def baseline(self) -> Literal["zero", "stays"]:
