@@ -430,18 +430,29 @@ def print_progress(done: int, total: int, text: str) -> None:
     print(f"{done} of {total}: {text}", file=sys.stderr, flush=True)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description="Whether the standard deviations of `solve` are true.")
-    parser.add_argument("cells", nargs="*", metavar="CELL", help=f"of {', '.join(CELLS)}; all when absent")
-    parser.add_argument("--twins", type=int, default=40, help="of each cell")
+def command(description: str, what: str, known: Mapping[str, Any], twins: int) -> argparse.ArgumentParser:
+    """The command line of a benchmark over twins of several cells or kinds, as `what` says."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("names", nargs="*", metavar=what.upper(), help=f"of {', '.join(known)}; all when absent")
+    parser.add_argument("--twins", type=int, default=twins, help=f"of each {what}")
     parser.add_argument("--jobs", type=int, default=None, help="processes; as many as there are processors when absent")
-    parser.add_argument("--out", type=Path, required=True, help="folder of recordings and solutions")
-    parser.add_argument("--record-only", action="store_true", help="make the recordings, to be solved later")
-    chosen = parser.parse_args(arguments)
-    unknown = sorted(set(chosen.cells) - set(CELLS))
+    parser.add_argument("--out", type=Path, required=True, help="folder of recordings and results")
+    parser.add_argument("--record-only", action="store_true", help="make the recordings, to be used later")
+    return parser
+
+
+def asked_for(parser: argparse.ArgumentParser, asked: Sequence[str], known: Mapping[str, Any], what: str) -> list[str]:
+    """Names in their own order, all of them where none is asked for; the parser's error where one is not known."""
+    unknown = sorted(set(asked) - set(known))
     if unknown:
-        parser.error(f"there is no cell '{unknown[0]}'; choose from {', '.join(CELLS)}")
-    names = [name for name in CELLS if name in chosen.cells or not chosen.cells]
+        parser.error(f"there is no {what} '{unknown[0]}'; choose from {', '.join(known)}")
+    return [name for name in known if name in asked or not asked]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = command("Whether the standard deviations of `solve` are true.", "cell", CELLS, 40)
+    chosen = parser.parse_args(arguments)
+    names = asked_for(parser, chosen.names, CELLS, "cell")
     with process_pool(chosen.jobs) as pool:
         made = record(names, chosen.twins, pool, chosen.out)
         if chosen.record_only:

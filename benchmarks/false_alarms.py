@@ -11,7 +11,6 @@ are.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import sys
@@ -24,7 +23,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from coverage import CONFIGS, DURATION, INNER_STEP, PACKAGE, SPREAD, Cell, code_hash, gentle_enough, print_progress
+from coverage import (
+    CONFIGS,
+    DURATION,
+    INNER_STEP,
+    PACKAGE,
+    SPREAD,
+    Cell,
+    asked_for,
+    code_hash,
+    command,
+    gentle_enough,
+    print_progress,
+)
 from make_recordings import OFFSETS, TRUTH
 
 from yid_ocp.config.reader import DIAGNOSIS_DEFAULT, load_config
@@ -252,18 +263,10 @@ def diagnosed(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description="Whether `diagnose` finds what is not there, and misses what is.")
-    parser.add_argument("kinds", nargs="*", metavar="KIND", help=f"of {', '.join(KINDS)}; all when absent")
-    parser.add_argument("--twins", type=int, default=15, help="of each kind")
+    parser = command("Whether `diagnose` finds what is not there, and misses what is.", "kind", KINDS, 15)
     parser.add_argument("--candidates", default="all", help="`all`, or a list such as [kelvin_voigt, effort_offset]")
-    parser.add_argument("--jobs", type=int, default=None, help="processes; as many as there are processors when absent")
-    parser.add_argument("--out", type=Path, required=True, help="folder of recordings and findings")
-    parser.add_argument("--record-only", action="store_true", help="make the recordings, to be diagnosed later")
     chosen = parser.parse_args(arguments)
-    unknown = sorted(set(chosen.kinds) - set(KINDS))
-    if unknown:
-        parser.error(f"there is no kind '{unknown[0]}'; choose from {', '.join(KINDS)}")
-    names = [name for name in KINDS if name in chosen.kinds or not chosen.kinds]
+    names = asked_for(parser, chosen.names, KINDS, "kind")
     with process_pool(chosen.jobs) as pool:
         made = record(names, chosen.twins, pool, chosen.out)
         if chosen.record_only:
