@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.analysis.combinations import Component, combination_words, sparse_basis
-from yid_ocp.analysis.identifiability import identifiability, lowered, with_grasp_offsets
+from yid_ocp.analysis.identifiability import identifiability, with_grasp_offsets
 from yid_ocp.errors import ConfigError, SolverError
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem
@@ -173,22 +173,6 @@ def test_nothing_is_called_identifiable_whose_interval_is_open(springs, name):
     info = identifiability(problem, solve(problem, GaussNewton()), start="known", intervals="all")
     for entry in info.parameters.values():
         assert (entry.verdict == "identifiable") == (None not in entry.interval)
-
-
-@pytest.mark.parametrize(
-    ("said", "interval", "expected"),
-    [
-        ("identifiable", (1.0, 2.0), "identifiable"),
-        ("identifiable", (1.0, None), "weak"),
-        ("identifiable", (None, 2.0), "weak"),
-        ("identifiable", (None, None), "not_identifiable"),
-        ("weak", (1.0, None), "weak"),
-        ("not_identifiable", (1.0, 2.0), "not_identifiable"),
-        ("identifiable", None, "identifiable"),
-    ],
-)
-def test_no_verdict_contradicts_its_interval(said, interval, expected):
-    assert lowered(said, interval) == expected
 
 
 # -- nuisances --------------------------------------------------------------------------------------------------------

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
 import pytest
-from made_models import Formula
+from made_models import Formula, estimate, solution
 
-from yid_ocp.analysis.profile import LEVEL, best_fit, profile_likelihood, small
+from yid_ocp.analysis.profile import LEVEL, best_fit, profile_likelihood, small, sure_of_small, with_intervals
 
 OPEN = {"a": (-math.inf, math.inf), "b": (-math.inf, math.inf)}
 HALF = math.sqrt(LEVEL)
@@ -412,3 +413,55 @@ def test_intervals_are_worked_out_unasked_where_they_take_no_time(parameters, un
     names = tuple(f"k{i}" for i in range(parameters))
     starts = tuple(f"start.q.joint[{i}]" for i in range(unknowns - parameters))
     assert small(SimpleNamespace(names=names + starts, shared=names, local=())) is expected
+
+
+# -- verdicts ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_stiffness_that_comes_out_small_by_chance_is_not_called_found():
+    """Noise makes 0.2 fit best, while a joint that hardly gives fits nearly as well as 1/k fades."""
+
+    def rows(x):
+        return [100.0 * (x["a.bend"] - 20.0), 1.7 * (1.0 - 0.2 / x["b.bend"])]
+
+    problem = Formula(rows, {"a.bend": 20.0, "b.bend": 0.2})
+    there = problem.evaluate(problem.start)
+    fitted = solution(a_bend=estimate(20.0, 0.01), b_bend=estimate(0.2, 0.25))
+    judged = with_intervals(problem, replace(fitted, x=problem.start, evaluation=there)).parameters
+    assert judged["a.bend"] == fitted.parameters["a.bend"]
+    assert judged["b.bend"] == replace(fitted.parameters["b.bend"], verdict="not_identifiable", std=math.inf)
+
+
+@pytest.mark.parametrize(
+    ("asymptote", "said"), [(3.2, "not_identifiable"), (3.35, "identifiable"), (30.0, "identifiable")]
+)
+def test_a_small_stiffness_counts_where_its_typical_size_is_ruled_out(asymptote, said):
+    """3.29 standard deviations at 20, which is what others of its kind have."""
+    problem = Formula(
+        lambda x: [100.0 * (x["a.bend"] - 20.0), asymptote * (1.0 - 0.2 / x["b.bend"]) / 0.99],
+        {"a.bend": 20.0, "b.bend": 0.2},
+    )
+    there = problem.evaluate(problem.start)
+    entry = sure_of_small(problem, problem.start, 1, estimate(0.2, 0.01), 20.0, there)
+    assert entry.verdict == said
+    assert sure_of_small(problem, problem.start, 1, estimate(7.0, 0.01), 20.0, there).verdict == "identifiable"
+
+
+def test_an_interval_may_be_open_where_a_typical_size_is_not_asked():
+    problem = Formula(
+        lambda x: [100.0 * (x["a.bend"] - 20.0), 1.7 * (1.0 - 12.0 / x["b.bend"])], {"a.bend": 20.0, "b.bend": 12.0}
+    )
+    there = problem.evaluate(problem.start)
+    fitted = solution(a_bend=estimate(20.0, 0.01), b_bend=estimate(12.0, 7.0, "weak"))
+    found = with_intervals(problem, replace(fitted, x=problem.start, evaluation=there)).parameters["b.bend"]
+    assert (found.verdict, found.std) == ("weak", math.inf)
+    assert found.interval == (pytest.approx(12.0 / (1 + HALF / 1.7), rel=0.02), None)
+
+
+def test_a_stiffness_that_is_known_to_be_small_is_found():
+    problem = Formula(lambda x: [x["a.bend"] - 20.0, 10.0 * (x["b.bend"] - 0.05)], {"a.bend": 20.0, "b.bend": 0.05})
+    there = problem.evaluate(problem.start)
+    fitted = solution(a_bend=estimate(20.0, 1.0), b_bend=estimate(0.05, 0.1))
+    found = with_intervals(problem, replace(fitted, x=problem.start, evaluation=there)).parameters["b.bend"]
+    assert (found.verdict, found.std) == ("identifiable", 0.1)
+    assert found.interval == (None, pytest.approx(0.05 + HALF / 10, rel=0.01))

@@ -13,14 +13,17 @@ from yid_ocp.problem.null_test import GapLimits
 from yid_ocp.solvers.judgement import (
     MOST_ASKED,
     NO_FIT,
+    Estimate,
     Fit,
     bound_side,
+    by_profile,
     counting_misfit,
     estimates,
     judge_fit,
     one_sided,
     parameter_names,
     standing_std,
+    stands_by_itself,
     typical_sizes,
     uncertainty,
     verdict,
@@ -29,6 +32,53 @@ from yid_ocp.solvers.judgement import (
 GOOD, BAD = Fit(1.0, 0.5, True), Fit(9.0, 0.0, False)
 
 # -- verdicts ---------------------------------------------------------------------------------------------------------
+
+
+def stiffness(value, std, said, lower=0.0, upper=math.inf):
+    return Estimate(value, std, "N m/rad", 3.0, lower, upper, True, said)
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "said", "interval", "expected", "spread"),
+    [
+        (2.0, 0.1, "identifiable", (1.8, 2.2), "identifiable", 0.1),
+        (2.0, 1.0, "weak", (1.0, 4.5), "weak", 1.0),
+        # the wider side is more than twice what the parabola has
+        (2.0, 1.0, "weak", (1.0, 6.0), "weak", 4.0 / 1.959963984540054),
+        (2.0, 0.1, "identifiable", (1.9, None), "weak", math.inf),
+        (2.0, 0.1, "not_trusted", (1.9, None), "not_trusted", math.inf),
+        (2.0, 0.1, "identifiable", (None, None), "not_identifiable", math.inf),
+        (2.0, 0.1, "not_identifiable", (1.8, 2.2), "not_identifiable", 0.1),
+        # small beside others of its kind (10): known to be small, not quite, not at all
+        (0.1, 0.2, "identifiable", (None, 0.5), "identifiable", 0.2),
+        (0.1, 0.2, "identifiable", (0.02, 5.0), "weak", 4.9 / 1.959963984540054),
+        (0.25, 0.26, "identifiable", (0.06, None), "weak", math.inf),
+        # its bound is far away
+        (50.0, 1.0, "identifiable", (None, 51.0), "weak", math.inf),
+    ],
+)
+def test_no_verdict_and_no_spread_contradicts_a_profile(value, std, said, interval, expected, spread):
+    found = by_profile(stiffness(value, std, said), interval, 10.0)
+    assert (found.verdict, found.interval, found.value) == (expected, interval, value)
+    assert found.std == pytest.approx(spread, rel=1e-12)
+
+
+def test_an_upper_bound_within_reach_ends_an_interval():
+    found = by_profile(stiffness(8.0, 2.0, "weak", upper=10.0), (5.0, None), 5.0)
+    assert (found.verdict, found.std) == ("weak", 2.0)
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "said", "expected"),
+    [
+        (10.0, 1.0, "identifiable", True),
+        (0.1, 0.2, "identifiable", False),
+        (10.0, 3.0, "weak", False),
+        (-10.0, 1.0, "identifiable", True),
+    ],
+)
+def test_small_and_weak_values_do_not_stand_by_themselves(value, std, said, expected):
+    assert stands_by_itself(stiffness(value, std, said)) is expected
 
 
 @pytest.mark.parametrize(

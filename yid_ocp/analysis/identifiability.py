@@ -12,7 +12,7 @@ import threadpoolctl
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.analysis.combinations import Component, combination_words, listed_names, sparse_basis
-from yid_ocp.analysis.profile import Profile, best_fit, lowered, profile_likelihood
+from yid_ocp.analysis.profile import Profile, best_fit, profile_likelihood, sure_of_small
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ConfigError, SolverError, nearest
 from yid_ocp.model.system import System
@@ -25,10 +25,12 @@ from yid_ocp.solvers.judgement import (
     UNINFORMED,
     WEAK,
     Estimate,
+    by_profile,
     covariance_of_fit,
     estimates,
     judge_fit,
     parameter_names,
+    typical_sizes,
     uncertainty,
     verdict,
 )
@@ -59,8 +61,8 @@ class ParameterInformation:
     std_alone : float
         Relative standard deviation if everything else were known.
     verdict : str
-        That of a solution at the same point (`solvers.judgement.verdict`); a parameter whose interval was asked for and
-        is open on one side is at best weak, open on both sides not_identifiable.
+        That of a solution at the same point (`solvers.judgement.verdict`), which an interval that was asked for does
+        not contradict (`solvers.judgement.by_profile`).
     interval : (float or None, float or None), or None
         95 % interval by profile likelihood about the best fit of all unknowns, None for an open end; None as a whole
         where it was not asked for.
@@ -233,9 +235,9 @@ def _information(
     std = np.array([judged[name].std for name in names])
     plain = np.sqrt(np.diag(covariance)[chosen])
     informed = np.where(plain < UNINFORMED * np.maximum(scale, wide.scales[chosen]), plain, np.inf)
-    profiles = _profiles(view, std, wanted)
+    profiles, judged = _profiles(view, std, wanted, judged)
     return Identifiability(
-        _parameters(view, judged, profiles),
+        _parameters(view, judged),
         names,
         _correlations(covariance[np.ix_(chosen, chosen)], informed),
         view.relative.T @ view.relative,
@@ -246,36 +248,38 @@ def _information(
     )
 
 
-def _profiles(view: _Sensitivities, std: Array, wanted: Sequence[str]) -> dict[str, Profile]:
-    """Profile likelihoods of the wanted parameters, about the best fit of all unknowns."""
+def _profiles(
+    view: _Sensitivities, std: Array, wanted: Sequence[str], judged: Mapping[str, Estimate]
+) -> tuple[dict[str, Profile], dict[str, Estimate]]:
+    """Profile likelihoods of the wanted parameters about the best fit of all unknowns, and what they leave to say."""
+    said = dict(judged)
     if not wanted:
-        return {}
-    best, there = best_fit(view.problem, view.x)
-    return {
-        name: profile_likelihood(
-            view.problem, best, view.problem.names.index(name), float(std[view.names.index(name)]), there
-        )
-        for name in wanted
-    }
+        return {}, said
+    problem, (best, there), profiles = view.problem, best_fit(view.problem, view.x), {}
+    sizes = typical_sizes(problem, view.x)
+    for name in wanted:
+        index, size = problem.names.index(name), sizes[name.split("[")[0]]
+        profiles[name] = found = profile_likelihood(problem, best, index, float(std[view.names.index(name)]), there)
+        said[name] = sure_of_small(problem, best, index, judged[name], size, there)
+        if said[name].verdict == judged[name].verdict:
+            said[name] = by_profile(judged[name], (found.lower, found.upper), size)
+    return profiles, said
 
 
-def _parameters(
-    view: _Sensitivities, judged: Mapping[str, Estimate], profiles: Mapping[str, Profile]
-) -> dict[str, ParameterInformation]:
+def _parameters(view: _Sensitivities, judged: Mapping[str, Estimate]) -> dict[str, ParameterInformation]:
     """What is known of each parameter, from standard deviations with all others free and from its interval."""
     found = {}
     for i, name in enumerate(view.names):
-        profile = profiles.get(name)
-        interval = judged[name].interval if profile is None else (profile.lower, profile.upper)
+        entry = judged[name]
         scale, alone = float(view.scale[i]), float(view.alone[i])
         found[name] = ParameterInformation(
             float(view.x[view.chosen[i]]),
             view.unit(name),
-            judged[name].std,
-            judged[name].std / scale,
+            entry.std,
+            entry.std / scale,
             1.0 / alone if alone > 0 else math.inf,
-            judged[name].verdict if profile is None else lowered(judged[name].verdict, interval),
-            interval,
+            entry.verdict,
+            entry.interval,
         )
     return found
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -13,13 +14,26 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.solvers import Solution
 from yid_ocp.solvers.gauss_newton import GaussNewton
-from yid_ocp.solvers.judgement import Interval, parameter_names, uncertainty
+from yid_ocp.solvers.judgement import (
+    Estimate,
+    by_profile,
+    parameter_names,
+    stands_by_itself,
+    typical_sizes,
+    uncertainty,
+)
 from yid_ocp.solvers.linear_model import bounded_step
 
+log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 LEVEL = 3.841458820694124
 """Quantile 0.95 of chi2 with one degree of freedom."""
+
+RULED_OUT = 10.827566170662733
+"""Quantile 0.999."""
+SMALL = 0.3
+"""A value below this part of its typical size is small."""
 
 REACH = math.log(1e3)  # how far a positive unknown is followed, up and down, before its interval counts as open
 ANCHOR = math.log(1e3)  # standard deviation that keeps other positive unknowns in place that nothing informs
@@ -116,8 +130,9 @@ def with_intervals(
 ) -> Solution:
     """A solution whose weakly determined parameters have an interval by profile likelihood, and the verdict it allows.
 
-    There the cost is no parabola and a standard deviation tells one side at best. Nothing is added to a problem that
-    is not `small`, for which profiles take long.
+    There the cost is no parabola and a standard deviation tells one side at best; so it is with stiffnesses that are
+    found to be small beside the others (`sure_of_small`). Nothing is added to a problem that is not `small`, for which
+    profiles take long.
 
     Parameters
     ----------
@@ -127,35 +142,62 @@ def with_intervals(
     progress : callable, optional
         Told what takes time.
     """
-    weak = [name for name, entry in solution.parameters.items() if entry.verdict == "weak"]
+    sizes = typical_sizes(problem, solution.x)
+    asked = {
+        name: sizes[name.split("[")[0]]
+        for name, entry in solution.parameters.items()
+        if entry.verdict in ("identifiable", "weak")
+        and (not stands_by_itself(entry) or entry.value < SMALL * sizes[name.split("[")[0]])
+    }
     usable = solution.evaluation is not None and problem.options.weighting != "paper"
-    if not weak or not usable or not small(problem):
+    if not asked or not usable or not small(problem):
         return solution
     if progress is not None:
-        progress(f"intervals of {', '.join(weak)} by profile likelihood")
+        progress(f"intervals of {', '.join(asked)} by profile likelihood")
     best, there = best_fit(problem, solution.x)
     judged = dict(solution.parameters)
-    for name in weak:
-        found = profile_likelihood(problem, best, problem.names.index(name), judged[name].std, there)
-        interval = (found.lower, found.upper)
-        said = lowered(judged[name].verdict, interval)
-        std = math.inf if said == "not_identifiable" else judged[name].std
-        judged[name] = replace(judged[name], verdict=said, std=std, interval=interval)
+    for name, size in asked.items():
+        index = problem.names.index(name)
+        judged[name] = sure_of_small(problem, best, index, judged[name], size, there)
+        if judged[name].verdict != "not_identifiable" and not stands_by_itself(judged[name]):
+            found = profile_likelihood(problem, best, index, judged[name].std, there)
+            judged[name] = by_profile(judged[name], (found.lower, found.upper), size)
     return replace(solution, parameters=judged)
+
+
+def sure_of_small(
+    problem: EstimationProblem, x: Array, index: int, entry: Estimate, size: float, evaluation: Evaluation
+) -> Estimate:
+    """An estimate that is small beside its typical size counts only where the data rule that size out at 99.9 %.
+
+    A branch's twist that no sensor sees swings only where its stiffness is near zero. There it follows the noise: the
+    cost has a narrow minimum, below what it is for all large values by what one more parameter takes from the noise.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    x : ndarray, shape (nx,)
+        The best fit.
+    index : int
+        Which unknown.
+    entry : Estimate
+        Of this unknown.
+    size : float
+        Size that it might have; see `solvers.judgement.typical_sizes`.
+    evaluation : Evaluation
+        At `x`, with the Jacobian.
+    """
+    if entry.verdict not in ("identifiable", "weak") or not 0 <= entry.value < SMALL * size:
+        return entry
+    walk = _Walk(problem, x, index, evaluation, RULED_OUT)
+    rise = walk.rise(size)
+    log.info("%s = %.3g: chi2 rises by %.3g up to %.3g", problem.names[index], entry.value, rise, size)
+    return entry if rise > RULED_OUT else replace(entry, verdict="not_identifiable", std=math.inf, interval=None)
 
 
 def small(problem: EstimationProblem) -> bool:
     """Whether intervals of a problem's parameters are worked out unasked."""
     return len(parameter_names(problem)) <= MOST_INTERVALS and len(problem.names) <= MOST_UNKNOWNS
-
-
-def lowered(said: str, interval: Interval | None) -> str:
-    """A verdict that an interval with open ends does not contradict."""
-    if interval is None or None not in interval:
-        return said
-    if interval == (None, None):
-        return "not_identifiable"
-    return "weak" if said == "identifiable" else said
 
 
 def best_fit(problem: EstimationProblem, x: Array) -> tuple[Array, Evaluation]:
@@ -252,6 +294,13 @@ class _Walk:
                 self.notes.append(f"the model cannot be rolled out {'above' if sign > 0 else 'below'} {value:.4g}")
             return None
         return self._root(inside, outside, target)
+
+    def rise(self, value: float) -> float:
+        """Chi2 at a value, the others refitted, above the first one; NaN where no rollout succeeds."""
+        whole = self.unknowns(self.centre)
+        whole[self.index] = value
+        point = self._refit(self.points[0], float(self.coordinates(whole)[self.index]))
+        return math.nan if point is None else point.chi2
 
     def _limit(self, sign: int) -> float:
         bound = float((self.upper if sign > 0 else self.lower)[self.index])

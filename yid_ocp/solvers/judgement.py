@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -309,6 +309,45 @@ def by_size(value: float, std: float, scale: float = 0.0) -> str:
     if relative <= IDENTIFIABLE or (near_zero and reach <= IDENTIFIABLE * scale):
         return "identifiable"
     return "weak" if relative <= WEAK or (near_zero and reach <= scale) else "not_identifiable"
+
+
+def by_profile(entry: Estimate, interval: Interval, scale: float) -> Estimate:
+    """An estimate with its interval by profile likelihood, and no ± and no verdict that the interval contradicts.
+
+    Open on both sides it is not_identifiable, on one side at best weak and without a ±. An end that is not met before
+    a bound within `scale` is that bound. Else the wider side stands for two standard deviations (`by_size`), and is
+    the ± where a parabola's would be less than half of it.
+
+    Parameters
+    ----------
+    entry : Estimate
+    interval : (float or None, float or None)
+        95 %.
+    scale : float
+        See `verdict`.
+    """
+    low, high = interval
+    if low is None and entry.value - entry.lower <= scale:
+        low = entry.lower
+    if high is None and entry.upper - entry.value <= scale:
+        high = entry.upper
+    if interval == (None, None):
+        std, found = math.inf, "not_identifiable"
+    elif low is None or high is None:
+        std, found = math.inf, "weak"
+    else:
+        wide = max(entry.value - low, high - entry.value) / math.sqrt(TWO_SIDED)
+        std = wide if PROMISED * wide > entry.std else entry.std
+        found = by_size(entry.value, wide, scale)
+        found = "weak" if found == "not_identifiable" else found
+    order = ("identifiable", "weak", "not_identifiable")
+    said = max(entry.verdict, found, key=order.index) if entry.verdict in order else entry.verdict
+    return replace(entry, std=std, verdict=said, interval=interval)
+
+
+def stands_by_itself(entry: Estimate) -> bool:
+    """Whether a standard deviation tells all: not for a weak estimate, nor for one that is small beside others."""
+    return entry.verdict == "identifiable" and entry.std <= IDENTIFIABLE * abs(entry.value)
 
 
 def typical_sizes(problem: EstimationProblem, x: Array) -> Mapping[str, float]:
