@@ -256,12 +256,13 @@ def test_a_problem_has_the_options_of_its_section(written):
     [
         ("dual_arm_vision", ["model.arms.mode=prescribed"], True),
         ("dual_arm_vision", [], False),
-        ("single_arm_vision", ["model.arms.mode=prescribed"], False),
+        ("single_arm_vision", ["model.arms.mode=prescribed"], True),
+        ("baxter_arm", ["recordings.estimate=[]"], False),
         ("dual_arm_vision", ["model.arms.mode=prescribed", "recordings.estimate=[]"], False),
     ],
-    ids=["two grasps", "driven", "one grasp", "without recordings"],
+    ids=["two grasps", "driven", "one grasp", "no grasp", "without recordings"],
 )
-def test_prescribed_arms_whose_grasps_close_a_loop_are_states(repository, file, overrides, expected):
+def test_prescribed_arms_that_hold_an_object_are_states(repository, file, overrides, expected):
     run = load_config(repository / "configs" / f"{file}.yaml", overrides)
     assert tracked(run) is expected
     system = build_system(run)

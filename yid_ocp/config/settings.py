@@ -140,8 +140,8 @@ class ArmSettings:
     mode: Annotated[
         ArmMode,
         About(
-            "driven by measured effort, prescribed (moved as measured) or passive; where several grasps close loops, "
-            "and torques are recorded, prescribed arms are states that their encoders correct"
+            "driven by measured effort, prescribed (moved as measured) or passive; with a grasp and "
+            "recorded torques, prescribed arms are states that their encoders correct"
         ),
     ] = "driven"
     passive: Annotated[tuple[str, ...], About("joints among them that nothing drives, whatever the mode")] = ()
