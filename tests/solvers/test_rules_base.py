@@ -288,6 +288,28 @@ def test_beside_noise_that_drives_the_motion_doubtful_estimates_have_another_sta
     assert [4.0] not in [start for start, _ in calm.runs]
 
 
+def test_beside_such_noise_a_fit_that_explains_nothing_is_started_again_nearby():
+    """The valley of x = 2 and the one of x = 2.5 lie on two sides of a ridge."""
+
+    def rows(x, duration):
+        chi2 = 1.0 if x[0] > 2.3 else 4.9
+        return math.sqrt(0.9 * chi2) * (-1.0) ** np.arange(10), 1e3 * np.ones((10, 1))
+
+    there = [[1.0], [2.0]], [[2.0]]
+    solver = Carrying(*there, [[2.5], [2.5]], [[2.5]])
+    solution = solve(Disturbed(rows), solver)
+    assert [2.5] in [start for start, _ in solver.runs]
+    assert (solution.x.tolist(), solution.fit.explains) == ([2.5], True)
+    assert "(best of 2 starts)" in solution.message
+    assert {entry.note for entry in solution.history} == {"", "best fit x 1.25"}
+    poor = Carrying(*there, [[2.5], [2.1]], [[2.1]], [[3.2], [2.2]], [[2.2]])
+    solution = solve(Disturbed(rows), poor)
+    assert "(best of 3 starts)" in solution.message
+    assert [3.2] in [start for start, _ in poor.runs]
+    single = Carrying(*there)
+    assert "best of" not in solve(Disturbed(rows), single, restarts=False).message
+
+
 def test_a_method_that_cannot_carry_the_noise_says_so_and_runs_once():
     solver = Steps([[1.0], [2.0]], [[3.0]])
     problem = Disturbed(linear(np.eye(1), [-2.0]))

@@ -113,10 +113,10 @@ def build_system(run: Run, finer: int = 1) -> System:
 def tracked(run: Run) -> bool:
     """Whether prescribed arms are states that their encoders correct, driven by the torques that they measured.
 
-    So it is where they hold an object and torques are recorded. The encoders' noise reaches what the torques are compared
-    with through the arm's whole inertia, from joint to joint and from sample to sample, which a rollout that takes the
-    angles as true cannot say. Where several grasps close loops, such angles ask for what the object's geometry does not
-    allow, and no motion fits.
+    So it is where they hold an object and torques are recorded. The encoders' noise reaches the torques through the
+    arm's whole inertia, from joint to joint and from sample to sample, which a rollout that takes the angles as true
+    cannot say. Where several grasps close loops, such angles ask for what the object's geometry does not allow, and no
+    motion fits.
     """
     if run.model.arms.mode != "prescribed" or not run.model.grasp:
         return False
