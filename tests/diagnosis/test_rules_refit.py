@@ -39,10 +39,14 @@ class Problem:
     def __init__(self, cost, rows=10, names=("k", "k[run]", "start.q.k[run]", A, S)):
         self.cost, self.rows, self.names, self.nominal = cost, rows, names, ("k",)
         self.asked, self.warmed = [], []
-        self.freed = None
+        self.freed = self.placed = None
 
     def freeing(self, effects):
         self.freed = tuple(effects)
+        return self
+
+    def about_torques_of(self, x, frozen):
+        self.placed = self.named(x), self.named(frozen)
         return self
 
     def vector(self, values):
@@ -87,6 +91,15 @@ def solved(monkeypatch):
     monkeypatch.setattr(module, "held_out_loss", held_out)
     monkeypatch.setattr(module, "refit_std", lambda problem, finish: np.full(len(problem.names), 0.1))
     return made
+
+
+# -- where weights stand ----------------------------------------------------------------------------------------------
+
+
+def test_weights_stand_about_the_torques_of_the_start_without_the_effects(solved):
+    problem = Problem(lambda values: 1.0)
+    refit(problem, [FRICTION], {"k": 2.0, A: 3.0})
+    assert problem.placed == ({**problem.named(np.ones(5)), "k": 2.0, A: 3.0}, {**problem.placed[0], A: 0.25, S: 0.5})
 
 
 # -- is a refit half done ---------------------------------------------------------------------------------------------

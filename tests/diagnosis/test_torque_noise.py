@@ -88,6 +88,32 @@ def test_all_hypotheses_share_weights_frozen_at_one_point(step, held_out):
     assert there.cost == pytest.approx(again.cost, rel=0.02)
 
 
+@pytest.mark.parametrize("held_out", [True, False], ids=["held_out", "in_blocks"])
+def test_what_an_effect_takes_from_a_torque_its_offset_gives_back(step, held_out):
+    """Weights are frozen once, about torques that an offset among the effects must not move."""
+    made = composed(step, held_out, "effort_offset", "joint_viscous").weighted_at({"elbow.stiffness": 2.5})
+    wide = made.freeing(made.effects)
+    at = {"elbow.stiffness": 2.5}
+    x, frozen = (wide.vector({**at, "effort_offset@shoulder.offset": value}) for value in (0.3, 0.0))
+    moved = wide.about_torques_of(x, frozen)
+    for before, after in (
+        (wide.innovations, moved.innovations),
+        (wide.held_out_innovations, moved.held_out_innovations),
+    ):
+        assert after[0].steps is before[0].steps
+        np.testing.assert_allclose(after[0].offset, before[0].offset - 0.3, atol=1e-12)
+    there, then = moved.weighted_by_sensors().evaluate(x), wide.weighted_by_sensors().evaluate(frozen)
+    np.testing.assert_allclose(there.residual[: len(then.residual)], then.residual, atol=1e-7)
+    own, nominal = (
+        problem.held_out_rows(0, *problem.validate(point)[0]).residual
+        for problem, point in ((moved, x), (wide, frozen))
+    )
+    assert np.max(np.abs(own - nominal)) > 1e-3  # its prior is no longer about zero
+    # and to first order the rows are those of a filter that is worked out there
+    again = moved.weighted_at(x)
+    np.testing.assert_allclose(again.evaluate(x).residual, moved.evaluate(x).residual, atol=0.05)
+
+
 def test_noise_that_drives_the_motion_is_no_gap(step):
     """With weights by the sensors' noise alone the same fit leaves several times what noise would."""
     made = composed(step, True)

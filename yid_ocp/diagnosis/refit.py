@@ -183,7 +183,7 @@ def refit(
     known = recalled(problem, effects, store, name)
     if known is not None:
         return known
-    own = _centred(problem.freeing(effects), effects, start)
+    own = _placed(problem, effects, start)
     best = _attempt(own, effects, start)
     if best is not None and _half_done(own, effects, start, best[1], limits):
         # the nominal fit may have driven its parameters to where this model cannot come back from
@@ -206,16 +206,14 @@ def refit(
     return Fit(tuple(effects), own, values, std, finish.cost, finish, loss, outcome.message)
 
 
-def _centred(own: EstimationProblem, effects: Sequence[EffectBase], start: Mapping[str, float]) -> EstimationProblem:
-    """The problem about torques as they are with an offset among the effects.
+def _placed(problem: CandidateProblem, effects: Sequence[EffectBase], start: Mapping[str, float]) -> EstimationProblem:
+    """The problem with some effects free, its weights frozen about the torques that the nominal model has.
 
-    What is frozen is about the offsets that the nominal model sees; with one of them in the model it would be about
-    torques that are wrong by as much.
+    Torque offsets that the nominal model sees are too large by what an effect adds.
     """
-    if all(effect.kind != "effort_offset" for effect in effects) or not own.disturbed:
-        return own
-    x = own.vector(start)
-    return own.weighted_at(x, rounds=2).held_out_weighted_at(x)
+    own = problem.freeing(effects)
+    neutral = {name: value for effect in effects for name, value in effect.neutral.items()}
+    return own.about_torques_of(own.vector(start), own.vector({**start, **neutral}))
 
 
 def _half_done(
@@ -256,7 +254,7 @@ def recalled(
     own = problem.freeing(effects)
     if known is None or not set(known.values) == set(known.std) == set(own.names):
         return None
-    own = _centred(own, effects, known.values)
+    own = _placed(problem, effects, known.values)
     x = own.vector(known.values)
     finish = own.evaluate(x)
     if not finish.ok:

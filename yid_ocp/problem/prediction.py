@@ -314,6 +314,24 @@ class Predictor:
             return episode, None
         return episode, innovations(self._course(episode, result, theta), errors)
 
+    def about_torques(
+        self, episode: Episode, whitening: Innovations | None, theta: Array, frozen: Array
+    ) -> tuple[Episode, Innovations | None]:
+        """An episode and its filter about another torque offset, so that the torques stay what they are on average.
+
+        Parameters
+        ----------
+        episode : Episode
+        whitening : Innovations or None
+            Frozen at parameters that correct torques like `frozen`; it is kept but for its offset.
+        theta, frozen : ndarray, shape (ntheta,)
+        """
+        if episode.errors is None or whitening is None:
+            return episode, whitening
+        now, before = (self.inputs(episode, self.own_theta(episode, t), ()).torque for t in (theta, frozen))
+        offset = episode.errors.offset + np.mean(now - before, axis=0)
+        return replace(episode, errors=replace(episode.errors, offset=offset)), replace(whitening, offset=offset)
+
     def torque_offset(self, episode: Episode, result: EpisodeResult, whitening: Innovations) -> Array:
         """Constant error of every driven joint's torque, as all measurements of an episode have it, (nu,) [N m]."""
         rows = [s.rows(y).residual for s, y in zip(episode.samples, result.predicted, strict=True)]

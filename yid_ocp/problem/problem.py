@@ -16,7 +16,7 @@ from yid_ocp.integrator.step import Step
 from yid_ocp.model.system import System
 from yid_ocp.parallel import map_threads
 from yid_ocp.problem.episodes import Episode, apparent_inertia, beginning, prepare_episode
-from yid_ocp.problem.evaluation import Evaluation, ResidualRows, WarmStart, joined
+from yid_ocp.problem.evaluation import Evaluation, ResidualRows, WarmStart, residual_rows
 from yid_ocp.problem.functions import ModelFunctions
 from yid_ocp.problem.measurements import Rows, huber
 from yid_ocp.problem.noise import Innovations
@@ -296,7 +296,7 @@ class EstimationProblem:
         done = tuple(result for result in results if isinstance(result, EpisodeResult))
         cost, residuals, jacobians = 0.0, [], []
         for i, result in enumerate(done):
-            part = _rows(self.episodes[i], self.innovations[i], result, self.options.huber_threshold)
+            part = residual_rows(self.episodes[i], self.innovations[i], result, self.options.huber_threshold)
             cost += part.cost
             residuals.append(part.residual)
             if part.jacobian is not None:
@@ -545,12 +545,29 @@ class EstimationProblem:
             made.append(whitening)
         return self._changed(held_out=tuple(episodes), held_out_innovations=tuple(made))
 
+    def about_torques_of(self, x: Array, frozen: Array) -> EstimationProblem:
+        """The same problem, its filters about torque offsets that leave the torques at `x` what they were at `frozen`.
+
+        What an effect adds to a torque, its offset no longer has to.
+        """
+        about = self.predictor.about_torques
+        own = zip(self.episodes, self.innovations, strict=True)
+        others = zip(self.held_out, self.held_out_innovations, strict=True)
+        fitted = [about(e, w, self.split(x, i)[0], self.split(frozen, i)[0]) for i, (e, w) in enumerate(own)]
+        held = [about(e, w, self._held_out_theta(x), self._held_out_theta(frozen)) for e, w in others]
+        return self._changed(
+            episodes=tuple(episode for episode, _ in fitted),
+            innovations=tuple(whitening for _, whitening in fitted),
+            held_out=tuple(episode for episode, _ in held),
+            held_out_innovations=tuple(whitening for _, whitening in held),
+        )
+
     def held_out_rows(self, i: int, episode: Episode, result: EpisodeResult) -> Rows:
         """Residual of a held-out recording, from its place and what `validate` says of it.
 
         Without a robust loss, in the order of its measurements; innovations where they are frozen.
         """
-        return _rows(episode, self.held_out_innovations[i], result, np.inf)
+        return residual_rows(episode, self.held_out_innovations[i], result, np.inf)
 
     def shortened(self, duration: float) -> EstimationProblem:
         """The same problem over the first seconds of every recording, prepared anew, without held-out ones."""
@@ -581,17 +598,3 @@ class EstimationProblem:
             "held_out": [episode.recording for episode in self.held_out],
         }
         return EstimationProblem(**{**same, **changes})
-
-
-def _rows(episode: Episode, whitening: Innovations | None, result: EpisodeResult, threshold: float) -> Rows:
-    """One episode's part of the residual: in units of the sensors' noise, or innovations where they are frozen."""
-    if whitening is None:
-        return joined(episode.samples, result, threshold)
-    plain = joined(episode.samples, result)
-    columns = plain.residual[:, None]
-    if plain.jacobian is not None:
-        columns = np.hstack([columns, plain.jacobian])
-    columns = whitening.whitened(columns, result.push)[0]
-    cost, factor = huber(columns[:, 0], threshold)
-    columns = factor[:, None] * columns
-    return Rows(cost, columns[:, 0], None if plain.jacobian is None else columns[:, 1:], factor)

@@ -161,7 +161,8 @@ def in_units_of_noise(problem: EstimationProblem, run: Run) -> EstimationProblem
                 "noise_fraction",
                 hint=f"set sensors.{group}.{field}",
             )
-        sensors[group] = replace(sensors[group], **{field: _times(share, level)})
+        smaller: dict[str, Any] = {field: _times(share, level)}
+        sensors[group] = replace(sensors[group], **smaller)
     return problem.with_options(
         replace(
             options,
