@@ -20,6 +20,7 @@ from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import Spring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
+from yid_ocp.solvers import GaussNewton, solve
 
 TIME_STEP, STEPS = 0.01, 300
 WHITE, OFFSET, ANGLE, POINT = 0.05, 0.1, 2e-4, 1e-3
@@ -124,6 +125,20 @@ def test_noise_that_drives_the_motion_is_no_gap(step):
     test = held_out_test(fit)
     assert 0.8 < test.chi2_per_dof < 1.2
     assert test.p_value > 1e-3
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.5], ids=["explained", "not explained"])
+def test_a_refit_is_as_sure_as_a_solution(step, friction):
+    """One deviation for one parameter, whichever command says it; a misfit counts in it."""
+    problem = problem_of(step, [recorded(step, 1, friction=friction)])
+    found = solve(problem, GaussNewton())
+    effects = chosen_effects(step.system, [problem.episodes[0].recording], ["joint_viscous"])
+    fit = nominal_fit(problem, CandidateProblem.of(problem, effects, [recorded(step, 2)]), found)
+    std = found.parameters["elbow.stiffness"].std
+    assert fit.std["elbow.stiffness"] == pytest.approx(std, rel=0.1)
+    _, jacobian = fit.problem.informing(fit.evaluation)
+    noise = np.sqrt(np.linalg.inv(jacobian.T @ jacobian)[0, 0])
+    assert (std > 1.5 * noise) == (friction > 0)
 
 
 def test_offsets_are_named_where_they_leave_what_was_expected(step):

@@ -14,18 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.diagnosis.hypotheses import CandidateProblem, describe
-from yid_ocp.diagnosis.screening import robust
 from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
 from yid_ocp.effects import EffectBase, Reported
 from yid_ocp.parallel import map_threads
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.problem.null_test import residual_series, sample_times
+from yid_ocp.problem.null_test import sample_times
 from yid_ocp.problem.validation import channel_errors
 from yid_ocp.solvers import GaussNewton, Status
 from yid_ocp.solvers.base import Outcome
-from yid_ocp.solvers.judgement import uncertainty
+from yid_ocp.solvers.judgement import covariance_of_fit, judge_fit, plain_std
 
 Array = NDArray[np.float64]
 
@@ -198,7 +197,7 @@ def refit(
     if best is None:
         return None
     outcome, finish = best
-    std = own.named(refit_std(own, finish))
+    std = own.named(refit_std(own, finish, limits))
     loss = held_out_loss(own, outcome.x)
     values = own.named(outcome.x)
     if store is not None:
@@ -263,22 +262,10 @@ def recalled(
     return Fit(tuple(effects), own, known.values, known.std, finish.cost, finish, loss, known.message, True)
 
 
-def refit_std(problem: EstimationProblem, finish: Evaluation) -> Array:
-    """Standard deviation of every unknown, shape (nx,): the larger of two.
-
-    The first scales (J'J)^-1 by chi2 per degree of freedom; the second is the sandwich (J'J)^-1 S (J'J)^-1 with the
-    scores' autocovariances in S, which knows that samples of a coloured residual repeat each other.
-    """
-    covariance, _ = uncertainty(problem, finish)
-    plain = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    if finish.jacobian is None or not plain.size:
-        return plain
-    scale = problem.scales
-    residual, jacobian = problem.informing(finish)
-    jacobian = jacobian * scale
-    inverse = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-10, hermitian=True)
-    middle = robust(jacobian, residual, residual_series(problem))
-    return np.maximum(plain, scale * np.sqrt(np.maximum(np.diag(inverse @ middle @ inverse), 0.0)))
+def refit_std(problem: EstimationProblem, finish: Evaluation, limits: Thresholds = DEFAULTS) -> Array:
+    """Standard deviation of every unknown, shape (nx,), counting the misfit where there is one, as `solve` has it."""
+    covariance = covariance_of_fit(problem, finish, judge_fit(problem, finish, limits.gap))
+    return plain_std(covariance, problem.start)
 
 
 def refit_all(
