@@ -312,7 +312,7 @@ class Predictor:
             result = self.run(episode, theta, offset, False, guess)
         if isinstance(result, str):
             return episode, None
-        return episode, innovations(self._course(episode, result, theta), errors)
+        return episode, innovations(self.course(episode, result, theta), errors)
 
     def about_torques(
         self, episode: Episode, whitening: Innovations | None, theta: Array, frozen: Array
@@ -337,7 +337,8 @@ class Predictor:
         rows = [s.rows(y).residual for s, y in zip(episode.samples, result.predicted, strict=True)]
         return whitening.whitened(np.concatenate(rows)[:, None], result.push)[1][:, 0]
 
-    def _course(self, episode: Episode, result: EpisodeResult, theta: Array) -> Course:
+    def course(self, episode: Episode, result: EpisodeResult, theta: Array) -> Course:
+        """The rollout of an episode, about which errors of what drives it are small."""
         own, rollout = self.own_theta(episode, theta), result.rollout
         late = (self.lateness(samples, own, ()) for samples in episode.samples)
         nx, nu = self.step.sizes["nx"], self.step.sizes["nu"]
