@@ -116,10 +116,10 @@ def test_a_predicted_camera_tells_beside_wrong_torques_what_it_tells_when_it_is_
             position, std = np.zeros(shape), np.full(shape, float(np.nanmedian(group.std)))
             group = PointGroup(group.name, group.names, times, position, std=std, sensor=group.sensor, pose=group.pose)
         groups.append(group)
-    # what is there tells of offsets too: those that the real recording tells of
-    joints = recording.joints
-    offset = noisy.weighted_at(noisy.start, rounds=2).episodes[0].errors.offset
-    faster = replace(recording, points=tuple(groups), joints=replace(joints, effort=joints.effort - offset))
+    # what is there tells of errors of torques too: those that the real recording tells of
+    effort, errors = recording.joints.effort.copy(), noisy.weighted_at(noisy.start, rounds=2).episodes[0].errors
+    effort[: len(errors.white)] -= errors.taken_off
+    faster = replace(recording, points=tuple(groups), joints=replace(recording.joints, effort=effort))
     problem = EstimationProblem(noisy.step, [faster], noisy.free, noisy.options, noisy.named(noisy.start))
     weighted = problem.weighted_at(problem.start)
     jacobian = weighted.informing(weighted.evaluate(problem.start))[1]

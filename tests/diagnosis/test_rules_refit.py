@@ -320,7 +320,9 @@ def predicting(monkeypatch):
         return SimpleNamespace(residual=np.concatenate(parts))
 
     return lambda *pairs: (
-        SimpleNamespace(held_out=[e for e, _ in pairs], validate=lambda x: list(pairs), held_out_rows=rows),
+        SimpleNamespace(
+            held_out=[e for e, _ in pairs], validate=lambda x: list(pairs), held_out_rows=rows, disturbed=False
+        ),
         told,
     )
 

@@ -412,20 +412,21 @@ class LayoutBuilder:
 
     @cached_property
     def _corrected(self) -> EstimationProblem:
-        """The problem with the torque offsets known that its measurements tell of."""
+        """The problem with the errors of torques known that its measurements tell of."""
         return self.setting.problem.weighted_at(self.setting.x, rounds=2)
 
     def _cut(self, episode: Episode) -> Recording:
-        """The part of a recording that the problem uses, its torques without the offsets that are known."""
+        """The part of a recording that the problem uses, its torques without the errors that are known."""
         recording, errors = episode.recording, episode.errors
-        if self.setting.problem.options.duration is not None:
-            recording = recording.slice(-math.inf, float(episode.grid.times[-1]) + 1e-6)
         joints = recording.joints
-        if errors is None or joints is None or joints.effort is None:
+        if errors is not None and joints is not None and joints.effort is not None:
+            effort = joints.effort.copy()
+            columns = [joints.names.index(name) for name in self.setting.problem.system.driven]
+            effort[errors.sample[:, None], columns] = effort[errors.sample[:, None], columns] - errors.taken_off
+            recording = replace(recording, joints=replace(joints, effort=effort))
+        if self.setting.problem.options.duration is None:
             return recording
-        effort = joints.effort.copy()
-        effort[:, [joints.names.index(name) for name in self.setting.problem.system.driven]] -= errors.offset
-        return replace(recording, joints=replace(joints, effort=effort))
+        return recording.slice(-math.inf, float(episode.grid.times[-1]) + 1e-6)
 
     def _welded(self, system: System, others: frozenset[str]) -> System:
         """Grasps as welds that keep the orientation in which the ends lie at the start."""

@@ -308,8 +308,8 @@ def held_out_loss(problem: EstimationProblem, x: Array) -> Loss:
     length = block_length(problem.held_out)
     squares: list[Array] = []
     counts: list[Array] = []
-    results, episodes = [], []
-    for i, (episode, result) in enumerate(problem.validate(x)):
+    found = problem.validate(x)
+    for i, (episode, result) in enumerate(found):
         number = int(episode.grid.steps * episode.grid.time_step / length) + 1
         blocks = []
         for samples in episode.samples:
@@ -323,11 +323,13 @@ def held_out_loss(problem: EstimationProblem, x: Array) -> Loss:
             total = np.bincount(
                 of_row, weights=problem.held_out_rows(i, episode, result).residual ** 2, minlength=number
             )
-            results.append(result)
-            episodes.append(episode)
         keep = count > 0
         squares.append(total[keep])
         counts.append(count[keep])
-    errors = channel_errors(results, episodes) if results else {}
+    if problem.disturbed:
+        # in metres and radians a prediction has its torques as they were recorded, less their offsets
+        found = problem.weighted_by_sensors().validate(x)
+    predicted = [(result, episode) for episode, result in found if not isinstance(result, str)]
+    errors = channel_errors(*map(list, zip(*predicted, strict=True))) if predicted else {}
     channels = {name: (float(entry["rmse"]), str(entry["unit"])) for name, entry in errors.items()}
     return Loss(np.concatenate(squares), np.concatenate(counts), channels)

@@ -15,8 +15,15 @@ measurement. Residuals are r = H d + v, so that with the filter's prediction m o
 Sigma the covariance of all residuals. The map is linear and frozen at the point where it was worked out: the same for
 residual and Jacobian, which is generalised least squares.
 
+Recorded torques are regressors with errors: along a rollout under them the derivatives share their noise with the
+residual, and whatever stands beside accelerations, inertias above all, comes out biased. Where a filter is known
+already, the next one is therefore about the smoothed motion, w and b taken off the torques; then the derivatives are
+those of the sum of squares that is least over w and b (Golub and Pereyra).
+
 References
 ----------
+Golub and Pereyra (1973), SIAM J. Numerical Analysis 10:2, doi:10.1137/0710036. Bryson and Frazier (1963), Smoothing
+for linear and nonlinear dynamic systems, Aeronautical Systems Division report TDR-63-119.
 Anderson and Moore (1979), Optimal Filtering, chapters 3 and 5. Ljung (1999), System Identification, section 7.4.
 """
 
@@ -66,6 +73,10 @@ class InputErrors:
         Whether the encoders are measurements.
     offset : ndarray, shape (nu,)
         Value of b that is taken off the recorded torque [N m], so that what is linearised is small.
+    white : ndarray, shape (N, nu)
+        Value of w that is taken off in every step [N m].
+    followed : ndarray, shape (N, nb), or None
+        What the tracking filter follows in place of the measured motion.
     """
 
     torque_std: Array
@@ -75,6 +86,23 @@ class InputErrors:
     spread: float
     encoders: bool
     offset: Array
+    white: Array
+    followed: Array | None = None
+
+    @property
+    def taken_off(self) -> Array:
+        """Off the recorded torque of every step, shape (N, nu) [N m]."""
+        return self.offset + self.white
+
+    @property
+    def as_recorded(self) -> InputErrors:
+        """The same with torques and angles as they were recorded, but for the constant offset."""
+        return replace(self, white=np.zeros_like(self.white), followed=None)
+
+    def until(self, steps: int) -> InputErrors:
+        """The same of the first steps."""
+        followed = None if self.followed is None else self.followed[:steps]
+        return replace(self, sample=self.sample[:steps], white=self.white[:steps], followed=followed)
 
 
 def input_errors(
@@ -124,6 +152,7 @@ def input_errors(
         max(1.0, period / grid.time_step),
         encoders,
         np.zeros(len(driven)),
+        np.zeros((grid.steps, len(driven))),
     )
 
 
@@ -176,6 +205,34 @@ class _FilterStep:
         later[ns + nu :] += mean[ns + nu :]
         return gap, later
 
+    def back(self, costate: Array) -> Array:
+        """The transposed map of (d, w, b) over the step, without what the rows tell."""
+        ns, nu = self.by_torque.shape
+        earlier, pulled = np.zeros_like(costate), self.by_torque.T @ costate[:ns]
+        earlier[:ns] = self.by_state.T @ costate[:ns]
+        earlier[ns : ns + nu] = pulled + costate[ns : ns + nu] * self.held
+        earlier[ns + nu :] = pulled + costate[ns + nu :]
+        return earlier
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """What all measurements of a recording say of what drove it.
+
+    Attributes
+    ----------
+    offset : ndarray, shape (nu,)
+        b [N m]
+    white : ndarray, shape (N, nu)
+        w in every step [N m].
+    error : ndarray, shape (N + 1, nx)
+        State of the rollout less the true one; where encoders are measurements.
+    """
+
+    offset: Array
+    white: Array
+    error: Array
+
 
 @dataclass(frozen=True)
 class Innovations:
@@ -185,14 +242,20 @@ class Innovations:
     ----------
     steps : tuple of _FilterStep
         One for every node.
-    offset : ndarray, shape (nu,)
-        Value of b about which it is linearised [N m].
+    errors : InputErrors
+        With the values of b and w about which it is linearised.
+    start : ndarray, shape (na, na)
+        Covariance of (d, w, b) before all measurements.
+    states : ndarray of bool, shape (nx,)
+        Those that d is made up of.
     bias_std : ndarray, shape (nu,)
         Standard deviation of b after all measurements [N m].
     """
 
     steps: tuple[_FilterStep, ...]
-    offset: Array
+    errors: InputErrors
+    start: Array
+    states: NDArray[np.bool_]
     bias_std: Array
 
     def whitened(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
@@ -211,16 +274,65 @@ class Innovations:
         bias : ndarray, shape (nu, c)
             Estimate of b from all rows [N m], and its derivative.
         """
-        result = np.empty_like(rows)
-        mean = np.zeros((len(self.steps[0].gain), rows.shape[1]))
-        last = len(mean) - len(self.offset)
-        mean[last:, 0] = -self.offset
+        result, mean = np.empty_like(rows), self._expected(rows.shape[1])
         for k, step in enumerate(self.steps):
-            given = None if push is None or k >= len(push) else push[k]
-            gap, mean = step.over(mean, rows[step.rows], given)
+            gap, mean = self._over(k, mean, rows[step.rows], push)
             result[step.rows] = step.whiten @ gap
-        mean[last:, 0] += self.offset
-        return result, mean[last:]
+        bias = mean[-len(self.errors.offset) :]
+        bias[:, 0] += self.errors.offset
+        return result, bias
+
+    def smoothed(self, rows: Array, push: Array | None) -> Smoothed:
+        """What all measurements say of what drove the motion, by the costates of the filter (Bryson and Frazier 1963).
+
+        Parameters
+        ----------
+        rows : ndarray, shape (r,)
+            A residual in units of the sensors' noise.
+        push : ndarray, shape (N, nu, 1), or None
+            As in `whitened`.
+        """
+        errors, last = self.errors, len(self.steps) - 1
+        nu, ns = len(errors.offset), int(np.count_nonzero(self.states))
+        torque = slice(ns, ns + nu)
+        column, noise = rows[:, None], np.zeros((len(rows), 1))
+        mean = self._expected(1)
+        for k, step in enumerate(self.steps):
+            gap, mean = self._over(k, mean, column[step.rows], push)
+            noise[step.rows] = step.whiten.T @ (step.whiten @ gap)
+        offset = mean[-nu:, 0] + errors.offset
+        white, costate = np.zeros_like(errors.white), np.zeros_like(mean)
+        for k in range(last, -1, -1):
+            step = self.steps[k]
+            if not step.held:
+                white[k + 1] = errors.torque_std**2 * costate[torque, 0]
+            noise[step.rows] -= step.gain.T @ costate
+            costate = step.back(costate) + step.observe.T @ noise[step.rows]
+        mean = self._expected(1) + self.start @ costate
+        white[0] = errors.white[0] + mean[torque, 0]
+        error = np.zeros((last + 1, len(self.states)))
+        for k, step in enumerate(self.steps):
+            error[k, self.states] = mean[:ns, 0]
+            # without the sensors' noise there is no innovation; what rounding makes of one keeps the error bounded
+            _, mean = self._over(k, mean, column[step.rows] - noise[step.rows], push)
+            if k + 1 < last:
+                white[k + 1] = white[k] if step.held else white[k + 1]
+                mean[torque, 0] = white[k + 1] - errors.white[k + 1]
+        return Smoothed(offset, white, error)
+
+    def _expected(self, columns: int) -> Array:
+        """Mean of (d, w, b) before all measurements; no derivative in further columns, shape (na, columns)."""
+        mean = np.zeros((len(self.start), columns))
+        mean[len(mean) - 2 * len(self.errors.offset) :, 0] = -np.concatenate([self.errors.white[0], self.errors.offset])
+        return mean
+
+    def _over(self, k: int, mean: Array, own: Array, push: Array | None) -> tuple[Array, Array]:
+        """Step k, and the mean of another w after it."""
+        gap, later = self.steps[k].over(mean, own, None if push is None or k >= len(push) else push[k])
+        if not self.steps[k].held:
+            nu = len(self.errors.offset)
+            later[len(later) - 2 * nu : len(later) - nu, 0] -= self.errors.white[k + 1]
+        return gap, later
 
 
 @dataclass(frozen=True)
@@ -268,12 +380,13 @@ def innovations(course: Course, errors: InputErrors) -> Innovations:
     linear = partial(linear_steps, step, course.theta, course.rollout)
     readings = _Readings.of(course)
     ends = [*linear(chosen=slice(0, 1)), *linear(chosen=slice(count - 1, count))]
-    kept = np.flatnonzero(live_states(step, ends, readings.seen))
+    live = live_states(step, ends, readings.seen)
+    kept = np.flatnonzero(live)
     readings = replace(readings, before=readings.before[:, kept], after=readings.after[:, kept])
     start = np.hstack([course.start_by_angles, course.start_by_torque, course.start_by_torque])[kept]
     unit = np.vstack([start, np.eye(2 * nu, 3 * nu, nu)])
     unit *= np.concatenate([errors.angle_std, errors.torque_std, errors.bias_std])
-    covariance = unit @ unit.T
+    covariance = first = unit @ unit.T
     made, steps = [], linear()
     for k in range(count + 1):
         fresh = k + 1 < count and errors.sample[k + 1] != errors.sample[k]
@@ -294,7 +407,7 @@ def innovations(course: Course, errors: InputErrors) -> Innovations:
         covariance = transition @ (covariance - known.T @ known) @ transition.T + turn.noise
         covariance = 0.5 * (covariance + covariance.T)
     spread = np.sqrt(np.maximum(np.diag(covariance)[len(kept) + nu :], 0.0))
-    return Innovations(tuple(made), errors.offset, spread)
+    return Innovations(tuple(made), errors, first, live, spread)
 
 
 @dataclass(frozen=True)

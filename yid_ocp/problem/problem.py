@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -19,7 +19,7 @@ from yid_ocp.problem.episodes import Episode, apparent_inertia, beginning, prepa
 from yid_ocp.problem.evaluation import Evaluation, ResidualRows, WarmStart, residual_rows
 from yid_ocp.problem.functions import ModelFunctions
 from yid_ocp.problem.measurements import Rows, huber
-from yid_ocp.problem.noise import Innovations
+from yid_ocp.problem.noise import Innovations, InputErrors
 from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.problem.prediction import EpisodeResult, Predictor, Start
 from yid_ocp.problem.unknowns import (
@@ -496,7 +496,7 @@ class EstimationProblem:
         """The same problem with residuals weighted by all noise, that which drives the motion too, frozen at `x`.
 
         The problem itself where nothing is wrong with its torques and angles, or where it cannot be rolled out at `x`.
-        If it is weighted already, the new weights are about the torque offsets that the old ones see.
+        If it is weighted already, the new weights are about the motion and the torques that the old ones see.
 
         Parameters
         ----------
@@ -522,11 +522,15 @@ class EstimationProblem:
 
     def weighted_by_sensors(self) -> EstimationProblem:
         """The same problem with residuals in units of the sensors' noise alone, torque offsets as they are known."""
-        return self._changed(innovations=(), held_out_innovations=())
+        return self._with_errors(lambda errors: errors.as_recorded)
 
     def without_input_errors(self) -> EstimationProblem:
         """The same problem with torques and angles that drive the motion taken as they were recorded."""
-        return self.on(*([replace(e, errors=None) for e in group] for group in (self.episodes, self.held_out)))
+        return self._with_errors(lambda errors: None)
+
+    def _with_errors(self, changed: Callable[[InputErrors], InputErrors | None]) -> EstimationProblem:
+        groups = (self.episodes, self.held_out)
+        return self.on(*([replace(e, errors=e.errors and changed(e.errors)) for e in group] for group in groups))
 
     def held_out_weighted_at(self, x: ArrayLike) -> EstimationProblem:
         """The same problem with the residuals of held-out recordings weighted like this as well, for `held_out_rows`.
@@ -555,12 +559,8 @@ class EstimationProblem:
         others = zip(self.held_out, self.held_out_innovations, strict=True)
         fitted = [about(e, w, self.split(x, i)[0], self.split(frozen, i)[0]) for i, (e, w) in enumerate(own)]
         held = [about(e, w, self._held_out_theta(x), self._held_out_theta(frozen)) for e, w in others]
-        return self._changed(
-            episodes=tuple(episode for episode, _ in fitted),
-            innovations=tuple(whitening for _, whitening in fitted),
-            held_out=tuple(episode for episode, _ in held),
-            held_out_innovations=tuple(whitening for _, whitening in held),
-        )
+        (episodes, made), (held_out, there) = (tuple(zip(*p, strict=True)) or ((), ()) for p in (fitted, held))
+        return self._changed(episodes=episodes, innovations=made, held_out=held_out, held_out_innovations=there)
 
     def held_out_rows(self, i: int, episode: Episode, result: EpisodeResult) -> Rows:
         """Residual of a held-out recording, from its place and what `validate` says of it.

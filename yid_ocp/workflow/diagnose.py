@@ -202,7 +202,10 @@ def _times(share: float, std: float | Mapping[str, float]) -> float | Mapping[st
 
 def predictions(finding: Finding) -> list[Prediction]:
     """Held-out recordings that can be predicted both before and after."""
-    before, after = (fit.problem.validate(fit.problem.vector(fit.values)) for fit in (finding.nominal, finding.last))
+    before, after = (
+        fit.problem.weighted_by_sensors().validate(fit.problem.vector(fit.values))
+        for fit in (finding.nominal, finding.last)
+    )
     return [
         (episode, first, last)
         for (episode, first), (_, last) in zip(before, after, strict=True)
