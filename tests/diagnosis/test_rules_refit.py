@@ -9,7 +9,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from factories import amplitude, costing, effect, evaluation, fit, loss, measurements, shape
-from made_series import series
 
 from yid_ocp.diagnosis.refit import (
     Refitted,
@@ -20,9 +19,7 @@ from yid_ocp.diagnosis.refit import (
     recalled,
     refit,
     refit_all,
-    refit_std,
 )
-from yid_ocp.diagnosis.screening import robust
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.solvers import Status
 
@@ -39,10 +36,14 @@ class Problem:
     def __init__(self, cost, rows=10, names=("k", "k[run]", "start.q.k[run]", A, S)):
         self.cost, self.rows, self.names, self.nominal = cost, rows, names, ("k",)
         self.asked, self.warmed = [], []
-        self.freed = None
+        self.freed = self.placed = None
 
     def freeing(self, effects):
         self.freed = tuple(effects)
+        return self
+
+    def about_torques_of(self, x, frozen):
+        self.placed = self.named(x), self.named(frozen)
         return self
 
     def vector(self, values):
@@ -85,8 +86,17 @@ def solved(monkeypatch):
 
     monkeypatch.setattr(module, "SOLVER", SimpleNamespace(run=run))
     monkeypatch.setattr(module, "held_out_loss", held_out)
-    monkeypatch.setattr(module, "refit_std", lambda problem, finish: np.full(len(problem.names), 0.1))
+    monkeypatch.setattr(module, "refit_std", lambda problem, finish, limits: np.full(len(problem.names), 0.1))
     return made
+
+
+# -- where weights stand ----------------------------------------------------------------------------------------------
+
+
+def test_weights_stand_about_the_torques_of_the_start_without_the_effects(solved):
+    problem = Problem(lambda values: 1.0)
+    refit(problem, [FRICTION], {"k": 2.0, A: 3.0})
+    assert problem.placed == ({**problem.named(np.ones(5)), "k": 2.0, A: 3.0}, {**problem.placed[0], A: 0.25, S: 0.5})
 
 
 # -- is a refit half done ---------------------------------------------------------------------------------------------
@@ -271,71 +281,6 @@ def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
     ]
 
 
-# -- how sure ---------------------------------------------------------------------------------------------------------
-
-
-def informed(count, scales=None):
-    """A problem whose first rows are data."""
-    return SimpleNamespace(
-        scales=np.ones(1) if scales is None else scales,
-        informing=lambda at: (at.residual[:count], at.jacobian[:count]),
-    )
-
-
-def sandwich(jacobian, residual, parts):
-    inverse = np.linalg.inv(jacobian.T @ jacobian)
-    return np.sqrt(np.diag(inverse @ robust(jacobian, residual, parts) @ inverse))
-
-
-@pytest.mark.parametrize("plain", [1e-6, 10.0], ids=["the sandwich is larger", "the plain one is larger"])
-@pytest.mark.parametrize("weak", [0, 2])
-def test_deviations_are_the_larger_of_plain_and_sandwich(monkeypatch, plain, weak):
-    """Samples of a coloured residual repeat each other, which chi2 per degree of freedom does not know."""
-    rng = np.random.default_rng(4)
-    jacobian = rng.standard_normal((40, 2))
-    residual = np.cumsum(rng.standard_normal(40))
-    parts = [series(range(40))]
-    problem = informed(40, scales=np.array([2.0, 30.0]))
-    extra = np.full((weak, 2), 5.0)
-    finish = evaluation(np.append(residual, np.full(weak, 9.0)), np.vstack([jacobian, extra]))
-    told = []
-
-    def uncertainty(which, at):
-        told.append((which, at))
-        return np.diag([plain**2, -1.0]), 1.0
-
-    monkeypatch.setattr(module, "uncertainty", uncertainty)
-    monkeypatch.setattr(module, "residual_series", lambda which: parts if which is problem else [])
-    found, expected = refit_std(problem, finish), sandwich(jacobian, residual, parts)
-    assert told == [(problem, finish)]
-    assert found[0] == pytest.approx(max(plain, expected[0]), rel=1e-9)
-    assert found[1] == pytest.approx(expected[1], rel=1e-9)
-
-
-def test_a_coloured_residual_is_less_sure_than_its_size_says(monkeypatch):
-    residual, jacobian = np.repeat([1.0, -1.0, 1.0, 1.0], 25), np.ones((100, 1))
-    problem = informed(100)
-    monkeypatch.setattr(module, "uncertainty", lambda *_: (np.array([[0.01]]), 1.0))
-    monkeypatch.setattr(module, "residual_series", lambda _: [series(range(100))])
-    assert refit_std(problem, evaluation(residual, jacobian)) > 0.25
-
-
-def test_without_a_jacobian_or_unknowns_only_the_plain_deviation_is_left(monkeypatch):
-    monkeypatch.setattr(module, "uncertainty", lambda *_: (np.diag([4.0, 9.0]), 1.0))
-    problem = informed(3, scales=np.ones(2))
-    np.testing.assert_array_equal(refit_std(problem, evaluation([1.0])), [2.0, 3.0])
-    monkeypatch.setattr(module, "uncertainty", lambda *_: (np.zeros((0, 0)), 1.0))
-    assert refit_std(problem, evaluation([1.0], np.zeros((1, 0)))).shape == (0,)
-
-
-def test_a_direction_that_nothing_informs_does_not_spoil_the_others(monkeypatch):
-    monkeypatch.setattr(module, "uncertainty", lambda *_: (np.zeros((2, 2)), 1.0))
-    monkeypatch.setattr(module, "residual_series", lambda _: [series(range(3))])
-    problem = informed(3, scales=np.ones(2))
-    jacobian, residual = np.array([[1.0, 1.0], [1.0, 1.0], [0.0, 0.0]]), np.ones(3)
-    assert np.all(refit_std(problem, evaluation(residual, jacobian)) < 10)
-
-
 # -- held-out recordings ----------------------------------------------------------------------------------------------
 
 
@@ -375,7 +320,9 @@ def predicting(monkeypatch):
         return SimpleNamespace(residual=np.concatenate(parts))
 
     return lambda *pairs: (
-        SimpleNamespace(held_out=[e for e, _ in pairs], validate=lambda x: list(pairs), held_out_rows=rows),
+        SimpleNamespace(
+            held_out=[e for e, _ in pairs], validate=lambda x: list(pairs), held_out_rows=rows, disturbed=False
+        ),
         told,
     )
 

@@ -20,6 +20,7 @@ from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import Spring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
+from yid_ocp.solvers import GaussNewton, solve
 
 TIME_STEP, STEPS = 0.01, 300
 WHITE, OFFSET, ANGLE, POINT = 0.05, 0.1, 2e-4, 1e-3
@@ -88,6 +89,32 @@ def test_all_hypotheses_share_weights_frozen_at_one_point(step, held_out):
     assert there.cost == pytest.approx(again.cost, rel=0.02)
 
 
+@pytest.mark.parametrize("held_out", [True, False], ids=["held_out", "in_blocks"])
+def test_what_an_effect_takes_from_a_torque_its_offset_gives_back(step, held_out):
+    """Weights are frozen once, about torques that an offset among the effects must not move."""
+    made = composed(step, held_out, "effort_offset", "joint_viscous").weighted_at({"elbow.stiffness": 2.5})
+    wide = made.freeing(made.effects)
+    at = {"elbow.stiffness": 2.5}
+    x, frozen = (wide.vector({**at, "effort_offset@shoulder.offset": value}) for value in (0.3, 0.0))
+    moved = wide.about_torques_of(x, frozen)
+    for before, after in (
+        (wide.innovations, moved.innovations),
+        (wide.held_out_innovations, moved.held_out_innovations),
+    ):
+        assert after[0].steps is before[0].steps
+        np.testing.assert_allclose(after[0].errors.offset, before[0].errors.offset - 0.3, atol=1e-12)
+    there, then = moved.weighted_by_sensors().evaluate(x), wide.weighted_by_sensors().evaluate(frozen)
+    np.testing.assert_allclose(there.residual[: len(then.residual)], then.residual, atol=1e-7)
+    own, nominal = (
+        problem.held_out_rows(0, *problem.validate(point)[0]).residual
+        for problem, point in ((moved, x), (wide, frozen))
+    )
+    assert np.max(np.abs(own - nominal)) > 1e-3  # its prior is no longer about zero
+    # and to first order the rows are those of a filter that is worked out there
+    again = moved.weighted_at(x)
+    np.testing.assert_allclose(again.evaluate(x).residual, moved.evaluate(x).residual, atol=0.1)
+
+
 def test_noise_that_drives_the_motion_is_no_gap(step):
     """With weights by the sensors' noise alone the same fit leaves several times what noise would."""
     made = composed(step, True)
@@ -98,6 +125,74 @@ def test_noise_that_drives_the_motion_is_no_gap(step):
     test = held_out_test(fit)
     assert 0.8 < test.chi2_per_dof < 1.2
     assert test.p_value > 1e-3
+
+
+# -- torques are regressors with errors -------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def geared(step) -> Step:
+    """The pendulum whose motor may have an inertia."""
+    effects = chosen_effects(step.system, [recorded(step, 1)], ["rotor_inertia@shoulder"])
+    return compile_step(step.system.with_effects(effects), TIME_STEP)
+
+
+def weighted_at_truth(geared: Step, recording: Recording, feedback: str) -> EstimationProblem:
+    free = (*FREE, "rotor_inertia@shoulder.armature")
+    options = ProblemOptions(initial_state="equilibrium", feedback=feedback, gains=(9.0,))
+    problem = EstimationProblem(geared, [recording], free, options, {"elbow.stiffness": 3.0, "elbow.damping": 0.05})
+    return problem.weighted_at(problem.start, rounds=3)
+
+
+def test_an_inertia_is_not_mistaken_for_noise_of_the_torques_beside_it(geared, step, monkeypatch):
+    """Derivatives along rollouts under the recorded torques put the absent inertia at five standard deviations."""
+    monkeypatch.setattr("test_torque_noise.WHITE", 6 * WHITE)
+    z = []
+    for seed in range(20, 32):
+        problem = weighted_at_truth(geared, recorded(step, seed), "proportional")
+        residual, jacobian = problem.informing(problem.evaluate(problem.start))
+        covariance = np.linalg.inv(jacobian.T @ jacobian)
+        z.append(-covariance @ jacobian.T @ residual / np.sqrt(np.diag(covariance)))
+    assert np.all(np.abs(np.mean(z, axis=0)) < 3 / np.sqrt(len(z)))
+    assert np.all(np.mean(np.square(z), axis=0) < 2)
+
+
+def test_what_is_found_does_not_depend_on_the_tracking_filter(geared, step):
+    recording = recorded(step, 7)
+    one, other = (weighted_at_truth(geared, recording, name) for name in ("proportional", "lqr"))
+    first, second = (problem.evaluate(problem.start) for problem in (one, other))
+    np.testing.assert_allclose(first.residual, second.residual, atol=0.02)
+    size = np.linalg.norm(first.jacobian, axis=0)
+    np.testing.assert_allclose(np.linalg.norm(first.jacobian - second.jacobian, axis=0) / size, 0.0, atol=0.01)
+
+
+@pytest.mark.parametrize("feedback", ["proportional", "lqr"])
+def test_squares_of_innovations_are_the_least_over_all_errors(geared, step, feedback):
+    """What sensors and torques must have been wrong by along the smoothed motion, in units of their noise."""
+    problem = weighted_at_truth(geared, recorded(step, 8), feedback)
+    innovations = problem.evaluate(problem.start).residual[problem.rows.data]
+    errors = problem.episodes[0].errors
+    along = problem.on(problem.episodes, ()).evaluate(problem.start).residual[problem.rows.data]
+    apart = [errors.white[:-1] / errors.torque_std, errors.offset / errors.bias_std]
+    least = along @ along + sum(float(np.sum(part**2)) for part in apart)
+    assert least == pytest.approx(innovations @ innovations, rel=5e-3)
+    # and nobody mistakes it for a prediction
+    recorded_torque = problem.weighted_by_sensors().evaluate(problem.start).residual[problem.rows.data]
+    assert recorded_torque @ recorded_torque > 2 * along @ along
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.5], ids=["explained", "not explained"])
+def test_a_refit_is_as_sure_as_a_solution(step, friction):
+    """One deviation for one parameter, whichever command says it; a misfit counts in it."""
+    problem = problem_of(step, [recorded(step, 1, friction=friction)])
+    found = solve(problem, GaussNewton())
+    effects = chosen_effects(step.system, [problem.episodes[0].recording], ["joint_viscous"])
+    fit = nominal_fit(problem, CandidateProblem.of(problem, effects, [recorded(step, 2)]), found)
+    std = found.parameters["elbow.stiffness"].std
+    assert fit.std["elbow.stiffness"] == pytest.approx(std, rel=0.1)
+    _, jacobian = fit.problem.informing(fit.evaluation)
+    noise = np.sqrt(np.linalg.inv(jacobian.T @ jacobian)[0, 0])
+    assert (std > 1.5 * noise) == (friction > 0)
 
 
 def test_offsets_are_named_where_they_leave_what_was_expected(step):

@@ -51,6 +51,64 @@ def problem_of(step, position_std=None, **changed):
     return EstimationProblem(step, [recording], free, ProblemOptions(**options | changed))
 
 
+@pytest.fixture(scope="module")
+def driven(urdf_folder):
+    """A shoulder whose recorded torques are wrong, seen by the tip or by its own encoder."""
+    robot = read_urdf(urdf_folder / "double_pendulum.urdf")
+    springs = {"elbow": Spring(3.0, 0.1)}
+    system = System.build(robot, driven=["shoulder"], springs=springs, damping=0.1, points=["tip"])
+    step = compile_step(system, 0.01, use_compiler=False)
+
+    def problem(**sensors):
+        t = 0.01 * np.arange(41)
+        noise = {"effort_std": 0.05, "effort_bias_std": 0.1, "position_std": 1e-3}
+        angle, torque = 0.1 * np.sin(9 * t[:, None]), 1.0 + 0.3 * np.sin(9 * t[:, None])
+        joints = JointGroup(("shoulder",), t, angle, effort=torque, **noise)
+        tip = np.tile([0.0, 0.1, 0.4], (41, 1, 1)) + 0.02 * np.random.default_rng(1).standard_normal((41, 1, 3))
+        recording = Recording(joints, (PointGroup("points", ("tip",), t, tip),), name="made")
+        options = ProblemOptions(sensors=sensors, priors={"elbow.rest": 0.05})
+        return EstimationProblem(step, [recording], ("elbow.stiffness", "elbow.rest"), options)
+
+    return problem
+
+
+STATED = {
+    "joints.effort": SensorOptions(std=0.2, bias_std={"shoulder": 0.4}),
+    "joints.position": SensorOptions(std=2e-3),
+    "points": SensorOptions(std=0.02),
+}
+
+
+@pytest.mark.parametrize("encoders", [False, True])
+def test_errors_of_torques_shrink_like_all_other_noise(driven, encoders):
+    use = {True: {"joints.position": replace(STATED["joints.position"], use=True)}, False: {}}[encoders]
+    problem = driven(**STATED | use)
+    shrunk = in_units_of_noise(problem, settings())
+    x = problem.start * 1.1
+    one, other = (made.weighted_at(x, rounds=2) for made in (problem, shrunk))
+    before, after = one.evaluate(x), other.evaluate(x)
+    assert one.innovations[0] is not None
+    assert other.innovations[0] is not None
+    np.testing.assert_allclose(after.residual, before.residual / SHARE, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(after.jacobian, before.jacobian / SHARE, rtol=1e-6, atol=1e-6)
+    (value, std), (smaller_value, smaller_std) = one.torque_offsets(x)[0], other.torque_offsets(x)[0]
+    np.testing.assert_allclose(smaller_value, value, rtol=1e-6)
+    np.testing.assert_allclose(smaller_std, SHARE * std, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("group", "entry", "words"),
+    [
+        ("joints.effort", SensorOptions(bias_std=0.4), "noise in the std of 'joints.effort'"),
+        ("joints.effort", SensorOptions(std=0.2), "noise in the bias_std of 'joints.effort'"),
+        ("joints.position", SensorOptions(), "noise in the std of 'joints.position'"),
+    ],
+)
+def test_a_fraction_of_an_unstated_error_of_torques_is_refused(driven, group, entry, words):
+    with pytest.raises(ConfigError, match=words):
+        in_units_of_noise(driven(**STATED | {group: entry}), settings())
+
+
 def settings(share=SHARE):
     def refuse(what, *where, **more):
         return ConfigError(what, where=".".join(where), **more)

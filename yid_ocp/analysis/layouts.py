@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
+import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.analysis.identifiability import StartKnowledge, carried, with_nuisances
+from yid_ocp.analysis.torque_errors import in_view
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import DataError, SolverError, YidError
 from yid_ocp.integrator.step import Step, compile_alike
@@ -21,6 +24,7 @@ from yid_ocp.problem import EstimationProblem, SensorOptions
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.grid import Grid
 from yid_ocp.sensors import camera_pose
+from yid_ocp.sensors.joints import POSITION, PositionSensor, of_arm
 from yid_ocp.virtual.engine import Simulation, simulate_in_mujoco
 from yid_ocp.virtual.motion import Excitation, multisine
 from yid_ocp.virtual.posture import initial_posture
@@ -210,10 +214,13 @@ class Layout:
     x : ndarray, shape (nx,)
     names : tuple of str
         Free parameters, in the order of judgements.
-    slopes : mapping of (episode, group, frame) to ndarray, shape (N + 1, 3, nx)
-        Sensitivity of a frame's position at every node.
+    slopes : mapping of (episode, group, frame) to ndarray, shape (N + 1, 3, nx + q)
+        Sensitivity of a frame's position at every node by the unknowns, then by what stands for the errors of the
+        torques that drive this episode (`seen_errors`).
     fixed : ndarray, shape (nx, nx)
-        Information that does not depend on points: priors of nuisances, joint torques that are measured.
+        Information that no error of torques blurs: priors of nuisances.
+    by_joints : mapping of episode to ndarray, shape (nx + q, nx + q)
+        What joints tell, torques or angles that are measured, and the prior of the errors.
     notes : tuple of str
         What would stand in the way on a real robot, such as joint limits.
     """
@@ -223,15 +230,22 @@ class Layout:
     names: tuple[str, ...]
     slopes: Mapping[tuple[int, str, str], Array]
     fixed: Array
+    by_joints: Mapping[int, Array] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     _known: dict[tuple[int, str, str, bytes, bytes], Array] = field(default_factory=dict, repr=False)
 
     def information(self, views: Sequence[Sequence[View]]) -> Array:
         """Fisher information of some views, one list for each recording, together with what is fixed."""
         total = self.fixed.copy()
+        nx = len(total)
         for i, episode in enumerate(self.problem.episodes):
-            for view in views[i % len(views)]:
-                total += self._of(i, episode.grid, view)
+            seen = [self._of(i, episode.grid, view) for view in views[i % len(views)]]
+            if i in self.by_joints:
+                seen.append(self.by_joints[i])
+            own = sum(seen, np.zeros_like(seen[0]) if seen else np.zeros((nx, nx)))
+            total += own[:nx, :nx]
+            if len(own) > nx:
+                total -= own[:nx, nx:] @ scipy.linalg.solve(own[nx:, nx:], own[nx:, :nx], assume_a="pos")
         return total
 
     def _of(self, episode: int, grid: Grid, view: View) -> Array:
@@ -311,6 +325,9 @@ class LayoutBuilder:
         step = seeing(step, {sight.name: sight.frame for sight in seen if sight.frame is not None})
         wide = with_nuisances(base, setting.x, setting.start, setting.grasp_std)
         sensors = {k: replace(v, use=None) for k, v in base.options.sensors.items() if k.startswith("joints.")}
+        if "second_arm" in mechanics:
+            # made motions state their noise, that of joints which the settings do not know too
+            sensors = {name: replace(choice, std=None, bias_std=None) for name, choice in sensors.items()}
         if "torque" in mechanics:
             sensors["joints.effort"] = self._torque_options()
         options = replace(
@@ -330,28 +347,48 @@ class LayoutBuilder:
         if not evaluation.ok or evaluation.jacobian is None:
             raise SolverError(f"the model cannot be rolled out: {evaluation.message}")
         slopes: dict[tuple[int, str, str], Array] = {}
-        fixed = np.zeros((len(x), len(x)))
-        for i, episode in enumerate(problem.episodes):
-            for samples, rows in zip(episode.samples, problem.rows.measurements[i], strict=True):
-                count, width = samples.value.shape
-                block = evaluation.jacobian[rows]
-                if samples.sensor.width == 3:
-                    parts = block.reshape(count, width // 3, 3, len(x))
-                    for k, frame in enumerate(samples.sensor.frames):
-                        slopes[i, samples.sensor.group, frame] = parts[:, k]
-                else:
-                    fixed += block.T @ block
+        by_joints: dict[int, Array] = {}
+        encoders = self._with_encoders(problem)
+        for i in range(len(problem.episodes)):
+            finest = self._finest(base.episodes[i % len(base.episodes)])
+            points, by_joints[i] = in_view(problem, evaluation, x, i, finest, encoders)
+            slopes |= {(i, *key): value for key, value in points.items()}
         names = tuple(name for name in problem.names if name.split("[")[0] in base.free)
         stated = evaluation.jacobian[problem.rows.stated_priors].copy()
         # what is assumed of the parameters themselves stays out: what is asked is what sensors say
         stated[:, [problem.names.index(name) for name in names]] = 0.0
-        return Layout(problem, x, names, slopes, fixed + stated.T @ stated, tuple(notes))
+        return Layout(problem, x, names, slopes, stated.T @ stated, by_joints, tuple(notes))
+
+    def _finest(self, episode: Episode) -> dict[str, float]:
+        """Least standard deviation that each group's points can have in a recording [m]."""
+        setting, finest = self.setting, {}
+        for default, (group, _, std) in ((CAMERA, setting.camera(episode)), (ARM, setting.arm(episode))):
+            finest[default if group is None else group.name] = std
+        for view in setting.views(episode):
+            finest[view.group] = min(finest.get(view.group, math.inf), float(view.std.min()))
+        return finest
+
+    def _with_encoders(self, problem: EstimationProblem) -> EstimationProblem | None:
+        """The same experiment with the driven joints' encoders as measurements, where they are in the one made."""
+        base = self.setting.problem
+        used = any(isinstance(samples.sensor, PositionSensor) for e in base.episodes for samples in e.samples)
+        if not used or not problem.system.driven:
+            return None
+        sensors = dict(problem.options.sensors)
+        sensors[POSITION] = replace(sensors.get(POSITION, SensorOptions()), use=True)
+        recordings = [
+            replace(e.recording, points=tuple(group for group in e.recording.points if not of_arm(group)))
+            for e in problem.episodes
+        ]
+        values = dict(zip(problem.system.parameters.names, map(float, problem.theta), strict=True))
+        options = replace(problem.options, sensors=sensors)
+        return EstimationProblem(problem.step, recordings, problem.free, options, values)
 
     def _experiment(self, mechanics: frozenset[str]) -> tuple[System, list[Recording], list[str]]:
         """System and motion, driven as in the recordings."""
         setting = self.setting
         base = setting.problem
-        recordings = [self._cut(episode) for episode in base.episodes]
+        recordings = [self._cut(episode) for episode in self._corrected.episodes]
         system = base.system
         if "second_arm" in mechanics:
             assert setting.second_arm is not None
@@ -373,11 +410,23 @@ class LayoutBuilder:
             notes += [note for note in beyond if note not in notes]
         return system, made, notes
 
+    @cached_property
+    def _corrected(self) -> EstimationProblem:
+        """The problem with the errors of torques known that its measurements tell of."""
+        return self.setting.problem.weighted_at(self.setting.x, rounds=2)
+
     def _cut(self, episode: Episode) -> Recording:
-        """The part of a recording that the problem uses."""
+        """The part of a recording that the problem uses, its torques without the errors that are known."""
+        recording, errors = episode.recording, episode.errors
+        joints = recording.joints
+        if errors is not None and joints is not None and joints.effort is not None:
+            effort = joints.effort.copy()
+            columns = [joints.names.index(name) for name in self.setting.problem.system.driven]
+            effort[errors.sample[:, None], columns] = effort[errors.sample[:, None], columns] - errors.taken_off
+            recording = replace(recording, joints=replace(joints, effort=effort))
         if self.setting.problem.options.duration is None:
-            return episode.recording
-        return episode.recording.slice(-math.inf, float(episode.grid.times[-1]) + 1e-6)
+            return recording
+        return recording.slice(-math.inf, float(episode.grid.times[-1]) + 1e-6)
 
     def _welded(self, system: System, others: frozenset[str]) -> System:
         """Grasps as welds that keep the orientation in which the ends lie at the start."""
@@ -414,16 +463,16 @@ class LayoutBuilder:
         excitation = Excitation(travel=travel, speed=speed, duration=duration)
         motion = multisine(system, values, seed=seed, posture=posture, excitation=excitation)
         run = simulate_in_mujoco(system, values, motion, Simulation(duration), posture=posture)
-        driven = list(system.driven_indices)
+        driven, noise = list(system.driven_indices), _noise_as_recorded(base.system, system, episode)
         joints = JointGroup(
             system.driven,
             run.t,
             run.q[:, driven],
             effort=run.effort,
-            position_std=0.0,
-            effort_std=0.0,
-            effort_bias_std=0.0,
             effort_kind="command",
+            position_std=noise[0],
+            effort_std=noise[1],
+            effort_bias_std=noise[2],
         )
         beyond: dict[str, list[str]] = {"range": [], "torque": []}
         for k, name in enumerate(system.driven):
@@ -474,6 +523,18 @@ class LayoutBuilder:
         said = None if joints is None else joints.effort_std
         stated = said is not None and bool(np.all(np.asarray(said) > 0))
         return SensorOptions(std=None if stated else self.setting.torque_std)
+
+
+def _noise_as_recorded(base: System, system: System, episode: Episode) -> Sequence[Array | float]:
+    """Of encoders, of torques, and the constant one, of driven joints; that of joints not recorded is a typical one."""
+    errors = episode.errors
+    if errors is None:
+        return (0.0, 0.0, 0.0)
+    place = {joint: i for i, joint in enumerate(base.driven)}
+    return [
+        np.array([std[place[joint]] if joint in place else np.median(std) for joint in system.driven])
+        for std in (errors.angle_std, errors.torque_std, errors.bias_std)
+    ]
 
 
 def _travel(system: System, values: Mapping[str, float], episode: Episode) -> float:

@@ -222,7 +222,7 @@ class DiagnosisSettings(Thresholds):
         float,
         Gt(0),
         Le(1),
-        About("part of the sensors' std that is noise, where the rest stands for the model's error"),
+        About("part of all stated std, torques' included, that is noise, where the rest stands for the model's error"),
     ] = 1.0
 
     @property

@@ -182,11 +182,18 @@ def _settled(
 ) -> Fit | None:
     """The nominal model fitted from a start, under weights that were frozen near its end."""
     if composed.problem.disturbed:
-        composed = composed.weighted_at(start)
-        first = refit(composed, (), start, limits=limits)
-        start = start if first is None else first.values
+        composed, start = _nearer(composed, start, limits)
         composed = composed.weighted_at(start)
     return refit(composed, (), start, store, name, limits)
+
+
+def _nearer(
+    composed: CandidateProblem, start: Mapping[str, float], limits: Thresholds
+) -> tuple[CandidateProblem, Mapping[str, float]]:
+    """The problem weighted at a start, and the nominal fit under these weights."""
+    weighted = composed.weighted_at(start)
+    first = refit(weighted, (), start, limits=limits)
+    return weighted, start if first is None else first.values
 
 
 def _composed(
@@ -250,23 +257,27 @@ def nominal_fit(
     SolverError
         The nominal model cannot be rolled out.
     """
-    start: Mapping[str, float] = {}
     known = recalled(composed, (), store)
     if known is not None and composed.problem.disturbed:
         known = recalled(composed.weighted_at(known.values), (), store)
     if known is not None:
         return known
-    if not composed.blocks:
-        found = solution or solve(problem, GaussNewton(iterations=30))
-        if found.evaluation is None:
-            raise SolverError(f"the nominal model cannot be fitted: {found.message}", where="diagnosis")
-        start = dict(zip(found.names, map(float, found.x), strict=True))
-    elif solution is not None:
-        start = dict(zip(solution.names, map(float, solution.x), strict=True))
-    fit = _settled(composed, start, store, "", limits)
+    fit = _settled(composed, _nominal_start(problem, composed, solution), store, "", limits)
     if fit is None:
         raise SolverError("the nominal model cannot be rolled out at its fit", where="diagnosis")
     return fit
+
+
+def _nominal_start(
+    problem: EstimationProblem, composed: CandidateProblem, solution: Solution | None
+) -> Mapping[str, float]:
+    """Unknowns of the nominal model's solution; nothing where a single recording is both fitted and held out."""
+    found = solution if solution is not None or composed.blocks else solve(problem, GaussNewton(iterations=30))
+    if found is None:
+        return {}
+    if found.evaluation is None:
+        raise SolverError(f"the nominal model cannot be fitted: {found.message}", where="diagnosis")
+    return dict(zip(found.names, map(float, found.x), strict=True))
 
 
 def largest_angles(fit: Fit) -> dict[str, float]:

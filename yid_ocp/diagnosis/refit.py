@@ -14,18 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.diagnosis.hypotheses import CandidateProblem, describe
-from yid_ocp.diagnosis.screening import robust
 from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
 from yid_ocp.effects import EffectBase, Reported
 from yid_ocp.parallel import map_threads
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.problem.null_test import residual_series, sample_times
+from yid_ocp.problem.null_test import sample_times
 from yid_ocp.problem.validation import channel_errors
 from yid_ocp.solvers import GaussNewton, Status
 from yid_ocp.solvers.base import Outcome
-from yid_ocp.solvers.judgement import uncertainty
+from yid_ocp.solvers.judgement import covariance_of_fit, judge_fit, plain_std
 
 Array = NDArray[np.float64]
 
@@ -183,7 +182,7 @@ def refit(
     known = recalled(problem, effects, store, name)
     if known is not None:
         return known
-    own = _centred(problem.freeing(effects), effects, start)
+    own = _placed(problem, effects, start)
     best = _attempt(own, effects, start)
     if best is not None and _half_done(own, effects, start, best[1], limits):
         # the nominal fit may have driven its parameters to where this model cannot come back from
@@ -198,7 +197,7 @@ def refit(
     if best is None:
         return None
     outcome, finish = best
-    std = own.named(refit_std(own, finish))
+    std = own.named(refit_std(own, finish, limits))
     loss = held_out_loss(own, outcome.x)
     values = own.named(outcome.x)
     if store is not None:
@@ -206,16 +205,14 @@ def refit(
     return Fit(tuple(effects), own, values, std, finish.cost, finish, loss, outcome.message)
 
 
-def _centred(own: EstimationProblem, effects: Sequence[EffectBase], start: Mapping[str, float]) -> EstimationProblem:
-    """The problem about torques as they are with an offset among the effects.
+def _placed(problem: CandidateProblem, effects: Sequence[EffectBase], start: Mapping[str, float]) -> EstimationProblem:
+    """The problem with some effects free, its weights frozen about the torques that the nominal model has.
 
-    What is frozen is about the offsets that the nominal model sees; with one of them in the model it would be about
-    torques that are wrong by as much.
+    Torque offsets that the nominal model sees are too large by what an effect adds.
     """
-    if all(effect.kind != "effort_offset" for effect in effects) or not own.disturbed:
-        return own
-    x = own.vector(start)
-    return own.weighted_at(x, rounds=2).held_out_weighted_at(x)
+    own = problem.freeing(effects)
+    neutral = {name: value for effect in effects for name, value in effect.neutral.items()}
+    return own.about_torques_of(own.vector(start), own.vector({**start, **neutral}))
 
 
 def _half_done(
@@ -256,7 +253,7 @@ def recalled(
     own = problem.freeing(effects)
     if known is None or not set(known.values) == set(known.std) == set(own.names):
         return None
-    own = _centred(own, effects, known.values)
+    own = _placed(problem, effects, known.values)
     x = own.vector(known.values)
     finish = own.evaluate(x)
     if not finish.ok:
@@ -265,22 +262,10 @@ def recalled(
     return Fit(tuple(effects), own, known.values, known.std, finish.cost, finish, loss, known.message, True)
 
 
-def refit_std(problem: EstimationProblem, finish: Evaluation) -> Array:
-    """Standard deviation of every unknown, shape (nx,): the larger of two.
-
-    The first scales (J'J)^-1 by chi2 per degree of freedom; the second is the sandwich (J'J)^-1 S (J'J)^-1 with the
-    scores' autocovariances in S, which knows that samples of a coloured residual repeat each other.
-    """
-    covariance, _ = uncertainty(problem, finish)
-    plain = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    if finish.jacobian is None or not plain.size:
-        return plain
-    scale = problem.scales
-    residual, jacobian = problem.informing(finish)
-    jacobian = jacobian * scale
-    inverse = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-10, hermitian=True)
-    middle = robust(jacobian, residual, residual_series(problem))
-    return np.maximum(plain, scale * np.sqrt(np.maximum(np.diag(inverse @ middle @ inverse), 0.0)))
+def refit_std(problem: EstimationProblem, finish: Evaluation, limits: Thresholds = DEFAULTS) -> Array:
+    """Standard deviation of every unknown, shape (nx,), counting the misfit where there is one, as `solve` has it."""
+    covariance = covariance_of_fit(problem, finish, judge_fit(problem, finish, limits.gap))
+    return plain_std(covariance, problem.start)
 
 
 def refit_all(
@@ -323,8 +308,8 @@ def held_out_loss(problem: EstimationProblem, x: Array) -> Loss:
     length = block_length(problem.held_out)
     squares: list[Array] = []
     counts: list[Array] = []
-    results, episodes = [], []
-    for i, (episode, result) in enumerate(problem.validate(x)):
+    found = problem.validate(x)
+    for i, (episode, result) in enumerate(found):
         number = int(episode.grid.steps * episode.grid.time_step / length) + 1
         blocks = []
         for samples in episode.samples:
@@ -338,11 +323,13 @@ def held_out_loss(problem: EstimationProblem, x: Array) -> Loss:
             total = np.bincount(
                 of_row, weights=problem.held_out_rows(i, episode, result).residual ** 2, minlength=number
             )
-            results.append(result)
-            episodes.append(episode)
         keep = count > 0
         squares.append(total[keep])
         counts.append(count[keep])
-    errors = channel_errors(results, episodes) if results else {}
+    if problem.disturbed:
+        # in metres and radians a prediction has its torques as they were recorded, less their offsets
+        found = problem.weighted_by_sensors().validate(x)
+    predicted = [(result, episode) for episode, result in found if not isinstance(result, str)]
+    errors = channel_errors(*map(list, zip(*predicted, strict=True))) if predicted else {}
     channels = {name: (float(entry["rmse"]), str(entry["unit"])) for name, entry in errors.items()}
     return Loss(np.concatenate(squares), np.concatenate(counts), channels)

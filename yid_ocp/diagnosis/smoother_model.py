@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import casadi as ca
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 
 from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
 from yid_ocp.effects.base import grasp_names, robot_joints
+from yid_ocp.integrator.linear import Loads, linear_steps, live_states
 from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
@@ -300,82 +302,38 @@ def _loads(course: _Course) -> Array:
 # -- the slopes of single steps ---------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Moving:
-    """What takes part: states that can move, and unknowns of a step (q, z, lam) that its equations are solved for.
-
-    Attributes
-    ----------
-    states : ndarray of int, shape (ns,)
-    solved : ndarray of int
-    """
-
-    states: NDArray[np.int64]
-    solved: NDArray[np.int64]
-
-
-def _moving(course: _Course, unknowns: _Unknowns, last: int) -> _Moving:
-    """All but states that cannot move and internal coordinates that nothing depends on."""
-    sizes = course.problem.step.sizes
-    n, nx = sizes["n"], sizes["nx"]
-    inner = np.arange(2 * n, nx)
-    solved = np.concatenate([course.free, np.arange(n, n + sizes["nz"] + sizes["m"])]).astype(int)
-    everything = _Moving(np.arange(nx), solved)
-    steps = [_steps(course, unknowns, everything, k, k + 1) for k in (0, last)]
-    a, e, effort = (sum(np.abs(found[i][0]) for found in steps) for i in range(3))
-    used = np.any(a[: 2 * n, inner] > 1e-12, axis=0) | np.any(effort[:, inner] > 1e-12, axis=0)
-    # a coordinate whose compliance is neutral neither moves nor is moved
-    active = np.any(a > 0, axis=1) | np.any(e > 0, axis=1)
-    active[course.fixed] = False
-    active[inner] = used
-    return _Moving(np.flatnonzero(active), np.setdiff1d(solved, n + np.flatnonzero(~used)))
-
-
-def _steps(course: _Course, unknowns: _Unknowns, moving: _Moving, first: int, last: int) -> tuple[Array, Array, Array]:
-    """A_k (steps, ns, ns), E_k (steps, ns, nd') and the effort's slopes (steps, nc, ns + nd') of some steps."""
-    step, rollout = course.problem.step, course.rollout
-    n, nz, nx, h = step.sizes["n"], step.sizes["nz"], step.sizes["nx"], step.time_step
-    free, fixed, solved = course.free, course.fixed, moving.solved
-    span = slice(first, last)
-    stages = step.kernel.linearize(
-        course.theta,
-        rollout.state[first : last + 1],
-        rollout.multipliers[span],
-        rollout.torque[span],
-        (),
-        True,
-    )
-    steps, nt = last - first, n + nz + step.sizes["m"]
-    forces = len(unknowns.forced)
-    width = nx + unknowns.driving
-    top, bottom = np.zeros((steps, nt, width)), np.zeros((steps, n, width))
-    for target, matrix in ((top, stages.rows_old), (bottom, stages.p1_old)):
-        target[:, :, :n], target[:, :, 2 * n : nx] = matrix[:, :, :n], matrix[:, :, n:]
-    top[:, np.arange(n), n + np.arange(n)] += 1.0
-    feedback = course.episode.feedback
-    if feedback is not None:
-        gain = feedback.gain[span]
-        top[:, :, feedback.index] -= stages.rows_input @ gain
-        bottom[:, :, feedback.index] -= stages.p1_input @ gain
+def _loads_of(course: _Course, unknowns: _Unknowns) -> Loads:
+    """What unknown forces and grasp offsets of their reference size add to every step."""
+    step = course.problem.step
+    n, nz, m = (step.sizes[key] for key in ("n", "nz", "m"))
+    forces, driving = len(unknowns.forced), unknowns.driving
+    rows, momentum = np.zeros((n + nz + m, driving)), np.zeros((n, driving))
     # an unknown force is held over the step and shared by both equations like any other
     first_share = 1.0 if step.force_split == "left" else 0.5
-    column = nx + np.arange(forces)
-    unit = h * unknowns.reference[:forces]
-    top[:, unknowns.forced, column] = first_share * unit
-    bottom[:, unknowns.forced, column] = (1 - first_share) * unit
-    column = nx + np.arange(forces, unknowns.driving)
-    top[:, n + nz + unknowns.grasped, column] = unknowns.reference[forces : unknowns.driving]
-    columns = np.concatenate([moving.states, np.arange(nx, width)])
-    top, bottom = top[:, :, columns], bottom[:, :, columns]
-    new = -np.linalg.solve(stages.rows_new[:, solved[:, None], solved], top[:, solved])
-    after = np.zeros((steps, nx, len(columns)))
-    inner = solved[(solved >= n) & (solved < n + nz)]
-    after[:, free] = new[:, : len(free)]
-    after[:, n : 2 * n] = bottom + stages.p1_new[:, :, solved] @ new
-    after[:, n + inner] = new[:, len(free) : len(free) + len(inner)]
-    effort = -(top[:, fixed] + stages.rows_new[:, fixed[:, None], solved] @ new) / h
-    ns = len(moving.states)
-    return after[:, moving.states, :ns], after[:, moving.states, ns:], effort
+    impulse = step.time_step * unknowns.reference[:forces]
+    rows[unknowns.forced, np.arange(forces)] = first_share * impulse
+    momentum[unknowns.forced, np.arange(forces)] = (1 - first_share) * impulse
+    rows[n + nz + unknowns.grasped, np.arange(forces, driving)] = unknowns.reference[forces:driving]
+    return Loads(rows, momentum)
+
+
+def _steps(
+    course: _Course, loads: Loads, moving: NDArray[np.int64], first: int, last: int
+) -> tuple[Array, Array, Array]:
+    """A_k (steps, ns, ns), E_k (steps, ns, nd') and the effort's slopes (steps, nc, ns + nd') of some steps."""
+    a, e, effort = [], [], []
+    feedback = course.episode.feedback
+    found = linear_steps(course.problem.step, course.theta, course.rollout, loads, slice(first, last))
+    for k, one in enumerate(found, first):
+        by_state, effort_by_state = one.by_state, one.effort_by_state
+        if feedback is not None:
+            by_state, effort_by_state = by_state.copy(), effort_by_state.copy()
+            by_state[:, feedback.index] -= one.by_torque @ feedback.gain[k]
+            effort_by_state[:, feedback.index] -= one.effort_by_torque @ feedback.gain[k]
+        a.append(by_state[np.ix_(moving, moving)])
+        e.append(one.by_load[moving])
+        effort.append(np.hstack([effort_by_state[:, moving], one.effort_by_load]))
+    return np.stack(a), np.stack(e), np.stack(effort)
 
 
 # -- from steps to intervals ------------------------------------------------------------------------------------------
@@ -387,14 +345,17 @@ def _recording(course: _Course, observed: Array, limits: Thresholds) -> Linear:
     length = int(max(round(INTERVAL / h), math.ceil(steps / INTERVALS), 1))
     edges = np.unique(np.append(np.arange(0, steps, length), steps))
     unknowns = _unknowns(course, limits)
-    moving = _moving(course, unknowns, int(edges[-1]) - 1)
+    loads = _loads_of(course, unknowns)
+    linear = partial(linear_steps, course.problem.step, course.theta, course.rollout, loads)
+    ends = [*linear(slice(0, 1)), *linear(slice(steps - 1, steps))]
+    moving = np.flatnonzero(live_states(course.problem.step, ends))
     reading = _reading(course, moving, edges)
     rests = course.problem.options.initial_state != "fitted_to_points"
-    ns, driving = len(moving.states), unknowns.driving
+    ns, driving = len(moving), unknowns.driving
     at_rest = np.zeros((ns, len(unknowns.names)))
     intervals = []
     for j in range(len(edges) - 1):
-        slopes = _steps(course, unknowns, moving, int(edges[j]), int(edges[j + 1]))
+        slopes = _steps(course, loads, moving, int(edges[j]), int(edges[j + 1]))
         if j == 0 and rests:
             # rest under constant unknowns, x = A x + E d; what has no stiffness does not come to rest
             at_rest[:, :driving] = np.linalg.lstsq(np.eye(ns) - slopes[0][0], slopes[1][0], rcond=1e-6)[0]
@@ -409,7 +370,7 @@ def _recording(course: _Course, observed: Array, limits: Thresholds) -> Linear:
         unknowns.sources,
         unknowns.reference,
         at_rest,
-        np.zeros(ns) if rests else _loose_start(course)[moving.states],
+        np.zeros(ns) if rests else _loose_start(course)[moving],
         decay,
         _torque_noise(course, unknowns, span, decay),
     )
@@ -545,7 +506,7 @@ class _Reading:
         return found
 
 
-def _reading(course: _Course, moving: _Moving, edges: NDArray[np.int64]) -> _Reading:
+def _reading(course: _Course, moving: NDArray[np.int64], edges: NDArray[np.int64]) -> _Reading:
     problem, theta, n = course.problem, course.theta, course.system.size
     predictor, threshold = problem.predictor, problem.options.huber_threshold
     state, efforts = course.rollout.state, predictor.efforts(course.rollout)
@@ -564,7 +525,7 @@ def _reading(course: _Course, moving: _Moving, edges: NDArray[np.int64]) -> _Rea
         node.append(where[keep])
         fraction.append(beyond[keep])
         weight.append(samples.rows(predicted, threshold=threshold).weight)
-        slope.append(np.concatenate([by_q, np.zeros((*by_q.shape[:2], n)), by_z], axis=2)[:, :, moving.states])
+        slope.append(np.concatenate([by_q, np.zeros((*by_q.shape[:2], n)), by_z], axis=2)[:, :, moving])
         load.append(by_e[:, :, course.fixed])
     nodes = np.concatenate(node)
     interval = np.clip(np.searchsorted(edges, nodes, side="right") - 1, 0, len(edges) - 2)

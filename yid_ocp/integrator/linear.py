@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +16,11 @@ Array = NDArray[np.float64]
 CHUNK = 50
 """Steps that are linearised at once: their matrices are dense."""
 
+FELT = 1e-12
+"""Slope by an internal state that is more than rounding."""
+
+EVERY = slice(None)
+
 
 @dataclass(frozen=True)
 class LinearStep:
@@ -27,46 +32,110 @@ class LinearStep:
         A_k = dx_{k+1}/dx_k
     by_torque : ndarray, shape (nx, nu)
         B_k = dx_{k+1}/du_k
+    by_load : ndarray, shape (nx, e)
+        E_k, by the further loads.
     effort_by_state : ndarray, shape (nc, nx)
         Of the effort that the prescribed coordinates need at node k.
     effort_by_torque : ndarray, shape (nc, nu)
+    effort_by_load : ndarray, shape (nc, e)
     """
 
     by_state: Array
     by_torque: Array
+    by_load: Array
     effort_by_state: Array
     effort_by_torque: Array
+    effort_by_load: Array
 
 
-def linear_steps(step: Step, theta: Array, rollout: Rollout) -> Iterator[LinearStep]:
-    """Derivatives of every step of a finished rollout, in order; prescribed coordinates stay as they are.
+@dataclass(frozen=True)
+class Loads:
+    """What else acts on every step, to first order, one column for each of e loads.
+
+    Attributes
+    ----------
+    rows : ndarray, shape (nt, e)
+        What it adds to the balance, internal and constraint rows.
+    momentum : ndarray, shape (n, e)
+        To p_{k+1}.
+    """
+
+    rows: Array
+    momentum: Array
+
+
+def live_states(step: Step, steps: Sequence[LinearStep], seen: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
+    """States that move and, where they are internal, that others, efforts or sensors depend on, shape (nx,).
+
+    What an effect adds to the state stays still, or is felt by nothing, while the effect is neutral.
+
+    Parameters
+    ----------
+    step : Step
+    steps : sequence of LinearStep
+        Some that stand for all.
+    seen : ndarray of bool, shape (nx,), optional
+        Those that sensors depend on.
+    """
+    by_state = np.max([np.abs(one.by_state) for one in steps], axis=0)
+    by_input = np.max([np.abs(np.hstack([one.by_torque, one.by_load])) for one in steps], axis=0)
+    moved = np.any(by_state > 0, axis=1) | np.any(by_input > 0, axis=1)
+    moved[list(step.system.prescribed_indices)] = False
+    felt = np.arange(len(moved)) < 2 * step.sizes["n"]
+    felt |= False if seen is None else seen
+    felt |= np.any([np.any(np.abs(one.effort_by_state) > FELT, axis=0) for one in steps], axis=0)
+    while np.any(more := ~felt & np.any(by_state[felt] > FELT, axis=0)):
+        felt |= more
+    return moved & felt
+
+
+def linear_steps(
+    step: Step, theta: Array, rollout: Rollout, loads: Loads | None = None, chosen: slice = EVERY
+) -> Iterator[LinearStep]:
+    """Derivatives of steps of a finished rollout, in order; prescribed coordinates stay as they are.
 
     Parameters
     ----------
     step : Step
     theta : ndarray, shape (ntheta,)
     rollout : Rollout
+    loads : Loads, optional
+    chosen : slice
+        Steps in a row; all by default.
     """
-    for first in range(0, len(rollout.torque), CHUNK):
-        yield from _chunk(step, theta, rollout, slice(first, min(first + CHUNK, len(rollout.torque))))
+    sizes = step.sizes
+    if loads is None:
+        loads = Loads(np.zeros((sizes["n"] + sizes["nz"] + sizes["m"], 0)), np.zeros((sizes["n"], 0)))
+    begin, end, _ = chosen.indices(len(rollout.torque))
+    for first in range(begin, end, CHUNK):
+        yield from _chunk(step, theta, rollout, loads, slice(first, min(first + CHUNK, end)))
 
 
-def _chunk(step: Step, theta: Array, rollout: Rollout, span: slice) -> list[LinearStep]:
+def _chunk(step: Step, theta: Array, rollout: Rollout, loads: Loads, span: slice) -> list[LinearStep]:
     sizes, h = step.sizes, step.time_step
     n, nz, nu, nx = sizes["n"], sizes["nz"], sizes["nu"], sizes["nx"]
-    nt, count = n + nz + sizes["m"], span.stop - span.start
+    nt, count, width = n + nz + sizes["m"], span.stop - span.start, nx + nu + loads.rows.shape[1]
     free, fixed = (np.array(index, int) for index in (step.system.free_indices, step.system.prescribed_indices))
     state = rollout.state[span.start : span.stop + 1]
     found = step.kernel.linearize(theta, state, rollout.multipliers[span], rollout.torque[span], (), True)
-    top, bottom = np.zeros((count, nt, nx + nu)), np.zeros((count, n, nx + nu))
-    for target, old, push in ((top, found.rows_old, found.rows_input), (bottom, found.p1_old, found.p1_input)):
-        target[:, :, :n], target[:, :, 2 * n : nx], target[:, :, nx:] = old[:, :, :n], old[:, :, n:], push
+    top, bottom = np.zeros((count, nt, width)), np.zeros((count, n, width))
+    pushed = slice(nx, nx + nu)
+    for target, old, push, load in (
+        (top, found.rows_old, found.rows_input, loads.rows),
+        (bottom, found.p1_old, found.p1_input, loads.momentum),
+    ):
+        target[:, :, :n], target[:, :, 2 * n : nx] = old[:, :, :n], old[:, :, n:]
+        target[:, :, pushed], target[:, :, nx + nu :] = push, load
     top[:, np.arange(n), n + np.arange(n)] += 1.0
     solved = np.concatenate([free, np.arange(n, nt)])
     moved = -np.linalg.solve(found.rows_new[:, solved[:, None], solved], top[:, solved])
-    after = np.zeros((count, nx, nx + nu))
+    after = np.zeros((count, nx, width))
     after[:, free] = moved[:, : len(free)]
     after[:, n : 2 * n] = bottom + found.p1_new[:, :, solved] @ moved
     after[:, 2 * n :] = moved[:, len(free) : len(free) + nz]
     effort = -(top[:, fixed] + found.rows_new[:, fixed[:, None], solved] @ moved) / h
-    return [LinearStep(a[:, :nx], a[:, nx:], e[:, :nx], e[:, nx:]) for a, e in zip(after, effort, strict=True)]
+    parts = (slice(0, nx), pushed, slice(nx + nu, width))
+    return [
+        LinearStep(*(a[:, part] for part in parts), *(e[:, part] for part in parts))
+        for a, e in zip(after, effort, strict=True)
+    ]

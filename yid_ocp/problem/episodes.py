@@ -74,6 +74,13 @@ class Episode:
     shares_start_of: int | None = None
 
     @property
+    def tracking(self) -> Feedback | None:
+        """The tracking filter, following the smoothed motion where that is known."""
+        if self.feedback is None or self.errors is None or self.errors.followed is None:
+            return self.feedback
+        return replace(self.feedback, reference=self.errors.followed)
+
+    @property
     def name(self) -> str:
         """Name of the recording."""
         return self.recording.name
@@ -163,7 +170,7 @@ def beginning(episode: Episode, steps: int) -> Episode:
         load=episode.load[: steps + 1],
         smooth_arm=episode.smooth_arm[: steps + 1],
         feedback=None if whole is None else Feedback(whole.index, whole.gain[:steps], whole.reference[:steps]),
-        errors=None if errors is None else replace(errors, sample=errors.sample[:steps]),
+        errors=None if errors is None else errors.until(steps),
     )
 
 

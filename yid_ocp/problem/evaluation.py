@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.problem.episodes import Episode
-from yid_ocp.problem.measurements import Measurements, Rows
+from yid_ocp.problem.measurements import Measurements, Rows, huber
+from yid_ocp.problem.noise import Innovations
 from yid_ocp.problem.prediction import EpisodeResult
 
 Array = NDArray[np.float64]
@@ -96,3 +97,17 @@ def joined(measurements: Sequence[Measurements], result: EpisodeResult, threshol
         np.vstack(jacobians) if jacobians else None,
         np.concatenate([part.weight for part in parts]),
     )
+
+
+def residual_rows(episode: Episode, whitening: Innovations | None, result: EpisodeResult, threshold: float) -> Rows:
+    """One episode's part of the residual: in units of the sensors' noise, or innovations where they are frozen."""
+    if whitening is None:
+        return joined(episode.samples, result, threshold)
+    plain = joined(episode.samples, result)
+    columns = plain.residual[:, None]
+    if plain.jacobian is not None:
+        columns = np.hstack([columns, plain.jacobian])
+    columns = whitening.whitened(columns, result.push)[0]
+    cost, factor = huber(columns[:, 0], threshold)
+    columns = factor[:, None] * columns
+    return Rows(cost, columns[:, 0], None if plain.jacobian is None else columns[:, 1:], factor)

@@ -15,8 +15,15 @@ measurement. Residuals are r = H d + v, so that with the filter's prediction m o
 Sigma the covariance of all residuals. The map is linear and frozen at the point where it was worked out: the same for
 residual and Jacobian, which is generalised least squares.
 
+Recorded torques are regressors with errors: along a rollout under them the derivatives share their noise with the
+residual, and whatever stands beside accelerations, inertias above all, comes out biased. Where a filter is known
+already, the next one is therefore about the smoothed motion, w and b taken off the torques; then the derivatives are
+those of the sum of squares that is least over w and b (Golub and Pereyra).
+
 References
 ----------
+Golub and Pereyra (1973), SIAM J. Numerical Analysis 10:2, doi:10.1137/0710036. Bryson and Frazier (1963), Smoothing
+for linear and nonlinear dynamic systems, Aeronautical Systems Division report TDR-63-119.
 Anderson and Moore (1979), Optimal Filtering, chapters 3 and 5. Ljung (1999), System Identification, section 7.4.
 """
 
@@ -24,14 +31,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
 from yid_ocp.data.recording import Recording
-from yid_ocp.integrator.linear import LinearStep, linear_steps
+from yid_ocp.integrator.linear import LinearStep, linear_steps, live_states
 from yid_ocp.integrator.step import Feedback, Rollout
 from yid_ocp.model.system import System
 from yid_ocp.problem.functions import ModelFunctions
@@ -65,6 +73,10 @@ class InputErrors:
         Whether the encoders are measurements.
     offset : ndarray, shape (nu,)
         Value of b that is taken off the recorded torque [N m], so that what is linearised is small.
+    white : ndarray, shape (N, nu)
+        Value of w that is taken off in every step [N m].
+    followed : ndarray, shape (N, nb), or None
+        What the tracking filter follows in place of the measured motion.
     """
 
     torque_std: Array
@@ -74,6 +86,23 @@ class InputErrors:
     spread: float
     encoders: bool
     offset: Array
+    white: Array
+    followed: Array | None = None
+
+    @property
+    def taken_off(self) -> Array:
+        """Off the recorded torque of every step, shape (N, nu) [N m]."""
+        return self.offset + self.white
+
+    @property
+    def as_recorded(self) -> InputErrors:
+        """The same with torques and angles as they were recorded, but for the constant offset."""
+        return replace(self, white=np.zeros_like(self.white), followed=None)
+
+    def until(self, steps: int) -> InputErrors:
+        """The same of the first steps."""
+        followed = None if self.followed is None else self.followed[:steps]
+        return replace(self, sample=self.sample[:steps], white=self.white[:steps], followed=followed)
 
 
 def input_errors(
@@ -123,20 +152,86 @@ def input_errors(
         max(1.0, period / grid.time_step),
         encoders,
         np.zeros(len(driven)),
+        np.zeros((grid.steps, len(driven))),
     )
 
 
 @dataclass(frozen=True)
 class _FilterStep:
-    """One step of a frozen filter: its rows, and the matrices by which they and the prediction m are turned over."""
+    """One step of a frozen filter, by which rows and the prediction m of (d, w, b) are turned over.
+
+    Attributes
+    ----------
+    rows : ndarray of int, shape (r,)
+    observe : ndarray, shape (r, na)
+        H
+    whiten : ndarray, shape (r, r)
+        S^(-1/2)
+    gain : ndarray, shape (na, r)
+        Of the prediction a step later.
+    ahead : ndarray, shape (r, nu)
+        Rows by a known correction of the torque over the step.
+    by_state : ndarray, shape (ns, ns)
+        A_k, less B_k K_k where the tracking filter is part of the model.
+    by_torque : ndarray, shape (ns, nu)
+        B_k
+    held : bool
+        Whether w stays what it is.
+    """
 
     rows: Rows
     observe: Array
     whiten: Array
     gain: Array
-    transition: Array
     ahead: Array
-    push: Array
+    by_state: Array
+    by_torque: Array
+    held: bool
+
+    def over(self, mean: Array, own: Array, push: Array | None) -> tuple[Array, Array]:
+        """What the rows say beyond the prediction, and the prediction a step later.
+
+        Only A_k is as large as (d, w, b) squared, so that the whole is not kept as one matrix.
+        """
+        (ns, nu), gap = self.by_torque.shape, own - self.observe @ mean
+        error = mean[ns : ns + nu] + mean[ns + nu :]
+        if push is not None:
+            gap -= self.ahead @ push
+            error = error + push
+        later = self.gain @ gap
+        later[:ns] += self.by_state @ mean[:ns] + self.by_torque @ error
+        if self.held:
+            later[ns : ns + nu] += mean[ns : ns + nu]
+        later[ns + nu :] += mean[ns + nu :]
+        return gap, later
+
+    def back(self, costate: Array) -> Array:
+        """The transposed map of (d, w, b) over the step, without what the rows tell."""
+        ns, nu = self.by_torque.shape
+        earlier, pulled = np.zeros_like(costate), self.by_torque.T @ costate[:ns]
+        earlier[:ns] = self.by_state.T @ costate[:ns]
+        earlier[ns : ns + nu] = pulled + costate[ns : ns + nu] * self.held
+        earlier[ns + nu :] = pulled + costate[ns + nu :]
+        return earlier
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """What all measurements of a recording say of what drove it.
+
+    Attributes
+    ----------
+    offset : ndarray, shape (nu,)
+        b [N m]
+    white : ndarray, shape (N, nu)
+        w in every step [N m].
+    error : ndarray, shape (N + 1, nx)
+        State of the rollout less the true one; where encoders are measurements.
+    """
+
+    offset: Array
+    white: Array
+    error: Array
 
 
 @dataclass(frozen=True)
@@ -147,14 +242,20 @@ class Innovations:
     ----------
     steps : tuple of _FilterStep
         One for every node.
-    offset : ndarray, shape (nu,)
-        Value of b about which it is linearised [N m].
+    errors : InputErrors
+        With the values of b and w about which it is linearised.
+    start : ndarray, shape (na, na)
+        Covariance of (d, w, b) before all measurements.
+    states : ndarray of bool, shape (nx,)
+        Those that d is made up of.
     bias_std : ndarray, shape (nu,)
         Standard deviation of b after all measurements [N m].
     """
 
     steps: tuple[_FilterStep, ...]
-    offset: Array
+    errors: InputErrors
+    start: Array
+    states: NDArray[np.bool_]
     bias_std: Array
 
     def whitened(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
@@ -173,20 +274,65 @@ class Innovations:
         bias : ndarray, shape (nu, c)
             Estimate of b from all rows [N m], and its derivative.
         """
-        result = np.empty_like(rows)
-        mean = np.zeros((len(self.steps[0].transition), rows.shape[1]))
-        last = len(mean) - len(self.offset)
-        mean[last:, 0] = -self.offset
+        result, mean = np.empty_like(rows), self._expected(rows.shape[1])
         for k, step in enumerate(self.steps):
-            own = rows[step.rows]
-            gap = own - step.observe @ mean
-            mean = step.transition @ mean + step.gain @ own
-            if push is not None and k < len(push):
-                gap -= step.ahead @ push[k]
-                mean += step.push @ push[k]
+            gap, mean = self._over(k, mean, rows[step.rows], push)
             result[step.rows] = step.whiten @ gap
-        mean[last:, 0] += self.offset
-        return result, mean[last:]
+        bias = mean[-len(self.errors.offset) :]
+        bias[:, 0] += self.errors.offset
+        return result, bias
+
+    def smoothed(self, rows: Array, push: Array | None) -> Smoothed:
+        """What all measurements say of what drove the motion, by the costates of the filter (Bryson and Frazier 1963).
+
+        Parameters
+        ----------
+        rows : ndarray, shape (r,)
+            A residual in units of the sensors' noise.
+        push : ndarray, shape (N, nu, 1), or None
+            As in `whitened`.
+        """
+        errors, last = self.errors, len(self.steps) - 1
+        nu, ns = len(errors.offset), int(np.count_nonzero(self.states))
+        torque = slice(ns, ns + nu)
+        column, noise = rows[:, None], np.zeros((len(rows), 1))
+        mean = self._expected(1)
+        for k, step in enumerate(self.steps):
+            gap, mean = self._over(k, mean, column[step.rows], push)
+            noise[step.rows] = step.whiten.T @ (step.whiten @ gap)
+        offset = mean[-nu:, 0] + errors.offset
+        white, costate = np.zeros_like(errors.white), np.zeros_like(mean)
+        for k in range(last, -1, -1):
+            step = self.steps[k]
+            if not step.held:
+                white[k + 1] = errors.torque_std**2 * costate[torque, 0]
+            noise[step.rows] -= step.gain.T @ costate
+            costate = step.back(costate) + step.observe.T @ noise[step.rows]
+        mean = self._expected(1) + self.start @ costate
+        white[0] = errors.white[0] + mean[torque, 0]
+        error = np.zeros((last + 1, len(self.states)))
+        for k, step in enumerate(self.steps):
+            error[k, self.states] = mean[:ns, 0]
+            # without the sensors' noise there is no innovation; what rounding makes of one keeps the error bounded
+            _, mean = self._over(k, mean, column[step.rows] - noise[step.rows], push)
+            if k + 1 < last:
+                white[k + 1] = white[k] if step.held else white[k + 1]
+                mean[torque, 0] = white[k + 1] - errors.white[k + 1]
+        return Smoothed(offset, white, error)
+
+    def _expected(self, columns: int) -> Array:
+        """Mean of (d, w, b) before all measurements; no derivative in further columns, shape (na, columns)."""
+        mean = np.zeros((len(self.start), columns))
+        mean[len(mean) - 2 * len(self.errors.offset) :, 0] = -np.concatenate([self.errors.white[0], self.errors.offset])
+        return mean
+
+    def _over(self, k: int, mean: Array, own: Array, push: Array | None) -> tuple[Array, Array]:
+        """Step k, and the mean of another w after it."""
+        gap, later = self.steps[k].over(mean, own, None if push is None or k >= len(push) else push[k])
+        if not self.steps[k].held:
+            nu = len(self.errors.offset)
+            later[len(later) - 2 * nu : len(later) - nu, 0] -= self.errors.white[k + 1]
+        return gap, later
 
 
 @dataclass(frozen=True)
@@ -230,24 +376,22 @@ def innovations(course: Course, errors: InputErrors) -> Innovations:
     -------
     Innovations
     """
-    step = course.functions.step
-    nx, nu, count = step.sizes["nx"], step.sizes["nu"], len(course.rollout.torque)
+    step, nu, count = course.functions.step, len(errors.bias_std), len(course.rollout.torque)
+    linear = partial(linear_steps, step, course.theta, course.rollout)
     readings = _Readings.of(course)
-    unit = np.vstack(
-        [
-            np.hstack([course.start_by_angles, course.start_by_torque, course.start_by_torque]),
-            np.eye(2 * nu, 3 * nu, nu),
-        ]
-    ) * np.concatenate([errors.angle_std, errors.torque_std, errors.bias_std])
-    covariance = unit @ unit.T
-    made, linear = [], linear_steps(step, course.theta, course.rollout)
+    ends = [*linear(chosen=slice(0, 1)), *linear(chosen=slice(count - 1, count))]
+    live = live_states(step, ends, readings.seen)
+    kept = np.flatnonzero(live)
+    readings = replace(readings, before=readings.before[:, kept], after=readings.after[:, kept])
+    start = np.hstack([course.start_by_angles, course.start_by_torque, course.start_by_torque])[kept]
+    unit = np.vstack([start, np.eye(2 * nu, 3 * nu, nu)])
+    unit *= np.concatenate([errors.angle_std, errors.torque_std, errors.bias_std])
+    covariance = first = unit @ unit.T
+    made, steps = [], linear()
     for k in range(count + 1):
-        here = next(linear, None)
-        if here is None:
-            turn = _Turn(np.eye(len(covariance)), np.zeros((len(covariance), nu)), np.zeros_like(covariance), None)
-        else:
-            fresh = k + 1 < count and errors.sample[k + 1] != errors.sample[k]
-            turn = _turn(here, course.feedback, errors, k, fresh)
+        fresh = k + 1 < count and errors.sample[k + 1] != errors.sample[k]
+        here = next(steps, None)
+        turn = _last_turn(len(kept), nu) if here is None else _turn(here, kept, course.feedback, errors, k, fresh)
         rows, observe, ahead = readings.at(k, turn)
         cross = observe @ covariance
         try:
@@ -257,12 +401,13 @@ def innovations(course: Course, errors: InputErrors) -> Innovations:
             factor = np.diag(np.sqrt(1.0 + np.maximum(np.sum(cross * observe, axis=1), 0.0)))
         whiten = scipy.linalg.solve_triangular(factor, np.eye(len(rows)), lower=True)
         known = whiten @ cross
-        gain = turn.transition @ known.T @ whiten
-        kept = turn.transition - gain @ observe
-        made.append(_FilterStep(rows, observe, whiten, gain, kept, ahead, turn.push - gain @ ahead))
-        covariance = turn.transition @ (covariance - known.T @ known) @ turn.transition.T + turn.noise
+        transition = turn.transition
+        gain = transition @ known.T @ whiten
+        made.append(_FilterStep(rows, observe, whiten, gain, ahead, turn.by_state, turn.by_torque, not turn.fresh))
+        covariance = transition @ (covariance - known.T @ known) @ transition.T + turn.noise
         covariance = 0.5 * (covariance + covariance.T)
-    return Innovations(tuple(made), errors.offset, np.sqrt(np.maximum(np.diag(covariance)[nx + nu :], 0.0)))
+    spread = np.sqrt(np.maximum(np.diag(covariance)[len(kept) + nu :], 0.0))
+    return Innovations(tuple(made), errors, first, live, spread)
 
 
 @dataclass(frozen=True)
@@ -271,41 +416,56 @@ class _Turn:
 
     Attributes
     ----------
-    transition : ndarray, shape (na, na)
-    push : ndarray, shape (na, nu)
-        By a known correction of the torque.
+    by_state : ndarray, shape (ns, ns)
+    by_torque : ndarray, shape (ns, nu)
+    fresh : bool
+        Whether w is another one after it.
     noise : ndarray, shape (na, na)
         Covariance that comes in.
     effort : ndarray, shape (nc, na), or None
         Of prescribed coordinates at the node before; None after the last step.
     """
 
-    transition: Array
-    push: Array
+    by_state: Array
+    by_torque: Array
+    fresh: bool
     noise: Array
     effort: Array | None
 
+    @property
+    def transition(self) -> Array:
+        """The whole of it, shape (na, na)."""
+        ns, nu = self.by_torque.shape
+        whole = np.eye(ns + 2 * nu)
+        whole[:ns] = np.hstack([self.by_state, self.by_torque, self.by_torque])
+        if self.fresh:
+            torque = np.arange(ns, ns + nu)
+            whole[torque, torque] = 0.0
+        return whole
 
-def _turn(here: LinearStep, feedback: Feedback | None, errors: InputErrors, k: int, fresh: bool) -> _Turn:
-    nx, nu = here.by_torque.shape
-    size = nx + 2 * nu
-    transition, push, noise = np.eye(size), np.zeros((size, nu)), np.zeros((size, size))
-    transition[:nx] = np.hstack([here.by_state, here.by_torque, here.by_torque])
-    effort = np.hstack([here.effort_by_state, here.effort_by_torque, here.effort_by_torque])
-    if errors.encoders:
-        push[:nx] = here.by_torque
-    elif feedback is not None:
-        pulled = here.by_torque @ feedback.gain[k]
-        transition[:nx, feedback.index] -= pulled
-        effort[:, feedback.index] -= here.effort_by_torque @ feedback.gain[k]
+
+def _last_turn(ns: int, nu: int) -> _Turn:
+    none = np.zeros((ns, nu))
+    return _Turn(np.eye(ns), none, False, np.zeros((ns + 2 * nu, ns + 2 * nu)), None)
+
+
+def _turn(here: LinearStep, kept: Rows, feedback: Feedback | None, errors: InputErrors, k: int, fresh: bool) -> _Turn:
+    by_state, by_torque, ns = here.by_state, here.by_torque[kept], len(kept)
+    nu = by_torque.shape[1]
+    effort_by_state = here.effort_by_state
+    noise = np.zeros((ns + 2 * nu, ns + 2 * nu))
+    if feedback is not None and not errors.encoders:
+        by_state, effort_by_state = by_state.copy(), effort_by_state.copy()
+        by_state[:, feedback.index] -= here.by_torque @ feedback.gain[k]
+        effort_by_state[:, feedback.index] -= here.effort_by_torque @ feedback.gain[k]
         # an error of the angles that the filter follows; that of the momenta, their slope, averages out
-        angles = pulled[:, :nu] * errors.angle_std * np.sqrt(errors.spread)
-        noise[:nx, :nx] = angles @ angles.T
+        angles = by_torque @ feedback.gain[k][:, :nu] * errors.angle_std * np.sqrt(errors.spread)
+        noise[:ns, :ns] = angles @ angles.T
     if fresh:
-        torque = np.arange(nx, nx + nu)
-        transition[torque, torque] = 0.0
+        torque = np.arange(ns, ns + nu)
         noise[torque, torque] = errors.torque_std**2
-    return _Turn(transition, push, noise, effort)
+    effort = np.hstack([effort_by_state[:, kept], here.effort_by_torque, here.effort_by_torque])
+    return _Turn(by_state[np.ix_(kept, kept)], by_torque, fresh, noise, effort)
 
 
 @dataclass(frozen=True)
@@ -319,7 +479,7 @@ class _Readings:
         Where the rows of every node begin.
     fraction : ndarray, shape (r,)
         Of a step beyond the node.
-    before, after : ndarray, shape (r, nx)
+    before, after : ndarray, shape (r, nx), or of some of the states alone
         By the states of the two nodes, their shares of the interpolation included.
     effort : ndarray, shape (r, nc)
         By the effort of prescribed joints, as at the node before.
@@ -364,12 +524,17 @@ class _Readings:
         first = np.searchsorted(at[order], np.arange(last + 2))
         return _Readings(order, first, np.vstack(before), np.vstack(after), np.vstack(effort))
 
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """States that a residual depends on, shape (nx,)."""
+        return np.any(self.before != 0, axis=0) | np.any(self.after != 0, axis=0)
+
     def at(self, k: int, turn: _Turn) -> tuple[Rows, Array, Array]:
         """Rows of node k, their slopes by (d, w, b), and by a known correction of the torque over the step."""
         rows = self.order[self.first[k] : self.first[k + 1]]
-        before, after, nx = self.before[rows], self.after[rows], self.before.shape[1]
-        observe = after @ turn.transition[:nx]
-        observe[:, :nx] += before
+        before, after = self.before[rows], self.after[rows]
+        ahead = after @ turn.by_torque
+        observe = np.hstack([before + after @ turn.by_state, ahead, ahead])
         if turn.effort is not None:
             observe += self.effort[rows] @ turn.effort
-        return rows, observe, after @ turn.push[:nx]
+        return rows, observe, ahead

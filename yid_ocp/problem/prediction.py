@@ -192,9 +192,6 @@ class Predictor:
             Parameters by which to differentiate.
         """
         inputs = self._corrected(episode, theta, wanted)
-        if episode.errors is not None:
-            offset = episode.errors.offset
-            inputs = replace(inputs, torque=inputs.torque - offset, first_torque=inputs.first_torque - offset)
         if not self.system.driven or self.options.feedback != "lqr":
             return inputs
         shift = self.functions.momentum_shift
@@ -206,7 +203,9 @@ class Predictor:
     def _corrected(self, episode: Episode, theta: Array, wanted: tuple[str, ...]) -> Inputs:
         """The recording's torques, angles and paths as the effects say they truly were."""
         corrections = self.functions.corrections
-        torque, arm, path = episode.torque, episode.measured_arm, episode.path
+        # what readings are wrong by is taken off them, before an effect says what they mean
+        wrong = 0.0 if episode.errors is None else episode.errors.taken_off
+        torque, arm, path = episode.torque - wrong, episode.measured_arm, episode.path
         nu, nc = torque.shape[1], path.shape[1]
         first = torque[0] if nu else np.zeros(0)
         by_torque = by_first = by_arm = by_path = None
@@ -216,7 +215,7 @@ class Predictor:
             where = (joints, self.system.driven, episode.grid, episode.name)
             delay, by_delay = corrections.torque_delay(theta, wanted)
             if corrections.delays_torque:
-                torque = held_torque(*where, delay)
+                torque = held_torque(*where, delay) - wrong
             readings = np.pad(np.vstack([torque, first]), ((0, 0), (0, nc)))
             _, true, _, by_theta, by_reading = corrections.true(np.zeros_like(readings), readings, theta, wanted)
             by_theta = by_theta[:, :nu].copy()
@@ -241,7 +240,7 @@ class Predictor:
         if start.message:
             return start.message
         inputs, by_start = self.inputs(episode, theta, wanted), start.by_unknowns
-        feedback, driven = episode.feedback, self.system.driven_indices
+        feedback, driven = episode.tracking, self.system.driven_indices
         directions = None
         if derivatives and by_start.shape[1]:
             extra = ((0, 0), (0, 0), (0, by_start.shape[1] - len(wanted)))
@@ -301,25 +300,58 @@ class Predictor:
         guess : ndarray, shape (n,), or None
             Configuration near the equilibrium.
         before : Innovations or None
-            The episode's filter, where it has one already: the new one is about the torque offsets that it sees.
+            The episode's filter, where it has one already: the new one is about the motion and torques that it sees.
         """
         if episode.errors is None:
             return episode, None
-        result, errors = self.run(episode, theta, offset, False, guess), episode.errors
-        if before is not None and not isinstance(result, str) and np.any(errors.bias_std > 0):
-            errors = replace(errors, offset=self.torque_offset(episode, result, before))
-            episode = replace(episode, errors=errors)
+        result = self.run(episode, theta, offset, False, guess)
+        if before is not None and not isinstance(result, str):
+            episode = self._about_smoothed(episode, theta, result, before)
             result = self.run(episode, theta, offset, False, guess)
-        if isinstance(result, str):
+        if isinstance(result, str) or episode.errors is None:
             return episode, None
-        return episode, innovations(self._course(episode, result, theta), errors)
+        return episode, innovations(self.course(episode, result, theta), episode.errors)
+
+    def _about_smoothed(self, episode: Episode, theta: Array, result: EpisodeResult, before: Innovations) -> Episode:
+        """The episode about what all measurements say of its torques and, where encoders are among them, its motion."""
+        errors, feedback = episode.errors, episode.feedback
+        assert errors is not None
+        found = before.smoothed(_plain(episode, result), result.push)
+        errors = replace(errors, offset=found.offset, white=found.white)
+        if errors.encoders and feedback is not None:
+            inputs = self.inputs(episode, self.own_theta(episode, theta), ())
+            guided = inputs.guided(feedback, self.system.driven_indices, episode.measured_arm)
+            assert guided is not None
+            shift = guided.reference - feedback.reference
+            true = (result.rollout.state - found.error)[:-1, feedback.index]
+            errors = replace(errors, followed=true - shift)
+        return replace(episode, errors=errors)
+
+    def about_torques(
+        self, episode: Episode, whitening: Innovations | None, theta: Array, frozen: Array
+    ) -> tuple[Episode, Innovations | None]:
+        """An episode and its filter about another torque offset, so that the torques stay what they are on average.
+
+        Parameters
+        ----------
+        episode : Episode
+        whitening : Innovations or None
+            Frozen at parameters that correct torques like `frozen`; it is kept but for its offset.
+        theta, frozen : ndarray, shape (ntheta,)
+        """
+        if episode.errors is None or whitening is None:
+            return episode, whitening
+        now, before = (self.inputs(episode, self.own_theta(episode, t), ()).torque for t in (theta, frozen))
+        offset = episode.errors.offset + np.mean(now - before, axis=0)
+        errors = replace(episode.errors, offset=offset)
+        return replace(episode, errors=errors), replace(whitening, errors=errors)
 
     def torque_offset(self, episode: Episode, result: EpisodeResult, whitening: Innovations) -> Array:
         """Constant error of every driven joint's torque, as all measurements of an episode have it, (nu,) [N m]."""
-        rows = [s.rows(y).residual for s, y in zip(episode.samples, result.predicted, strict=True)]
-        return whitening.whitened(np.concatenate(rows)[:, None], result.push)[1][:, 0]
+        return whitening.whitened(_plain(episode, result)[:, None], result.push)[1][:, 0]
 
-    def _course(self, episode: Episode, result: EpisodeResult, theta: Array) -> Course:
+    def course(self, episode: Episode, result: EpisodeResult, theta: Array) -> Course:
+        """The rollout of an episode, about which errors of what drives it are small."""
         own, rollout = self.own_theta(episode, theta), result.rollout
         late = (self.lateness(samples, own, ()) for samples in episode.samples)
         nx, nu = self.step.sizes["nx"], self.step.sizes["nu"]
@@ -484,3 +516,9 @@ class _Pulls:
     by_state: Array
     by_effort: Array
     by_torque: Array
+
+
+def _plain(episode: Episode, result: EpisodeResult) -> Array:
+    """Residual of an episode in units of the sensors' noise."""
+    rows = [s.rows(y).residual for s, y in zip(episode.samples, result.predicted, strict=True)]
+    return np.concatenate(rows)

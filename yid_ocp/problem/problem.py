@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -16,10 +16,10 @@ from yid_ocp.integrator.step import Step
 from yid_ocp.model.system import System
 from yid_ocp.parallel import map_threads
 from yid_ocp.problem.episodes import Episode, apparent_inertia, beginning, prepare_episode
-from yid_ocp.problem.evaluation import Evaluation, ResidualRows, WarmStart, joined
+from yid_ocp.problem.evaluation import Evaluation, ResidualRows, WarmStart, residual_rows
 from yid_ocp.problem.functions import ModelFunctions
 from yid_ocp.problem.measurements import Rows, huber
-from yid_ocp.problem.noise import Innovations
+from yid_ocp.problem.noise import Innovations, InputErrors
 from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.problem.prediction import EpisodeResult, Predictor, Start
 from yid_ocp.problem.unknowns import (
@@ -296,7 +296,7 @@ class EstimationProblem:
         done = tuple(result for result in results if isinstance(result, EpisodeResult))
         cost, residuals, jacobians = 0.0, [], []
         for i, result in enumerate(done):
-            part = _rows(self.episodes[i], self.innovations[i], result, self.options.huber_threshold)
+            part = residual_rows(self.episodes[i], self.innovations[i], result, self.options.huber_threshold)
             cost += part.cost
             residuals.append(part.residual)
             if part.jacobian is not None:
@@ -496,7 +496,7 @@ class EstimationProblem:
         """The same problem with residuals weighted by all noise, that which drives the motion too, frozen at `x`.
 
         The problem itself where nothing is wrong with its torques and angles, or where it cannot be rolled out at `x`.
-        If it is weighted already, the new weights are about the torque offsets that the old ones see.
+        If it is weighted already, the new weights are about the motion and the torques that the old ones see.
 
         Parameters
         ----------
@@ -522,11 +522,15 @@ class EstimationProblem:
 
     def weighted_by_sensors(self) -> EstimationProblem:
         """The same problem with residuals in units of the sensors' noise alone, torque offsets as they are known."""
-        return self._changed(innovations=(), held_out_innovations=())
+        return self._with_errors(lambda errors: errors.as_recorded)
 
     def without_input_errors(self) -> EstimationProblem:
         """The same problem with torques and angles that drive the motion taken as they were recorded."""
-        return self.on(*([replace(e, errors=None) for e in group] for group in (self.episodes, self.held_out)))
+        return self._with_errors(lambda errors: None)
+
+    def _with_errors(self, changed: Callable[[InputErrors], InputErrors | None]) -> EstimationProblem:
+        groups = (self.episodes, self.held_out)
+        return self.on(*([replace(e, errors=e.errors and changed(e.errors)) for e in group] for group in groups))
 
     def held_out_weighted_at(self, x: ArrayLike) -> EstimationProblem:
         """The same problem with the residuals of held-out recordings weighted like this as well, for `held_out_rows`.
@@ -545,12 +549,25 @@ class EstimationProblem:
             made.append(whitening)
         return self._changed(held_out=tuple(episodes), held_out_innovations=tuple(made))
 
+    def about_torques_of(self, x: Array, frozen: Array) -> EstimationProblem:
+        """The same problem, its filters about torque offsets that leave the torques at `x` what they were at `frozen`.
+
+        What an effect adds to a torque, its offset no longer has to.
+        """
+        about = self.predictor.about_torques
+        own = zip(self.episodes, self.innovations, strict=True)
+        others = zip(self.held_out, self.held_out_innovations, strict=True)
+        fitted = [about(e, w, self.split(x, i)[0], self.split(frozen, i)[0]) for i, (e, w) in enumerate(own)]
+        held = [about(e, w, self._held_out_theta(x), self._held_out_theta(frozen)) for e, w in others]
+        (episodes, made), (held_out, there) = (tuple(zip(*p, strict=True)) or ((), ()) for p in (fitted, held))
+        return self._changed(episodes=episodes, innovations=made, held_out=held_out, held_out_innovations=there)
+
     def held_out_rows(self, i: int, episode: Episode, result: EpisodeResult) -> Rows:
         """Residual of a held-out recording, from its place and what `validate` says of it.
 
         Without a robust loss, in the order of its measurements; innovations where they are frozen.
         """
-        return _rows(episode, self.held_out_innovations[i], result, np.inf)
+        return residual_rows(episode, self.held_out_innovations[i], result, np.inf)
 
     def shortened(self, duration: float) -> EstimationProblem:
         """The same problem over the first seconds of every recording, prepared anew, without held-out ones."""
@@ -581,17 +598,3 @@ class EstimationProblem:
             "held_out": [episode.recording for episode in self.held_out],
         }
         return EstimationProblem(**{**same, **changes})
-
-
-def _rows(episode: Episode, whitening: Innovations | None, result: EpisodeResult, threshold: float) -> Rows:
-    """One episode's part of the residual: in units of the sensors' noise, or innovations where they are frozen."""
-    if whitening is None:
-        return joined(episode.samples, result, threshold)
-    plain = joined(episode.samples, result)
-    columns = plain.residual[:, None]
-    if plain.jacobian is not None:
-        columns = np.hstack([columns, plain.jacobian])
-    columns = whitening.whitened(columns, result.push)[0]
-    cost, factor = huber(columns[:, 0], threshold)
-    columns = factor[:, None] * columns
-    return Rows(cost, columns[:, 0], None if plain.jacobian is None else columns[:, 1:], factor)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from yid_ocp.errors import YidError
 from yid_ocp.problem.evaluation import Evaluation, WarmStart
 from yid_ocp.problem.null_test import USUAL, GapLimits
+from yid_ocp.problem.prediction import EpisodeResult
 from yid_ocp.problem.problem import EstimationProblem
 from yid_ocp.registry import Registry
 from yid_ocp.solvers.judgement import Estimate, Fit, covariance_of_fit, estimates, judge_fit, uncertainty
@@ -115,6 +116,15 @@ class Solution:
     def std(self) -> dict[str, float]:
         """Standard deviation of every shared free parameter."""
         return {name: entry.std for name, entry in self.parameters.items() if entry.free}
+
+    @property
+    def predicted(self) -> tuple[EpisodeResult, ...]:
+        """What the model makes of every recording's torques as they are, less their offsets; empty without a point."""
+        found = self.evaluation
+        if found is not None and self.problem is not None and self.problem.disturbed:
+            # weights are about torques without the noise that the measurements told of
+            found = self.problem.weighted_by_sensors().evaluate(self.x, False, found.warm)
+        return () if found is None else found.episodes
 
 
 Callback = Callable[[Iterate], None]

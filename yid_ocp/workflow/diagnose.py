@@ -20,6 +20,7 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import Findings
 from yid_ocp.report.terminal import diagnose_summary
+from yid_ocp.sensors.joints import EFFORT, POSITION
 from yid_ocp.solvers import Solution, solve
 from yid_ocp.workflow.build import build_problem
 from yid_ocp.workflow.command import DONE, carry_out
@@ -139,32 +140,29 @@ def reproducing(run: Run, folder: Path) -> str:
 def in_units_of_noise(problem: EstimationProblem, run: Run) -> EstimationProblem:
     """The same problem with the noise alone as the sensors' standard deviations, by `diagnosis.noise_fraction`.
 
-    Priors and weak prior shrink alike, so that every fit stays what it is; what changes is when a gap counts as one.
+    Errors of torques and angles that drive the motion, priors and weak prior shrink alike, so that every fit stays what
+    it is; what changes is when a gap counts as one.
 
     Raises
     ------
     ConfigError
-        A sensor without a standard deviation in the settings.
+        A sensor, or a torque, without a standard deviation in the settings.
     """
     share, options = run.diagnosis.noise_fraction, problem.options
     if share == 1:
         return problem
-    used = {samples.sensor.group for episode in problem.episodes for samples in episode.samples}
-    recorded = [e.recording.joints.position_std for e in problem.episodes if e.recording.joints is not None]
-    if "joints.effort" in used and any(std is not None and np.any(std) for std in recorded):
-        used.add("joints.position")  # the encoders' noise is part of that of efforts
     sensors = dict(options.sensors)
-    used |= {"joints.position"} & set(sensors)
-    for group in sorted(used):
-        std = sensors[group].std if group in sensors else None
-        if std is None:
+    for group, field in sorted(_noise_levels(problem)):
+        level = getattr(sensors[group], field) if group in sensors else None
+        if level is None:
             raise run.refuse(
-                f"the fraction of noise in the std of '{group}' is given, but not the std",
+                f"the fraction of noise in the {field} of '{group}' is given, but not the {field}",
                 "diagnosis",
                 "noise_fraction",
-                hint=f"set sensors.{group}.std",
+                hint=f"set sensors.{group}.{field}",
             )
-        sensors[group] = replace(sensors[group], std=_times(share, std))
+        smaller: dict[str, Any] = {field: _times(share, level)}
+        sensors[group] = replace(sensors[group], **smaller)
     return problem.with_options(
         replace(
             options,
@@ -178,13 +176,36 @@ def in_units_of_noise(problem: EstimationProblem, run: Run) -> EstimationProblem
     )
 
 
+def _noise_levels(problem: EstimationProblem) -> set[tuple[str, str]]:
+    """Group and field of every noise level that residuals or their weights depend on."""
+    levels = {(samples.sensor.group, "std") for episode in problem.episodes for samples in episode.samples}
+    recorded = [e.recording.joints.position_std for e in problem.episodes if e.recording.joints is not None]
+    encoders = problem.options.sensors.get(POSITION)
+    if (EFFORT, "std") in levels and any(std is not None and np.any(std) for std in recorded):
+        levels.add((POSITION, "std"))  # the encoders' noise is part of that of efforts
+    if encoders is not None and encoders.std is not None:
+        levels.add((POSITION, "std"))
+    for errors in (episode.errors for episode in problem.episodes):
+        if errors is not None:
+            given = {
+                (EFFORT, "std"): errors.torque_std,
+                (EFFORT, "bias_std"): errors.bias_std,
+                (POSITION, "std"): errors.angle_std,
+            }
+            levels |= {level for level, std in given.items() if np.any(std > 0)}
+    return levels
+
+
 def _times(share: float, std: float | Mapping[str, float]) -> float | Mapping[str, float]:
     return {name: share * value for name, value in std.items()} if isinstance(std, Mapping) else share * std
 
 
 def predictions(finding: Finding) -> list[Prediction]:
     """Held-out recordings that can be predicted both before and after."""
-    before, after = (fit.problem.validate(fit.problem.vector(fit.values)) for fit in (finding.nominal, finding.last))
+    before, after = (
+        fit.problem.weighted_by_sensors().validate(fit.problem.vector(fit.values))
+        for fit in (finding.nominal, finding.last)
+    )
     return [
         (episode, first, last)
         for (episode, first), (_, last) in zip(before, after, strict=True)

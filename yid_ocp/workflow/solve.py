@@ -134,7 +134,7 @@ def solve_result(
     residuals: Mapping[str, Any] = {}
     fitted: list[dict[str, Any]] = []
     if solution.evaluation is not None:
-        done = solution.evaluation.episodes
+        done = solution.predicted
         residuals = channel_errors(done, problem.episodes)
         fitted = [held_out_entry(problem, *pair, cable) for pair in zip(problem.episodes, done, strict=True)]
     predicted = [held_out_entry(problem, episode, outcome, cable) for episode, outcome in held_out]

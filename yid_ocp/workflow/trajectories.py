@@ -39,7 +39,7 @@ def write_trajectories(
     """
     pairs: list[tuple[str, Episode, EpisodeResult | str]] = [("held_out", *pair) for pair in held_out]
     if solution.evaluation is not None:
-        done = solution.evaluation.episodes
+        done = solution.predicted
         pairs = [("estimate", e, r) for e, r in zip(problem.episodes, done, strict=True)] + pairs
     with _file(path, SOLVED) as file:
         unknowns = file.create_group("unknowns")

@@ -51,7 +51,7 @@ class Findings:
         """Role (estimate, held_out), episode and prediction of all that could be predicted."""
         found: list[tuple[str, Episode, EpisodeResult]] = []
         if self.problem is not None and self.solution is not None and self.solution.evaluation is not None:
-            done = self.solution.evaluation.episodes
+            done = self.solution.predicted
             found += [("estimate", e, r) for e, r in zip(self.problem.episodes, done, strict=True)]
         return found + [("held_out", e, r) for e, r in self.held_out if not isinstance(r, str)]
 
