@@ -318,9 +318,7 @@ def inspect_summary(result: Mapping[str, Any]) -> list[str]:
     lines += [*table(rows), ""]
     rows = [("function", "operations", "nonzeros")]
     rows += [(f["name"], str(f["operations"]), str(f["nonzeros"])) for f in equations["functions"]]
-    count = equations["unknowns"]
-    lines += [*table(rows), ""]
-    lines.append(f"Jacobian of the step: {count} x {count}, {equations['jacobian_nonzeros']} nonzeros (sparsity.png)")
+    lines += [*table(rows), "", *_block_lines(result["blocks"]), *_pattern_lines(result), ""]
     linear = result["linearisation"]
     lines.append(f"linearised at {linear['at']}: spectral radius of A {linear['spectral_radius']:.6g}")
     rows = [("matrix", "norm", "largest difference from finite differences")]
@@ -328,7 +326,43 @@ def inspect_summary(result: Mapping[str, Any]) -> list[str]:
         (name, f"{norm:.4g}", f"{linear['finite_difference_errors'][name]:.1e}")
         for name, norm in linear["norms"].items()
     ]
-    return [*lines, *table(rows), "matrices: linearisation.h5"]
+    lines += [*table(rows), "matrices: linearisation.h5", ""]
+    for name, entry in result["dependence"].items():
+        if result["parameters"][name]["free"]:
+            lines += textwrap.wrap(entry["words"], 120, subsequent_indent="  ")
+    lines.append("where every parameter enters: result.json; all equations and names: equations.txt")
+    for entry in result["entries"]:
+        lines += ["", *entry["lines"]]
+    if result["exported"]:
+        lines += ["", f"exported: {', '.join(result['exported'])}"]
+    return lines
+
+
+def _block_lines(blocks: Mapping[str, Any]) -> list[str]:
+    """Blocks of rows and columns with the name of their first entry."""
+    lines: list[str] = []
+    for kind, head in (("rows", "equations of a step"), ("columns", "variables of a step")):
+        rows: Rows = [(head, "", "first", "")]
+        rows += [(b["name"], str(len(b["names"])), b["names"][0], b["meaning"]) for b in blocks[kind]]
+        lines += [*table(rows), ""]
+    return lines
+
+
+def _pattern_lines(result: Mapping[str, Any]) -> list[str]:
+    """Sizes of matrices, and how many entries can and do differ from zero."""
+    rows: Rows = [("matrix (sparsity.png)", "size", "can differ from zero", "do at this point")]
+    for name, entry in result["patterns"].items():
+        height, width = entry["shape"]
+        if height and width:
+            rows.append((name, f"{height} x {width}", str(entry["nonzeros"]), str(entry["at_point"])))
+    nlp = result["nlp"]
+    if nlp is None:
+        return table(rows)
+    size = nlp["variables"] + nlp["constraints"]
+    text = f"KKT matrix of the NLP with a node at every step (kkt.png): {size} x {size}, {nlp['variables']} variables, "
+    text += f"{nlp['constraints']} constraints; {nlp['jacobian_nonzeros']} entries of the constraints' Jacobian and "
+    text += f"{nlp['hessian_nonzeros']} of their Hessian can differ from zero"
+    return [*table(rows), *textwrap.wrap(text, 120)]
 
 
 def simulate_summary(result: Mapping[str, Any]) -> list[str]:
