@@ -61,30 +61,35 @@ class Dependence:
 
     @property
     def words(self) -> str:
-        """One sentence on the rows, one on what a change does from the rest on."""
-        count = f"{len(self.rows)} row{'' if len(self.rows) == 1 else 's'}"
-        listed = listing(self.rows)
-        said = f"{self.parameter} enters {count}" + (f" ({listed})" if listed else "")
-        if self.seen is None or not self.rows:
-            said += "" if self.rows else " of a step"
-        elif not self.seen:
-            said += f", {'which no sensor sees' if len(self.rows) == 1 else 'none of which a sensor sees'} to first order"
-        elif len(self.seen) == len(self.rows):
-            said += f", {'which' if len(self.rows) == 1 else 'all of which'} sensors see to first order"
-            said += f", {self.best} best" if self.best else ""
-        else:
-            said += f", {len(self.seen)} of which sensors see to first order ({listing(self.seen)})"
-            said += f", {self.best} best" if self.best else ""
+        """One sentence on the rows, then on what a change does from the rest on and along the recordings."""
+        said = f"{self.parameter} enters {self._rows}"
         if self.read:
             said += f"; the reading of {', '.join(self.read)} depends on it directly"
-        more, within = f"one {self.unit} more of it" if self.unit != "1" else "1 more of it", f"within {self.seconds:.2g} s"
+        more = "1 more of it" if self.unit == "1" else f"one {self.unit} more of it"
+        within = f"within {self.seconds:.2g} s"
         if self.moved is not None and self.moved > NOTHING:
             said += f". From rest, {more} moves readings by at most {self.moved:.2g} standard deviations {within}"
         elif self.moved is not None:
             said += f". From rest, {more} moves no reading by a millionth of its standard deviation {within}"
         if self.along is not None:
-            said += f". Along the recordings, {more} moves all readings together by {self.along:.2g} standard deviations"
+            moves = f"moves all readings together by {self.along:.2g} standard deviations"
+            said += f". Along the recordings, {more} {moves}, to first order"
         return said + "."
+
+    @property
+    def _rows(self) -> str:
+        if not self.rows:
+            return "no row of a step"
+        one, listed = len(self.rows) == 1, listing(self.rows)
+        said = f"{len(self.rows)} row{'' if one else 's'} ({listed})"
+        if self.seen is None:
+            return said
+        best = f", {self.best} best" if self.best else ""
+        if not self.seen:
+            return f"{said}, {'which no sensor' if one else 'none of which a sensor'} sees to first order"
+        if len(self.seen) == len(self.rows):
+            return f"{said}, {'which' if one else 'all of which'} sensors see to first order{best}"
+        return f"{said}, {len(self.seen)} of which sensors see to first order ({listing(self.seen)}){best}"
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.integrator.step import Step, check_shape
 from yid_ocp.integrator.step_model import StepLinearization
+from yid_ocp.model.system import System
 
 Array = NDArray[np.float64]
 
@@ -147,6 +148,18 @@ def linearised_rows(step: Step, state: Array, torque: Array, theta: Array, path:
     q1, p1, lam, status = step(state[:n], state[n : 2 * n], torque, theta, (path, path), state[2 * n :])
     pair = np.stack([state, np.concatenate([q1, p1, status.internal])])
     return step.kernel.linearize(theta, pair, lam[None, :], torque[None, :], step.system.parameters.names, True)
+
+
+def in_numbers(system: System, theta: Array) -> System:
+    """The system with numbers in place of its parameters, internal coordinates at zero."""
+    inner = ca.vertcat(*system.internal.values()) if system.internal else ca.SX(0, 1)
+    symbols = ca.vertcat(system.parameters.symbols, inner)
+    values = np.concatenate([theta, np.zeros(inner.numel())])
+
+    def number(expression: ca.SX) -> ca.SX:
+        return ca.SX(ca.densify(ca.Function("number", [symbols], [expression])(values)))
+
+    return system.mapped(number)
 
 
 def _differences(function: Callable[[Array], Array], at: Array) -> Array:

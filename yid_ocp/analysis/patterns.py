@@ -252,7 +252,7 @@ def stages(
     places = [*range(f + nx), *range(f + nx, f + nx + n), *range(f + nx + 2 * n, f + 2 * nx + m)]
     placing = np.zeros((local.numel(), f + 2 * nx + m), bool)
     placing[np.arange(len(places)), places] = True
-    placing[np.ix_(np.arange(len(places), len(places) + nu), [f + i for i in followed])] = True
+    placing[np.ix_(np.arange(len(places), len(places) + nu), f + np.array(followed, int))] = True
     by_stage = _times(by_local, placing)
     hessian = _times(_times(placing.T, curved), placing)
     # the constraint on the momentum after the step holds that momentum itself
@@ -304,7 +304,7 @@ def nlp_masks(stage: Stages, steps: int) -> tuple[Mask, Mask, Mask]:
             break
         columns = np.concatenate([here, node + nx + m + np.arange(nx), node + nx + np.arange(m)])
         top = len(fixed) + k * height
-        jacobian[np.ix_(range(top, top + height), columns)] |= stage.rows
+        jacobian[np.ix_(np.arange(top, top + height), columns)] |= stage.rows
         hessian[np.ix_(columns, columns)] |= stage.hessian
     return jacobian, hessian, measured
 
@@ -360,4 +360,6 @@ def kkt_pattern(stage: Stages, free: Sequence[str], steps: int) -> Pattern:
     title = f"KKT matrix of the NLP with a node at every step: the first {steps} steps"
     marked = np.zeros_like(mask)
     marked[: len(measured), : len(measured)] = measured
-    return Pattern("kkt", title, mask, blocks, blocks, named, named, marked, "of a reading or a prior, where there is one")
+    return Pattern(
+        "kkt", title, mask, blocks, blocks, named, named, marked, "of a reading or a prior, where there is one"
+    )

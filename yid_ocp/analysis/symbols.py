@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -88,7 +88,7 @@ class Entry:
         """The whole expression for people, its shared parts first."""
         if self.zero:
             return [f"{self.title} = 0 whatever the state"]
-        said = [f"{self.title}: {self.formula.operations} operations, depends on {', '.join(self.variables) or 'nothing'}"]
+        said = [_headline(self.title, self.formula.operations, self.variables)]
         said += [f"  {name} = {text}" for name, text in self.formula.shared]
         return [*said, f"  {self.title} = {self.formula.values[0]}"]
 
@@ -237,7 +237,7 @@ class StepSymbols:
                 entry = Entry(name, "", made, self.grouped(made.variables), self.all_rows[at])
                 said += entry.lines
             else:
-                said.append(f"{name}: {made.operations} operations, depends on {', '.join(self.grouped(made.variables))}")
+                said.append(_headline(name, made.operations, self.grouped(made.variables)))
         blocks = [block for block in self.columns if block.labels]
         return [
             "equations of one step; `inspect --entry 'NAME'` prints any of them whole, with ', COLUMN' its derivative",
@@ -256,6 +256,10 @@ def constraint_names(grasp: Grasp) -> tuple[str, ...]:
 def latex_text(name: str) -> str:
     """A name as it stands in LaTeX's text."""
     return "".join("\\" + letter if letter in "_%#&${}" else letter for letter in name)
+
+
+def _headline(title: str, count: int, variables: Sequence[str]) -> str:
+    return f"{title}: {count} operations, depends on {', '.join(variables) or 'nothing'}"
 
 
 def _place(name: str, known: tuple[str, ...], kind: str, blocks: tuple[Block, ...]) -> int:

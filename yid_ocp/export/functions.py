@@ -103,12 +103,13 @@ def export_functions(
     source = folder / "equations.c"
     write_text(source, functions_source("equations", functions))
     parameters = symbols.equations.system.parameters
+    values = {p.name: {"value": float(value), "unit": p.unit} for p, value in zip(parameters, theta, strict=True)}
     names = {
         "format": FORMAT,
         "functions": {f.name(): {"arguments": f.name_in(), "results": f.name_out()} for f in functions},
         "rows": {block.name: list(block.names) for block in symbols.rows},
         "columns": {block.name: list(block.names) for block in symbols.columns},
-        "parameters": {p.name: {"value": float(value), "unit": p.unit} for p, value in zip(parameters, theta, strict=True)},
+        "parameters": values,
         "time_step": time_step,
     }
     listed = folder / "names.json"

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.analysis.formulas import Formula, formula, operations
+from yid_ocp.analysis.inspection import in_numbers
 from yid_ocp.analysis.symbols import Block, StepSymbols, latex_text
 from yid_ocp.files import write_text
 from yid_ocp.model.mechanism import merged
@@ -68,14 +69,19 @@ def write_sheet(path: Path, symbols: StepSymbols, theta: Array, free: Sequence[s
 
 def _rules(symbols: StepSymbols, time_step: float) -> list[str]:
     e = symbols.equations
-    force, pull = RULES[e.force_split], RULES[e.constraint_force]
+    held = e.lam.numel() > 0
+    force = RULES[e.force_split]
+    pull = [f" - {part}" if held else "" for part in RULES[e.constraint_force]]
+    rows = [
+        rf"0 &= p_k + \tfrac{{h}}{{2}} L_q(q_m, v_m) - L_v(q_m, v_m) + {force[0]}{pull[0]}",
+        rf"p_{{k+1}} &= \tfrac{{h}}{{2}} L_q(q_m, v_m) + L_v(q_m, v_m) + {force[1]}{pull[1]}",
+        *([r"0 &= \varphi(q_{k+1}) - C \lambda_k / h"] if held else []),
+    ]
     return [
         rf"Time step $h = {time_step:g}$ s, $q_m = (q_k + q_{{k+1}})/2$, $v_m = (q_{{k+1}} - q_k)/h$,",
         r"$L$ the Lagrangian of bodies, springs and energies, $F$ all other forces at the midpoint.",
         r"\begin{align*}",
-        rf"0 &= p_k + \tfrac{{h}}{{2}} L_q(q_m, v_m) - L_v(q_m, v_m) + {force[0]} - {pull[0]} \\",
-        rf"p_{{k+1}} &= \tfrac{{h}}{{2}} L_q(q_m, v_m) + L_v(q_m, v_m) + {force[1]} - {pull[1]} \\",
-        r"0 &= \varphi(q_{k+1}) - C \lambda_k / h",
+        " \\\\\n".join(rows),
         r"\end{align*}",
         r"The first line holds at free coordinates; at a prescribed one its right side is $-h$ times the effort.",
     ]
@@ -90,16 +96,8 @@ def _free_table(system: System, values: dict[str, float], free: Sequence[str]) -
 
 def _tree_tables(system: System, values: dict[str, float]) -> list[str]:
     """Joints with their placements, and bodies with their masses, all in numbers."""
-    own = system.parameters
-    vector = own.vector(values)
-    inner = ca.vertcat(*system.internal.values()) if system.internal else ca.SX(0, 1)
-    symbols = ca.vertcat(own.symbols, inner)
-    point = np.concatenate([vector, np.zeros(inner.numel())])
-
-    def number(expression: ca.SX) -> ca.SX:
-        return ca.SX(ca.densify(ca.Function("number", [symbols], [expression])(point)))
-
-    mechanism = system.mechanism.mapped(number)
+    built = in_numbers(system, system.parameters.vector(values))
+    mechanism = built.mechanism
     roles = dict.fromkeys(system.driven, "driven") | dict.fromkeys(system.prescribed, "prescribed")
     joints, bodies = [], []
     for joint in mechanism.joints:
@@ -108,14 +106,15 @@ def _tree_tables(system: System, values: dict[str, float]) -> list[str]:
         rotation = np.array(ca.DM(joint.placement.rotation))
         turned = "" if np.allclose(rotation, np.eye(3)) else f"${_matrix(rotation)}$"
         place = f"${_vector(np.array(ca.DM(joint.placement.translation)).ravel())}$"
-        joints.append((name, joint.kind, parent, roles.get(joint.name, "free"), f"${_vector(joint.axis)}$", place, turned))
+        axis, role = f"${_vector(joint.axis)}$", roles.get(joint.name, "free")
+        joints.append((name, joint.kind, parent, role, axis, place, turned))
         # what gravity pulls at may differ from the mass; only inertia is listed
         body = merged(b.__class__(b.mass, b.com, b.about_com) for b in joint.bodies)
         if body is not None:
             com = np.array(ca.DM(body.com)).ravel()
             tensor = np.array(ca.DM(body.about_com))
             bodies.append((name, f"${_value(float(body.mass))}$", f"${_vector(com)}$", f"${_matrix(tensor)}$"))
-    gravity = np.array(ca.DM(number(system.gravity))).ravel()
+    gravity = np.array(ca.DM(built.gravity)).ravel()
     return [
         r"\section*{Joints}",
         *_table("lllllll", ("joint", "kind", "parent", "role", "axis", "place [m]", "rotation"), joints),
@@ -138,8 +137,8 @@ def _rows(symbols: StepSymbols, block: Block, values: dict[str, float], free: Se
         sign = "-" if block.name == "del" else "+"
         pull = "" if not e.lam.numel() else ", $G$ the pull of the grasps"
         lines.append(
-            rf"$B$ stands for $\tfrac{{h}}{{2}} \, \partial (T - V) / \partial q_m {sign} \partial T / \partial v_m$ of the "
-            rf"bodies above{pull}."
+            rf"$B$ stands for $\tfrac{{h}}{{2}} \, \partial (T - V) / \partial q_m {sign} \partial T / \partial v_m$ "
+            rf"of the bodies above{pull}."
         )
     for i, label in enumerate(block.labels):
         letter = block.letter.replace("#", rf"\mathrm{{{latex_text(label)}}}")
@@ -168,7 +167,12 @@ def _equation(letter: str, value: str, made: Formula) -> str:
 
 def _table(columns: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     body = [" & ".join(row) + r" \\" for row in rows]
-    return [rf"{{\footnotesize\begin{{longtable}}{{{columns}}}", " & ".join(head) + r" \\ \hline", *body, r"\end{longtable}}"]
+    return [
+        rf"{{\footnotesize\begin{{longtable}}{{{columns}}}",
+        " & ".join(head) + r" \\ \hline",
+        *body,
+        r"\end{longtable}}",
+    ]
 
 
 def _value(value: float) -> str:

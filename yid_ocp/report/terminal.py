@@ -244,6 +244,7 @@ def check_summary(result: Mapping[str, Any]) -> list[str]:
     lines = [
         f"model: {model['n']} coordinates, {model['m']} constraints, {model['nu']} driven, {model['nc']} prescribed, "
         f"{model['ntheta']} parameters",
+        *(entry["words"] for entry in result["mechanics"].values() if entry["agrees"]),
         "",
     ]
     rows: Rows = [("recording", "use", "group", "samples", "rate", "longest gap", "noise (median)")]
