@@ -200,8 +200,9 @@ class Stages:
         Of their entries and of a step's multipliers.
     free : int
         Number of free parameters.
-    fixed : tuple of int
-        Rows of the first node's state that the start fixes; it depends on all free parameters.
+    fixed, loose : tuple of int
+        Rows of the first node's state that the start fixes, and that have a prior about it; the start depends on all
+        free parameters.
     """
 
     rows: Mask
@@ -214,6 +215,7 @@ class Stages:
     lam_labels: tuple[str, ...]
     free: int
     fixed: tuple[int, ...]
+    loose: tuple[int, ...]
 
     @property
     def multipliers(self) -> int:
@@ -222,7 +224,11 @@ class Stages:
 
 
 def stages(
-    symbols: StepSymbols, free: Sequence[str], sensors: Sequence[Sensor], followed: Sequence[int], fixed: Sequence[int]
+    symbols: StepSymbols,
+    free: Sequence[str],
+    sensors: Sequence[Sensor],
+    followed: Sequence[int],
+    loose: Sequence[int] = (),
 ) -> Stages:
     """Patterns of one stage of the NLP with a node at every step, in the order of `solvers.transcription`.
 
@@ -235,8 +241,8 @@ def stages(
         Those that read nodes.
     followed : sequence of int
         Rows of the state that the tracking filter feeds back to the torques.
-    fixed : sequence of int
-        Rows of the first node's state that the start fixes.
+    loose : sequence of int
+        Rows of the first node's state that are estimated, with a prior; the start fixes those that are not prescribed.
     """
     e, system = symbols.equations, symbols.equations.system
     kept = list(system.free_indices)
@@ -269,7 +275,8 @@ def stages(
     node_spans, node_labels = _spans(symbols, [("q0", None), ("p0", None), ("z0", None)])
     lam_labels = _spans(symbols, [("lam", None)])[1]
     spans, labels = (row_spans, node_spans), (row_labels, node_labels, lam_labels)
-    return Stages(by_stage, hessian, measured, *spans, *labels, f, tuple(fixed))
+    fixed = tuple(map(int, np.setdiff1d(np.arange(nx), [*system.prescribed_indices, *loose])))
+    return Stages(by_stage, hessian, measured, *spans, *labels, f, fixed, tuple(map(int, loose)))
 
 
 def kkt_size(stage: Stages, steps: Sequence[int]) -> KktSize:
@@ -295,6 +302,9 @@ def nlp_masks(stage: Stages, steps: int) -> tuple[Mask, Mask, Mask]:
     hessian, measured = np.zeros((width, width), bool), np.zeros((width, width), bool)
     jacobian[np.arange(len(fixed)), f + np.array(fixed, int)] = True
     jacobian[: len(fixed), :f] = True
+    if stage.loose:
+        begun = np.concatenate([np.arange(f), f + np.array(stage.loose)])
+        measured[np.ix_(begun, begun)] = True
     for k in range(steps + 1):
         # x_0, lam_0, x_1, lam_1, ...
         node = f + k * (nx + m)

@@ -196,9 +196,7 @@ def _nlp(symbols: StepSymbols, problem: EstimationProblem, picture: Path) -> Kkt
     episode = problem.episodes[0]
     sensors = [samples.sensor for samples in episode.samples if not samples.sensor.efforts]
     followed = () if episode.feedback is None else tuple(map(int, episode.feedback.index))
-    loose = problem.predictor.start_rows
-    fixed = np.setdiff1d(np.arange(problem.step.sizes["nx"]), [*problem.system.prescribed_indices, *loose])
-    stage = stages(symbols, problem.shared, sensors, followed, tuple(map(int, fixed)))
+    stage = stages(symbols, problem.shared, sensors, followed, problem.predictor.start_rows)
     steps = [entry.grid.steps for entry in problem.episodes]
     draw_patterns(picture, [[kkt_pattern(stage, problem.shared, min(SHOWN_STEPS, *steps))]])
     return kkt_size(stage, steps)
