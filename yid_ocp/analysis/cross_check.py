@@ -47,7 +47,7 @@ class CrossCheck:
     @property
     def agrees(self) -> bool:
         """Whether all three are one within rounding."""
-        return max(self.mass, self.weight, self.motion) <= TOLERANCE
+        return all(size <= TOLERANCE for size in (self.mass, self.weight, self.motion))
 
     @property
     def words(self) -> str:
@@ -57,7 +57,7 @@ class CrossCheck:
             said = f"{self.of}: mass matrix, weight and inverse dynamics are Pinocchio's"
             return f"{said} within {largest:.1g} of the largest entry"
         parts = (("mass matrix", self.mass), ("weight", self.weight), ("inverse dynamics", self.motion))
-        wrong = [f"{name} by {100 * size:.2g} %" for name, size in parts if size > TOLERANCE]
+        wrong = [f"{name} by {100 * size:.2g} %" for name, size in parts if not size <= TOLERANCE]
         return f"{self.of} differs from Pinocchio's: {', '.join(wrong)} of the largest entry"
 
 
