@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pathlib
 import subprocess
 import sys
 import time
@@ -225,7 +226,24 @@ def test_inspect(cli, pendulum, tmp_path):
     assert result["format"] == "yid-inspect/1"
     assert [entry["role"] for entry in result["variables"]] == ["prescribed", "prescribed"]
     assert result["parameters"]["shoulder.stiffness"]["free"]
-    assert (folder / "sparsity.png").read_bytes().startswith(b"\x89PNG")
+    for picture in ("sparsity.png", "kkt.png"):
+        assert (folder / picture).read_bytes().startswith(b"\x89PNG")
+    assert [block["names"][0] for block in result["blocks"]["rows"]] == ["del[shoulder]", "p1[shoulder]"]
+    assert result["patterns"]["A"]["shape"] == [4, 4]
+    steps = 120
+    assert result["nlp"]["variables"] == 3 + (steps + 1) * 4
+    damping = result["dependence"]["elbow.damping"]
+    assert damping["rows"] == damping["seen"] == ["del[elbow]", "p1[elbow]"]
+    assert damping["best"] == "joints.effort"
+    assert damping["along"] > 0
+    assert damping["words"] in " ".join(done.out.split())
+    # what is not free is in the result alone
+    assert "elbow.mass enters" not in done.out
+    assert result["dependence"]["elbow.mass"]["words"].startswith("elbow.mass enters 4 rows")
+    assert result["dependence"]["elbow.mass"]["along"] is None
+    lines = (folder / "equations.txt").read_text().splitlines()
+    assert any(line.startswith("del[elbow]: ") for line in lines)
+    assert (result["entries"], result["exported"]) == ([], [])
     with h5py.File(folder / "linearisation.h5") as file:
         assert file["A"].shape == (4, 4)
         assert file["B_theta"].shape == (4, len(result["parameters"]))
@@ -243,6 +261,45 @@ def test_inspect_agrees_with_finite_differences(cli, tmp_path, monkeypatch, urdf
     assert all(error < 1e-6 for error in result["linearisation"]["finite_difference_errors"].values())
     assert result["equations"]["unknowns"] == 2
     assert result["equations"]["jacobian_nonzeros"] == 4
+
+
+def test_inspect_prints_entries_and_exports_equations(cli, pendulum, tmp_path):
+    asked = ("--entry", "del[elbow], elbow.damping", "--entry", "p1[shoulder]", "--export", "eq")
+    done = cli("inspect", pendulum, "--out", "i", *asked)
+    assert done.code == 0, done.err
+    result = json.loads((tmp_path / "i" / "result.json").read_text())
+    assert [entry["title"] for entry in result["entries"]] == ["d del[elbow] / d elbow.damping", "p1[shoulder]"]
+    for entry in result["entries"]:
+        for line in entry["lines"]:
+            assert line in done.out
+    files = {path.name for path in (tmp_path / "eq").iterdir()}
+    assert files == {pathlib.Path(name).name for name in result["exported"]}
+    assert {"rows.casadi", "equations.c", "equations.tex", "names.json"} <= files
+
+
+@pytest.mark.parametrize(
+    ("entry", "said"),
+    [
+        ("dle[elbow]", "did you mean 'del[elbow]'?"),
+        ("del[elbow], q1[elbo]", "did you mean 'q1[elbow]'?"),
+        ("del[elbow], h, h", "the name of a row, or of a row and a column"),
+    ],
+)
+def test_a_wrong_entry_leaves_nothing_behind(cli, pendulum, tmp_path, entry, said):
+    done = cli("inspect", pendulum, "--out", "i", "--entry", entry, "--export", "eq")
+    assert done.code == 2
+    assert said in done.err
+    assert not (tmp_path / "i").exists()
+    assert not (tmp_path / "eq").exists()
+
+
+def test_check_compares_with_another_library(cli, pendulum, tmp_path):
+    done = cli("check", pendulum, "--out", "c")
+    assert done.code == 0, done.err
+    mechanics = json.loads((tmp_path / "c" / "result.json").read_text())["mechanics"]
+    assert set(mechanics) == {"built", "file"}
+    assert all(entry["agrees"] for entry in mechanics.values())
+    assert "double_pendulum.urdf as read: mass matrix, weight and inverse dynamics are Pinocchio's within" in done.out
 
 
 def test_simulate_is_a_recording_that_solve_reads(pendulum_data):
