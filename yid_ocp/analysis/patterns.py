@@ -77,8 +77,8 @@ class KktSize:
     jacobian_nonzeros : int
         Of the constraints.
     hessian_nonzeros : int
-        Both triangles of the exact Hessian of the constraints times their multipliers; what measurements add to it is
-        not counted.
+        Both triangles of the exact Hessian of the steps' constraints times their multipliers; what measurements add to
+        it is not counted, and the start is linear in the parameters, as multiple shooting takes it.
     """
 
     variables: int

@@ -305,6 +305,9 @@ def _convergence_lines(convergence: Mapping[str, Any]) -> list[str]:
     return [*lines, "", f"frequencies: {convergence['message']}"] if convergence["message"] else lines
 
 
+MOST = 12  # free parameters of which `inspect` speaks in the terminal
+
+
 def inspect_summary(result: Mapping[str, Any]) -> list[str]:
     """Lines that tell a person what a `yid-inspect/1` result says."""
     roles = [entry["role"] for entry in result["variables"]]
@@ -328,9 +331,13 @@ def inspect_summary(result: Mapping[str, Any]) -> list[str]:
         for name, norm in linear["norms"].items()
     ]
     lines += [*table(rows), "matrices: linearisation.h5", ""]
-    for name, entry in result["dependence"].items():
-        if result["parameters"][name]["free"]:
-            lines += textwrap.wrap(entry["words"], 120, subsequent_indent="  ")
+    free = [entry for name, entry in result["dependence"].items() if result["parameters"][name]["free"]]
+    for entry in free[:MOST]:
+        lines += textwrap.wrap(entry["words"], 120, subsequent_indent="  ")
+    if len(free) > MOST:
+        lines.append(f"and {len(free) - MOST} more free parameters, in result.json")
+    if any(entry["seen"] is None for entry in free):
+        lines.append("what sensors see to first order is looked for about a rest, which this is not")
     lines.append("where every parameter enters: result.json; all equations and names: equations.txt")
     for entry in result["entries"]:
         lines += ["", *entry["lines"]]

@@ -142,7 +142,7 @@ def run_inspect(
 
 
 def _point(step: Step, problem: EstimationProblem | None) -> Point:
-    """The rest at the first recording's first posture, or what comes nearest to it."""
+    """Where the first recording starts: at rest at its first posture, or as fitted to its first points."""
     system, sizes = step.system, step.sizes
     theta = system.parameters.vector()
     known = np.zeros(len(system.driven) + len(system.prescribed))
@@ -152,6 +152,10 @@ def _point(step: Step, problem: EstimationProblem | None) -> Point:
         known, words = episode.posture, f"rest at the first posture of {episode.name}"
         torque = episode.torque[0] if system.driven else None
         theta = problem.predictor.own_theta(episode, theta)
+        if episode.start is not None:
+            held = np.zeros(sizes["nu"]) if torque is None else torque
+            words = f"the start that was fitted to the first points of {episode.name}"
+            return Point(words, False, episode.start.state.copy(), held, theta, episode.path[0])
     rest = Statics(step).solve(known, theta, torque)
     if rest.converged:
         return Point(words, True, rest.state, rest.torque, theta, known[len(system.driven) :])
@@ -183,7 +187,7 @@ def _patterns(
         "B_theta": linearisation.b_theta,
         "dR_dtheta": np.vstack([rows.rows_theta[0], rows.p1_theta[0]]),
     }
-    where = "the rest" if point.resting else "zero"
+    where = "the rest" if point.resting else "this point"
     return {name: entry.with_values(values[name], where) for name, entry in step_patterns(symbols).items()}
 
 
