@@ -86,6 +86,7 @@ def test_an_entry_is_the_row_as_text(symbols, row):
     at, entry = point(symbols), symbols.entry(row)
     expected = value(symbols, symbols.all_rows, at)[symbols.row(row)]
     assert worked_out(symbols, entry, at) == pytest.approx(expected, rel=1e-9)
+    assert entry.value(symbols.all_columns, at) == pytest.approx(expected, rel=1e-12)
     assert entry.title == row
     assert entry.lines[0].startswith(f"{row}: {entry.formula.operations} operations, depends on ")
     assert entry.lines[-1] == f"  {row} = {entry.formula.values[0]}"

@@ -272,6 +272,14 @@ def test_inspect_prints_entries_and_exports_equations(cli, pendulum, tmp_path):
     for entry in result["entries"]:
         for line in entry["lines"]:
             assert line in done.out
+    # a damper takes half of what the coordinate moves, which is nothing at rest; there the momentum stays what it was
+    slope, momentum = result["entries"]
+    with h5py.File(tmp_path / "i" / "linearisation.h5") as file:
+        before = file["state"][2]
+    assert slope["value"] == pytest.approx(0.0, abs=1e-12)
+    assert abs(before) > 1e-3
+    assert momentum["value"] == pytest.approx(before, rel=1e-9)
+    assert f"  which is {before:.6g} at rest at the first posture of estimate" in done.out
     files = {path.name for path in (tmp_path / "eq").iterdir()}
     assert files == {pathlib.Path(name).name for name in result["exported"]}
     assert {"rows.casadi", "equations.c", "equations.tex", "names.json"} <= files

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
 
 from yid_ocp.analysis.formulas import Formula, Name, formula
 from yid_ocp.errors import ConfigError, nearest
@@ -82,6 +84,17 @@ class Entry:
     def zero(self) -> bool:
         """Whether it vanishes whatever the state."""
         return bool(self.expression.is_zero())
+
+    def value(self, variables: ca.SX, at: NDArray[np.float64]) -> float:
+        """The entry in numbers.
+
+        Parameters
+        ----------
+        variables : casadi.SX, shape (k, 1)
+            `StepSymbols.all_columns`.
+        at : ndarray, shape (k,)
+        """
+        return float(ca.Function("value", [variables], [ca.densify(self.expression)])(at))
 
     @property
     def lines(self) -> list[str]:

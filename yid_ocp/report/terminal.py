@@ -341,6 +341,9 @@ def inspect_summary(result: Mapping[str, Any]) -> list[str]:
     lines.append("where every parameter enters: result.json; all equations and names: equations.txt")
     for entry in result["entries"]:
         lines += ["", *entry["lines"]]
+        if not entry["zero"]:
+            value = "unknown" if entry["value"] is None else f"{entry['value']:.6g}"
+            lines.append(f"  which is {value} at {linear['at']}")
     if result["exported"]:
         lines += ["", f"exported: {', '.join(result['exported'])}"]
     return lines

@@ -131,7 +131,7 @@ def run_inspect(
             "nlp": None if nlp is None else asdict(nlp),
             "dependence": _dependence_result(_dependence(step, symbols, problem, point, rows)),
             "linearisation": _linearisation_result(linearisation, point),
-            "entries": [_entry_result(entry) for entry in chosen],
+            "entries": [_entry_result(entry, symbols, _columns_at(step, point)) for entry in chosen],
             "exported": [str(path) for path in files],
         }
         written = folder.finish(result)
@@ -170,6 +170,14 @@ def _linearised(step: Step, point: Point) -> tuple[Linearisation, StepLinearizat
     except np.linalg.LinAlgError as error:
         raise ModelError("the step cannot be linearised: its equations are singular", where=point.words) from error
     return found, linearised_rows(step, point.state, point.torque, point.theta, point.path)
+
+
+def _columns_at(step: Step, point: Point) -> Array:
+    """Every variable of the step that starts at the point, in the order of `StepSymbols.columns`."""
+    n = step.sizes["n"]
+    q, p, z = point.state[:n], point.state[n : 2 * n], point.state[2 * n :]
+    q1, _, lam, status = step(q, p, point.torque, point.theta, (point.path, point.path), z)
+    return np.concatenate([q, p, z, point.torque, point.theta, [step.time_step], q1, status.internal, lam])
 
 
 def _patterns(
@@ -248,9 +256,9 @@ def _dependence_result(found: Sequence[Dependence]) -> dict[str, dict[str, Any]]
     return {entry.parameter: {**asdict(entry), "words": entry.words} for entry in found}
 
 
-def _entry_result(entry: Entry) -> dict[str, Any]:
+def _entry_result(entry: Entry, symbols: StepSymbols, at: Array) -> dict[str, Any]:
     made = {"title": entry.title, "row": entry.row, "column": entry.column, "operations": entry.formula.operations}
-    return made | {"zero": entry.zero, "lines": entry.lines}
+    return made | {"zero": entry.zero, "value": entry.value(symbols.all_columns, at), "lines": entry.lines}
 
 
 def _linearisation_result(linearisation: Linearisation, point: Point) -> dict[str, Any]:
