@@ -16,6 +16,7 @@ FUNCTIONS = {
 
 def read(text: str) -> str:
     """The text as Python."""
+    assert not re.search(r"[*/]-", text), f"a sign behind a product reads badly: {text}"
     text = text.replace("^", "**")
     return re.sub(r"\bif\(", "where(", text)
 
@@ -49,6 +50,8 @@ def read_latex(text: str) -> str:
     text = re.sub(r"\\operatorname\{(\w+)\}", r"\1", text)
     text = re.sub(r"\\(sin|cos|tan|exp|log|tanh)\b", r"\1", text)
     text = re.sub(r"\|([^|]*)\|", r"abs(\1)", text)
+    # where two factors stand beside each other, a sign between them is a difference
+    text = re.sub(r"\\,\s*-", "-", text)
     for latex, python in ((r"\,", "*"), (r"\le ", "<= "), (r"\land", "and"), (r"\lnot", "not"), ("^", "**")):
         text = text.replace(latex, python)
     return text.replace("{", "(").replace("}", ")")

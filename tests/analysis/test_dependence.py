@@ -44,22 +44,24 @@ def judged(problem):
 
 @pytest.fixture(scope="module")
 def hanging():
-    """hanging(gravity): a rod of three links under the ceiling, its tip seen."""
+    """hanging(gravity, turned): a rod of three links under the ceiling or a wall, its tip seen."""
     rod = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=3, bend=4.0, twist=3.0)])
-    down = transform(roll_pitch_yaw(math.pi, 0.0, 0.0), (0.0, 0.0, 0.0))
     t = 0.01 * np.arange(STEPS + 1)
 
-    def build(gravity=(0.0, 0.0, -9.81), points=("w_T1",)):
-        system = System.build(objects=[(rod, None, down)], gravity=gravity)
+    def build(gravity=(0.0, 0.0, -9.81), turned=(math.pi, 0.0, 0.0)):
+        system = System.build(objects=[(rod, None, transform(roll_pitch_yaw(*turned), np.zeros(3)))], gravity=gravity)
         step = compile_step(system, 0.01, use_compiler=False)
-        recording = Recording(None, (camera(t, points),), name="hanging")
+        recording = Recording(None, (camera(t, ["w_T1"]),), name="hanging")
         return EstimationProblem(step, [recording], ("T1.bend", "T1.twist"), ProblemOptions())
 
     return build
 
 
-def test_the_twist_of_a_straight_rod_is_seen_by_nobody(hanging):
-    found, _, _ = judged(hanging())
+@pytest.mark.parametrize("turned", [(math.pi, 0.0, 0.0), (2.8, 0.3, 0.7), (2.0, -0.5, 1.1)])
+def test_the_twist_of_a_straight_rod_is_seen_by_nobody(hanging, turned):
+    """Also where it hangs along no axis of the world, so that its rest is straight within rounding only."""
+    along = np.array(roll_pitch_yaw(*turned))[:, 2]
+    found, _, _ = judged(hanging(gravity=9.81 * along, turned=turned))
     twist, bend = found["T1.twist"], found["T1.bend"]
     rows = tuple(f"{row}[T1_{i}_z]" for row in ("del", "p1") for i in range(3))
     assert twist.rows == rows
@@ -91,6 +93,20 @@ def test_a_length_changes_readings_directly(hanging):
     assert found["T1.length"].read == ("points_camera",)
     assert found["T1.bend"].read == ()
     assert "the reading of points_camera depends on it directly" in found["T1.length"].words
+
+
+def test_what_changes_readings_directly_counts(hanging):
+    problem = hanging()
+    found, rest, _ = judged(problem)
+    index = problem.system.parameters.index("T1.length")
+    ends = []
+    for sign in (1, -1):
+        theta = problem.theta.copy()
+        theta[index] += sign * 1e-5
+        ends.append(rolled_out(problem, rest, theta)[0])
+    assert found["T1.length"].moved == pytest.approx(np.max(np.abs(ends[0] - ends[1])) / 2e-5, rel=1e-6)
+    # the tip goes down by as much, of a standard deviation of 2 mm
+    assert found["T1.length"].moved == pytest.approx(1.0 / STD, rel=1e-6)
 
 
 # -- numbers, against rollouts ----------------------------------------------------------------------------------------

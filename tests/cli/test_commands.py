@@ -11,6 +11,7 @@ import time
 import h5py
 import pytest
 
+from yid_ocp.analysis.cross_check import CrossCheck
 from yid_ocp.cli import COMMANDS
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.schema import schema
@@ -308,6 +309,21 @@ def test_check_compares_with_another_library(cli, pendulum, tmp_path):
     assert set(mechanics) == {"built", "file"}
     assert all(entry["agrees"] for entry in mechanics.values())
     assert "double_pendulum.urdf as read: mass matrix, weight and inverse dynamics are Pinocchio's within" in done.out
+
+
+def test_check_warns_of_a_file_that_another_library_reads_otherwise(cli, pendulum, monkeypatch):
+    otherwise = CrossCheck("double_pendulum.urdf as read", 0.03, 0.0, 0.0)
+    monkeypatch.setattr("yid_ocp.workflow.check.check_file", lambda *arguments: otherwise)
+    done = cli("check", pendulum, "--out", "c")
+    assert done.code == 0, done.err
+    assert "warning: double_pendulum.urdf as read differs from Pinocchio's: mass matrix by 3 %" in done.out
+
+    def unread(*arguments):
+        raise ValueError("no such joint type")
+
+    monkeypatch.setattr("yid_ocp.workflow.check.check_file", unread)
+    done = cli("check", pendulum, "--out", "d")
+    assert "warning: double_pendulum.urdf cannot be compared, Pinocchio does not read it: no such joint" in done.out
 
 
 def test_simulate_is_a_recording_that_solve_reads(pendulum_data):
