@@ -233,6 +233,9 @@ def test_inspect(cli, pendulum, tmp_path):
     assert result["patterns"]["A"]["shape"] == [4, 4]
     steps = 120
     assert result["nlp"]["variables"] == 3 + (steps + 1) * 4
+    # efforts belong to steps, not to nodes
+    assert result["nlp"]["left_out"] == ["joints.effort"]
+    assert "Hessian can differ from zero; without joints.effort" in " ".join(done.out.split())
     damping = result["dependence"]["elbow.damping"]
     assert damping["rows"] == damping["seen"] == ["del[elbow]", "p1[elbow]"]
     assert damping["best"] == "joints.effort"

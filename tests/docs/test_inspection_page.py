@@ -42,6 +42,13 @@ def test_the_entry_that_it_quotes_is_the_one_that_comes_out(page, symbols) -> No
     assert "\n".join(f"    {line}" for line in lines) in page
 
 
+def test_its_script_runs(page, repository, monkeypatch, capsys) -> None:
+    [script] = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    monkeypatch.chdir(repository)
+    exec(compile(script, "inspection.md", "exec"), {})
+    assert "d del[T1_0_x] / d T1.bend = -h/2*0.5*(q0[T1_0_x] + q1[T1_0_x])" in capsys.readouterr().out
+
+
 def test_the_names_that_it_lists_are_names(page, symbols) -> None:
     listed = re.findall(r"`((?:del|constraint|p1|q0|p0|u|q1|lam)\[[\w.]+\])`", page)
     assert len(listed) > 6

@@ -373,6 +373,7 @@ def _pattern_lines(result: Mapping[str, Any]) -> list[str]:
     text = f"KKT matrix of the NLP with a node at every step (kkt.png): {size} x {size}, {nlp['variables']} variables, "
     text += f"{nlp['constraints']} constraints; {nlp['jacobian_nonzeros']} entries of the constraints' Jacobian and "
     text += f"{nlp['hessian_nonzeros']} of their Hessian can differ from zero"
+    text += f"; without {', '.join(nlp['left_out'])}" if nlp["left_out"] else ""
     return [*table(rows), *textwrap.wrap(text, 120)]
 
 

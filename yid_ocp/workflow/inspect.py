@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from yid_ocp.analysis.dependence import Dependence, dependence
 from yid_ocp.analysis.inspection import Linearisation, inspect_step, linearise, linearised_rows
-from yid_ocp.analysis.patterns import KktSize, Pattern, kkt_pattern, kkt_size, stages, step_patterns
+from yid_ocp.analysis.patterns import Pattern, kkt_pattern, kkt_size, stages, step_patterns
 from yid_ocp.analysis.symbols import Entry, StepSymbols
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import Run
@@ -117,7 +117,7 @@ def run_inspect(
         patterns = _patterns(symbols, linearisation, rows, point)
         draw_patterns(folder.path / "sparsity.png", _layout(patterns))
         folder.write("equations.txt", "\n".join(symbols.lines()) + "\n")
-        nlp = _nlp(symbols, problem, folder.path / "kkt.png") if problem is not None else None
+        nlp = None if problem is None else _nlp(symbols, problem, folder.path / "kkt.png")
         files = () if export is None else _exported(symbols, Path(export), point, free, step.time_step)
         result = {
             "format": FORMAT,
@@ -128,7 +128,7 @@ def run_inspect(
             "equations": asdict(inspect_step(step)),
             "blocks": _blocks(symbols),
             "patterns": {name: _pattern_result(pattern) for name, pattern in patterns.items()},
-            "nlp": None if nlp is None else asdict(nlp),
+            "nlp": nlp,
             "dependence": _dependence_result(_dependence(step, symbols, problem, point, rows)),
             "linearisation": _linearisation_result(linearisation, point),
             "entries": [_entry_result(entry, symbols, _columns_at(step, point)) for entry in chosen],
@@ -203,15 +203,16 @@ def _layout(patterns: dict[str, Pattern]) -> list[list[Pattern]]:
     return [[patterns[name] for name in row] for row in (("dR_dy", "A"), ("dR_dtheta", "B_theta", "B_u"))]
 
 
-def _nlp(symbols: StepSymbols, problem: EstimationProblem, picture: Path) -> KktSize:
-    """Size of the NLP with a node at every step, and the picture of its first steps."""
+def _nlp(symbols: StepSymbols, problem: EstimationProblem, picture: Path) -> dict[str, Any]:
+    """Size of the NLP with a node at every step and what it leaves out; draws the picture of its first steps."""
     episode = problem.episodes[0]
     sensors = [samples.sensor for samples in episode.samples if not samples.sensor.efforts]
+    left_out = [samples.sensor.group for samples in episode.samples if samples.sensor.efforts] + list(problem.local)
     followed = () if episode.feedback is None else tuple(map(int, episode.feedback.index))
     stage = stages(symbols, problem.shared, sensors, followed, problem.predictor.start_rows)
     steps = [entry.grid.steps for entry in problem.episodes]
     draw_patterns(picture, [[kkt_pattern(stage, problem.shared, min(SHOWN_STEPS, *steps))]])
-    return kkt_size(stage, steps)
+    return {**asdict(kkt_size(stage, steps)), "left_out": left_out}
 
 
 def _dependence(
