@@ -108,7 +108,7 @@ def test_a_file_is_read_as_pinocchio_reads_it(urdf_folder, file, joints, locked)
     package = file.startswith("package:")
     path = robot_description_file(file.removeprefix("package:")) if package else urdf_folder / file
     robot = read_urdf(file if package else path, joints=joints, locked=locked)
-    found = check_file(path, robot, joints, locked, GRAVITY)
+    found = check_file(path, robot, GRAVITY, joints, locked)
     assert found.agrees, found.words
     assert found.words.startswith(f"{path.name} as read: ")
 
@@ -119,7 +119,7 @@ def test_a_file_read_wrongly_is_said(urdf_folder):
     joint = robot.joints[-1]
     placement = replace(joint.placement, translation=joint.placement.translation + ca.SX(ca.DM([0.0, 0.0, 0.001])))
     wrong = replace(robot, joints=(*robot.joints[:-1], replace(joint, placement=placement)))
-    found = check_file(path, wrong, None, {}, GRAVITY)
+    found = check_file(path, wrong, GRAVITY)
     assert not found.agrees
     assert found.words.startswith("mixed_joints.urdf as read differs from Pinocchio's: ")
 
@@ -128,5 +128,24 @@ def test_a_lock_at_another_value_is_noticed(urdf_folder):
     path = urdf_folder / "mixed_joints.urdf"
     kept = ["extend", "hinge", "spin", "swing"]
     robot = read_urdf(path, joints=kept, locked={"nod": 0.7})
-    assert check_file(path, robot, kept, {"nod": 0.7}, GRAVITY).agrees
-    assert not check_file(path, robot, kept, {"nod": 0.6}, GRAVITY).agrees
+    assert check_file(path, robot, GRAVITY, kept, {"nod": 0.7}).agrees
+    assert not check_file(path, robot, GRAVITY, kept, {"nod": 0.6}).agrees
+
+
+@pytest.mark.parametrize(
+    ("file", "left_out", "joints"),
+    [("package:panda", ["panda_hand"], None), ("double_pendulum.urdf", ["lower"], ["shoulder"])],
+)
+def test_what_is_left_out_of_a_file_is_left_out_of_both(urdf_folder, file, left_out, joints):
+    path = robot_description_file("panda") if file.startswith("package:") else urdf_folder / file
+    robot = read_urdf(path, joints=joints, exclude_links=left_out)
+    found = check_file(path, robot, GRAVITY, joints, None, left_out)
+    assert found.agrees, found.words
+    whole = read_urdf(path, joints=robot.joint_names)
+    assert not check_file(path, whole, GRAVITY, robot.joint_names, None, left_out).agrees
+
+
+def test_a_file_that_pinocchio_does_not_read_is_said(tmp_path, urdf_folder):
+    (tmp_path / "odd.urdf").write_text("<robot name='odd'><link name='a'/><link name='b'/></robot>")
+    with pytest.raises(ValueError, match="valid URDF"):
+        check_file(tmp_path / "odd.urdf", read_urdf(urdf_folder / "double_pendulum.urdf"), GRAVITY)

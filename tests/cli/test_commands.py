@@ -316,12 +316,12 @@ def test_check_compares_with_another_library(cli, pendulum, tmp_path):
 
 def test_check_warns_of_a_file_that_another_library_reads_otherwise(cli, pendulum, monkeypatch):
     otherwise = CrossCheck("double_pendulum.urdf as read", 0.03, 0.0, 0.0)
-    monkeypatch.setattr("yid_ocp.workflow.check.check_file", lambda *arguments: otherwise)
+    monkeypatch.setattr("yid_ocp.workflow.check.check_file", lambda *arguments, **more: otherwise)
     done = cli("check", pendulum, "--out", "c")
     assert done.code == 0, done.err
     assert "warning: double_pendulum.urdf as read differs from Pinocchio's: mass matrix by 3 %" in done.out
 
-    def unread(*arguments):
+    def unread(*arguments, **more):
         raise ValueError("no such joint type")
 
     monkeypatch.setattr("yid_ocp.workflow.check.check_file", unread)

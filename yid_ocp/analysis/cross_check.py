@@ -6,6 +6,7 @@ system, object and effects included. The first shows a file that was read wrongl
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -78,24 +79,36 @@ def check_system(system: System, theta: Array, posture: Array) -> CrossCheck:
 
 
 def check_file(
-    path: Path, mechanism: Mechanism, joints: Sequence[str] | None, locked: Mapping[str, float], gravity: Array
+    path: Path,
+    mechanism: Mechanism,
+    gravity: Array,
+    joints: Sequence[str] | None = None,
+    locked: Mapping[str, float] | None = None,
+    exclude_links: Sequence[str] = (),
 ) -> CrossCheck:
     """A robot as this package read it beside Pinocchio's own reading of the file.
 
     Parameters
     ----------
     path : Path
-        URDF file, nothing of it left out.
+        URDF file.
     mechanism : Mechanism
-        What `read_urdf` made of it.
-    joints : sequence of str or None
-        Joints that were kept; all movable ones for None.
-    locked : mapping of str to float
-        Values of joints that were not [rad or m].
+        What `read_urdf` made of it with the same `joints`, `locked` and `exclude_links`.
     gravity : ndarray, shape (3,)
         [m/s^2]
+    joints : sequence of str, optional
+        Joints that were kept; all movable ones when absent.
+    locked : mapping of str to float, optional
+        Values of joints that were not [rad or m].
+    exclude_links : sequence of str
+        Links that were left out with all that hangs on them.
+
+    Raises
+    ------
+    ValueError
+        Pinocchio does not read the file.
     """
-    model = pin.buildModelFromUrdf(str(path))
+    model, locked = pin.buildModelFromXML(_without(path, exclude_links)), locked or {}
     if joints is not None:
         at = pin.neutral(model)
         for i, name in enumerate(model.names):
@@ -106,6 +119,26 @@ def check_file(
     return _compared(
         f"{path.name} as read", mechanism.numeric(), gravity, model, model, np.zeros(len(mechanism.joints))
     )
+
+
+def _without(path: Path, links: Sequence[str]) -> str:
+    """Text of a URDF file without some links and all that hangs on them."""
+    root = ElementTree.parse(path).getroot()
+    dropped, joints = set(links), root.findall("joint")
+    for _ in joints:
+        dropped |= {_link(joint, "child") for joint in joints if _link(joint, "parent") in dropped}
+    for joint in joints:
+        if _link(joint, "child") in dropped:
+            root.remove(joint)
+    for link in root.findall("link"):
+        if link.get("name") in dropped:
+            root.remove(link)
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _link(joint: ElementTree.Element, end: str) -> str:
+    named = joint.find(end)
+    return "" if named is None else named.get("link", "")
 
 
 def _nearest_to_zero(model: Any, joint: Any) -> float:

@@ -109,12 +109,12 @@ def _mechanics(
         theta = problem.predictor.own_theta(problem.episodes[0], theta)
         posture[[*system.driven_indices, *system.prescribed_indices]] = problem.episodes[0].posture
     found = {"built": check_system(system, theta, posture)}
-    if run.model.robot is not None and not arms.exclude_links:
+    if run.model.robot is not None:
         # the file's own numbers, not those that settings or effects put in their place
-        robot = read_urdf(run.model.robot, joints=arms.joints, locked=arms.locked)
+        read: dict[str, Any] = {"joints": arms.joints, "locked": arms.locked, "exclude_links": arms.exclude_links}
         path = input_files(run)[run.model.robot]
         try:
-            found["file"] = check_file(path, robot, arms.joints, arms.locked, np.array(run.model.gravity, float))
+            found["file"] = check_file(path, read_urdf(path, **read), np.array(run.model.gravity, float), **read)
         except ValueError as error:
             warnings.append(f"{path.name} cannot be compared, Pinocchio does not read it: {error}")
     warnings += [entry.words for entry in found.values() if not entry.agrees]
