@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.analysis.symbols import StepSymbols
-from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Grasp, Segment, System, flexible_object
 from yid_ocp.model.rotations import roll_pitch_yaw, transform
@@ -21,7 +21,7 @@ TIMES = 0.01 * np.arange(31)
 
 @pytest.fixture(scope="module")
 def hanging():
-    """hanging(start): a rod of two links under the ceiling, pushed aside by an eighth of a radian, its links' ends seen."""
+    """hanging(start): a rod of two links under the ceiling, an eighth of a radian aside; the ends of both are seen."""
     rod = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=2, bend=4.0, twist=3.0)])
     down = transform(roll_pitch_yaw(math.pi, 0.0, 0.0), np.zeros(3))
     step = compile_step(System.build(objects=[(rod, None, down)]), 0.01, use_compiler=False)
@@ -86,7 +86,3 @@ def test_what_has_no_rest_is_looked_at_where_all_is_zero(urdf_folder):
     assert point.words.startswith("zero, since there is no rest: ")
     assert not point.resting
     assert not np.any(point.state)
-    joints = JointGroup(
-        ("shoulder", "elbow"), TIMES, np.zeros((31, 2)), effort=np.zeros((31, 2)), effort_kind="command"
-    )
-    assert joints.names == system.driven
