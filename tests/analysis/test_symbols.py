@@ -177,6 +177,8 @@ def test_all_rows_are_listed_the_short_ones_whole(symbols):
     text = "\n".join(lines)
     for name in symbols.row_names:
         assert any(line.startswith(f"{name}: ") for line in lines), name
+    long = symbols.entry("del[T1_0_z]")
+    assert long.lines[0] in lines
     inner = symbols.rows[1].names[0]
     assert f"  {inner} = " in text
     assert "  del[T1_0_z] = " not in text

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.analysis.formulas import Formula, Name, formula
+from yid_ocp.analysis.formulas import Formula, Name, formula, operations
 from yid_ocp.errors import ConfigError, nearest
 from yid_ocp.integrator.discrete import DiscreteEquations
 from yid_ocp.model.flexible import AXES
@@ -22,7 +22,7 @@ TURNS: dict[str, tuple[str, ...]] = {
     "weld": tuple(f"turn_{axis}" for axis in AXES),
 }
 """What the equations of a grasp after the three of its position are called."""
-SHORT = 60  # operations up to which an equation is written out without being asked for
+SHORT = 80  # operations up to which an equation is written out without being asked for
 MANY = 6  # names of one block that are still listed one by one
 
 
@@ -244,13 +244,15 @@ class StepSymbols:
     def lines(self) -> list[str]:
         """All equations for people, the short ones whole, then the names of all variables."""
         said = []
+        place = {self.all_columns[i].element_hash(): i for i in range(self.all_columns.numel())}
         for at, name in enumerate(self.row_names):
-            made = formula([self.all_rows[at]], self.all_columns, self.names)
-            if made.operations <= SHORT:
-                entry = Entry(name, "", made, self.grouped(made.variables), self.all_rows[at])
-                said += entry.lines
+            row = self.all_rows[at]
+            count = operations([row], self.all_columns)
+            if count <= SHORT:
+                said += self.entry(name).lines
             else:
-                said.append(_headline(name, made.operations, self.grouped(made.variables)))
+                used = self.grouped(place[symbol.element_hash()] for symbol in ca.symvar(row))
+                said.append(_headline(name, count, used))
         blocks = [block for block in self.columns if block.labels]
         return [
             "equations of one step; `inspect --entry 'NAME'` prints any of them whole, with ', COLUMN' its derivative",

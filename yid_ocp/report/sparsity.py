@@ -83,6 +83,8 @@ def _draw(axes: Axes, pattern: Pattern) -> None:
     axes.tick_params(axis="x", labelrotation=90, length=2)
     axes.tick_params(axis="y", length=2)
     named = [span for span in pattern.columns if span.stop > span.start]
+    # names of narrow neighbours would be written over each other
+    narrow = len(named) > 8 or any(span.stop - span.start < 0.03 * pattern.mask.shape[1] for span in named)
     top = axes.secondary_xaxis("top")
     top.set_xticks([_middle(s) for s in named], labels=[s.name for s in named], fontsize=8, color=EDGE)
     named = [span for span in pattern.rows if span.stop > span.start]
@@ -90,9 +92,7 @@ def _draw(axes: Axes, pattern: Pattern) -> None:
     right.set_yticks([_middle(s) for s in named], labels=[s.name for s in named], fontsize=8, color=EDGE)
     for side in (top, right):
         side.tick_params(length=0)
-    # a few names of neighbouring narrow blocks would be written over each other
-    slender = any(span.stop - span.start < 0.03 * pattern.mask.shape[1] for span in pattern.columns)
-    top.tick_params(axis="x", labelrotation=90 if slender or len(pattern.columns) > 8 else 0)
+    top.tick_params(axis="x", labelrotation=90 if narrow else 0)
 
 
 def _middle(span: Span) -> float:
