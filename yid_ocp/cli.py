@@ -88,7 +88,10 @@ def _simulate(parser: argparse.ArgumentParser) -> None:
 
 def _inspect(parser: argparse.ArgumentParser) -> None:
     _configured(parser)
-    text = "print an equation, or with ROW, COLUMN its derivative, such as 'del[T1_0_x], q1[T1_0_x]'; may be repeated"
+    text = (
+        "print an equation, with ROW, COLUMN its derivative, such as 'del[T1_0_x], q1[T1_0_x]', or where a parameter "
+    )
+    text += "enters; may be repeated"
     parser.add_argument("--entry", metavar="ROW[, COLUMN]", action="append", default=[], dest="entries", help=text)
     text = "folder for the equations as CasADi functions, C and a LaTeX sheet"
     parser.add_argument("--export", metavar="DIR", help=text)

@@ -268,11 +268,22 @@ def test_inspect_agrees_with_finite_differences(cli, tmp_path, monkeypatch, urdf
 
 
 def test_inspect_prints_entries_and_exports_equations(cli, pendulum, tmp_path):
-    asked = ("--entry", "del[elbow], elbow.damping", "--entry", "p1[shoulder]", "--export", "eq")
+    asked = (
+        "--entry",
+        "del[elbow], elbow.damping",
+        "--entry",
+        "p1[shoulder]",
+        "--entry",
+        "elbow.mass",
+        "--export",
+        "eq",
+    )
     done = cli("inspect", pendulum, "--out", "i", *asked)
     assert done.code == 0, done.err
     result = json.loads((tmp_path / "i" / "result.json").read_text())
     assert [entry["title"] for entry in result["entries"]] == ["d del[elbow] / d elbow.damping", "p1[shoulder]"]
+    assert result["asked"] == ["elbow.mass"]
+    assert result["dependence"]["elbow.mass"]["words"] in " ".join(done.out.split())
     for entry in result["entries"]:
         for line in entry["lines"]:
             assert line in done.out
@@ -294,6 +305,7 @@ def test_inspect_prints_entries_and_exports_equations(cli, pendulum, tmp_path):
     [
         ("dle[elbow]", "did you mean 'del[elbow]'?"),
         ("del[elbow], q1[elbo]", "did you mean 'q1[elbow]'?"),
+        ("elbow.mas", "did you mean 'elbow.mass'?"),
         ("del[elbow], h, h", "the name of a row, or of a row and a column"),
     ],
 )

@@ -332,11 +332,12 @@ def inspect_summary(result: Mapping[str, Any]) -> list[str]:
     ]
     lines += [*table(rows), "matrices: linearisation.h5", ""]
     free = [entry for name, entry in result["dependence"].items() if result["parameters"][name]["free"]]
-    for entry in free[:MOST]:
+    asked = [result["dependence"][name] for name in result["asked"]]
+    for entry in [*free[:MOST], *(entry for entry in asked if entry not in free[:MOST])]:
         lines += textwrap.wrap(entry["words"], 120, subsequent_indent="  ")
     if len(free) > MOST:
         lines.append(f"and {len(free) - MOST} more free parameters, in result.json")
-    if any(entry["seen"] is None for entry in free):
+    if free and any(entry["seen"] is None for entry in free):
         lines.append("what sensors see to first order is looked for about a rest, which this is not")
     lines.append("where every parameter enters: result.json; all equations and names: equations.txt")
     for entry in result["entries"]:

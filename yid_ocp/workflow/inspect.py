@@ -90,7 +90,7 @@ def run_inspect(
     out : str or Path, optional
     progress : Progress, optional
     entries : sequence of str
-        Equations or their derivatives to write out, see `StepSymbols.entry`.
+        Equations or their derivatives to write out, see `StepSymbols.entry`; of a parameter, where it enters.
     export : str or Path, optional
         Folder for CasADi functions, C and a LaTeX sheet.
 
@@ -106,7 +106,7 @@ def run_inspect(
         seconds = time.perf_counter() - begun
         symbols = StepSymbols.of(step.equations)
         # a wrong name is told before anything takes time
-        chosen = [symbols.entry(text) for text in entries]
+        named, chosen = _asked(symbols, entries)
         free = tuple(name for name, said in parameter_settings(run, step.system.parameters).items() if said.free)
         progress.stage("linearising")
         problem = build_problem(run, step) if run.recordings.estimate and free else None
@@ -131,6 +131,7 @@ def run_inspect(
             "nlp": nlp,
             "dependence": _dependence_result(_dependence(step, symbols, problem, point, rows)),
             "linearisation": _linearisation_result(linearisation, point),
+            "asked": named,
             "entries": [_entry_result(entry, symbols, _columns_at(step, point)) for entry in chosen],
             "exported": [str(path) for path in files],
         }
@@ -139,6 +140,15 @@ def run_inspect(
 
 
 # -- what is computed -------------------------------------------------------------------------------------------------
+
+
+def _asked(symbols: StepSymbols, entries: Sequence[str]) -> tuple[list[str], list[Entry]]:
+    """Parameters, which are single names without brackets, and equations or derivatives among what was asked for."""
+    parameters = symbols.equations.system.parameters
+    named = [text.strip() for text in entries if text.strip() and not set(text) & set("[,")]
+    for name in named:
+        parameters.index(name)
+    return named, [symbols.entry(text) for text in entries if text.strip() not in named]
 
 
 def _point(step: Step, problem: EstimationProblem | None) -> Point:
