@@ -94,7 +94,21 @@ def test_rules_say_what_the_step_does(symbols, tmp_path):
     assert r"\tfrac{h}{2} F - \tfrac12" in sheet(symbols, tmp_path)
     system = symbols.equations.system
     left = StepSymbols.of(discrete_equations(system, "left", "node"))
-    assert r"+ h F - D\varphi(q_k)^{T} \lambda_k" in sheet(left, tmp_path)
+    text = sheet(left, tmp_path)
+    assert r"- L_v(q_m, v_m) + h F - D\varphi(q_k)^{T} \lambda_k" in text
+    assert "p_{k+1} &= \\tfrac{h}{2} L_q(q_m, v_m) + L_v(q_m, v_m) \\\\\n" in text
+    assert "multiplied by it" not in text
+    added = [
+        make_effect("grasp_compliance", "hand", system, {}),
+        make_effect("mount_compliance", "base", system, {}),
+    ]
+    soft = StepSymbols.of(discrete_equations(system.with_effects(added)))
+    assert soft.equations.constraint_gain is not None
+    assert soft.equations.system.compliant
+    text = sheet(soft, tmp_path, free=())
+    check(text)
+    assert r"+ T \left(" in text
+    assert "multiplied by it" in text
 
 
 def test_without_grasps_there_is_no_word_of_them(urdf_folder, tmp_path):

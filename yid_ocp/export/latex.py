@@ -29,12 +29,12 @@ HEAD = r"""\documentclass[a4paper,10pt]{article}
 \begin{document}
 """
 RULES = {
-    "symmetric": (r"\tfrac{h}{2} F", r"\tfrac{h}{2} F"),
-    "left": ("h F", "0"),
-    "node": (r"D\varphi(q_k)^{T} \lambda_k", "0"),
+    "symmetric": (r" + \tfrac{h}{2} F", r" + \tfrac{h}{2} F"),
+    "left": (" + h F", ""),
+    "node": (r" - D\varphi(q_k)^{T} \lambda_k", ""),
     "midpoint": (
-        r"\tfrac12 \left( D\varphi(q_k) + D\varphi(q_m) \right)^{T} \lambda_k",
-        r"\tfrac12 \left( D\varphi(q_m) - D\varphi(q_{k+1}) \right)^{T} \lambda_k",
+        r" - \tfrac12 \left( D\varphi(q_k) + D\varphi(q_m) \right)^{T} \lambda_k",
+        r" - \tfrac12 \left( D\varphi(q_m) - D\varphi(q_{k+1}) \right)^{T} \lambda_k",
     ),
 }
 """Force and pull in the balance, and in the momentum after the step, by `force_split` and `constraint_force`."""
@@ -71,11 +71,12 @@ def _rules(symbols: StepSymbols, time_step: float) -> list[str]:
     e = symbols.equations
     held = e.lam.numel() > 0
     force = RULES[e.force_split]
-    pull = [f" - {part}" if held else "" for part in RULES[e.constraint_force]]
+    pull = RULES[e.constraint_force] if held else ("", "")
+    slack = "" if e.constraint_gain is None else r" + T \left( \varphi(q_{k+1}) - \varphi(q_k) \right) / h"
     rows = [
-        rf"0 &= p_k + \tfrac{{h}}{{2}} L_q(q_m, v_m) - L_v(q_m, v_m) + {force[0]}{pull[0]}",
-        rf"p_{{k+1}} &= \tfrac{{h}}{{2}} L_q(q_m, v_m) + L_v(q_m, v_m) + {force[1]}{pull[1]}",
-        *([r"0 &= \varphi(q_{k+1}) - C \lambda_k / h"] if held else []),
+        rf"0 &= p_k + \tfrac{{h}}{{2}} L_q(q_m, v_m) - L_v(q_m, v_m){force[0]}{pull[0]}",
+        rf"p_{{k+1}} &= \tfrac{{h}}{{2}} L_q(q_m, v_m) + L_v(q_m, v_m){force[1]}{pull[1]}",
+        *([rf"0 &= \varphi(q_{{k+1}}){slack} - C \lambda_k / h"] if held else []),
     ]
     return [
         rf"Time step $h = {time_step:g}$ s, $q_m = (q_k + q_{{k+1}})/2$, $v_m = (q_{{k+1}} - q_k)/h$,",
@@ -84,6 +85,7 @@ def _rules(symbols: StepSymbols, time_step: float) -> list[str]:
         " \\\\\n".join(rows),
         r"\end{align*}",
         r"The first line holds at free coordinates; at a prescribed one its right side is $-h$ times the effort.",
+        *(["Rows of coordinates that a compliance holds are multiplied by it."] if e.system.compliant else []),
     ]
 
 
