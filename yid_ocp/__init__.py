@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from yid_ocp.analysis.identifiability import identifiability as identifiability
+    from yid_ocp.analysis.symbols import StepSymbols as StepSymbols
     from yid_ocp.analysis.what_if import what_if as what_if
     from yid_ocp.config.reader import load_config as load_config
     from yid_ocp.data import Recording as Recording
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
 # here and imported above.
 _HOMES: dict[str, tuple[str, ...]] = {
     "analysis.identifiability": ("identifiability",),
+    "analysis.symbols": ("StepSymbols",),
     "analysis.what_if": ("what_if",),
     "config.reader": ("load_config",),
     "data": ("Recording", "read_any", "read_recording", "write_recording"),
@@ -87,6 +89,7 @@ __all__ = [
     "Solution",
     "Status",
     "SteepestDescent",
+    "StepSymbols",
     "System",
     "YidError",
     "__version__",

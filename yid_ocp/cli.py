@@ -86,6 +86,17 @@ def _simulate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--noise", action="store_true", help="add noise of the recorded standard deviations")
 
 
+def _inspect(parser: argparse.ArgumentParser) -> None:
+    _configured(parser)
+    text = (
+        "print an equation, with ROW, COLUMN its derivative, such as 'del[T1_0_x], q1[T1_0_x]', or where a parameter "
+    )
+    text += "enters; may be repeated"
+    parser.add_argument("--entry", metavar="ROW[, COLUMN]", action="append", default=[], dest="entries", help=text)
+    text = "folder for the equations as CasADi functions, C and a LaTeX sheet"
+    parser.add_argument("--export", metavar="DIR", help=text)
+
+
 def _import(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", metavar="FILE", help="CSV file or folder, rosbag, MCAP, or a recording")
     parser.add_argument("--out", metavar="RECORDING.h5", required=True, help="recording to write")
@@ -125,7 +136,7 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command("simulate", "write what the model says would be recorded", "simulate", _simulate),
     Command("check", "validate a configuration, its recordings and the model before a long run", "check", _configured),
-    Command("inspect", "show the model's equations in numbers", "inspect", _configured),
+    Command("inspect", "show the model's equations: names, patterns, single entries, numbers", "inspect", _inspect),
     Command("track", "measure the object's points in the frames of a depth camera", "track", _configured),
     Command("import", "turn CSV, rosbag or MCAP into a recording", "import_recording", _import),
     Command("export", "turn a recording into CSV", "export_recording", _export),

@@ -10,7 +10,6 @@ import casadi as ca
 import numpy as np
 import pytest
 from made_recordings import places
-from matplotlib.figure import Figure
 
 from yid_ocp.analysis import convergence
 from yid_ocp.analysis.convergence import grasp_gaps, held_still, natural_frequencies
@@ -21,9 +20,7 @@ from yid_ocp.analysis.inspection import (
     inspect_step,
     jacobian_sparsity,
     linearise,
-    sparsity_picture,
 )
-from yid_ocp.errors import OutputError
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Grasp, Segment, System, flexible_object
 from yid_ocp.model.system import Spring
@@ -74,45 +71,6 @@ def test_the_pattern_is_of_the_residual_by_its_unknowns(held):
     # a multiplier does not enter the constraint that it keeps
     corner = np.array(ca.DM(pattern, 1.0))[-held.sizes["m"] :, -held.sizes["m"] :]
     assert not np.any(corner)
-
-
-@pytest.fixture
-def drawn(monkeypatch):
-    """Figures that were saved."""
-    figures, save = [], Figure.savefig
-
-    def keep(self, *arguments, **settings):
-        figures.append(self)
-        return save(self, *arguments, **settings)
-
-    monkeypatch.setattr(Figure, "savefig", keep)
-    return figures
-
-
-def test_the_picture_shows_the_pattern_and_sets_blocks_apart(held, drawn, tmp_path):
-    sparsity_picture(held, tmp_path / "pattern.png")
-    assert (tmp_path / "pattern.png").read_bytes().startswith(b"\x89PNG")
-    axes = drawn[0].axes[0]
-    pattern = jacobian_sparsity(held)
-    row, column = pattern.get_triplet()
-    points = axes.collections[0].get_offsets()
-    np.testing.assert_array_equal(points, np.stack([column, row], axis=1))
-    count, m = pattern.size1(), held.sizes["m"]
-    lines = [line.get_xydata() for line in axes.lines]
-    across = {float(line[0, 1]) for line in lines if line[0, 1] == line[1, 1]}
-    along = {float(line[0, 0]) for line in lines if line[0, 0] == line[1, 0]}
-    assert across == along == {count - m - held.sizes["nz"] - 0.5, count - m - 0.5}
-    assert axes.get_xlim() == (-0.5, count - 0.5)
-    assert axes.get_ylim() == (count - 0.5, -0.5)
-    assert axes.get_title() == f"Jacobian of one step: {count} x {count}, {pattern.nnz()} nonzeros"
-
-
-def test_a_picture_without_constraints_has_no_lines(swing, drawn, tmp_path):
-    sparsity_picture(swing, tmp_path / "pattern.png")
-    assert not drawn[0].axes[0].lines
-    with pytest.raises(OutputError, match="cannot be written") as caught:
-        sparsity_picture(swing, tmp_path / "nowhere" / "pattern.png")
-    assert str(tmp_path / "nowhere") in str(caught.value.where)
 
 
 # -- linearisation ----------------------------------------------------------------------------------------------------

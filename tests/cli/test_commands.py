@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pathlib
 import subprocess
 import sys
 import time
@@ -10,6 +11,7 @@ import time
 import h5py
 import pytest
 
+from yid_ocp.analysis.cross_check import CrossCheck
 from yid_ocp.cli import COMMANDS
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.schema import schema
@@ -225,7 +227,27 @@ def test_inspect(cli, pendulum, tmp_path):
     assert result["format"] == "yid-inspect/1"
     assert [entry["role"] for entry in result["variables"]] == ["prescribed", "prescribed"]
     assert result["parameters"]["shoulder.stiffness"]["free"]
-    assert (folder / "sparsity.png").read_bytes().startswith(b"\x89PNG")
+    for picture in ("sparsity.png", "kkt.png"):
+        assert (folder / picture).read_bytes().startswith(b"\x89PNG")
+    assert [block["names"][0] for block in result["blocks"]["rows"]] == ["del[shoulder]", "p1[shoulder]"]
+    assert result["patterns"]["A"]["shape"] == [4, 4]
+    steps = 120
+    assert result["nlp"]["variables"] == 3 + (steps + 1) * 4
+    # efforts belong to steps, not to nodes
+    assert result["nlp"]["left_out"] == ["joints.effort"]
+    assert "Hessian can differ from zero; without joints.effort" in " ".join(done.out.split())
+    damping = result["dependence"]["elbow.damping"]
+    assert damping["rows"] == damping["seen"] == ["del[elbow]", "p1[elbow]"]
+    assert damping["best"] == "joints.effort"
+    assert damping["along"] > 0
+    assert damping["words"] in " ".join(done.out.split())
+    # what is not free is in the result alone
+    assert "elbow.mass enters" not in done.out
+    assert result["dependence"]["elbow.mass"]["words"].startswith("elbow.mass enters 4 rows")
+    assert result["dependence"]["elbow.mass"]["along"] is None
+    lines = (folder / "equations.txt").read_text().splitlines()
+    assert any(line.startswith("del[elbow]: ") for line in lines)
+    assert (result["entries"], result["exported"]) == ([], [])
     with h5py.File(folder / "linearisation.h5") as file:
         assert file["A"].shape == (4, 4)
         assert file["B_theta"].shape == (4, len(result["parameters"]))
@@ -243,6 +265,80 @@ def test_inspect_agrees_with_finite_differences(cli, tmp_path, monkeypatch, urdf
     assert all(error < 1e-6 for error in result["linearisation"]["finite_difference_errors"].values())
     assert result["equations"]["unknowns"] == 2
     assert result["equations"]["jacobian_nonzeros"] == 4
+
+
+def test_inspect_prints_entries_and_exports_equations(cli, pendulum, tmp_path):
+    asked = (
+        "--entry",
+        "del[elbow], elbow.damping",
+        "--entry",
+        "p1[shoulder]",
+        "--entry",
+        "elbow.mass",
+        "--export",
+        "eq",
+    )
+    done = cli("inspect", pendulum, "--out", "i", *asked)
+    assert done.code == 0, done.err
+    result = json.loads((tmp_path / "i" / "result.json").read_text())
+    assert [entry["title"] for entry in result["entries"]] == ["d del[elbow] / d elbow.damping", "p1[shoulder]"]
+    assert result["asked"] == ["elbow.mass"]
+    assert result["dependence"]["elbow.mass"]["words"] in " ".join(done.out.split())
+    for entry in result["entries"]:
+        for line in entry["lines"]:
+            assert line in done.out
+    # a damper takes half of what the coordinate moves, which is nothing at rest; there the momentum stays what it was
+    slope, momentum = result["entries"]
+    with h5py.File(tmp_path / "i" / "linearisation.h5") as file:
+        before = file["state"][2]
+    assert slope["value"] == pytest.approx(0.0, abs=1e-12)
+    assert abs(before) > 1e-3
+    assert momentum["value"] == pytest.approx(before, rel=1e-9)
+    assert f"  which is {before:.6g} at rest at the first posture of estimate" in done.out
+    files = {path.name for path in (tmp_path / "eq").iterdir()}
+    assert files == {pathlib.Path(name).name for name in result["exported"]}
+    assert {"rows.casadi", "equations.c", "equations.tex", "names.json"} <= files
+
+
+@pytest.mark.parametrize(
+    ("entry", "said"),
+    [
+        ("dle[elbow]", "did you mean 'del[elbow]'?"),
+        ("del[elbow], q1[elbo]", "did you mean 'q1[elbow]'?"),
+        ("elbow.mas", "did you mean 'elbow.mass'?"),
+        ("del[elbow], h, h", "the name of a row, or of a row and a column"),
+    ],
+)
+def test_a_wrong_entry_leaves_nothing_behind(cli, pendulum, tmp_path, entry, said):
+    done = cli("inspect", pendulum, "--out", "i", "--entry", entry, "--export", "eq")
+    assert done.code == 2
+    assert said in done.err
+    assert not (tmp_path / "i").exists()
+    assert not (tmp_path / "eq").exists()
+
+
+def test_check_compares_with_another_library(cli, pendulum, tmp_path):
+    done = cli("check", pendulum, "--out", "c")
+    assert done.code == 0, done.err
+    mechanics = json.loads((tmp_path / "c" / "result.json").read_text())["mechanics"]
+    assert set(mechanics) == {"built", "file"}
+    assert all(entry["agrees"] for entry in mechanics.values())
+    assert "double_pendulum.urdf as read: mass matrix, weight and inverse dynamics are Pinocchio's within" in done.out
+
+
+def test_check_warns_of_a_file_that_another_library_reads_otherwise(cli, pendulum, monkeypatch):
+    otherwise = CrossCheck("double_pendulum.urdf as read", 0.03, 0.0, 0.0)
+    monkeypatch.setattr("yid_ocp.workflow.check.check_file", lambda *arguments, **more: otherwise)
+    done = cli("check", pendulum, "--out", "c")
+    assert done.code == 0, done.err
+    assert "warning: double_pendulum.urdf as read differs from Pinocchio's: mass matrix by 3 %" in done.out
+
+    def unread(*arguments, **more):
+        raise ValueError("no such joint type")
+
+    monkeypatch.setattr("yid_ocp.workflow.check.check_file", unread)
+    done = cli("check", pendulum, "--out", "d")
+    assert "warning: double_pendulum.urdf cannot be compared, Pinocchio does not read it: no such joint" in done.out
 
 
 def test_simulate_is_a_recording_that_solve_reads(pendulum_data):

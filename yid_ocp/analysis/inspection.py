@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from yid_ocp.errors import OutputError
 from yid_ocp.integrator.step import Step, check_shape
+from yid_ocp.integrator.step_model import StepLinearization
+from yid_ocp.model.system import System
 
 Array = NDArray[np.float64]
 
@@ -91,38 +91,6 @@ def jacobian_sparsity(step: Step) -> ca.Sparsity:
     return pattern
 
 
-def sparsity_picture(step: Step, path: str | Path) -> None:
-    """Draw the pattern of the residual's Jacobian as PNG, blocks of coordinates and multipliers set apart.
-
-    Raises
-    ------
-    OutputError
-    """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    pattern = jacobian_sparsity(step)
-    row, column = (np.array(part) for part in pattern.get_triplet())
-    count, m = pattern.size1(), step.sizes["m"]
-    figure = Figure(figsize=(6.4, 6.6), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    axes.scatter(column, row, s=max(1.0, (250.0 / max(count, 1)) ** 2), marker="s", color="#0b6e99", linewidths=0)
-    for edge in (count - m - step.sizes["nz"] - 0.5, count - m - 0.5):
-        if -0.5 < edge < count - 0.5:
-            axes.axhline(edge, color="#c2571a", linewidth=0.8)
-            axes.axvline(edge, color="#c2571a", linewidth=0.8)
-    edge = max(count, 1) - 0.5
-    axes.set(xlim=(-0.5, edge), ylim=(edge, -0.5), aspect="equal")
-    axes.set_xlabel("unknown: coordinates, internal coordinates, multipliers")
-    axes.set_ylabel("equation")
-    axes.set_title(f"Jacobian of one step: {count} x {count}, {pattern.nnz()} nonzeros", fontsize=10)
-    try:
-        figure.savefig(path, dpi=130, format="png")
-    except OSError as error:
-        raise OutputError(f"the picture cannot be written: {error.strerror}", where=str(path)) from error
-
-
 def linearise(
     step: Step, state: ArrayLike, torque: ArrayLike, theta: ArrayLike, prescribed: tuple[ArrayLike, ArrayLike] | None
 ) -> Linearisation:
@@ -160,6 +128,38 @@ def linearise(
     }
     radius = float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0))
     return Linearisation(x, a, b_input, b_theta, radius, errors)
+
+
+def linearised_rows(step: Step, state: Array, torque: Array, theta: Array, path: Array) -> StepLinearization:
+    """Equations of the step that starts at a state, with their derivatives by all parameters.
+
+    Parameters
+    ----------
+    step : Step
+    state : ndarray, shape (nx,)
+        (q, p, z)
+    torque : ndarray, shape (nu,)
+        [N m]
+    theta : ndarray, shape (ntheta,)
+    path : ndarray, shape (nc,)
+        Prescribed coordinates, before and after the step.
+    """
+    n = step.sizes["n"]
+    q1, p1, lam, status = step(state[:n], state[n : 2 * n], torque, theta, (path, path), state[2 * n :])
+    pair = np.stack([state, np.concatenate([q1, p1, status.internal])])
+    return step.kernel.linearize(theta, pair, lam[None, :], torque[None, :], step.system.parameters.names, True)
+
+
+def in_numbers(system: System, theta: Array) -> System:
+    """The system with numbers in place of its parameters, internal coordinates at zero."""
+    inner = ca.vertcat(*system.internal.values()) if system.internal else ca.SX(0, 1)
+    symbols = ca.vertcat(system.parameters.symbols, inner)
+    values = np.concatenate([theta, np.zeros(inner.numel())])
+
+    def number(expression: ca.SX) -> ca.SX:
+        return ca.SX(ca.densify(ca.Function("number", [symbols], [expression])(values)))
+
+    return system.mapped(number)
 
 
 def _differences(function: Callable[[Array], Array], at: Array) -> Array:

@@ -244,6 +244,7 @@ def check_summary(result: Mapping[str, Any]) -> list[str]:
     lines = [
         f"model: {model['n']} coordinates, {model['m']} constraints, {model['nu']} driven, {model['nc']} prescribed, "
         f"{model['ntheta']} parameters",
+        *(entry["words"] for entry in result["mechanics"].values() if entry["agrees"]),
         "",
     ]
     rows: Rows = [("recording", "use", "group", "samples", "rate", "longest gap", "noise (median)")]
@@ -304,6 +305,9 @@ def _convergence_lines(convergence: Mapping[str, Any]) -> list[str]:
     return [*lines, "", f"frequencies: {convergence['message']}"] if convergence["message"] else lines
 
 
+MOST = 12  # free parameters of which `inspect` speaks in the terminal
+
+
 def inspect_summary(result: Mapping[str, Any]) -> list[str]:
     """Lines that tell a person what a `yid-inspect/1` result says."""
     roles = [entry["role"] for entry in result["variables"]]
@@ -318,9 +322,7 @@ def inspect_summary(result: Mapping[str, Any]) -> list[str]:
     lines += [*table(rows), ""]
     rows = [("function", "operations", "nonzeros")]
     rows += [(f["name"], str(f["operations"]), str(f["nonzeros"])) for f in equations["functions"]]
-    count = equations["unknowns"]
-    lines += [*table(rows), ""]
-    lines.append(f"Jacobian of the step: {count} x {count}, {equations['jacobian_nonzeros']} nonzeros (sparsity.png)")
+    lines += [*table(rows), "", *_block_lines(result["blocks"]), *_pattern_lines(result), ""]
     linear = result["linearisation"]
     lines.append(f"linearised at {linear['at']}: spectral radius of A {linear['spectral_radius']:.6g}")
     rows = [("matrix", "norm", "largest difference from finite differences")]
@@ -328,7 +330,52 @@ def inspect_summary(result: Mapping[str, Any]) -> list[str]:
         (name, f"{norm:.4g}", f"{linear['finite_difference_errors'][name]:.1e}")
         for name, norm in linear["norms"].items()
     ]
-    return [*lines, *table(rows), "matrices: linearisation.h5"]
+    lines += [*table(rows), "matrices: linearisation.h5", ""]
+    free = [entry for name, entry in result["dependence"].items() if result["parameters"][name]["free"]]
+    asked = [result["dependence"][name] for name in result["asked"]]
+    for entry in [*free[:MOST], *(entry for entry in asked if entry not in free[:MOST])]:
+        lines += textwrap.wrap(entry["words"], 120, subsequent_indent="  ")
+    if len(free) > MOST:
+        lines.append(f"and {len(free) - MOST} more free parameters, in result.json")
+    if free and any(entry["seen"] is None for entry in free):
+        lines.append("what sensors see to first order is looked for about a rest, which this is not")
+    lines.append("where every parameter enters: result.json; all equations and names: equations.txt")
+    for entry in result["entries"]:
+        lines += ["", *entry["lines"]]
+        if not entry["zero"]:
+            value = "unknown" if entry["value"] is None else f"{entry['value']:.6g}"
+            lines.append(f"  which is {value} at {linear['at']}")
+    if result["exported"]:
+        lines += ["", f"exported: {', '.join(result['exported'])}"]
+    return lines
+
+
+def _block_lines(blocks: Mapping[str, Any]) -> list[str]:
+    """Blocks of rows and columns with the name of their first entry."""
+    lines: list[str] = []
+    for kind, head in (("rows", "equations of a step"), ("columns", "variables of a step")):
+        rows: Rows = [(head, "", "first", "")]
+        rows += [(b["name"], str(len(b["names"])), b["names"][0], b["meaning"]) for b in blocks[kind]]
+        lines += [*table(rows), ""]
+    return lines
+
+
+def _pattern_lines(result: Mapping[str, Any]) -> list[str]:
+    """Sizes of matrices, and how many entries can and do differ from zero."""
+    rows: Rows = [("matrix (sparsity.png)", "size", "can differ from zero", "do at this point")]
+    for name, entry in result["patterns"].items():
+        height, width = entry["shape"]
+        if height and width:
+            rows.append((name, f"{height} x {width}", str(entry["nonzeros"]), str(entry["at_point"])))
+    nlp = result["nlp"]
+    if nlp is None:
+        return table(rows)
+    size = nlp["variables"] + nlp["constraints"]
+    text = f"KKT matrix of the NLP with a node at every step (kkt.png): {size} x {size}, {nlp['variables']} variables, "
+    text += f"{nlp['constraints']} constraints; {nlp['jacobian_nonzeros']} entries of the constraints' Jacobian and "
+    text += f"{nlp['hessian_nonzeros']} of their Hessian can differ from zero"
+    text += f"; without {', '.join(nlp['left_out'])}" if nlp["left_out"] else ""
+    return [*table(rows), *textwrap.wrap(text, 120)]
 
 
 def simulate_summary(result: Mapping[str, Any]) -> list[str]:

@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from yid_ocp.analysis.cross_check import check_file, check_system
 from yid_ocp.analysis.stability import growth_of_fit
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import Run
 from yid_ocp.data.recording import Recording
+from yid_ocp.integrator.step import Step
+from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.options import SensorOptions
 from yid_ocp.report.terminal import check_summary
 from yid_ocp.sensors.joints import EFFORT, POSITION, angle_std, is_stated, torque_std
 from yid_ocp.solvers.base import estimates, uncertainty
-from yid_ocp.workflow.build import build_problem, build_step, first_gaps
+from yid_ocp.workflow.build import build_problem, build_step, first_gaps, input_files
 from yid_ocp.workflow.command import DONE, carry_out
 from yid_ocp.workflow.folder import new_run_folder
 from yid_ocp.workflow.progress import SILENT, Progress
@@ -77,12 +80,15 @@ def run_check(run: Run, out: str | Path | None = None, progress: Progress = SILE
             problem = build_problem(plain, step)
             for role, episodes in (("estimate", problem.episodes), ("held_out", problem.held_out)):
                 recordings += [_recording(problem, role, episode, warnings) for episode in episodes]
+        progress.stage("comparing the bodies with another library")
+        mechanics = _mechanics(plain, step, problem, warnings)
         progress.stage("refining links and time step")
         convergence = refine(run, problem, warnings)
         moved = {} if problem is None else _moves(plain, problem, warnings, progress)
         result = {
             "format": FORMAT,
             "model": model,
+            "mechanics": mechanics,
             "recordings": recordings,
             "convergence": convergence,
             "discretisation": moved,
@@ -90,6 +96,29 @@ def run_check(run: Run, out: str | Path | None = None, progress: Progress = SILE
         }
         written = folder.finish(result)
     return CheckOutcome(folder.path, written)
+
+
+def _mechanics(
+    run: Run, step: Step, problem: EstimationProblem | None, warnings: list[str]
+) -> dict[str, dict[str, Any]]:
+    """The robot's file as it was read, and the built model, beside Pinocchio's."""
+    system, arms = step.system, run.model.arms
+    theta = system.parameters.vector()
+    posture = np.zeros(system.size)
+    if problem is not None:
+        theta = problem.predictor.own_theta(problem.episodes[0], theta)
+        posture[[*system.driven_indices, *system.prescribed_indices]] = problem.episodes[0].posture
+    found = {"built": check_system(system, theta, posture)}
+    if run.model.robot is not None:
+        # the file's own numbers, not those that settings or effects put in their place
+        read: dict[str, Any] = {"joints": arms.joints, "locked": arms.locked, "exclude_links": arms.exclude_links}
+        path = input_files(run)[run.model.robot]
+        try:
+            found["file"] = check_file(path, read_urdf(path, **read), np.array(run.model.gravity, float), **read)
+        except ValueError as error:
+            warnings.append(f"{path.name} cannot be compared, Pinocchio does not read it: {error}")
+    warnings += [entry.words for entry in found.values() if not entry.agrees]
+    return {name: {**asdict(entry), "agrees": entry.agrees, "words": entry.words} for name, entry in found.items()}
 
 
 def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings: list[str]) -> dict[str, Any]:

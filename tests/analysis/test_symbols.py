@@ -1,0 +1,191 @@
+"""Rows and columns of a step by name: what stands under a name, its derivative, and names that do not exist."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+from formula_reader import FUNCTIONS, read
+
+from yid_ocp.analysis.symbols import StepSymbols, constraint_names, latex_text
+from yid_ocp.effects import make_effect
+from yid_ocp.errors import ConfigError
+from yid_ocp.integrator.discrete import discrete_equations
+from yid_ocp.model import Grasp, Segment, System, flexible_object
+from yid_ocp.model.system import Spring
+from yid_ocp.model.urdf import read_urdf
+
+
+@pytest.fixture(scope="module")
+def symbols(urdf_folder):
+    """A driven shoulder, a springy elbow whose tip is tied to a rod; a relaxing branch on the rod."""
+    robot = read_urdf(urdf_folder / "double_pendulum.urdf")
+    rod = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=2, bend=4.0, twist=3.0)])
+    system = System.build(
+        robot,
+        objects=[(rod, None, None)],
+        grasps=[Grasp("hand", "tip", "w_T1", "axis")],
+        driven=["shoulder"],
+        springs={"elbow": Spring(3.0)},
+    )
+    system = system.with_effects([make_effect("standard_linear_solid", "T1", system, {})])
+    return StepSymbols.of(discrete_equations(system))
+
+
+def point(symbols):
+    rng = np.random.default_rng(3)
+    values = rng.uniform(0.2, 0.6, len(symbols.column_names))
+    span = symbols.span("theta")
+    values[span] = symbols.equations.system.parameters.vector() + 0.1
+    values[symbols.column("h")] = 0.02
+    return values
+
+
+def value(symbols, expression, at):
+    return np.array(ca.densify(ca.Function("f", [symbols.all_columns], [expression])(at))).ravel()
+
+
+def test_blocks_have_the_names_of_the_project(symbols):
+    joints = ["shoulder", "elbow", *(f"T1_{i}_{axis}" for i in (0, 1) for axis in "xyz")]
+    assert list(symbols.rows[0].names) == [f"del[{name}]" for name in joints]
+    assert [block.name for block in symbols.rows] == ["del", "internal", "constraint", "p1"]
+    assert symbols.rows[2].names == tuple(f"constraint[hand.{part}]" for part in ("x", "y", "z", "tilt_x", "tilt_y"))
+    assert list(symbols.rows[1].labels) == list(symbols.equations.system.internal)
+    assert symbols.columns[3].names == ("u[shoulder]",)
+    # parameters are called as everywhere, without a block
+    assert symbols.columns[4].names == symbols.equations.system.parameters.names
+    assert len(set(symbols.row_names)) == len(symbols.row_names)
+    assert len(set(symbols.column_names)) == len(symbols.column_names)
+
+
+def test_rows_and_columns_stand_where_the_equations_have_them(symbols):
+    e = symbols.equations
+    at = point(symbols)
+    expected = value(symbols, ca.vertcat(e.momentum_balance, e.internal, e.constraint, e.p1), at)
+    np.testing.assert_array_equal(value(symbols, symbols.all_rows, at), expected)
+    for block in (*symbols.rows, *symbols.columns):
+        span = symbols.span(block.name)
+        assert span.stop - span.start == len(block.labels) == block.values.numel()
+    assert symbols.column("q1[T1_0_x]") == symbols.span("q1").start + 2
+    assert symbols.row("p1[elbow]") == symbols.span("p1").start + 1
+    for name in ("lam[hand.tilt_y]", "T1.bend", "h", "u[shoulder]"):
+        assert symbols.column_names[symbols.column(name)] == name
+
+
+@pytest.mark.parametrize("kind", ["point", "axis", "weld"])
+def test_every_equation_of_a_grasp_has_a_name(kind):
+    grasp = Grasp("left", "a", "b", kind)
+    names = constraint_names(grasp)
+    assert len(set(names)) == len(names) == grasp.equations
+    assert names[:3] == ("left.x", "left.y", "left.z")
+
+
+@pytest.mark.parametrize("row", ["del[T1_0_x]", "del[elbow]", "constraint[hand.tilt_x]", "p1[T1_1_z]"])
+def test_an_entry_is_the_row_as_text(symbols, row):
+    """The printed lines are all that is needed to work the row out."""
+    at, entry = point(symbols), symbols.entry(row)
+    expected = value(symbols, symbols.all_rows, at)[symbols.row(row)]
+    assert worked_out(symbols, entry, at) == pytest.approx(expected, rel=1e-9)
+    assert entry.value(symbols.all_columns, at) == pytest.approx(expected, rel=1e-12)
+    assert entry.title == row
+    assert entry.lines[0].startswith(f"{row}: {entry.formula.operations} operations, depends on ")
+    assert entry.lines[-1] == f"  {row} = {entry.formula.values[0]}"
+
+
+def worked_out(symbols, entry, at):
+    """Value of an entry's text, column names put in as numbers."""
+    known = dict(FUNCTIONS)
+    places = sorted(range(len(symbols.column_names)), key=lambda i: -len(symbols.column_names[i]))
+
+    def numbers(text):
+        for i in places:
+            name = symbols.column_names[i]
+            # `h` is a letter of many words; all other names are longer than any function's
+            text = text.replace(name, f"v[{i}]") if name != "h" else text
+        return read(text)
+
+    known |= {"v": at, "h": at[symbols.column("h")]}
+    for name, text in entry.formula.shared:
+        known[name] = eval(numbers(text), {"__builtins__": {}}, known)
+    return eval(numbers(entry.formula.values[0]), {"__builtins__": {}}, known)
+
+
+@pytest.mark.parametrize(
+    ("row", "column"),
+    [
+        ("del[T1_0_x]", "q1[T1_0_x]"),
+        ("del[T1_0_x]", "T1.bend"),
+        ("del[shoulder]", "u[shoulder]"),
+        ("del[elbow]", "lam[hand.y]"),
+        ("constraint[hand.x]", "q1[T1_0_y]"),
+        ("p1[T1_1_y]", "h"),
+    ],
+)
+def test_an_entry_with_a_column_is_the_slope(symbols, row, column):
+    at, i, j = point(symbols), symbols.row(row), symbols.column(column)
+    width = 1e-6 * max(1.0, abs(at[j]))
+    ends = []
+    for sign in (1, -1):
+        moved = at.copy()
+        moved[j] += sign * width
+        ends.append(value(symbols, symbols.all_rows, moved)[i])
+    entry = symbols.entry(f" {row},{column} ")
+    assert entry.title == f"d {row} / d {column}"
+    assert not entry.zero
+    assert worked_out(symbols, entry, at) == pytest.approx((ends[0] - ends[1]) / (2 * width), rel=1e-6, abs=1e-9)
+
+
+def test_an_entry_that_vanishes_says_so(symbols):
+    entry = symbols.entry("constraint[hand.x], T1.bend")
+    assert entry.zero
+    assert entry.lines == ["d constraint[hand.x] / d T1.bend = 0 whatever the state"]
+
+
+def test_the_variables_of_an_entry_are_named_or_counted(symbols):
+    stiffness = symbols.entry("del[elbow], elbow.stiffness")
+    assert stiffness.variables == ("q0[elbow]", "elbow.rest", "h", "q1[elbow]")
+    assert "8 of q0" in symbols.entry("del[T1_0_z]").variables
+
+
+@pytest.mark.parametrize(
+    ("text", "what", "hint"),
+    [
+        ("del[T1_0_w]", "no row 'del[T1_0_w]'", "did you mean 'del[T1_0_"),
+        ("q1[T1_0_x]", "no row 'q1[T1_0_x]'", "did you mean 'p1[T1_0_x]'?"),
+        ("del[T1_0_x], q1[T1_0_w]", "no column 'q1[T1_0_w]'", "did you mean 'q1[T1_0_"),
+        ("del[T1_0_x], T1.bent", "no column 'T1.bent'", "did you mean 'T1.bend'?"),
+        ("something else entirely", "no row", "equations.txt"),
+    ],
+)
+def test_a_wrong_name_gets_the_nearest(symbols, text, what, hint):
+    with pytest.raises(ConfigError) as caught:
+        symbols.entry(text)
+    assert what in caught.value.what
+    assert hint in caught.value.hint
+    assert caught.value.where == "--entry"
+    assert "del[shoulder]" in caught.value.allowed or "q0[shoulder]" in caught.value.allowed
+
+
+@pytest.mark.parametrize("text", ["", "del[elbow],", "del[elbow], h, h"])
+def test_neither_one_name_nor_two_is_refused(symbols, text):
+    with pytest.raises(ConfigError, match="is no entry"):
+        symbols.entry(text)
+
+
+def test_all_rows_are_listed_the_short_ones_whole(symbols):
+    lines = symbols.lines()
+    text = "\n".join(lines)
+    for name in symbols.row_names:
+        assert any(line.startswith(f"{name}: ") for line in lines), name
+    long = symbols.entry("del[T1_0_z]")
+    assert long.lines[0] in lines
+    inner = symbols.rows[1].names[0]
+    assert f"  {inner} = " in text
+    assert "  del[T1_0_z] = " not in text
+    for name in symbols.column_names:
+        assert name in text
+
+
+def test_latex_gets_no_letter_that_it_would_read_as_its_own():
+    assert latex_text("kelvin_voigt@T1.tau") == r"kelvin\_voigt@T1.tau"
+    assert latex_text("T1:40%") == r"T1:40\%"

@@ -1,0 +1,171 @@
+"""Exported equations: loaded back from CasADi files and compiled from C, they have the step's values."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from yid_ocp.analysis.symbols import StepSymbols
+from yid_ocp.effects import make_effect
+from yid_ocp.errors import OutputError
+from yid_ocp.export import functions as exported
+from yid_ocp.export.functions import export_functions, step_exports
+from yid_ocp.integrator.statics import Statics
+from yid_ocp.integrator.step import compile_step
+from yid_ocp.model import Grasp, Segment, System, flexible_object
+from yid_ocp.model.kinematics import forward_kinematics
+from yid_ocp.model.urdf import read_urdf
+
+FUNCTIONS = ("rows", "rows_by_theta", "rows_by_unknowns", "points", "mechanics")
+
+
+@pytest.fixture(scope="module")
+def step(urdf_folder):
+    """Two motors that take the end of a rod with a relaxing branch; a point half way along it."""
+    robot = read_urdf(urdf_folder / "double_pendulum.urdf")
+    rod = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=2, bend=4.0, twist=3.0)])
+    system = System.build(
+        robot,
+        objects=[(rod, None, None)],
+        grasps=[Grasp("hand", "tip", "w_T1")],
+        driven=["shoulder", "elbow"],
+        points=["w_T1", "T1:50%"],
+    )
+    system = system.with_effects([make_effect("standard_linear_solid", "T1", system, {"ratio": 0.4})])
+    return compile_step(system, 0.01, use_compiler=False)
+
+
+@pytest.fixture(scope="module")
+def folder(step, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("export") / "deep" / "folder"
+    written = export_functions(StepSymbols.of(step.equations), folder, step.system.parameters.vector(), step.time_step)
+    assert [path.name for path in written] == [*(f"{name}.casadi" for name in FUNCTIONS), "equations.c", "names.json"]
+    assert sorted(path.name for path in folder.iterdir()) == sorted(path.name for path in written)
+    return folder
+
+
+def arguments(step, seed=0):
+    """Values of `rows`' arguments: any state, any parameters near their own."""
+    rng = np.random.default_rng(seed)
+    values = [rng.uniform(-0.5, 0.5, x.numel()) for x in step.equations.arguments[:7]]
+    theta = step.system.parameters.vector() * rng.uniform(0.9, 1.1, step.sizes["ntheta"])
+    return [*values, theta, 0.01]
+
+
+def compared(function, reference, values):
+    for found, expected in zip(function.call(values), reference.call(values), strict=True):
+        assert found.shape == expected.shape
+        np.testing.assert_allclose(np.array(found.full()), np.array(expected.full()), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_what_is_loaded_back_has_the_same_values(step, folder, name):
+    reference = {f.name(): f for f in step_exports(StepSymbols.of(step.equations))}[name]
+    loaded = ca.Function.load(str(folder / f"{name}.casadi"))
+    assert loaded.name_in() == reference.name_in()
+    assert loaded.name_out() == reference.name_out()
+    values = arguments(step)
+    n = step.sizes["n"]
+    values = {"points": [values[0], values[7]], "mechanics": [values[0], np.ones(n), values[7]]}.get(name, values)
+    compared(loaded, reference, values)
+
+
+def test_the_loaded_rows_vanish_along_a_step(step, folder):
+    """What the kernel solves is what was written: DEL, inner equations and constraints are met, p1 is the momentum."""
+    rows = ca.Function.load(str(folder / "rows.casadi"))
+    theta = step.system.parameters.vector()
+    rest = Statics(step).solve(np.array([0.3, -0.6]), theta, None)
+    n = step.sizes["n"]
+    q0, p0, z0 = rest.state[:n], rest.state[n : 2 * n], rest.state[2 * n :]
+    torque = rest.torque + 0.5
+    q1, p1, lam, status = step(q0, p0, torque, theta, None, z0)
+    assert status.ok
+    found = rows(
+        q0=q0, q1=q1, p0=p0, z0=z0, z1=status.internal, lam=lam, u=torque, theta=theta, time_step=step.time_step
+    )
+    for name in ("del", "internal", "constraint"):
+        assert np.max(np.abs(found[name].full()), initial=0.0) < 1e-9, name
+    np.testing.assert_allclose(found["p1"].full().ravel(), p1, atol=1e-12)
+
+
+def test_the_loaded_slopes_are_those_of_the_rows(step, folder):
+    rows, by_theta, by_unknowns = (
+        ca.Function.load(str(folder / f"{name}.casadi")) for name in ("rows", "rows_by_theta", "rows_by_unknowns")
+    )
+
+    def together(values):
+        return np.concatenate([x.full().ravel() for x in rows.call(values)])
+
+    def slope(which, i):
+        ends = []
+        for sign in (1, -1):
+            moved = [np.array(x, float) for x in arguments(step)]
+            moved[which][i] += sign * 1e-6
+            ends.append(together(moved))
+        return (ends[0] - ends[1]) / 2e-6
+
+    values = arguments(step)
+    theta, unknowns = by_theta.call(values)[0].full(), by_unknowns.call(values)[0].full()
+    for i in range(step.sizes["ntheta"]):
+        np.testing.assert_allclose(theta[:, i], slope(7, i), rtol=1e-5, atol=1e-7)
+    at = 0
+    for which in (1, 4, 5):
+        for i in range(len(values[which])):
+            np.testing.assert_allclose(unknowns[:, at], slope(which, i), rtol=1e-5, atol=1e-6)
+            at += 1
+    assert at == unknowns.shape[1]
+
+
+def test_points_and_mechanics_are_the_models(step, folder):
+    points = ca.Function.load(str(folder / "points.casadi"))
+    assert points.name_out() == ["w_T1", "T1_50"]
+    theta = step.system.parameters.vector()
+    q = np.random.default_rng(1).uniform(-0.5, 0.5, step.sizes["n"])
+    symbol = ca.SX.sym("q", len(q))
+    kinematics = forward_kinematics(step.system.mechanism, symbol)
+    place = ca.Function("at", [symbol, step.system.parameters.symbols], [kinematics.position("T1:50%")])
+    np.testing.assert_allclose(points.call([q, theta])[1].full(), place(q, theta).full(), atol=1e-14)
+    v = np.random.default_rng(2).normal(size=len(q))
+    mass, _, momentum = (x.full() for x in ca.Function.load(str(folder / "mechanics.casadi")).call([q, v, theta]))
+    np.testing.assert_allclose(mass, mass.T, atol=1e-14)
+    assert np.min(np.linalg.eigvalsh(mass)) > 0
+    np.testing.assert_allclose(mass @ v[:, None], momentum, rtol=1e-12)
+
+
+def test_the_c_file_compiles_to_the_same_values(step, folder, tmp_path):
+    compiler = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+    if compiler is None:
+        pytest.skip("there is no C compiler")
+    library = tmp_path / "equations.so"
+    command = [compiler, "-O1", "-fPIC", "-shared", str(folder / "equations.c"), "-o", str(library), "-lm"]
+    subprocess.run(command, check=True)
+    for name in ("rows", "rows_by_theta"):
+        compared(ca.external(name, str(library)), ca.Function.load(str(folder / f"{name}.casadi")), arguments(step))
+
+
+def test_names_say_what_stands_where(step, folder):
+    symbols = StepSymbols.of(step.equations)
+    names = json.loads((folder / "names.json").read_text())
+    assert names["format"] == "yid-equations/1"
+    assert list(names["functions"]) == list(FUNCTIONS)
+    assert names["functions"]["rows"]["results"] == ["del", "internal", "constraint", "p1"]
+    assert [name for part in names["rows"].values() for name in part] == list(symbols.row_names)
+    assert [name for part in names["columns"].values() for name in part] == list(symbols.column_names)
+    assert names["parameters"]["T1.bend"] == {"value": 4.0, "unit": "N m/rad"}
+    assert names["time_step"] == 0.01
+
+
+def test_a_large_jacobian_is_left_to_the_reader(step, monkeypatch):
+    monkeypatch.setattr(exported, "LARGEST_JACOBIAN", 10)
+    assert "rows_by_unknowns" not in [f.name() for f in step_exports(StepSymbols.of(step.equations))]
+
+
+def test_a_folder_that_cannot_be_made_is_said(step, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="cannot be made"):
+        export_functions(StepSymbols.of(step.equations), tmp_path / "file" / "x", step.system.parameters.vector(), 0.01)

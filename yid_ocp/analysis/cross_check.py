@@ -1,0 +1,221 @@
+"""The built model beside Pinocchio: mass matrix, weight and inverse dynamics of the same bodies in another library.
+
+Pinocchio gets the robot in two ways: from the URDF file, which it reads itself, and joint by joint from the built
+system, object and effects included. The first shows a file that was read wrongly, the second wrong mechanics.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from yid_ocp.analysis.inspection import in_numbers
+from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body, second_derivatives
+from yid_ocp.model.mechanism import Joint, Mechanism
+from yid_ocp.model.system import System
+
+Array = NDArray[np.float64]
+
+TOLERANCE = 1e-8  # of the largest entry; placements are rounded to 1e-11 of an exact quarter turn
+POSTURES = 3  # at which both are compared, besides the one that is given
+
+
+@dataclass(frozen=True)
+class CrossCheck:
+    """How far the model is from Pinocchio's.
+
+    Attributes
+    ----------
+    of : str
+        What was compared.
+    mass, weight, motion : float
+        Largest difference of mass matrix, gravity's forces and inverse dynamics, each over its largest entry.
+    """
+
+    of: str
+    mass: float
+    weight: float
+    motion: float
+
+    @property
+    def agrees(self) -> bool:
+        """Whether all three are one within rounding."""
+        return all(size <= TOLERANCE for size in (self.mass, self.weight, self.motion))
+
+    @property
+    def words(self) -> str:
+        """One sentence."""
+        if self.agrees:
+            largest = max(self.mass, self.weight, self.motion)
+            said = f"{self.of}: mass matrix, weight and inverse dynamics are Pinocchio's"
+            return f"{said} within {largest:.1g} of the largest entry"
+        parts = (("mass matrix", self.mass), ("weight", self.weight), ("inverse dynamics", self.motion))
+        wrong = [f"{name} by {100 * size:.2g} %" for name, size in parts if not size <= TOLERANCE]
+        return f"{self.of} differs from Pinocchio's: {', '.join(wrong)} of the largest entry"
+
+
+def check_system(system: System, theta: Array, posture: Array) -> CrossCheck:
+    """The built system, its parameters at `theta`, beside Pinocchio's model of the same joints and bodies.
+
+    Parameters
+    ----------
+    system : System
+    theta : ndarray, shape (ntheta,)
+    posture : ndarray, shape (n,)
+        Compared besides `POSTURES` drawn ones [rad or m].
+    """
+    built = in_numbers(system, theta)
+    gravity = np.array(ca.DM(built.gravity)).ravel()
+    inert, heavy = (_assembled(built.mechanism, gravity, weight) for weight in (False, True))
+    return _compared("the built model", built.mechanism, gravity, inert, heavy, posture)
+
+
+def check_file(
+    path: Path,
+    mechanism: Mechanism,
+    gravity: Array,
+    joints: Sequence[str] | None = None,
+    locked: Mapping[str, float] | None = None,
+    exclude_links: Sequence[str] = (),
+) -> CrossCheck:
+    """A robot as this package read it beside Pinocchio's own reading of the file.
+
+    Parameters
+    ----------
+    path : Path
+        URDF file.
+    mechanism : Mechanism
+        What `read_urdf` made of it with the same `joints`, `locked` and `exclude_links`.
+    gravity : ndarray, shape (3,)
+        [m/s^2]
+    joints : sequence of str, optional
+        Joints that were kept; all movable ones when absent.
+    locked : mapping of str to float, optional
+        Values of joints that were not [rad or m].
+    exclude_links : sequence of str
+        Links that were left out with all that hangs on them.
+
+    Raises
+    ------
+    ValueError
+        Pinocchio does not read the file.
+    """
+    model, locked = pin.buildModelFromXML(_without(path, exclude_links)), locked or {}
+    if joints is not None:
+        at = pin.neutral(model)
+        for i, name in enumerate(model.names):
+            if i and name not in joints:
+                _place(at, model.joints[i], locked.get(name, _nearest_to_zero(model, model.joints[i])))
+        model = pin.buildReducedModel(model, [i for i in range(1, model.njoints) if model.names[i] not in joints], at)
+    model.gravity.linear = gravity
+    return _compared(
+        f"{path.name} as read", mechanism.numeric(), gravity, model, model, np.zeros(len(mechanism.joints))
+    )
+
+
+def _without(path: Path, links: Sequence[str]) -> str:
+    """Text of a URDF file without some links and all that hangs on them."""
+    root = ElementTree.parse(path).getroot()
+    dropped, joints = set(links), root.findall("joint")
+    for _ in joints:
+        dropped |= {_link(joint, "child") for joint in joints if _link(joint, "parent") in dropped}
+    for joint in joints:
+        if _link(joint, "child") in dropped:
+            root.remove(joint)
+    for link in root.findall("link"):
+        if link.get("name") in dropped:
+            root.remove(link)
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _link(joint: ElementTree.Element, end: str) -> str:
+    named = joint.find(end)
+    return "" if named is None else named.get("link", "")
+
+
+def _nearest_to_zero(model: Any, joint: Any) -> float:
+    """Where a joint is locked that nothing is said of: at zero, or at the bound next to it."""
+    if joint.nq != 1:
+        return 0.0
+    return float(np.clip(0.0, model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]))
+
+
+def _place(configuration: Array, joint: Any, value: float) -> None:
+    """Set a joint in Pinocchio's configuration, in which a continuous one is a cosine and a sine."""
+    values = [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
+    configuration[joint.idx_q : joint.idx_q + joint.nq] = values
+
+
+def _assembled(mechanism: Mechanism, gravity: Array, weight: bool) -> Any:
+    """Pinocchio's model of a mechanism in numbers; with weight, masses are what gravity pulls at."""
+    model = pin.Model()
+    model.gravity.linear = gravity if weight else np.zeros(3)
+    # Pinocchio's mass matrix needs all that hangs on a joint to follow it at once
+    placed: dict[int, int] = {-1: 0}
+    for j in sorted(range(len(mechanism.joints)), key=mechanism.ancestors):
+        joint = mechanism.joints[j]
+        placement = pin.SE3(_number(joint.placement.rotation), _number(joint.placement.translation).ravel())
+        index = model.addJoint(placed[joint.parent], _joint_model(joint), placement, joint.name)
+        placed[j] = index
+        for body in joint.bodies:
+            fraction = 1.0 if body.gravity_fraction is None or not weight else float(body.gravity_fraction)
+            mass, tensor = float(body.mass) * fraction, _number(body.about_com) * fraction
+            # gravity's forces do not depend on the inertia about the centre
+            inertia = pin.Inertia(mass, _number(body.com).ravel(), tensor)
+            model.appendBodyToJoint(index, inertia, pin.SE3.Identity())
+    return model
+
+
+def _joint_model(joint: Joint) -> Any:
+    kind = pin.JointModelRevoluteUnaligned if joint.kind == "revolute" else pin.JointModelPrismaticUnaligned
+    return kind(*joint.axis)
+
+
+def _number(expression: ca.SX) -> Array:
+    return np.array(ca.DM(ca.densify(expression)))
+
+
+def _compared(of: str, mechanism: Mechanism, gravity: Array, inert: Any, heavy: Any, posture: Array) -> CrossCheck:
+    """Largest differences at the posture and at drawn ones, in random motion.
+
+    `inert` gives mass matrix and inverse dynamics less gravity's forces, `heavy` these forces.
+    """
+    n = len(mechanism.joints)
+    q, v, a = (ca.SX.sym(name, n) for name in "qva")
+    kinematics = forward_kinematics(mechanism, q)
+    rigid = rigid_body(kinematics, v, ca.SX(ca.DM(gravity)))
+    still = rigid_body(kinematics, ca.SX.zeros(n), ca.SX(ca.DM(gravity))).by_q
+    mass, by_qv = mass_matrix(rigid, mechanism), second_derivatives(rigid, mechanism)[1]
+    ours = ca.Function("ours", [q, v, a], [mass, -still, mass @ a + by_qv.T @ v - rigid.by_q])
+    rng = np.random.default_rng(0)
+    joints = [inert.joints[inert.getJointId(name)] for name in mechanism.joint_names]
+    columns = [joint.idx_v for joint in joints]
+    worst = np.zeros(3)
+    data, weights = inert.createData(), heavy.createData()
+    for at in (posture, *rng.uniform(-1.0, 1.0, (POSTURES, n))):
+        speed, acceleration = rng.normal(size=(2, n))
+        theirs_q, theirs_v, theirs_a = pin.neutral(inert), np.zeros(inert.nv), np.zeros(inert.nv)
+        for joint, value in zip(joints, at, strict=True):
+            _place(theirs_q, joint, float(value))
+        theirs_v[columns], theirs_a[columns] = speed, acceleration
+        upper = np.triu(pin.crba(inert, data, theirs_q))
+        whole = (upper + np.triu(upper, 1).T)[np.ix_(columns, columns)]
+        weight = pin.computeGeneralizedGravity(heavy, weights, theirs_q)[columns].copy()
+        moving = pin.rnea(inert, data, theirs_q, theirs_v, theirs_a)[columns].copy()
+        if inert is not heavy:
+            moving += weight
+        for i, (found, expected) in enumerate(
+            zip(ours(at, speed, acceleration), (whole, weight[:, None], moving[:, None]), strict=True)
+        ):
+            size = float(np.max(np.abs(expected), initial=0.0))
+            difference = float(np.max(np.abs(np.array(ca.densify(found)) - expected), initial=0.0))
+            worst[i] = max(worst[i], difference / size if size > 0 else difference)
+    return CrossCheck(of, *map(float, worst))

@@ -1,0 +1,375 @@
+"""Which entries of a step's matrices and of the NLP's can differ from zero, whatever the state."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import maximum_bipartite_matching
+
+from yid_ocp.analysis.symbols import StepSymbols
+from yid_ocp.sensors import Sensor, sensor_function
+
+Mask = NDArray[np.bool_]
+NEGLIGIBLE = 1e-14  # of the largest entry: rounding
+
+
+@dataclass(frozen=True)
+class Span:
+    """A named run of rows or columns."""
+
+    name: str
+    start: int
+    stop: int
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """A matrix's entries that can differ from zero.
+
+    Attributes
+    ----------
+    name, title : str
+        For files, and for people.
+    mask : ndarray of bool, shape (r, c)
+    rows, columns : tuple of Span
+        Blocks, in order and without gaps.
+    row_labels, column_labels : tuple of str
+        One for every row and column.
+    marked : ndarray of bool, shape (r, c), or None
+        Entries to be told from the others.
+    marked_as : str
+        What they are.
+    """
+
+    name: str
+    title: str
+    mask: Mask
+    rows: tuple[Span, ...]
+    columns: tuple[Span, ...]
+    row_labels: tuple[str, ...]
+    column_labels: tuple[str, ...]
+    marked: Mask | None = None
+    marked_as: str = ""
+
+    def with_values(self, values: NDArray[np.float64], where: str) -> Pattern:
+        """The pattern with the entries marked that do differ from zero in one matrix."""
+        size = np.abs(values)
+        return replace(self, marked=size > NEGLIGIBLE * np.max(size, initial=0.0), marked_as=f"not zero at {where}")
+
+    @property
+    def nonzeros(self) -> int:
+        """Entries that can differ from zero."""
+        return int(np.count_nonzero(self.mask))
+
+
+@dataclass(frozen=True)
+class KktSize:
+    """Size of the NLP with a node at every step.
+
+    Attributes
+    ----------
+    variables, constraints : int
+    jacobian_nonzeros : int
+        Of the constraints.
+    hessian_nonzeros : int
+        Both triangles of the exact Hessian of the steps' constraints times their multipliers; what measurements add to
+        it is not counted, and the start is linear in the parameters, as multiple shooting takes it.
+    """
+
+    variables: int
+    constraints: int
+    jacobian_nonzeros: int
+    hessian_nonzeros: int
+
+
+# -- one step ---------------------------------------------------------------------------------------------------------
+
+
+def step_patterns(symbols: StepSymbols) -> dict[str, Pattern]:
+    """Patterns of one step.
+
+    Parameters
+    ----------
+    symbols : StepSymbols
+
+    Returns
+    -------
+    dict of str to Pattern
+        `dR_dy`, residual by unknowns; `A` = dx_{k+1}/dx_k, `B_u` and `B_theta` by the implicit function theorem;
+        `dR_dtheta`, all rows by the parameters.
+    """
+    whole = _mask(symbols.pattern)
+    system = symbols.equations.system
+    free = list(system.free_indices)
+    joints = system.mechanism.joint_names
+
+    def block(row: str, column: str) -> Mask:
+        return whole[symbols.span(row), symbols.span(column)]
+
+    def by(*columns: str) -> Mask:
+        """Residual's rows by columns."""
+        parts = [np.hstack([block(row, column) for column in columns]) for row in ("del", "internal", "constraint")]
+        return np.vstack([parts[0][free], *parts[1:]])
+
+    by_new = by("q1", "z1", "lam")
+    nc = len(joints)
+    known = np.setdiff1d(np.arange(by_new.shape[1]), system.prescribed_indices)
+    by_unknown = by_new[:, known]
+    inverse = inverse_mask(by_unknown)
+
+    def response(*columns: str) -> Mask:
+        """The state after the step by columns."""
+        y = _times(inverse, by(*columns))
+        full = np.zeros((by_new.shape[1], y.shape[1]), bool)
+        full[known] = y
+        direct = np.hstack([block("p1", column) for column in columns])
+        p1 = direct | _times(np.hstack([block("p1", c) for c in ("q1", "z1", "lam")]), full)
+        nz = len(system.internal)
+        return np.vstack([full[:nc], p1, full[nc : nc + nz]])
+
+    unknowns = _spans(symbols, [("q1", free), ("z1", None), ("lam", None)])
+    residual = _spans(symbols, [("del", free), ("internal", None), ("constraint", None)])
+    before, after = (_spans(symbols, [(f"{c}{k}", None) for c in "qpz"]) for k in (0, 1))
+    every = _spans(symbols, [(b.name, None) for b in symbols.rows])
+    torque, theta = _spans(symbols, [("u", None)]), _spans(symbols, [("theta", None)])
+    return {
+        name: Pattern(name, title, mask, rows[0], columns[0], rows[1], columns[1])
+        for name, title, mask, rows, columns in (
+            ("dR_dy", "residual of a step by its unknowns", by_unknown, residual, unknowns),
+            ("A", "A: state after a step by the state before it", response("q0", "p0", "z0"), after, before),
+            ("B_u", "B_u: state after a step by torques", response("u"), after, torque),
+            ("B_theta", "B_theta: state after a step by parameters", response("theta"), after, theta),
+            ("dR_dtheta", "dR/dtheta: equations by parameters", whole[:, symbols.span("theta")], every, theta),
+        )
+    }
+
+
+def inverse_mask(mask: Mask) -> Mask:
+    """Entries of a matrix's inverse that can differ from zero, from those of the matrix.
+
+    With rows put in the order of a perfect matching the diagonal is full, and entry (i, j) of the inverse can differ
+    from zero where a path leads from i to j in the matrix's graph; all can where there is no perfect matching.
+    """
+    count = len(mask)
+    matched = maximum_bipartite_matching(scipy.sparse.csr_matrix(mask), perm_type="row")
+    if count == 0 or np.any(matched < 0):
+        return np.ones((count, count), bool)
+    reach = mask[matched]
+    for _ in range(int(np.ceil(np.log2(max(count, 2))))):
+        reach = _times(reach, reach)
+    result = np.zeros_like(mask)
+    result[:, matched] = reach
+    return result
+
+
+def _times(a: Mask, b: Mask) -> Mask:
+    product: Mask = (a.astype(np.float32) @ b.astype(np.float32)) > 0
+    return product
+
+
+def _mask(pattern: ca.Sparsity) -> Mask:
+    mask = np.zeros(pattern.shape, bool)
+    row, column = pattern.get_triplet()
+    mask[row, column] = True
+    return mask
+
+
+# -- the NLP ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Stages:
+    """What the NLP's stages have in common; see `stages`.
+
+    Attributes
+    ----------
+    rows : ndarray of bool, shape (r, w)
+        One step's constraints by (theta_free, x_k, x_{k+1}, lam_k).
+    hessian : ndarray of bool, shape (w, w)
+        Of these constraints times their multipliers.
+    measured : ndarray of bool, shape (f + nx, f + nx)
+        Gauss-Newton Hessian of the priors and of one reading of every sensor, by (theta_free, x_k).
+    row_spans, node_spans : tuple of Span
+        Blocks of a step's constraints and of a node's state.
+    row_labels, node_labels, lam_labels : tuple of str
+        Of their entries and of a step's multipliers.
+    free : int
+        Number of free parameters.
+    fixed, loose : tuple of int
+        Rows of the first node's state that the start fixes, and that have a prior about it; the start depends on all
+        free parameters.
+    """
+
+    rows: Mask
+    hessian: Mask
+    measured: Mask
+    row_spans: tuple[Span, ...]
+    node_spans: tuple[Span, ...]
+    row_labels: tuple[str, ...]
+    node_labels: tuple[str, ...]
+    lam_labels: tuple[str, ...]
+    free: int
+    fixed: tuple[int, ...]
+    loose: tuple[int, ...]
+
+    @property
+    def multipliers(self) -> int:
+        """Of a step."""
+        return len(self.lam_labels)
+
+
+def stages(
+    symbols: StepSymbols,
+    free: Sequence[str],
+    sensors: Sequence[Sensor],
+    followed: Sequence[int],
+    loose: Sequence[int] = (),
+) -> Stages:
+    """Patterns of one stage of the NLP with a node at every step, in the order of `solvers.transcription`.
+
+    Parameters
+    ----------
+    symbols : StepSymbols
+    free : sequence of str
+        Parameters that are unknowns.
+    sensors : sequence of Sensor
+        Those that read nodes.
+    followed : sequence of int
+        Rows of the state that the tracking filter feeds back to the torques.
+    loose : sequence of int
+        Rows of the first node's state that are estimated, with a prior; the start fixes those that are not prescribed.
+    """
+    e, system = symbols.equations, symbols.equations.system
+    kept = list(system.free_indices)
+    rows = ca.vertcat(e.residual, e.p1)
+    chosen = ca.vertcat(*(system.parameters[name].symbol for name in free)) if free else ca.SX(0, 1)
+    local = ca.vertcat(chosen, e.q0, e.p0, e.z0, e.q1, e.z1, e.lam, e.u)
+    weights = ca.SX.sym("weights", rows.numel())
+    by_local = _mask(ca.jacobian_sparsity(rows, local))
+    curved = _mask(ca.jacobian_sparsity(ca.gradient(ca.dot(weights, rows), local), local))
+    f, n, nz, m, nu = len(free), system.size, e.z0.numel(), e.lam.numel(), e.u.numel()
+    nx = 2 * n + nz
+    # where each local variable stands in the stage; torques are not unknowns, under the filter they follow the state
+    places = [*range(f + nx), *range(f + nx, f + nx + n), *range(f + nx + 2 * n, f + 2 * nx + m)]
+    placing = np.zeros((local.numel(), f + 2 * nx + m), bool)
+    placing[np.arange(len(places)), places] = True
+    placing[np.ix_(np.arange(len(places), len(places) + nu), f + np.array(followed, int))] = True
+    by_stage = _times(by_local, placing)
+    hessian = _times(_times(placing.T, curved), placing)
+    # the constraint on the momentum after the step holds that momentum itself
+    at = rows.numel() - n
+    by_stage[at + np.arange(n), f + nx + n + np.arange(n)] = True
+    measured = np.zeros((f + nx, f + nx), bool)
+    measured[np.arange(f), np.arange(f)] = True  # priors
+    for sensor in sensors:
+        function = sensor_function(system, sensor, tuple(free))
+        by_q, by_z, by_theta = (_mask(function.sparsity_out(i)) for i in (1, 2, 4))
+        reading = np.hstack([by_theta, by_q, np.zeros((len(by_q), n), bool), by_z])
+        measured |= _times(reading.T, reading)
+    row_spans, row_labels = _spans(symbols, [("del", kept), ("internal", None), ("constraint", None), ("p1", None)])
+    node_spans, node_labels = _spans(symbols, [("q0", None), ("p0", None), ("z0", None)])
+    lam_labels = _spans(symbols, [("lam", None)])[1]
+    spans, labels = (row_spans, node_spans), (row_labels, node_labels, lam_labels)
+    fixed = tuple(map(int, np.setdiff1d(np.arange(nx), [*system.prescribed_indices, *loose])))
+    return Stages(by_stage, hessian, measured, *spans, *labels, f, fixed, tuple(map(int, loose)))
+
+
+def kkt_size(stage: Stages, steps: Sequence[int]) -> KktSize:
+    """Size of the NLP of recordings of so many steps each."""
+    f, nx, m = stage.free, stage.node_spans[-1].stop, stage.multipliers
+    height = len(stage.rows)
+    # every step after the first adds the same entries
+    one, two = (int(np.count_nonzero(nlp_masks(stage, k)[1])) for k in (1, 2))
+    shared = int(np.count_nonzero(stage.hessian[:f, :f]))
+    return KktSize(
+        f + sum((k + 1) * nx + k * m for k in steps),
+        sum(len(stage.fixed) + k * height for k in steps),
+        sum(len(stage.fixed) * (1 + f) + k * int(np.count_nonzero(stage.rows)) for k in steps),
+        shared + sum(one - shared + (k - 1) * (two - one) for k in steps),
+    )
+
+
+def nlp_masks(stage: Stages, steps: int) -> tuple[Mask, Mask, Mask]:
+    """Constraints' Jacobian, their Hessian and that of readings at every node, of so many steps of one recording."""
+    f, nx, m, fixed = stage.free, stage.node_spans[-1].stop, stage.multipliers, stage.fixed
+    width, height = f + (steps + 1) * nx + steps * m, len(stage.rows)
+    jacobian = np.zeros((len(fixed) + steps * height, width), bool)
+    hessian, measured = np.zeros((width, width), bool), np.zeros((width, width), bool)
+    jacobian[np.arange(len(fixed)), f + np.array(fixed, int)] = True
+    jacobian[: len(fixed), :f] = True
+    if stage.loose:
+        begun = np.concatenate([np.arange(f), f + np.array(stage.loose)])
+        measured[np.ix_(begun, begun)] = True
+    for k in range(steps + 1):
+        # x_0, lam_0, x_1, lam_1, ...
+        node = f + k * (nx + m)
+        here = np.concatenate([np.arange(f), node + np.arange(nx)])
+        measured[np.ix_(here, here)] |= stage.measured
+        if k == steps:
+            break
+        columns = np.concatenate([here, node + nx + m + np.arange(nx), node + nx + np.arange(m)])
+        top = len(fixed) + k * height
+        jacobian[np.ix_(np.arange(top, top + height), columns)] |= stage.rows
+        hessian[np.ix_(columns, columns)] |= stage.hessian
+    return jacobian, hessian, measured
+
+
+Labelled = tuple[tuple[Span, ...], tuple[str, ...]]
+
+
+def _spans(symbols: StepSymbols, wanted: Sequence[tuple[str, Sequence[int] | None]]) -> Labelled:
+    """Blocks one after the other, each whole or some of it, with the labels of their entries."""
+    blocks = {block.name: block for block in (*symbols.rows, *symbols.columns)}
+    spans: list[Span] = []
+    labels: list[str] = []
+    for name, chosen in wanted:
+        block = blocks[name]
+        kept = range(len(block.labels)) if chosen is None else chosen
+        spans.append(Span(name, len(labels), len(labels) + len(kept)))
+        labels += [block.labels[i] for i in kept]
+    return tuple(spans), tuple(labels)
+
+
+def kkt_pattern(stage: Stages, free: Sequence[str], steps: int) -> Pattern:
+    """The KKT matrix [[H, J'], [J, 0]] of the first steps of a recording, as if every node were measured.
+
+    Parameters
+    ----------
+    stage : Stages
+    free : sequence of str
+        Parameters that are unknowns.
+    steps : int
+    """
+    jacobian, hessian, measured = nlp_masks(stage, steps)
+    blank = np.zeros((len(jacobian), len(jacobian)), bool)
+    mask = np.vstack([np.hstack([hessian | measured, jacobian.T]), np.hstack([jacobian, blank])])
+    spans: list[Span] = []
+    labels: list[str] = []
+
+    def add(name: str, own: Sequence[str]) -> None:
+        if own:
+            spans.append(Span(name, len(labels), len(labels) + len(own)))
+            labels.extend(own)
+
+    add("theta", free)
+    for k in range(steps + 1):
+        for span in stage.node_spans:
+            add(f"{span.name[0]}{k}", stage.node_labels[span.start : span.stop])
+        add(f"lam{k}", stage.lam_labels if k < steps else ())
+    add("start", [stage.node_labels[i] for i in stage.fixed])
+    for k in range(steps):
+        for span in stage.row_spans:
+            name = f"p{k + 1} rule" if span.name == "p1" else f"{span.name}{k}"
+            add(name, stage.row_labels[span.start : span.stop])
+    blocks, named = tuple(spans), tuple(labels)
+    title = f"KKT matrix of the NLP with a node at every step: the first {steps} steps"
+    marked = np.zeros_like(mask)
+    marked[: len(measured), : len(measured)] = measured
+    return Pattern(
+        "kkt", title, mask, blocks, blocks, named, named, marked, "of a reading or a prior, where there is one"
+    )
