@@ -16,6 +16,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
 
 from yid_ocp.errors import SolverError
@@ -30,7 +31,7 @@ Array = NDArray[np.float64]
 
 NEGLIGIBLE = 0.1
 """Standard deviation that is left out, in units of a reading's noise."""
-SAMPLES, MOST = 128, 1024
+SAMPLES, MOST = 128, 512
 """Random samples of all errors at first, twice as many as long as they are too few, and at most."""
 
 
@@ -152,7 +153,8 @@ def seen_errors(course: Course, errors: InputErrors, slopes: Array) -> Array:
     while True:
         back = rng.standard_normal((motion.size, count))
         for _ in range(2):
-            basis = np.linalg.qr(motion.moved(back, slopes).reshape(-1, count))[0]
+            moved = motion.moved(back, slopes).reshape(-1, count)
+            basis, _ = scipy.linalg.qr(moved, mode="economic", overwrite_a=True, check_finite=False)
             back = motion.pulled(basis.reshape(*shape, count), slopes)
         squares, vectors = np.linalg.eigh(back.T @ back)
         sizes = np.sqrt(np.maximum(squares, 0.0))
@@ -230,12 +232,13 @@ class _Motion:
         angles, constant, white, followed = self._parts(errors)
         constant, white = self.bias_std[:, None] * constant, self.torque_std[:, None] * white
         state = self.start_by_angles @ angles + self.start_by_torque @ (constant + white[0])
-        found = [slopes[0] @ state]
+        found = np.empty((*slopes.shape[:2], errors.shape[1]))
+        found[0] = slopes[0] @ state
         for k, sample in enumerate(self.sample):
             state = self.by_state[k] @ state + self.by_torque[k] @ (constant + white[sample])
             state += self.by_angles[k] @ followed[k]
-            found.append(slopes[k + 1] @ state)
-        return np.array(found)
+            found[k + 1] = slopes[k + 1] @ state
+        return found
 
     def pulled(self, readings: Array, slopes: Array) -> Array:
         """The transposed map, G' y: (N + 1, k, c) to (size, c)."""
