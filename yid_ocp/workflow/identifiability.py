@@ -251,7 +251,9 @@ def identifiability_result(
         return result
     for name, entry in information.parameters.items():
         unsure = unknown.parameters[name]
-        own = {"std_relative_unknown": unsure.std_relative, "verdict_unknown": unsure.verdict}
+        # knowing less makes nothing better known, whatever the interval took back
+        spread = max(entry.std_relative, unsure.std_relative)
+        own = {"std_relative_unknown": spread, "verdict_unknown": unsure.verdict}
         result["parameters"][name] = asdict(entry) | own
     result["correlations"] = {"names": information.names, "matrix": information.correlations}
     result["directions"] = [asdict(direction) for direction in information.directions]
