@@ -44,6 +44,8 @@ class Stage:
         Derivatives of `rows` by `x0`, `x1`, `lam` and `u`, sparse.
     effort : casadi.SX, shape (nc, 1)
         What the prescribed coordinates need at the first node [N m].
+    effort_slopes : mapping of str to casadi.SX
+        Derivatives of `effort` by `x0`, `x1`, `lam` and `u`, sparse.
     """
 
     equations: DiscreteEquations
@@ -57,19 +59,20 @@ class Stage:
     names: tuple[str, ...]
     slopes: dict[str, ca.SX]
     effort: ca.SX
+    effort_slopes: dict[str, ca.SX]
 
-    def by_theta(self, names: Sequence[str]) -> ca.SX:
-        """Derivative of `rows` by named parameters, sparse, shape (nr, len(names))."""
+    def by_theta(self, names: Sequence[str]) -> tuple[ca.SX, ca.SX]:
+        """Derivatives of `rows` and of `effort` by named parameters, sparse, shape (..., len(names))."""
         parameters = self.equations.system.parameters
-        chosen = [parameters[name].symbol for name in names]
-        return ca.jacobian(self.rows, ca.vertcat(ca.SX(0, 1), *chosen))
+        chosen = ca.vertcat(ca.SX(0, 1), *(parameters[name].symbol for name in names))
+        return ca.jacobian(self.rows, chosen), ca.jacobian(self.effort, chosen)
 
 
 def stage(equations: DiscreteEquations, time_step: float) -> Stage:
     """The rows of one step and their derivatives.
 
-    The bodies' second derivatives come in closed form (`RigidBody`), with a fifth of the operations that differentiating
-    the tree takes; the rest is differentiated.
+    The bodies' second derivatives come in closed form (`RigidBody`), with a quarter of the operations that come of
+    differentiating the tree; the rest is differentiated.
 
     Parameters
     ----------
@@ -88,26 +91,28 @@ def stage(equations: DiscreteEquations, time_step: float) -> Stage:
     names += [f"phi[{grasp.name}.{i}]" for grasp in system.grasps for i in range(grasp.equations)]
     names += [f"p[{name}]" for name in system.mechanism.joint_names]
     rows = ca.vertcat(e.momentum_balance[free] / h, e.internal, e.constraint, (p1 - e.p1) / h)
-    slopes = {name: ca.SX(0, 0) for name in ("x0", "x1", "lam", "u")}
+    effort = -e.momentum_balance[fixed] / e.h
     balance, end = _slopes(e)
     groups = {"x0": ("q0", "p0", "z0"), "x1": ("q1", "none", "z1"), "lam": ("lam",), "u": ("u",)}
     symbols = {"x0": x0, "x1": x1, "lam": e.lam, "u": e.u}
+    slopes, effort_slopes = [], []
     for name, parts in groups.items():
         first, last = (ca.horzcat(*(by[part] for part in parts)) for by in (balance, end))
         middle = ca.jacobian(ca.vertcat(e.internal, e.constraint), symbols[name])
-        slopes[name] = ca.vertcat(first[free, :] / h, middle, (ca.jacobian(p1, symbols[name]) - last) / h)
-    effort = -e.momentum_balance[fixed] / e.h
-    placed = ca.substitute([rows, effort, *slopes.values()], [e.time_step], [ca.SX(h)])
-    rows, effort, *values = ca.cse([ca.sparsify(expression) for expression in placed])
-    made = dict(zip(slopes, values, strict=True))
-    return Stage(e, h, x0, x1, e.lam, e.u, e.theta, ca.densify(rows), tuple(names), made, ca.densify(effort))
+        slopes.append(ca.vertcat(first[free, :] / h, middle, (ca.jacobian(p1, symbols[name]) - last) / h))
+        effort_slopes.append(-first[fixed, :] / e.h)
+    made = ca.substitute([rows, effort, *slopes, *effort_slopes], [e.time_step], [ca.SX(h)])
+    rows, effort, *values = ca.cse([ca.sparsify(expression) for expression in made])
+    by = [dict(zip(groups, part, strict=True)) for part in (values[: len(groups)], values[len(groups) :])]
+    dense = ca.densify(rows), ca.densify(effort)
+    return Stage(e, h, x0, x1, e.lam, e.u, e.theta, dense[0], tuple(names), by[0], dense[1], by[1])
 
 
 def _slopes(e: DiscreteEquations) -> tuple[dict[str, ca.SX], dict[str, ca.SX]]:
-    """Derivatives of `momentum_balance` and of `p1` by each of the step's symbols; `none` is one on which neither depends.
+    """Derivatives of `momentum_balance` and of `p1` by the step's symbols, and by `none`, on which neither depends.
 
-    With L the bodies' Lagrangian at the midpoint:  h/2 L_q -+ L_v  changes by  h/4 L_qq +- 1/2 L_qv -+ (1/2 L_vq +- L_vv/h)
-    with q_{k+1} (upper inner sign) and q_k.
+    With L the bodies' Lagrangian at the midpoint and a = -1 in the balance, +1 in p1,  h/2 L_q + a L_v  changes by
+    h/4 L_qq + b/2 L_qv + a (1/2 L_vq + b/h L_vv)  with q_k (b = -1) and with q_{k+1} (b = 1).
     """
     n, h, scale, pulls = e.q0.numel(), e.h, e.row_scale, e.pulls
     L_qq, L_qv, L_vv = second_derivatives(e.rigid, e.system.mechanism)
@@ -118,7 +123,8 @@ def _slopes(e: DiscreteEquations) -> tuple[dict[str, ca.SX], dict[str, ca.SX]]:
     }
     impulses = e.closed_impulses or (ca.SX(n, 1), ca.SX(n, 1))
     found = []
-    for side, rest, impulse, rows in zip((-1, 1), (e.balance_rest, e.p1_rest), impulses, (pulls.left, pulls.right)):
+    parts = ((-1, e.balance_rest, impulses[0], pulls.left), (1, e.p1_rest, impulses[1], pulls.right))
+    for side, rest, impulse, rows in parts:
         apart = rest + impulse
         by = {name: ca.jacobian(apart, getattr(e, name)) for name in ("q0", "q1", "z0", "z1", "u")}
         for name, sign in (("q0", -1), ("q1", 1)):

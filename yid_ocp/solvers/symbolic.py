@@ -1,0 +1,453 @@
+"""An estimation problem as a nonlinear program in CasADi alone: every step's equations, nothing eliminated.
+
+The unknowns are, in this order,
+
+    (shared parameters | recording 1: local parameters, its rest, x_0, lam_0, x_1, lam_1, ... x_N | recording 2: ... )
+
+with x = (q, p, z). `rest` is the equilibrium at the first posture (coordinates sought, internal ones, forces of the
+grasps), of which x_0 is a function; it is absent where a start is given. The constraints are the equations of that
+equilibrium and the rows of every `Stage`; the objective has the whitened samples, interpolated between nodes, and the
+priors. What was recorded are parameters of the program. Residuals are in units of the sensors' noise: noise that drives
+the motion is left out, as in all methods that cannot carry its covariance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import casadi as ca
+import numpy as np
+import scipy.sparse
+from numpy.typing import ArrayLike, NDArray
+
+from yid_ocp.errors import SolverError
+from yid_ocp.integrator.stage import Stage, stage
+from yid_ocp.integrator.statics import HOLD_STIFFNESS, HOLD_STIFFNESS_WITH_TORQUE
+from yid_ocp.parallel import SYMBOLIC
+from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.measurements import Measurements
+from yid_ocp.problem.problem import EstimationProblem
+from yid_ocp.problem.unknowns import SMALL_RATIO
+from yid_ocp.sensors import Sensor, sensor_function
+from yid_ocp.solvers.guess import node_states
+from yid_ocp.solvers.program import Block, Local, NonlinearProgram, Places, Residual, Ridge, Term
+
+Array = NDArray[np.float64]
+
+# Least curvature for a change of a parameter by its size, over the mean square of the whitened residuals.
+RIDGE = 0.1
+
+
+def transcribe(
+    problem: EstimationProblem, start: ArrayLike | None = None, use_compiler: bool | None = None
+) -> NonlinearProgram:
+    """The nonlinear program of an estimation problem, with a node at every step.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    start : array_like, optional, shape (nx,)
+        Unknown vector of the problem near which the guess of the program's unknowns is made; the problem's when absent.
+    use_compiler : bool, optional
+        Whether the derivatives of a stage are compiled where that is possible; as the problem's step when absent.
+
+    Returns
+    -------
+    NonlinearProgram
+        With the variables `theta`, and of every recording `local[NAME]`, `rest[NAME]`, `q[NAME]`, `p[NAME]`, `z[NAME]`
+        and `lam[NAME]`; with the parameters `theta[NAME]`, `torque[NAME]`, `gain[NAME]`, `reference[NAME]`,
+        `value.GROUP[NAME]`, `weight.GROUP[NAME]`, `start[NAME]`, `prior` and others where there are such.
+
+    Raises
+    ------
+    SolverError
+        An effect on recorded inputs or times is at work, or a free parameter has a known value in a recording.
+
+    References
+    ----------
+    Johnson and Murphey (2009), IEEE Trans. Robotics 25(6):1249, doi:10.1109/TRO.2009.2032955.
+    """
+    check(problem, "transcribe")
+    compiled = problem.step.compiled if use_compiler is None else use_compiler
+    with SYMBOLIC:
+        return _Maker(problem, compiled).program(problem.start if start is None else np.asarray(start, float))
+
+
+def check(problem: EstimationProblem, where: str) -> None:
+    """Refuse what no transcription with nodes does."""
+    if not problem.as_recorded:
+        raise SolverError(
+            "an effect changes recorded inputs, times or what the tracking filter follows",
+            where=where,
+            allowed="effects of the mechanics and of what sensors read",
+            hint="use gauss_newton",
+        )
+    for episode in problem.episodes:
+        known = {**episode.values, **({} if episode.start is None else episode.start.values)}
+        both = [name for name in problem.free if name in known]
+        if both:
+            raise SolverError(
+                f"{both[0]} is free and has a known value in a recording", where=f"{where}: {episode.name}"
+            )
+
+
+def unknown_vector(problem: EstimationProblem, program: NonlinearProgram, w: Array) -> Array:
+    """The problem's unknown vector that belongs to a point of its program."""
+    x = problem.start.copy()
+    shared, own = len(problem.shared), len(problem.local)
+    x[:shared] = w[program.variables["theta"].index.ravel()] if shared else 0.0
+    rows = list(problem.predictor.start_rows)
+    for i, episode in enumerate(problem.episodes):
+        columns = problem.unknowns.columns(i)[shared:]
+        if own:
+            x[columns[:own]] = w[program.variables[f"local[{episode.name}]"].index.ravel()]
+        if rows:
+            blocks = (program.variables.get(f"{part}[{episode.name}]") for part in "qpz")
+            first = w[np.concatenate([block.index[:, 0] for block in blocks if block is not None])]
+            begin = problem.start_state(episode, problem.split(x, i)[0], guess=first[: problem.step.sizes["n"]])
+            x[columns[own:]] = (first - begin.state)[rows]
+    return x
+
+
+@dataclass
+class _Vector:
+    """Blocks laid one after the other, with values and bounds."""
+
+    size: int = 0
+    blocks: dict[str, Block] = field(default_factory=dict)
+    values: list[Array] = field(default_factory=list)
+    lower: list[Array] = field(default_factory=list)
+    upper: list[Array] = field(default_factory=list)
+
+    def extend(self, values: Array, lower: float | Array = -math.inf, upper: float | Array = math.inf) -> Places:
+        """Lay values down; their places."""
+        self.values.append(values)
+        self.lower.append(np.broadcast_to(lower, values.shape).astype(float))
+        self.upper.append(np.broadcast_to(upper, values.shape).astype(float))
+        self.size += len(values)
+        return np.arange(self.size - len(values), self.size)
+
+    def name(self, name: str, index: Places, rows: Sequence[str], unit: str = "") -> None:
+        """Name places, unless there are none."""
+        if index.size:
+            self.blocks[name] = Block(index, tuple(rows), unit)
+
+    def add(self, name: str, values: Array, rows: Sequence[str], unit: str = "") -> Places:
+        """Lay a block down, column by column; its places, (rows, columns)."""
+        table = np.asarray(values, float).reshape(len(rows), -1) if len(rows) else np.zeros((0, 1))
+        index = self.extend(table.ravel(order="F")).reshape(table.shape, order="F")
+        self.name(name, index, rows, unit)
+        return index
+
+
+@dataclass(frozen=True)
+class _Places:
+    """Where the unknowns of one recording stand."""
+
+    free: Places
+    rest: Places
+    state: Places
+    multipliers: Places
+    theta: Places
+    torque: Places
+    gain: Places
+    reference: Places
+
+    def stages(self) -> Places:
+        """(free, x_k, x_{k+1}, lam_k) of every step, (N, nv)."""
+        steps = len(self.multipliers)
+        free = np.broadcast_to(self.free, (steps, len(self.free)))
+        return np.hstack([free, self.state[:-1], self.state[1:], self.multipliers])
+
+    def inputs(self) -> Places:
+        """(torque, gain, reference) of every step, (N, nd)."""
+        return np.hstack([self.torque.T, self.gain.T, self.reference.T])
+
+
+class _Maker:
+    """Lays out unknowns and parameters of a problem, and makes the terms about them."""
+
+    def __init__(self, problem: EstimationProblem, compiled: bool) -> None:
+        self._problem, self._compiled = problem, compiled
+        self._step, self._sizes = problem.step, problem.step.sizes
+        self._names = problem.unknowns.parameters
+        self._w, self._p = _Vector(), _Vector()
+        system = problem.system
+        self._free = ca.SX.sym("free", len(self._names))
+        self._fixed = ca.SX.sym("theta", len(system.parameters))
+        theta = ca.SX(self._fixed)
+        for k, name in enumerate(self._names):
+            theta[system.parameters.index(name)] = self._free[k]
+        self._theta = theta
+        self._stage = stage(self._step.equations, self._step.time_step)
+        self._tracked_motion(theta)
+        self._sensors: dict[Sensor, tuple[Local, bool]] = {}
+
+    def program(self, x: Array) -> NonlinearProgram:
+        """The program, its guess made near the problem's unknown vector `x`."""
+        problem, low, high = self._problem, *self._problem.bounds
+        shared = len(problem.shared)
+        theta = self._w.extend(x[:shared], low[:shared], high[:shared])
+        self._w.name("theta", theta[:, None], problem.shared)
+        constraints: list[Term] = []
+        residuals: list[Residual] = []
+        ridge, columns = [theta], {k: int(place) for k, place in enumerate(theta)}
+        for i, episode in enumerate(problem.episodes):
+            at = problem.unknowns.columns(i)[shared : shared + len(problem.local)]
+            local = self._w.extend(x[at], low[at], high[at])
+            self._w.name(f"local[{episode.name}]", local[:, None], problem.local)
+            columns |= {int(k): int(place) for k, place in zip(at, local, strict=True)}
+            ridge.append(local)
+            places = self._laid_out(i, episode, x, np.concatenate([theta, local]))
+            begun, prior = self._begun(episode, places)
+            constraints += [begun, self._moved(episode, places)]
+            residuals += [self._sampled(episode, samples, places) for samples in episode.samples if samples.count]
+            residuals += prior
+        residuals += self._priors(columns)
+        index = np.concatenate(ridge)
+        order = [k for k, _ in sorted(columns.items(), key=lambda entry: entry[1])]
+        lower, upper, start = (np.concatenate(part) for part in (self._w.lower, self._w.upper, self._w.values))
+        return NonlinearProgram(
+            self._w.blocks,
+            self._p.blocks,
+            tuple(constraints),
+            tuple(residuals),
+            lower,
+            upper,
+            start,
+            np.concatenate([np.zeros(0), *self._p.values]),
+            Ridge(index, problem.scales[order], RIDGE),
+            ca.MX.sym("w", self._w.size),
+            ca.MX.sym("p", self._p.size),
+        )
+
+    # -- layout -------------------------------------------------------------------------------------------------------
+
+    def _laid_out(self, i: int, episode: Episode, x: Array, free: Places) -> _Places:
+        """The unknowns of a recording at their guess, and what drives it."""
+        problem, step, name = self._problem, self._step, episode.name
+        system, n, nx, m = problem.system, self._sizes["n"], self._sizes["nx"], self._sizes["m"]
+        theta = problem.predictor.own_theta(episode, problem.split(x, i)[0])
+        begin = problem.start_state(episode, theta)
+        nodes = np.arange(episode.grid.steps + 1)
+        state, pull = node_states(problem, episode, nodes, theta, begin, lambda s, _: self._misfit(episode, s, theta))
+        rest = np.zeros(0)
+        if begin.rest is not None:
+            sought = list(problem.functions.statics.unknown)
+            rest = np.concatenate([begin.rest.state[sought], begin.rest.state[2 * n :], begin.rest.constraint_force])
+        joints = system.mechanism.joint_names
+        grasped = [f"{grasp.name}.{k}" for grasp in system.grasps for k in range(grasp.equations)]
+        at_rest = [*(joints[k] for k in problem.functions.statics.unknown), *system.internal, *grasped]
+        rest_at = self._w.extend(rest)
+        self._w.name(f"rest[{name}]", rest_at[:, None], at_rest if len(rest) else ())
+        table = np.zeros((3, len(nodes), nx + m))
+        table[0, :, :nx], table[0, :-1, nx:] = state, pull
+        table[1], table[2] = -np.inf, np.inf
+        for column, index in enumerate(system.prescribed_indices):
+            table[:, :, index] = episode.path[:, column]
+        # the last node has no multipliers
+        at = self._w.extend(*(part.ravel()[: part.size - m] for part in table))
+        index = np.append(at, np.zeros(m, np.int64)).reshape(len(nodes), nx + m)
+        states, multipliers = index[:, :nx], index[:-1, nx:]
+        for label, part, rows in (("q", states[:, :n], joints), ("p", states[:, n : 2 * n], joints)):
+            self._w.name(f"{label}[{name}]", part.T, rows)
+        self._w.name(f"z[{name}]", states[:, 2 * n :].T, tuple(system.internal))
+        self._w.name(f"lam[{name}]", multipliers.T, grasped)
+        known = self._p.add(f"theta[{name}]", theta, system.parameters.names)
+        torque = self._p.add(f"torque[{name}]", episode.torque.T, system.driven, "N m")
+        gain, reference = self._followed(episode)
+        return _Places(free, rest_at, states, multipliers, known[:, 0], torque, gain, reference)
+
+    def _followed(self, episode: Episode) -> tuple[Places, Places]:
+        """Gains (row by row) and reference of the tracking filter at every step."""
+        feedback, steps = episode.feedback, episode.grid.steps
+        if feedback is None:
+            return np.zeros((0, steps), np.int64), np.zeros((0, steps), np.int64)
+        driven, joints, n = self._problem.system.driven, self._problem.system.mechanism.joint_names, self._sizes["n"]
+        followed = [f"{'q' if row < n else 'p'}.{joints[row % n]}" for row in feedback.index]
+        pairs = [f"{joint}, {other}" for joint in driven for other in followed]
+        gain = self._p.add(f"gain[{episode.name}]", feedback.gain.reshape(steps, -1).T, pairs)
+        return gain, self._p.add(f"reference[{episode.name}]", feedback.reference.T, followed)
+
+    def _misfit(self, episode: Episode, state: Array, theta: Array) -> float:
+        """Mean square whitened residual of what node states alone predict."""
+        problem = self._problem
+        flat, parts = np.zeros((*state.shape, len(self._names))), [np.zeros(1)]
+        for samples in episode.samples:
+            if not samples.sensor.efforts:
+                predicted, _ = problem.predictor.along(samples, state, flat, theta)
+                parts.append(samples.rows(predicted, threshold=problem.options.huber_threshold).residual)
+        return float(np.mean(np.concatenate(parts) ** 2))
+
+    def _tracked_motion(self, theta: ca.SX) -> None:
+        """The stage under the tracking filter, and what sensors of efforts need of it.
+
+        u = ubar - K (x_k[index] - xbar), so that the slopes by x_k get those by u times -K.
+        """
+        one, sizes = self._stage, self._sizes
+        feedback = self._problem.episodes[0].feedback
+        index = np.zeros(0, int) if feedback is None else feedback.index
+        x0, x1 = ca.SX.sym("x0", sizes["nx"]), ca.SX.sym("x1", sizes["nx"])
+        lam, nominal = ca.SX.sym("lam", sizes["m"]), ca.SX.sym("u", sizes["nu"])
+        gain, reference = ca.SX.sym("gain", sizes["nu"] * len(index)), ca.SX.sym("reference", len(index))
+        matrix = ca.reshape(gain, len(index), sizes["nu"]).T
+        applied, by_x0 = ca.SX(nominal), ca.SX(sizes["nu"], sizes["nx"])
+        if len(index):
+            applied = nominal - ca.mtimes(matrix, x0[index.tolist()] - reference)
+            by_x0[:, index.tolist()] = -matrix
+        outputs = []
+        for value, slopes, by_theta in zip(
+            (one.rows, one.effort), (one.slopes, one.effort_slopes), one.by_theta(self._names), strict=True
+        ):
+            outputs += [value, by_theta, *slopes.values()]
+        symbols = [one.x0, one.x1, one.lam, one.u, one.theta]
+        placed = ca.substitute(outputs, symbols, [x0, x1, lam, applied, theta])
+        v = ca.vertcat(self._free, x0, x1, lam)
+        self._motion_inputs = [v, ca.vertcat(nominal, gain, reference), self._fixed]
+        made = []
+        for value, by_free, first, second, by_lam, by_u in (placed[:6], placed[6:]):
+            slopes = ca.horzcat(by_free, first + ca.mtimes(by_u, by_x0), second, by_lam)
+            made.append((value, slopes))
+        (rows, slopes), self._effort = made
+        none = ca.SX(sizes["nu"], sizes["nx"] + sizes["m"])
+        self._applied = (applied, ca.horzcat(ca.SX(sizes["nu"], len(self._names)), by_x0, none))
+        self._motion = Local("step", self._motion_inputs, rows, slopes, self._compiled)
+
+    # -- terms --------------------------------------------------------------------------------------------------------
+
+    def _moved(self, episode: Episode, places: _Places) -> Term:
+        """Every step's equations."""
+        return Term(
+            f"step[{episode.name}]", self._stage.names, self._motion, places.stages(), places.inputs(), places.theta
+        )
+
+    def _begun(self, episode: Episode, places: _Places) -> tuple[Term, list[Residual]]:
+        """What fixes the first state, and the prior of what is free of it."""
+        problem, name, nx = self._problem, episode.name, self._sizes["nx"]
+        loose = list(problem.predictor.start_rows)
+        fixed = [k for k in range(nx) if k not in {*problem.system.prescribed_indices, *loose}]
+        joints = problem.system.mechanism.joint_names
+        rows = [*(f"q.{joint}" for joint in joints), *(f"p.{joint}" for joint in joints), *problem.system.internal]
+        first = ca.SX.sym("x0", nx)
+        if episode.start is not None:
+            given = self._p.add(f"start[{name}]", episode.start.state, rows)
+            state, balance = ca.SX.sym("given", nx), ca.SX(0, 1)
+            inputs = [first, state, ca.SX(0, 1)]
+            at, data, shared = places.state[:1], given.T, np.zeros(0, np.int64)
+        else:
+            statics = problem.functions.statics
+            sought, held = statics.inputs[0], statics.inputs[2]
+            stiffness = HOLD_STIFFNESS_WITH_TORQUE if problem.system.driven else HOLD_STIFFNESS
+            symbols = [statics.inputs[3], statics.inputs[4], statics.inputs[5]]
+            values = [ca.SX(stiffness), self._theta, ca.SX(self._step.time_step)]
+            balance, state = ca.substitute([statics.residual, statics.state], symbols, values)
+            inputs = [ca.vertcat(self._free, sought, first), ca.vertcat(statics.inputs[1], held), self._fixed]
+            known = [problem.system.mechanism.joint_names[k] for k in statics.known]
+            posture = self._p.add(f"posture[{name}]", episode.posture, known)
+            at = np.concatenate([places.free, places.rest, places.state[0]])[None, :]
+            data, shared = np.concatenate([posture[:, 0], places.torque[:, 0]])[None, :], places.theta
+        labels = [f"rest.{k}" for k in range(balance.numel())] + [f"start.{rows[k]}" for k in fixed]
+        value = ca.densify(ca.vertcat(balance, (first - state)[fixed]))
+        term = Term(f"start[{name}]", tuple(labels), Local("start", inputs, value), at, data, shared)
+        if not loose:
+            return term, []
+        offset = Local("offset", inputs, ca.densify((first - state)[loose]))
+        weight = self._p.add(f"weight.start[{name}]", 1.0 / problem.start_std, [rows[k] for k in loose])
+        named = tuple(f"offset.{rows[k]}" for k in loose)
+        free = Term(f"offset[{name}]", named, offset, at, data, shared)
+        return term, [Residual(free, ca.DM.eye(len(loose)), weight[:, 0])]
+
+    def _sampled(self, episode: Episode, samples: Measurements, places: _Places) -> Residual:
+        """Samples of one sensor, predicted linearly between the two nodes beside them."""
+        sensor, nodes, n = samples.sensor, samples.nodes, self._sizes["n"]
+        read, loaded = self._reading(sensor)
+        if loaded:
+            # after the last step the effort is that of this step
+            step = np.minimum(nodes, len(places.multipliers) - 1)
+            ends = self._p.add(f"last.{sensor.group}[{episode.name}]", (nodes > step)[None, :], ["last"])
+            at, data = places.stages()[step], np.hstack([places.inputs()[step], ends.T])
+        else:
+            free = np.broadcast_to(places.free, (len(nodes), len(places.free)))
+            states = places.state[nodes]
+            at, data = np.hstack([free, states[:, :n], states[:, 2 * n :]]), np.zeros((len(nodes), 0), np.int64)
+        columns = samples.channel_of_column
+        rows = tuple(f"{channel}.{k % sensor.width}" if sensor.width > 1 else channel for k, channel in enumerate(columns))
+        term = Term(f"{sensor.group}[{episode.name}]", rows, read, at, data, places.theta)
+        seen = samples.seen
+        value = self._p.add(f"value.{term.name}", np.where(seen, samples.value, 0.0).T, rows, sensor.unit)
+        weight = self._p.add(f"weight.{term.name}", samples.weight.T, rows)
+        threshold = self._problem.options.huber_threshold
+        return Residual(term, _between(samples), weight.T[seen], value.T[seen], threshold)
+
+    def _reading(self, sensor: Sensor) -> tuple[Local, bool]:
+        """What a sensor reads at a node, and whether it depends on efforts, that is, on the step from there."""
+        if sensor not in self._sensors:
+            n, nz = self._sizes["n"], self._sizes["nz"]
+            function = sensor_function(self._problem.system, sensor, self._names)
+            loaded = function.nnz_out(3) > 0
+            self._sensors[sensor] = (self._loaded(function) if loaded else self._unloaded(function, n, nz)), loaded
+        return self._sensors[sensor]
+
+    def _unloaded(self, function: ca.Function, n: int, nz: int) -> Local:
+        q, z = ca.SX.sym("q", n), ca.SX.sym("z", nz)
+        y, by_q, by_z, _, by_free = function(q, z, ca.SX(ca.DM.zeros(n)), self._theta)
+        inputs = [ca.vertcat(self._free, q, z), ca.SX(0, 1), self._fixed]
+        return Local("reading", inputs, y, ca.horzcat(by_free, by_q, by_z))
+
+    def _loaded(self, function: ca.Function) -> Local:
+        system, n, nx, m = self._problem.system, self._sizes["n"], self._sizes["nx"], self._sizes["m"]
+        (v, data, fixed), torque, effort = self._motion_inputs, self._applied, self._effort
+        last, first = ca.SX.sym("last"), len(self._names)
+        before, after = v[first : first + nx], v[first + nx : first + 2 * nx]
+        node = (1 - last) * before + last * after
+        load, by_v = ca.SX(ca.DM.zeros(n)), ca.SX(n, first + 2 * nx + m)
+        for index, values, slopes in ((system.prescribed_indices, *effort), (system.driven_indices, *torque)):
+            for k, row in enumerate(index):
+                load[row], by_v[row, :] = values[k], slopes[k, :]
+        y, by_q, by_z, by_load, by_free = function(node[:n], node[2 * n :], load, self._theta)
+        at_node = ca.horzcat(by_q, ca.SX(y.numel(), n), by_z)
+        slopes = ca.mtimes(by_load, by_v)
+        slopes += ca.horzcat(by_free, (1 - last) * at_node, last * at_node, ca.SX(y.numel(), m))
+        return Local("reading_under_load", [v, ca.vertcat(data, last), fixed], y, slopes)
+
+    def _priors(self, columns: dict[int, int]) -> list[Residual]:
+        """Stated priors of parameters, and the weak ones."""
+        problem = self._problem
+        _, slopes = problem.prior(problem.start)
+        v, about = ca.SX.sym("v"), ca.SX.sym("about")
+        ratio = v / about
+        below = (ratio - SMALL_RATIO) / SMALL_RATIO
+        soft = ca.log(ca.fmax(ratio, SMALL_RATIO)) + ca.if_else(ratio < SMALL_RATIO, below - below**2 / 2, 0)
+        stated = problem.rows.stated_priors.stop - problem.rows.stated_priors.start
+        found = []
+        for name, part, value, scaled in (("prior", slice(0, stated), v - about, False), ("weak_prior", slice(stated, None), soft, True)):
+            row, unknown = np.nonzero(slopes[part])
+            kept = np.isin(unknown, list(columns))
+            weight = slopes[part][row, unknown][kept] * (problem.start[unknown[kept]] if scaled else 1.0)
+            unknown = unknown[kept]
+            if not len(unknown):
+                continue
+            names = [problem.names[k] for k in unknown]
+            start = self._p.add(f"{name}.start", problem.start[unknown], names)
+            weights = self._p.add(f"{name}.weight", weight, names)
+            local = Local(name, [v, about, ca.SX(0, 1)], value)
+            at = np.array([[columns[int(k)]] for k in unknown])
+            term = Term(name, (name,), local, at, start, np.zeros(0, np.int64))
+            found.append(Residual(term, ca.DM.eye(len(unknown)), weights[:, 0]))
+        return found
+
+
+def _between(samples: Measurements) -> ca.DM:
+    """What makes predictions of samples, those that count, from readings at nodes, node by node."""
+    width, nodes = samples.value.shape[1], samples.nodes
+    sample, column = np.nonzero(samples.seen)
+    row, before = np.arange(len(sample)), np.searchsorted(nodes, samples.node[sample])
+    fraction = samples.fraction[sample]
+    after = np.minimum(before + 1, len(nodes) - 1)
+    entries = np.concatenate([1 - fraction, fraction])
+    at = np.concatenate([before * width + column, after * width + column])
+    matrix = scipy.sparse.csc_matrix((entries, (np.tile(row, 2), at)), shape=(len(sample), width * len(nodes)))
+    matrix.eliminate_zeros()
+    return ca.DM(matrix)
