@@ -1,11 +1,9 @@
-"""A nonlinear program in CasADi, made of functions at many places, with their derivatives placed by hand.
+"""A nonlinear program in CasADi, made of terms.
 
     min f(w, p)   subject to   lower <= w <= upper,   g_lower <= g(w, p) <= g_upper
 
-f is half the sum of squares (or Huber's loss) of residuals, g the values of constraint terms, and each is one function
-mapped over its places in w. The derivatives of that function, once for all places, are placed into the program's:
-CasADi would find the same ones by colouring the whole band, in many times the time. Nothing here knows mechanics or
-recordings.
+f is half the sum of squares (or Huber's loss) of residuals, g the values of constraint terms. Nothing here knows
+mechanics or recordings.
 """
 
 from __future__ import annotations
@@ -13,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import casadi as ca
@@ -20,12 +19,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import SolverError, nearest
-from yid_ocp.integrator.compiler import compiled_function
-from yid_ocp.parallel import SYMBOLIC, Once
+from yid_ocp.parallel import SYMBOLIC
+from yid_ocp.solvers.terms import Places, Residual, Ridge, Term, assembled, summed
 
 Array = NDArray[np.float64]
-Places = NDArray[np.int64]
 Hessian = Literal["gauss_newton", "exact"]
+# Measured with IPOPT and MUMPS on 40 to 50 coordinates and 500 to 2000 steps [bytes an entry of Jacobian and Hessian].
+ENTRY = 250.0
+
+# A trial point that cannot be worked out is the solver's to reject, not for the screen; multipliers of the parameters,
+# which are thousands, are for whoever asks.
+SILENT = {"show_eval_warnings": False, "error_on_fail": False, "print_time": False, "calc_lam_p": False}
+
+# Options that fit programs of one size only.
+SIZED = ("iteration_callback", "discrete", "equality", "structure_detection", "N", "nx", "nu", "ng")
 
 
 @dataclass(frozen=True)
@@ -46,213 +53,6 @@ class Block:
     unit: str = ""
 
 
-class Local:
-    """A function y(v; d, s) of local variables v, data d and data s that all places share, with its derivatives.
-
-    Parameters
-    ----------
-    name : str
-    inputs : sequence of casadi.SX
-        (v, d, s), columns.
-    value : casadi.SX, shape (ny, 1)
-    jacobian : casadi.SX, shape (ny, nv), optional
-        dy/dv; differentiated from the value when absent.
-    use_compiler : bool
-        Whether the derivatives are compiled where that is possible; the value stays CasADi's own, so that whoever
-        builds upon it can differentiate it.
-    """
-
-    def __init__(
-        self,
-        name: str,
-        inputs: Sequence[ca.SX],
-        value: ca.SX,
-        jacobian: ca.SX | None = None,
-        use_compiler: bool = False,
-    ) -> None:
-        self.name, self._inputs, self._expression, self._use_compiler = name, list(inputs), value, use_compiler
-        self.value = ca.Function(name, self._inputs, [value])
-        slopes = ca.jacobian(value, inputs[0]) if jacobian is None else jacobian
-        self.jacobian = self._compiled(ca.Function(f"{name}_slope", self._inputs, ca.cse([ca.sparsify(slopes)])))
-        self._curvature: Once[None, ca.Function | None] = Once(lambda _: self._curved())
-
-    @property
-    def curvature(self) -> ca.Function | None:
-        """Second derivative of weight . y by v at (v, d, s, weight), sparse; None where y is linear."""
-        return self._curvature(None)
-
-    def _compiled(self, function: ca.Function) -> ca.Function:
-        return compiled_function(function) if self._use_compiler else function
-
-    def _curved(self) -> ca.Function | None:
-        """One product with a direction, for each colour of the pattern: the whole would be millions of operations."""
-        v, weight = self._inputs[0], ca.SX.sym("weight", self._expression.numel())
-        gradient = ca.gradient(ca.dot(weight, self._expression), v)
-        pattern = ca.jacobian_sparsity(gradient, v)
-        if not pattern.nnz():
-            return None
-        direction = ca.SX.sym("direction", v.numel())
-        product = ca.cse([ca.densify(ca.jtimes(gradient, v, direction))])
-        times = self._compiled(ca.Function(f"{self.name}_product", [*self._inputs, weight, direction], product))
-        group = pattern.uni_coloring()
-        colour = np.zeros(v.numel(), int)
-        members, column = group.get_triplet()
-        colour[members] = column
-        row, column = (np.array(x) for x in pattern.get_triplet())
-        symbols = [ca.MX.sym(f"a{i}", times.sparsity_in(i)) for i in range(4)]
-        columns = times.map(f"{self.name}_products", "serial", group.size2(), [0, 1, 2, 3], [])
-        products = ca.vec(columns(*symbols, ca.DM(group, 1.0)))
-        entries = products[(row + v.numel() * colour[column]).tolist()]
-        return ca.Function(f"{self.name}_curvature", symbols, [ca.MX(pattern, entries)])
-
-
-@dataclass(frozen=True)
-class Term:
-    """One function at K places of a program.
-
-    Attributes
-    ----------
-    name : str
-    rows : tuple of str
-        Names of the ny outputs.
-    local : Local
-    places : ndarray of int, shape (K, nv)
-        Where the local variables of every place stand among the unknowns; none twice in a row.
-    data : ndarray of int, shape (K, nd)
-        Where its data stand among the parameters.
-    shared : ndarray of int, shape (ns,)
-        Where the data stand that all places share.
-    """
-
-    name: str
-    rows: tuple[str, ...]
-    local: Local
-    places: Places
-    data: Places
-    shared: Places
-
-    @property
-    def size(self) -> int:
-        """Number of values at all places."""
-        return len(self.rows) * len(self.places)
-
-    def arguments(self, w: ca.MX, p: ca.MX) -> tuple[ca.MX, ca.MX, ca.MX]:
-        """Local variables (nv, K), data (nd, K) and shared data (ns, 1)."""
-
-        def gathered(vector: ca.MX, index: Places) -> ca.MX:
-            return ca.reshape(vector[index.ravel().tolist()], index.shape[1], index.shape[0])
-
-        return gathered(w, self.places), gathered(p, self.data), p[self.shared.tolist()]
-
-    def mapped(self, function: ca.Function, *arguments: ca.MX) -> ca.MX:
-        """A function of the local ones at every place, its results side by side."""
-        return function.map(f"{function.name()}_{len(self.places)}", "serial", len(self.places), [2], [])(*arguments)
-
-    def values(self, w: ca.MX, p: ca.MX) -> ca.MX:
-        """Values place by place, shape (ny K, 1)."""
-        return ca.vec(self.mapped(self.local.value, *self.arguments(w, p)))
-
-    def entries(self, w: ca.MX, p: ca.MX) -> ca.MX:
-        """Entries of the Jacobian, in the order of `slots`."""
-        return nonzeros(self.mapped(self.local.jacobian, *self.arguments(w, p)))
-
-    def slots(self) -> tuple[Places, Places]:
-        """Row and column of the entries of the Jacobian."""
-        row, column = (np.array(x, np.int64) for x in self.local.jacobian.sparsity_out(0).get_triplet())
-        first = len(self.rows) * np.arange(len(self.places))[:, None]
-        return (first + row).ravel(), self.places[:, column].ravel()
-
-    def curvature(self, w: ca.MX, p: ca.MX, weight: ca.MX) -> tuple[ca.MX, Places, Places] | None:
-        """Second derivative of weight . values: entries, rows and columns, which may repeat; None where it is zero."""
-        function = self.local.curvature
-        if function is None:
-            return None
-        weights = ca.reshape(weight, len(self.rows), len(self.places))
-        entries = nonzeros(self.mapped(function, *self.arguments(w, p), weights))
-        row, column = (np.array(x, np.int64) for x in function.sparsity_out(0).get_triplet())
-        return entries, self.places[:, row].ravel(), self.places[:, column].ravel()
-
-
-@dataclass(frozen=True)
-class Residual:
-    """Weighted differences of combined values and data: r = weight (combination values - target).
-
-    Attributes
-    ----------
-    term : Term
-    combination : casadi.DM, shape (nr, ny K), or None
-        None takes the values as they are.
-    weight, target : ndarray of int, shape (nr,), or None
-        Where they stand among the parameters; None for ones and for zeros.
-    threshold : float
-        Beyond which Huber's loss is linear.
-    """
-
-    term: Term
-    combination: ca.DM | None = None
-    weight: Places | None = None
-    target: Places | None = None
-    threshold: float = math.inf
-
-    @property
-    def size(self) -> int:
-        """Number of residuals."""
-        return self.term.size if self.combination is None else self.combination.size1()
-
-    def by_values(self, p: ca.MX) -> ca.MX | None:
-        """dr/dvalues, sparse; None for the identity."""
-        if self.combination is None and self.weight is None:
-            return None
-        combination = ca.DM.eye(self.size) if self.combination is None else self.combination
-        if self.weight is None:
-            return ca.MX(combination)
-        row, _ = combination.sparsity().get_triplet()
-        factors = p[self.weight[np.array(row, int)].tolist()]
-        return ca.MX(combination.sparsity(), factors * ca.MX(ca.DM(combination.nonzeros())))
-
-    def values(self, w: ca.MX, p: ca.MX) -> ca.MX:
-        """r, shape (nr, 1)."""
-        matrix, value = self.by_values(p), self.term.values(w, p)
-        result = value if matrix is None else ca.mtimes(matrix, value)
-        if self.target is None:
-            return result
-        target = p[self.target.tolist()]
-        return result - (target if self.weight is None else p[self.weight.tolist()] * target)
-
-    def jacobian(self, w: ca.MX, p: ca.MX) -> ca.MX:
-        """dr/dw, shape (nr, nw), sparse."""
-        placed = assembled(self.term.entries(w, p), *self.term.slots(), (self.term.size, w.numel()))
-        matrix = self.by_values(p)
-        return placed if matrix is None else ca.mtimes(matrix, placed)
-
-    def loss(self, r: ca.MX) -> ca.MX:
-        """Half the sum of squares, or Huber's loss."""
-        if math.isinf(self.threshold):
-            return ca.sumsqr(r) / 2
-        size, limit = ca.fabs(r), self.threshold
-        return ca.sum1(ca.if_else(size <= limit, r**2 / 2, limit * (size - limit / 2)))
-
-    def pull(self, r: ca.MX) -> ca.MX:
-        """Derivative of the loss by r."""
-        return r if math.isinf(self.threshold) else ca.fmax(ca.fmin(r, self.threshold), -self.threshold)
-
-    def slope_weight(self, r: ca.MX) -> ca.MX | None:
-        """Factor on the squares in Gauss-Newton's Hessian; None for ones."""
-        return None if math.isinf(self.threshold) else ca.fmin(1.0, self.threshold / ca.fmax(ca.fabs(r), 1e-300))
-
-
-@dataclass(frozen=True)
-class Ridge:
-    """Curvature added to Gauss-Newton's Hessian: factor * mean square residual / max(|w_i|, scale_i)^2.
-
-    Along unknowns that the data hardly inform the curvature that Gauss-Newton leaves out may be as large as its own.
-    """
-
-    index: Places
-    scale: Array
-    factor: float
-
-
 @dataclass(frozen=True)
 class Extra:
     """A user's own part of a program: a term of the objective, rows of the constraints, or both."""
@@ -263,27 +63,12 @@ class Extra:
     upper: Array
 
 
-def nonzeros(matrix: ca.MX) -> ca.MX:
-    """Entries of a sparse expression as a column."""
-    return ca.MX(ca.Sparsity.dense(matrix.nnz(), 1), matrix.nz[:])
-
-
-def assembled(entries: ca.MX, row: Places, column: Places, shape: tuple[int, int]) -> ca.MX:
-    """A sparse matrix from its entries, each at a place of its own."""
-    order = np.lexsort((row, column))
-    start = np.concatenate([[0], np.cumsum(np.bincount(column, minlength=shape[1]))])
-    sparsity = ca.Sparsity(*shape, start.tolist(), row[order].tolist())
-    return ca.MX(sparsity, entries[order.tolist()])
-
-
-def summed(entries: ca.MX, row: Places, column: Places, size: int) -> ca.MX:
-    """A sparse square matrix from entries that share places."""
-    keys, place = np.unique(column * size + row, return_inverse=True)
-    start = np.concatenate([[0], np.cumsum(np.bincount(keys // size, minlength=size))])
-    sparsity = ca.Sparsity(size, size, start.tolist(), (keys % size).tolist())
-    # one column for every entry, its only row being where it goes
-    columns = ca.Sparsity(len(keys), len(place), list(range(len(place) + 1)), place.ravel().tolist())
-    return ca.MX(sparsity, ca.mtimes(ca.MX(ca.DM(columns, 1.0)), entries))
+def free_memory() -> float:
+    """Memory that is free [bytes]; infinite where the system does not tell."""
+    told = Path("/proc/meminfo")
+    lines = told.read_text(encoding="ascii", errors="replace").splitlines() if told.is_file() else []
+    found = [float(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
+    return found[0] if found else math.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -418,36 +203,52 @@ class NonlinearProgram:
         """df/dw, shape (nw, 1)."""
         return self._once("grad_f", self._gradient)
 
-    def hessian(self, kind: Hessian, lam_f: ca.MX, lam_g: ca.MX) -> ca.MX:
+    @property
+    def lam_f(self) -> ca.MX:
+        """Factor on the objective in the Lagrangian, of which `hessian` is an expression."""
+        return self._once("lam_f", lambda: ca.MX.sym("lam_f"))
+
+    @property
+    def lam_g(self) -> ca.MX:
+        """Multipliers of the constraints in the Lagrangian, shape (ng, 1)."""
+        return self._once("lam_g", lambda: ca.MX.sym("lam_g", self.g.numel()))
+
+    def hessian(self, kind: Hessian = "gauss_newton") -> ca.MX:
         """Second derivative of lam_f f + lam_g . g, or what Gauss-Newton takes for it, sparse and symmetric.
 
-        Gauss-Newton leaves out the curvature of residuals and of terms of `constraints`, not that of what was added.
+        Gauss-Newton leaves out the curvature of residuals and of the terms of `constraints`, not of what was added.
         """
-        w, p, size = self.w, self.p, self.w.numel()
+        return self._once(kind, lambda: self._data_curvature(kind) + self._other_curvature(kind))
+
+    def _data_curvature(self, kind: Hessian) -> ca.MX:
+        size = self.w.numel()
         total = ca.MX(size, size)
         for i, residual in enumerate(self.residuals):
             r, slope = self._residual(i), self._slope(i)
             weight = residual.slope_weight(r)
             weighted = slope if weight is None else ca.mtimes(ca.diag(weight), slope)
-            total += lam_f * ca.mtimes(slope.T, weighted)
+            total += self.lam_f * ca.mtimes(slope.T, weighted)
             if kind == "exact":
-                matrix, pull = residual.by_values(p), residual.pull(r)
+                matrix, pull = residual.by_values(self.p), residual.pull(r)
                 pull = pull if matrix is None else ca.mtimes(matrix.T, pull)
-                curved = residual.term.curvature(w, p, lam_f * pull)
+                curved = residual.term.curvature(self.w, self.p, self.lam_f * pull)
                 total += 0 if curved is None else summed(*curved, size)
-        if kind == "exact":
-            at = 0
-            for term in self.constraints:
-                curved = term.curvature(w, p, lam_g[at : at + term.size])
-                at += term.size
-                total += 0 if curved is None else summed(*curved, size)
-        elif self.ridge is not None:
-            total += lam_f * self._ridge(self.ridge)
-        at = sum(term.size for term in self.constraints)
+        return total
+
+    def _other_curvature(self, kind: Hessian) -> ca.MX:
+        size, at = self.w.numel(), 0
+        total = ca.MX(size, size)
+        if kind == "gauss_newton" and self.ridge is not None:
+            total += self.lam_f * self._ridge(self.ridge)
+        for term in self.constraints:
+            weight = self.lam_g[at : at + term.size]
+            at += term.size
+            curved = term.curvature(self.w, self.p, weight) if kind == "exact" else None
+            total += 0 if curved is None else summed(*curved, size)
         for extra in self.extras:
-            own = lam_f * extra.objective + ca.dot(lam_g[at : at + len(extra.lower)], extra.constraints)
+            weight = self.lam_g[at : at + len(extra.lower)]
             at += len(extra.lower)
-            total += ca.hessian(own, w)[0]
+            total += ca.hessian(self.lam_f * extra.objective + ca.dot(weight, extra.constraints), self.w)[0]
         return total
 
     def _once(self, name: str, make: Any) -> Any:
@@ -495,7 +296,12 @@ class NonlinearProgram:
         at = ridge.index.tolist()
         size = ca.fmax(ca.fabs(self.w[at]), ca.DM(ridge.scale))
         pattern = ca.Sparsity.triplet(self.w.numel(), self.w.numel(), at, at)
-        return ca.MX(pattern, ridge.factor * 2 * cost / count / size**2)
+        factor = ridge.factor(self.w) if isinstance(ridge.factor, ca.Function) else ridge.factor
+        return ca.MX(pattern, factor * 2 * cost / count / size**2)
+
+    def memory(self, hessian: Hessian = "gauss_newton") -> float:
+        """About how much an interior-point method with a direct solver will need beside what there is [bytes]."""
+        return ENTRY * float(self.jac_g.nnz() + self.hessian(hessian).nnz())
 
     # -- use ----------------------------------------------------------------------------------------------------------
 
@@ -566,8 +372,7 @@ class NonlinearProgram:
             CasADi does not have the plug-in, or refuses the options.
         """
         with SYMBOLIC:
-            # a trial point that cannot be worked out is the solver's to reject, not for the screen
-            options = {"show_eval_warnings": False, "error_on_fail": False, "print_time": False, **options}
+            options = {**SILENT, **options}
             try:
                 asked = _asked_for(plugin, options)
                 made = {name: self._derivatives(name, *ends, hessian) for name, ends in asked.items()}
@@ -579,19 +384,16 @@ class NonlinearProgram:
                     hint="see casadi.doc_nlpsol for its options",
                 ) from error
 
-    def _derivatives(
-        self, name: str, inputs: list[str], outputs: list[str], hessian: Hessian
-    ) -> ca.Function | None:
-        lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", self.g.numel())
-        symbols = {"x": self.w, "p": self.p, "lam_f": lam_f, "lam_g": lam_g}
+    def _derivatives(self, name: str, inputs: list[str], outputs: list[str], hessian: Hessian) -> ca.Function | None:
+        symbols = {"x": self.w, "p": self.p, "lam_f": self.lam_f, "lam_g": self.lam_g}
         known = {
             "f": lambda: self.f,
             "g": lambda: self.g,
             "grad_f_x": lambda: self.grad_f,
             "jac_g_x": lambda: self.jac_g,
-            "grad_gamma_x": lambda: lam_f * self.grad_f + ca.mtimes(self.jac_g.T, lam_g),
-            "hess_gamma_x_x": lambda: self.hessian(hessian, lam_f, lam_g),
-            "triu_hess_gamma_x_x": lambda: ca.triu(self.hessian(hessian, lam_f, lam_g)),
+            "grad_gamma_x": lambda: self.lam_f * self.grad_f + ca.mtimes(self.jac_g.T, self.lam_g),
+            "hess_gamma_x_x": lambda: self.hessian(hessian),
+            "triu_hess_gamma_x_x": lambda: ca.triu(self.hessian(hessian)),
         }
         if not set(outputs) <= set(known) or not set(inputs) <= set(symbols):
             return None
@@ -605,6 +407,7 @@ def _is_of(symbol: ca.MX, *vectors: ca.MX) -> bool:
 def _asked_for(plugin: str, options: Mapping[str, Any]) -> dict[str, tuple[list[str], list[str]]]:
     """Inputs and outputs of the functions that a plug-in asks for, learnt on a program of one unknown."""
     x, p = ca.MX.sym("x"), ca.MX.sym("p")
-    tiny = ca.nlpsol("tiny", plugin, {"x": x, "p": p, "f": x**2, "g": x}, dict(options))
+    fitting = {name: value for name, value in options.items() if name not in SIZED}
+    tiny = ca.nlpsol("tiny", plugin, {"x": x, "p": p, "f": x**2, "g": x}, fitting)
     functions = {name: tiny.get_function(name) for name in tiny.get_function()}
     return {name: (f.name_in(), f.name_out()) for name, f in functions.items()}

@@ -23,7 +23,7 @@ import scipy.sparse
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import SolverError
-from yid_ocp.integrator.stage import Stage, stage
+from yid_ocp.integrator.stage import stage
 from yid_ocp.integrator.statics import HOLD_STIFFNESS, HOLD_STIFFNESS_WITH_TORQUE
 from yid_ocp.parallel import SYMBOLIC
 from yid_ocp.problem.episodes import Episode
@@ -32,7 +32,8 @@ from yid_ocp.problem.problem import EstimationProblem
 from yid_ocp.problem.unknowns import SMALL_RATIO
 from yid_ocp.sensors import Sensor, sensor_function
 from yid_ocp.solvers.guess import node_states
-from yid_ocp.solvers.program import Block, Local, NonlinearProgram, Places, Residual, Ridge, Term
+from yid_ocp.solvers.program import Block, NonlinearProgram
+from yid_ocp.solvers.terms import Local, Places, Residual, Ridge, Term
 
 Array = NDArray[np.float64]
 
@@ -227,7 +228,7 @@ class _Maker:
 
     def _laid_out(self, i: int, episode: Episode, x: Array, free: Places) -> _Places:
         """The unknowns of a recording at their guess, and what drives it."""
-        problem, step, name = self._problem, self._step, episode.name
+        problem, name = self._problem, episode.name
         system, n, nx, m = problem.system, self._sizes["n"], self._sizes["nx"], self._sizes["m"]
         theta = problem.predictor.own_theta(episode, problem.split(x, i)[0])
         begin = problem.start_state(episode, theta)
@@ -245,8 +246,8 @@ class _Maker:
         table = np.zeros((3, len(nodes), nx + m))
         table[0, :, :nx], table[0, :-1, nx:] = state, pull
         table[1], table[2] = -np.inf, np.inf
-        for column, index in enumerate(system.prescribed_indices):
-            table[:, :, index] = episode.path[:, column]
+        for column, joint in enumerate(system.prescribed_indices):
+            table[:, :, joint] = episode.path[:, column]
         # the last node has no multipliers
         at = self._w.extend(*(part.ravel()[: part.size - m] for part in table))
         index = np.append(at, np.zeros(m, np.int64)).reshape(len(nodes), nx + m)
@@ -308,12 +309,11 @@ class _Maker:
         self._motion_inputs = [v, ca.vertcat(nominal, gain, reference), self._fixed]
         made = []
         for value, by_free, first, second, by_lam, by_u in (placed[:6], placed[6:]):
-            slopes = ca.horzcat(by_free, first + ca.mtimes(by_u, by_x0), second, by_lam)
-            made.append((value, slopes))
-        (rows, slopes), self._effort = made
+            made.append((value, ca.horzcat(by_free, first + ca.mtimes(by_u, by_x0), second, by_lam)))
+        (rows, by_v), self._effort = made
         none = ca.SX(sizes["nu"], sizes["nx"] + sizes["m"])
         self._applied = (applied, ca.horzcat(ca.SX(sizes["nu"], len(self._names)), by_x0, none))
-        self._motion = Local("step", self._motion_inputs, rows, slopes, self._compiled)
+        self._motion = Local("step", self._motion_inputs, rows, by_v, self._compiled)
 
     # -- terms --------------------------------------------------------------------------------------------------------
 
@@ -366,14 +366,14 @@ class _Maker:
         if loaded:
             # after the last step the effort is that of this step
             step = np.minimum(nodes, len(places.multipliers) - 1)
-            ends = self._p.add(f"last.{sensor.group}[{episode.name}]", (nodes > step)[None, :], ["last"])
+            ends = self._p.add(f"last.{sensor.group}[{episode.name}]", (nodes > step).astype(float), ["last"])
             at, data = places.stages()[step], np.hstack([places.inputs()[step], ends.T])
         else:
             free = np.broadcast_to(places.free, (len(nodes), len(places.free)))
             states = places.state[nodes]
             at, data = np.hstack([free, states[:, :n], states[:, 2 * n :]]), np.zeros((len(nodes), 0), np.int64)
-        columns = samples.channel_of_column
-        rows = tuple(f"{channel}.{k % sensor.width}" if sensor.width > 1 else channel for k, channel in enumerate(columns))
+        parts = [f".{axis}" for axis in "xyz"] if sensor.width == 3 else [""] * sensor.width
+        rows = tuple(f"{channel}{part}" for channel in sensor.channels for part in parts)
         term = Term(f"{sensor.group}[{episode.name}]", rows, read, at, data, places.theta)
         seen = samples.seen
         value = self._p.add(f"value.{term.name}", np.where(seen, samples.value, 0.0).T, rows, sensor.unit)
@@ -403,9 +403,9 @@ class _Maker:
         before, after = v[first : first + nx], v[first + nx : first + 2 * nx]
         node = (1 - last) * before + last * after
         load, by_v = ca.SX(ca.DM.zeros(n)), ca.SX(n, first + 2 * nx + m)
-        for index, values, slopes in ((system.prescribed_indices, *effort), (system.driven_indices, *torque)):
+        for index, (values, by_these) in ((system.prescribed_indices, effort), (system.driven_indices, torque)):
             for k, row in enumerate(index):
-                load[row], by_v[row, :] = values[k], slopes[k, :]
+                load[row], by_v[row, :] = values[k], by_these[k, :]
         y, by_q, by_z, by_load, by_free = function(node[:n], node[2 * n :], load, self._theta)
         at_node = ca.horzcat(by_q, ca.SX(y.numel(), n), by_z)
         slopes = ca.mtimes(by_load, by_v)
@@ -422,13 +422,15 @@ class _Maker:
         soft = ca.log(ca.fmax(ratio, SMALL_RATIO)) + ca.if_else(ratio < SMALL_RATIO, below - below**2 / 2, 0)
         stated = problem.rows.stated_priors.stop - problem.rows.stated_priors.start
         found = []
-        for name, part, value, scaled in (("prior", slice(0, stated), v - about, False), ("weak_prior", slice(stated, None), soft, True)):
+        kinds = (("prior", slice(0, stated), v - about), ("weak_prior", slice(stated, None), soft))
+        for name, part, value in kinds:
             row, unknown = np.nonzero(slopes[part])
             kept = np.isin(unknown, list(columns))
-            weight = slopes[part][row, unknown][kept] * (problem.start[unknown[kept]] if scaled else 1.0)
-            unknown = unknown[kept]
+            weight, unknown = slopes[part][row, unknown][kept], unknown[kept]
             if not len(unknown):
                 continue
+            if name == "weak_prior":
+                weight = weight * problem.start[unknown]
             names = [problem.names[k] for k in unknown]
             start = self._p.add(f"{name}.start", problem.start[unknown], names)
             weights = self._p.add(f"{name}.weight", weight, names)
