@@ -255,12 +255,12 @@ def _solved(
         if _good_fit(problem, best[1]):
             break
         try_from(np.where(problem.positive, np.clip(first * factor, lower, upper), first), f"start x {factor:g}")
-    once = tried == 1 and restarts and problem.disturbed and carries_covariance(solver)
+    once = tried == 1 and restarts and problem.disturbed and carries_noise(solver)
     if once and np.any(_doubtful(best[2], best[1], best[0].x, first)):
         factor = RESTARTS[0]
         try_from(np.where(problem.positive, np.clip(first * factor, lower, upper), first), f"start x {factor:g}")
     outcome, finish, weighted = best
-    if problem.disturbed and not carries_covariance(solver):
+    if problem.disturbed and not carries_noise(solver):
         remark = "; weighted by the sensors' noise alone, without the noise that drives the motion"
         outcome = replace(outcome, message=outcome.message + remark)
     problem = weighted
@@ -325,6 +325,9 @@ def _attempt(
         # the second pass is the first about torque offsets that are not guessed
         if number and len(outcome.history) < 2:
             break
+    if problem.disturbed and passes == 1 and carries_noise(solver):
+        # it had the errors themselves as unknowns; what is judged is their likelihood about its answer
+        weighted = problem.weighted_at(x, warm, rounds=2)
     return (outcome, weighted.evaluate(outcome.x, warm=outcome.warm), weighted), evaluations, history
 
 
@@ -340,6 +343,11 @@ def _doubtful(problem: EstimationProblem, finish: Evaluation, x: Array, first: A
 def carries_covariance(solver: Solver) -> bool:
     """Whether a method can weigh residuals by noise that drives the motion."""
     return bool(getattr(solver, "carries_covariance", False))
+
+
+def carries_noise(solver: Solver) -> bool:
+    """Whether a method knows of noise that drives the motion, as a covariance or with the errors as unknowns."""
+    return carries_covariance(solver) or bool(getattr(solver, "errors_are_unknowns", False))
 
 
 def _good_fit(problem: EstimationProblem, finish: Evaluation) -> bool:

@@ -78,6 +78,16 @@ class MultipleShooting:
     def __post_init__(self) -> None:
         check(self, f"solver {self.name}")
 
+    @property
+    def form(self) -> Form:
+        """Which transcription is used."""
+        return self.transcription or ("symbolic" if self.node_interval == 1 else "compiled")
+
+    @property
+    def errors_are_unknowns(self) -> bool:
+        """Whether errors of torques that drive the motion are among the unknowns."""
+        return self.form == "symbolic"
+
     def run(self, problem: EstimationProblem, start: Array, callback: Callback | None) -> Outcome:
         """See `Solver.run`."""
         if self.hessian not in ("gauss_newton", "exact"):
@@ -94,15 +104,14 @@ class MultipleShooting:
                 allowed="exact",
                 hint="the node states number in the thousands; use hessian: gauss_newton",
             )
-        form = self.transcription or ("symbolic" if self.node_interval == 1 else "compiled")
-        if form == "symbolic" and self.node_interval != 1:
+        if self.form == "symbolic" and self.node_interval != 1:
             raise SolverError(
                 f"node_interval = {self.node_interval} with the symbolic transcription",
                 where="solver.transcription",
                 allowed="node_interval: 1",
                 hint="transcription: compiled eliminates the steps between nodes",
             )
-        return (self._symbolic if form == "symbolic" else self._compiled)(problem, start, callback)
+        return (self._symbolic if self.form == "symbolic" else self._compiled)(problem, start, callback)
 
     def _symbolic(self, problem: EstimationProblem, start: Array, callback: Callback | None) -> Outcome:
         program = transcribe(problem, start)

@@ -7,15 +7,16 @@ The unknowns are, in this order,
 with x = (q, p, z). `rest` is the equilibrium at the first posture (coordinates sought, internal ones, forces of the
 grasps), of which x_0 is a function; it is absent where a start is given. The constraints are the equations of that
 equilibrium and the rows of every `Stage`; the objective has the whitened samples, interpolated between nodes, and the
-priors. What was recorded are parameters of the program. Residuals are in units of the sensors' noise: noise that drives
-the motion is left out, as in all methods that cannot carry its covariance.
+priors. What was recorded are parameters. Where noise drives the motion its errors are unknowns too, after
+the states of their recording, with their standard deviations as priors: at the optimum this is the likelihood of
+`problem.noise`, but for what that linearises.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import casadi as ca
 import numpy as np
@@ -32,6 +33,7 @@ from yid_ocp.problem.problem import EstimationProblem
 from yid_ocp.problem.unknowns import SMALL_RATIO
 from yid_ocp.sensors import Sensor, sensor_function
 from yid_ocp.solvers.guess import node_states
+from yid_ocp.solvers.motion import DrivenStage, Freed, driven_stage
 from yid_ocp.solvers.program import Block, NonlinearProgram
 from yid_ocp.solvers.terms import Local, Places, Residual, Ridge, Term
 
@@ -70,10 +72,22 @@ def transcribe(
     ----------
     Johnson and Murphey (2009), IEEE Trans. Robotics 25(6):1249, doi:10.1109/TRO.2009.2032955.
     """
+    problem = _about_zero(problem)
     check(problem, "transcribe")
     compiled = problem.step.compiled if use_compiler is None else use_compiler
     with SYMBOLIC:
         return _Maker(problem, compiled).program(problem.start if start is None else np.asarray(start, float))
+
+
+def _about_zero(problem: EstimationProblem) -> EstimationProblem:
+    """The problem with torques as recorded: no offset of theirs is known yet, as it is an unknown."""
+    if not any(episode.errors is not None and np.any(episode.errors.offset) for episode in problem.episodes):
+        return problem
+    episodes = [
+        episode if (e := episode.errors) is None else replace(episode, errors=replace(e, offset=0.0 * e.offset))
+        for episode in problem.episodes
+    ]
+    return problem.on(episodes, problem.held_out)
 
 
 def check(problem: EstimationProblem, where: str) -> None:
@@ -145,22 +159,27 @@ class _Vector:
 
 @dataclass(frozen=True)
 class _Places:
-    """Where the unknowns of one recording stand."""
+    """Where the unknowns of one recording stand, and the parameters that drive it.
+
+    `errors` are those of the torque of every step, (N, ne), `first` those of the first angles, as `DrivenStage` wants.
+    """
 
     free: Places
     rest: Places
     state: Places
     multipliers: Places
+    errors: Places
+    first: Places
     theta: Places
     torque: Places
     gain: Places
     reference: Places
 
     def stages(self) -> Places:
-        """(free, x_k, x_{k+1}, lam_k) of every step, (N, nv)."""
+        """(free, x_k, x_{k+1}, lam_k, errors) of every step, (N, nv)."""
         steps = len(self.multipliers)
         free = np.broadcast_to(self.free, (steps, len(self.free)))
-        return np.hstack([free, self.state[:-1], self.state[1:], self.multipliers])
+        return np.hstack([free, self.state[:-1], self.state[1:], self.multipliers, self.errors])
 
     def inputs(self) -> Places:
         """(torque, gain, reference) of every step, (N, nd)."""
@@ -176,15 +195,14 @@ class _Maker:
         self._names = problem.unknowns.parameters
         self._w, self._p = _Vector(), _Vector()
         system = problem.system
-        self._free = ca.SX.sym("free", len(self._names))
-        self._fixed = ca.SX.sym("theta", len(system.parameters))
-        theta = ca.SX(self._fixed)
+        free, fixed = ca.SX.sym("free", len(self._names)), ca.SX.sym("theta", len(system.parameters))
+        theta = ca.SX(fixed)
         for k, name in enumerate(self._names):
-            theta[system.parameters.index(name)] = self._free[k]
-        self._theta = theta
+            theta[system.parameters.index(name)] = free[k]
+        self._freed = Freed(self._names, free, fixed, theta)
         self._stage = stage(self._step.equations, self._step.time_step)
-        self._tracked_motion(theta)
-        self._sensors: dict[Sensor, tuple[Local, bool]] = {}
+        self._stages: dict[tuple[bool, bool], DrivenStage] = {}
+        self._sensors: dict[tuple[Sensor, bool, bool], tuple[Local, bool]] = {}
 
     def program(self, x: Array) -> NonlinearProgram:
         """The program, its guess made near the problem's unknown vector `x`."""
@@ -201,11 +219,11 @@ class _Maker:
             self._w.name(f"local[{episode.name}]", local[:, None], problem.local)
             columns |= {int(k): int(place) for k, place in zip(at, local, strict=True)}
             ridge.append(local)
-            places = self._laid_out(i, episode, x, np.concatenate([theta, local]))
+            places, errors = self._laid_out(i, episode, x, np.concatenate([theta, local]))
             begun, prior = self._begun(episode, places)
             constraints += [begun, self._moved(episode, places)]
             residuals += [self._sampled(episode, samples, places) for samples in episode.samples if samples.count]
-            residuals += prior
+            residuals += [*prior, *errors]
         residuals += self._priors(columns)
         index = np.concatenate(ridge)
         order = [k for k, _ in sorted(columns.items(), key=lambda entry: entry[1])]
@@ -226,8 +244,8 @@ class _Maker:
 
     # -- layout -------------------------------------------------------------------------------------------------------
 
-    def _laid_out(self, i: int, episode: Episode, x: Array, free: Places) -> _Places:
-        """The unknowns of a recording at their guess, and what drives it."""
+    def _laid_out(self, i: int, episode: Episode, x: Array, free: Places) -> tuple[_Places, list[Residual]]:
+        """The unknowns of a recording at their guess and what drives it; priors of errors."""
         problem, name = self._problem, episode.name
         system, n, nx, m = problem.system, self._sizes["n"], self._sizes["nx"], self._sizes["m"]
         theta = problem.predictor.own_theta(episode, problem.split(x, i)[0])
@@ -259,12 +277,13 @@ class _Maker:
         known = self._p.add(f"theta[{name}]", theta, system.parameters.names)
         torque = self._p.add(f"torque[{name}]", episode.torque.T, system.driven, "N m")
         gain, reference = self._followed(episode)
-        return _Places(free, rest_at, states, multipliers, known[:, 0], torque, gain, reference)
+        errors, first, priors = self._erring(episode)
+        return _Places(free, rest_at, states, multipliers, errors, first, known[:, 0], torque, gain, reference), priors
 
     def _followed(self, episode: Episode) -> tuple[Places, Places]:
         """Gains (row by row) and reference of the tracking filter at every step."""
         feedback, steps = episode.feedback, episode.grid.steps
-        if feedback is None:
+        if feedback is None or not _kind(episode)[0]:
             return np.zeros((0, steps), np.int64), np.zeros((0, steps), np.int64)
         driven, joints, n = self._problem.system.driven, self._problem.system.mechanism.joint_names, self._sizes["n"]
         followed = [f"{'q' if row < n else 'p'}.{joints[row % n]}" for row in feedback.index]
@@ -282,46 +301,49 @@ class _Maker:
                 parts.append(samples.rows(predicted, threshold=problem.options.huber_threshold).residual)
         return float(np.mean(np.concatenate(parts) ** 2))
 
-    def _tracked_motion(self, theta: ca.SX) -> None:
-        """The stage under the tracking filter, and what sensors of efforts need of it.
+    def _driven(self, episode: Episode) -> DrivenStage:
+        """The stage as a recording drives it."""
+        key = _kind(episode)
+        if key not in self._stages:
+            followed = episode.feedback.index if key[0] and episode.feedback is not None else None
+            self._stages[key] = driven_stage(self._stage, self._freed, followed, key[1], self._compiled)
+        return self._stages[key]
 
-        u = ubar - K (x_k[index] - xbar), so that the slopes by x_k get those by u times -K.
-        """
-        one, sizes = self._stage, self._sizes
-        feedback = self._problem.episodes[0].feedback
-        index = np.zeros(0, int) if feedback is None else feedback.index
-        x0, x1 = ca.SX.sym("x0", sizes["nx"]), ca.SX.sym("x1", sizes["nx"])
-        lam, nominal = ca.SX.sym("lam", sizes["m"]), ca.SX.sym("u", sizes["nu"])
-        gain, reference = ca.SX.sym("gain", sizes["nu"] * len(index)), ca.SX.sym("reference", len(index))
-        matrix = ca.reshape(gain, len(index), sizes["nu"]).T
-        applied, by_x0 = ca.SX(nominal), ca.SX(sizes["nu"], sizes["nx"])
-        if len(index):
-            applied = nominal - ca.mtimes(matrix, x0[index.tolist()] - reference)
-            by_x0[:, index.tolist()] = -matrix
-        outputs = []
-        for value, slopes, by_theta in zip(
-            (one.rows, one.effort), (one.slopes, one.effort_slopes), one.by_theta(self._names), strict=True
-        ):
-            outputs += [value, by_theta, *slopes.values()]
-        symbols = [one.x0, one.x1, one.lam, one.u, one.theta]
-        placed = ca.substitute(outputs, symbols, [x0, x1, lam, applied, theta])
-        v = ca.vertcat(self._free, x0, x1, lam)
-        self._motion_inputs = [v, ca.vertcat(nominal, gain, reference), self._fixed]
-        made = []
-        for value, by_free, first, second, by_lam, by_u in (placed[:6], placed[6:]):
-            made.append((value, ca.horzcat(by_free, first + ca.mtimes(by_u, by_x0), second, by_lam)))
-        (rows, by_v), self._effort = made
-        none = ca.SX(sizes["nu"], sizes["nx"] + sizes["m"])
-        self._applied = (applied, ca.horzcat(ca.SX(sizes["nu"], len(self._names)), by_x0, none))
-        self._motion = Local("step", self._motion_inputs, rows, by_v, self._compiled)
+    def _erring(self, episode: Episode) -> tuple[Places, Places, list[Residual]]:
+        """Places of the torque's errors at every step and of the first angles', and their priors."""
+        errors, steps, name = episode.errors, episode.grid.steps, episode.name
+        if errors is None:
+            return np.zeros((steps, 0), np.int64), np.zeros(0, np.int64), []
+        driven, nu = self._problem.system.driven, self._sizes["nu"]
+        sample, of_step = np.unique(errors.sample, return_inverse=True)
+        spread = errors.angle_std * np.sqrt(errors.spread)
+        wanted = [("torque_error", errors.torque_std, len(sample)), ("torque_offset", errors.bias_std, 1)]
+        wanted += [("angle_error", spread, steps)] if _kind(episode)[0] else []
+        wanted += [("first_angle_error", errors.angle_std, 1)] if episode.start is None else []
+        places, priors = {}, []
+        for label, std, count in wanted:
+            none = np.tile(std <= 0, count)
+            zero = np.zeros(nu * count)
+            at = self._w.extend(zero, np.where(none, 0.0, -np.inf), np.where(none, 0.0, np.inf))
+            places[label] = at.reshape(count, nu)
+            self._w.name(f"{label}[{name}]", places[label].T, driven)
+            weight = self._p.add(f"weight.{label}[{name}]", 1.0 / np.where(std > 0, std, 1.0), driven)
+            term = Term(
+                f"{label}[{name}]", driven, _itself(nu), places[label], np.zeros((count, 0), np.int64), weight[:0, 0]
+            )
+            priors.append(Residual(term, ca.DM.eye(nu * count), np.tile(weight[:, 0], count)))
+        offset = np.broadcast_to(places["torque_offset"], (steps, nu))
+        per_step = [places["torque_error"][of_step.ravel()], offset]
+        per_step += [places["angle_error"]] if "angle_error" in places else []
+        first = places.get("first_angle_error", np.zeros((1, 0), np.int64))[0]
+        return np.hstack(per_step), first, priors
 
     # -- terms --------------------------------------------------------------------------------------------------------
 
     def _moved(self, episode: Episode, places: _Places) -> Term:
         """Every step's equations."""
-        return Term(
-            f"step[{episode.name}]", self._stage.names, self._motion, places.stages(), places.inputs(), places.theta
-        )
+        local = self._driven(episode).local
+        return Term(f"step[{episode.name}]", self._stage.names, local, places.stages(), places.inputs(), places.theta)
 
     def _begun(self, episode: Episode, places: _Places) -> tuple[Term, list[Residual]]:
         """What fixes the first state, and the prior of what is free of it."""
@@ -341,13 +363,21 @@ class _Maker:
             sought, held = statics.inputs[0], statics.inputs[2]
             stiffness = HOLD_STIFFNESS_WITH_TORQUE if problem.system.driven else HOLD_STIFFNESS
             symbols = [statics.inputs[3], statics.inputs[4], statics.inputs[5]]
-            values = [ca.SX(stiffness), self._theta, ca.SX(self._step.time_step)]
+            values = [ca.SX(stiffness), self._freed.theta, ca.SX(self._step.time_step)]
             balance, state = ca.substitute([statics.residual, statics.state], symbols, values)
-            inputs = [ca.vertcat(self._free, sought, first), ca.vertcat(statics.inputs[1], held), self._fixed]
+            posture, nu = statics.inputs[1], held.numel()
+            errors = ca.SX.sym("errors", 3 * len(places.first))
+            if len(places.first):
+                # (of the first angles, w of the first step, b)
+                moved = ca.vertcat(posture[:nu] - errors[:nu], posture[nu:])
+                true = held - errors[nu : 2 * nu] - errors[2 * nu :]
+                balance, state = ca.substitute([balance, state], [posture, held], [moved, true])
+            inputs = [ca.vertcat(self._freed.free, sought, first, errors), ca.vertcat(posture, held), self._freed.fixed]
             known = [problem.system.mechanism.joint_names[k] for k in statics.known]
-            posture = self._p.add(f"posture[{name}]", episode.posture, known)
-            at = np.concatenate([places.free, places.rest, places.state[0]])[None, :]
-            data, shared = np.concatenate([posture[:, 0], places.torque[:, 0]])[None, :], places.theta
+            given = self._p.add(f"posture[{name}]", episode.posture, known)
+            wrong = [places.first, places.errors[0, : 2 * nu]] if len(places.first) else []
+            at = np.concatenate([places.free, places.rest, places.state[0], *wrong])[None, :]
+            data, shared = np.concatenate([given[:, 0], places.torque[:, 0]])[None, :], places.theta
         labels = [f"rest.{k}" for k in range(balance.numel())] + [f"start.{rows[k]}" for k in fixed]
         value = ca.densify(ca.vertcat(balance, (first - state)[fixed]))
         term = Term(f"start[{name}]", tuple(labels), Local("start", inputs, value), at, data, shared)
@@ -362,7 +392,7 @@ class _Maker:
     def _sampled(self, episode: Episode, samples: Measurements, places: _Places) -> Residual:
         """Samples of one sensor, predicted linearly between the two nodes beside them."""
         sensor, nodes, n = samples.sensor, samples.nodes, self._sizes["n"]
-        read, loaded = self._reading(sensor)
+        read, loaded = self._reading(sensor, episode)
         if loaded:
             # after the last step the effort is that of this step
             step = np.minimum(nodes, len(places.multipliers) - 1)
@@ -381,36 +411,37 @@ class _Maker:
         threshold = self._problem.options.huber_threshold
         return Residual(term, _between(samples), weight.T[seen], value.T[seen], threshold)
 
-    def _reading(self, sensor: Sensor) -> tuple[Local, bool]:
+    def _reading(self, sensor: Sensor, episode: Episode) -> tuple[Local, bool]:
         """What a sensor reads at a node, and whether it depends on efforts, that is, on the step from there."""
-        if sensor not in self._sensors:
+        key = (sensor, *_kind(episode))
+        if key not in self._sensors:
             n, nz = self._sizes["n"], self._sizes["nz"]
             function = sensor_function(self._problem.system, sensor, self._names)
             loaded = function.nnz_out(3) > 0
-            self._sensors[sensor] = (self._loaded(function) if loaded else self._unloaded(function, n, nz)), loaded
-        return self._sensors[sensor]
+            made = self._loaded(function, self._driven(episode)) if loaded else self._unloaded(function, n, nz)
+            self._sensors[key] = made, loaded
+        return self._sensors[key]
 
     def _unloaded(self, function: ca.Function, n: int, nz: int) -> Local:
         q, z = ca.SX.sym("q", n), ca.SX.sym("z", nz)
-        y, by_q, by_z, _, by_free = function(q, z, ca.SX(ca.DM.zeros(n)), self._theta)
-        inputs = [ca.vertcat(self._free, q, z), ca.SX(0, 1), self._fixed]
+        y, by_q, by_z, _, by_free = function(q, z, ca.SX(ca.DM.zeros(n)), self._freed.theta)
+        inputs = [ca.vertcat(self._freed.free, q, z), ca.SX(0, 1), self._freed.fixed]
         return Local("reading", inputs, y, ca.horzcat(by_free, by_q, by_z))
 
-    def _loaded(self, function: ca.Function) -> Local:
-        system, n, nx, m = self._problem.system, self._sizes["n"], self._sizes["nx"], self._sizes["m"]
-        (v, data, fixed), torque, effort = self._motion_inputs, self._applied, self._effort
-        last, first = ca.SX.sym("last"), len(self._names)
-        before, after = v[first : first + nx], v[first + nx : first + 2 * nx]
-        node = (1 - last) * before + last * after
-        load, by_v = ca.SX(ca.DM.zeros(n)), ca.SX(n, first + 2 * nx + m)
-        for index, (values, by_these) in ((system.prescribed_indices, effort), (system.driven_indices, torque)):
+    def _loaded(self, function: ca.Function, step: DrivenStage) -> Local:
+        system, n, nx = self._problem.system, self._sizes["n"], self._sizes["nx"]
+        last, size = ca.SX.sym("last"), step.v.numel()
+        node = (1 - last) * step.before + last * step.after
+        load, by_v = ca.SX(ca.DM.zeros(n)), ca.SX(n, size)
+        pairs = ((system.prescribed_indices, *step.effort), (system.driven_indices, *step.torque))
+        for index, values, by_these in pairs:
             for k, row in enumerate(index):
                 load[row], by_v[row, :] = values[k], by_these[k, :]
-        y, by_q, by_z, by_load, by_free = function(node[:n], node[2 * n :], load, self._theta)
+        y, by_q, by_z, by_load, by_free = function(node[:n], node[2 * n :], load, self._freed.theta)
         at_node = ca.horzcat(by_q, ca.SX(y.numel(), n), by_z)
-        slopes = ca.mtimes(by_load, by_v)
-        slopes += ca.horzcat(by_free, (1 - last) * at_node, last * at_node, ca.SX(y.numel(), m))
-        return Local("reading_under_load", [v, ca.vertcat(data, last), fixed], y, slopes)
+        rest = ca.SX(y.numel(), size - len(self._names) - 2 * nx)
+        slopes = ca.mtimes(by_load, by_v) + ca.horzcat(by_free, (1 - last) * at_node, last * at_node, rest)
+        return Local("reading_under_load", [step.v, ca.vertcat(step.data, last), self._freed.fixed], y, slopes)
 
     def _priors(self, columns: dict[int, int]) -> list[Residual]:
         """Stated priors of parameters, and the weak ones."""
@@ -439,6 +470,17 @@ class _Maker:
             term = Term(name, (name,), local, at, start, np.zeros(0, np.int64))
             found.append(Residual(term, ca.DM.eye(len(unknown)), weights[:, 0]))
         return found
+
+
+def _kind(episode: Episode) -> tuple[bool, bool]:
+    """Whether a recording's stage is under the tracking filter, and whether errors of torques are unknowns."""
+    errors = episode.errors
+    return episode.feedback is not None and (errors is None or not errors.encoders), errors is not None
+
+
+def _itself(size: int) -> Local:
+    v = ca.SX.sym("v", size)
+    return Local("itself", [v, ca.SX(0, 1), ca.SX(0, 1)], v)
 
 
 def _between(samples: Measurements) -> ca.DM:
