@@ -1,8 +1,9 @@
-"""A guess of the node states of one recording, for methods that have them as unknowns."""
+"""A guess of node states and parameters, for methods that have states as unknowns."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,40 +17,94 @@ from yid_ocp.problem.prediction import Start
 from yid_ocp.problem.problem import EstimationProblem
 
 Array = NDArray[np.float64]
-Misfit = Callable[[Array, Array], float]
-"""Mean square whitened residual of node states and multipliers."""
+Misfit = Callable[[int, Array, Array, Array], float]
+"""Mean square whitened residual of one recording: which, node states, multipliers, unknowns of the problem."""
 
-# Mean square whitened residual above which a rollout is not the best guess of the node states.
-POOR_GUESS = 100.0
+# Mean square whitened residual above which another guess of the node states is tried.
+POOR_GUESS = 10.0
+# A soft object hangs in other shapes, and hops from one to another: positive parameters are tried that much larger.
+FACTORS = (1.0, 4.0, 2.0, 10.0)
 # Shapes change slowly: so far apart is enough [s].
 BETWEEN_SHAPES = 0.1
 
 
-def node_states(
-    problem: EstimationProblem, episode: Episode, nodes: NDArray[np.int64], theta: Array, begin: Start, misfit: Misfit
-) -> tuple[Array, Array]:
-    """Node states (K + 1, nx) and multipliers before each later one, (K, m) or (N, m), near a solution.
+@dataclass(frozen=True)
+class Guess:
+    """Where to begin.
 
-    Either the rollout under the tracking filter, which has no defects, or, where that fails or strays far from what was
-    measured, every node at rest at the posture that the arms had then, which has defects but follows the data.
+    Attributes
+    ----------
+    x : ndarray, shape (nx,)
+        Unknowns of the problem.
+    begins : tuple of Start
+        Starts of all recordings there.
+    states, multipliers : tuple of ndarray
+        Of every recording, (K + 1, nx) at the nodes and (K, m) or (N, m).
+    """
+
+    x: Array
+    begins: tuple[Start, ...]
+    states: tuple[Array, ...]
+    multipliers: tuple[Array, ...]
+
+
+def guess(problem: EstimationProblem, nodes: Sequence[NDArray[np.int64]], x: Array, misfit: Misfit) -> Guess:
+    """Node states near a solution, at an unknown vector or, where that is far from the data, at multiples of it.
+
+    A recording's states are the rollout under the tracking filter, which has no defects, or, where that fails or strays
+    from what was measured, every node at rest at the posture that the arms had then, which has defects but follows the
+    data.
 
     Parameters
     ----------
     problem : EstimationProblem
-    episode : Episode
-    nodes : ndarray of int, shape (K + 1,)
-    theta : ndarray, shape (ntheta,)
-        The episode's own.
-    begin : Start
+    nodes : sequence of ndarray of int, shape (K + 1,)
+        Of every recording.
+    x : ndarray, shape (nx,)
     misfit : callable
     """
+    lower, upper = problem.bounds
+    best: tuple[float, Guess] | None = None
+    for factor in FACTORS:
+        moved = np.where(problem.positive, np.clip(factor * x, lower, upper), x)
+        begins, states, multipliers, total = [], [], [], 0.0
+        for i, episode in enumerate(problem.episodes):
+            theta = problem.predictor.own_theta(episode, problem.split(moved, i)[0])
+            begins.append(problem.start_state(episode, theta))
+
+            def judged(state: Array, pull: Array, i: int = i, moved: Array = moved) -> float:
+                return misfit(i, state, pull, moved)
+
+            size, state, pull = _node_states(problem, episode, nodes[i], theta, begins[-1], judged)
+            states.append(state)
+            multipliers.append(pull)
+            total += size / len(problem.episodes)
+        if best is None or total < best[0]:
+            best = total, Guess(moved, tuple(begins), tuple(states), tuple(multipliers))
+        if best[0] <= POOR_GUESS or not np.any(problem.positive):
+            break
+    assert best is not None
+    return best[1]
+
+
+def _node_states(
+    problem: EstimationProblem,
+    episode: Episode,
+    nodes: NDArray[np.int64],
+    theta: Array,
+    begin: Start,
+    misfit: Callable[[Array, Array], float],
+) -> tuple[float, Array, Array]:
+    """Misfit, node states and multipliers of one recording."""
+    found: list[tuple[float, Array, Array]] = []
     rollout = None if begin.message else _tracked(problem, episode, theta, begin.state)
-    candidates = []
     if rollout is not None and rollout.status.ok:
-        candidates.append((rollout.state[nodes], rollout.multipliers))
-    if not candidates or misfit(*candidates[0]) > POOR_GUESS:
-        candidates.append(_resting(problem, episode, nodes, theta, begin.state))
-    return candidates[0] if len(candidates) == 1 else min(candidates, key=lambda pair: misfit(*pair))
+        state = rollout.state[nodes]
+        found.append((misfit(state, rollout.multipliers), state, rollout.multipliers))
+    if not found or found[0][0] > POOR_GUESS:
+        state, pull = _resting(problem, episode, nodes, theta, begin.state)
+        found.append((misfit(state, pull), state, pull))
+    return min(found, key=lambda entry: entry[0])
 
 
 def _tracked(problem: EstimationProblem, episode: Episode, theta: Array, start: Array) -> Rollout:

@@ -225,7 +225,7 @@ class NonlinearProgram:
         total = ca.MX(size, size)
         for i, residual in enumerate(self.residuals):
             r, slope = self._residual(i), self._slope(i)
-            weight = residual.slope_weight(r)
+            weight = residual.slope_weight(r, kind == "exact")
             weighted = slope if weight is None else ca.mtimes(ca.diag(weight), slope)
             total += self.lam_f * ca.mtimes(slope.T, weighted)
             if kind == "exact":

@@ -32,7 +32,7 @@ from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.problem import EstimationProblem
 from yid_ocp.problem.unknowns import SMALL_RATIO
 from yid_ocp.sensors import Sensor, sensor_function
-from yid_ocp.solvers.guess import node_states
+from yid_ocp.solvers.guess import Guess, guess
 from yid_ocp.solvers.motion import DrivenStage, Freed, driven_stage
 from yid_ocp.solvers.program import Block, NonlinearProgram
 from yid_ocp.solvers.terms import Local, Places, Residual, Ridge, Term
@@ -151,7 +151,8 @@ class _Vector:
 
     def add(self, name: str, values: Array, rows: Sequence[str], unit: str = "") -> Places:
         """Lay a block down, column by column; its places, (rows, columns)."""
-        table = np.asarray(values, float).reshape(len(rows), -1) if len(rows) else np.zeros((0, 1))
+        table = np.asarray(values, float)
+        table = table[:, None] if table.ndim == 1 else table
         index = self.extend(table.ravel(order="F")).reshape(table.shape, order="F")
         self.name(name, index, rows, unit)
         return index
@@ -207,6 +208,9 @@ class _Maker:
     def program(self, x: Array) -> NonlinearProgram:
         """The program, its guess made near the problem's unknown vector `x`."""
         problem, low, high = self._problem, *self._problem.bounds
+        nodes = [np.arange(episode.grid.steps + 1) for episode in problem.episodes]
+        found = guess(problem, nodes, x, self._misfit)
+        x = found.x
         shared = len(problem.shared)
         theta = self._w.extend(x[:shared], low[:shared], high[:shared])
         self._w.name("theta", theta[:, None], problem.shared)
@@ -219,7 +223,7 @@ class _Maker:
             self._w.name(f"local[{episode.name}]", local[:, None], problem.local)
             columns |= {int(k): int(place) for k, place in zip(at, local, strict=True)}
             ridge.append(local)
-            places, errors = self._laid_out(i, episode, x, np.concatenate([theta, local]))
+            places, errors = self._laid_out(i, found, np.concatenate([theta, local]))
             begun, prior = self._begun(episode, places)
             constraints += [begun, self._moved(episode, places)]
             residuals += [self._sampled(episode, samples, places) for samples in episode.samples if samples.count]
@@ -244,14 +248,12 @@ class _Maker:
 
     # -- layout -------------------------------------------------------------------------------------------------------
 
-    def _laid_out(self, i: int, episode: Episode, x: Array, free: Places) -> tuple[_Places, list[Residual]]:
+    def _laid_out(self, i: int, found: Guess, free: Places) -> tuple[_Places, list[Residual]]:
         """The unknowns of a recording at their guess and what drives it; priors of errors."""
-        problem, name = self._problem, episode.name
-        system, n, nx, m = problem.system, self._sizes["n"], self._sizes["nx"], self._sizes["m"]
-        theta = problem.predictor.own_theta(episode, problem.split(x, i)[0])
-        begin = problem.start_state(episode, theta)
-        nodes = np.arange(episode.grid.steps + 1)
-        state, pull = node_states(problem, episode, nodes, theta, begin, lambda s, _: self._misfit(episode, s, theta))
+        problem, episode = self._problem, self._problem.episodes[i]
+        system, name, n, nx, m = problem.system, episode.name, *(self._sizes[key] for key in ("n", "nx", "m"))
+        begin, state, pull = found.begins[i], found.states[i], found.multipliers[i]
+        theta = problem.predictor.own_theta(episode, problem.split(found.x, i)[0])
         rest = np.zeros(0)
         if begin.rest is not None:
             sought = list(problem.functions.statics.unknown)
@@ -261,14 +263,14 @@ class _Maker:
         at_rest = [*(joints[k] for k in problem.functions.statics.unknown), *system.internal, *grasped]
         rest_at = self._w.extend(rest)
         self._w.name(f"rest[{name}]", rest_at[:, None], at_rest if len(rest) else ())
-        table = np.zeros((3, len(nodes), nx + m))
+        table = np.zeros((3, len(state), nx + m))
         table[0, :, :nx], table[0, :-1, nx:] = state, pull
         table[1], table[2] = -np.inf, np.inf
         for column, joint in enumerate(system.prescribed_indices):
             table[:, :, joint] = episode.path[:, column]
         # the last node has no multipliers
         at = self._w.extend(*(part.ravel()[: part.size - m] for part in table))
-        index = np.append(at, np.zeros(m, np.int64)).reshape(len(nodes), nx + m)
+        index = np.append(at, np.zeros(m, np.int64)).reshape(len(state), nx + m)
         states, multipliers = index[:, :nx], index[:-1, nx:]
         for label, part, rows in (("q", states[:, :n], joints), ("p", states[:, n : 2 * n], joints)):
             self._w.name(f"{label}[{name}]", part.T, rows)
@@ -291,9 +293,10 @@ class _Maker:
         gain = self._p.add(f"gain[{episode.name}]", feedback.gain.reshape(steps, -1).T, pairs)
         return gain, self._p.add(f"reference[{episode.name}]", feedback.reference.T, followed)
 
-    def _misfit(self, episode: Episode, state: Array, theta: Array) -> float:
+    def _misfit(self, i: int, state: Array, _: Array, x: Array) -> float:
         """Mean square whitened residual of what node states alone predict."""
-        problem = self._problem
+        problem, episode = self._problem, self._problem.episodes[i]
+        theta = problem.predictor.own_theta(episode, problem.split(x, i)[0])
         flat, parts = np.zeros((*state.shape, len(self._names))), [np.zeros(1)]
         for samples in episode.samples:
             if not samples.sensor.efforts:
@@ -396,7 +399,7 @@ class _Maker:
         if loaded:
             # after the last step the effort is that of this step
             step = np.minimum(nodes, len(places.multipliers) - 1)
-            ends = self._p.add(f"last.{sensor.group}[{episode.name}]", (nodes > step).astype(float), ["last"])
+            ends = self._p.add(f"last.{sensor.group}[{episode.name}]", (nodes > step).astype(float)[None, :], ["last"])
             at, data = places.stages()[step], np.hstack([places.inputs()[step], ends.T])
         else:
             free = np.broadcast_to(places.free, (len(nodes), len(places.free)))

@@ -211,9 +211,17 @@ class Residual:
         """Derivative of the loss by r."""
         return r if math.isinf(self.threshold) else ca.fmax(ca.fmin(r, self.threshold), -self.threshold)
 
-    def slope_weight(self, r: ca.MX) -> ca.MX | None:
-        """Factor on the squares in Gauss-Newton's Hessian; None for ones."""
-        return None if math.isinf(self.threshold) else ca.fmin(1.0, self.threshold / ca.fmax(ca.fabs(r), 1e-300))
+    def slope_weight(self, r: ca.MX, exact: bool) -> ca.MX | None:
+        """Factor on the slopes' squares in a Hessian; None for ones.
+
+        Exactly it is one or zero; Gauss-Newton's, that of weighted squares with the same gradient, is never zero.
+        """
+        if math.isinf(self.threshold):
+            return None
+        size = ca.fabs(r)
+        if exact:
+            return ca.if_else(size <= self.threshold, 1.0, 0.0)
+        return ca.fmin(1.0, self.threshold / ca.fmax(size, 1e-300))
 
 
 @dataclass(frozen=True)

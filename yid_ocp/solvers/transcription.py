@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -25,7 +24,7 @@ from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.step import Directions, Rollout
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.problem import EstimationProblem
-from yid_ocp.solvers.guess import node_states
+from yid_ocp.solvers.guess import guess
 
 Array = NDArray[np.float64]
 Sparse: TypeAlias = Any
@@ -129,18 +128,12 @@ class Transcription:
     # -- initial guess ------------------------------------------------------------------------------------------------
 
     def guess(self, x: Array) -> Array:
-        """Unknowns near a solution at the parameters `x`.
-
-        See `node_states`.
-        """
+        """Unknowns near a solution, at the parameters `x` or at multiples of them (see `solvers.guess`)."""
+        found = guess(self.problem, [layout.nodes for layout in self.layouts], self._unknowns(x), self._misfit)
         w = np.zeros(self.size)
-        count = len(self.problem.shared)
-        w[:count] = x[:count]
-        for i, (episode, layout) in enumerate(zip(self.problem.episodes, self.layouts, strict=True)):
-            theta = self._theta(w, i)
-            begin = self.problem.start_state(episode, theta, guess=self.warm[i])
-            own = partial(self._misfit, w, i)
-            self._place(w, i, *node_states(self.problem, episode, layout.nodes, theta, begin, own))
+        w[: len(self.problem.shared)] = found.x[: len(self.problem.shared)]
+        for i, pair in enumerate(zip(found.states, found.multipliers, strict=True)):
+            self._place(w, i, *pair)
         return w
 
     def _place(self, w: Array, i: int, state: Array, multipliers: Array) -> None:
@@ -149,9 +142,10 @@ class Transcription:
         if self.has_multipliers:
             w[layout.multipliers.ravel()] = multipliers.ravel()
 
-    def _misfit(self, w: Array, i: int, state: Array, multipliers: Array) -> float:
+    def _misfit(self, i: int, state: Array, multipliers: Array, x: Array) -> float:
         """Mean square of one recording's whitened residuals at given node states."""
-        trial = w.copy()
+        trial = np.zeros(self.size)
+        trial[: len(self.problem.shared)] = x[: len(self.problem.shared)]
         self._place(trial, i, state, multipliers)
         values = [value for value, _, _ in self._sample_rows(trial, i, False)]
         return float(np.mean(np.concatenate(values) ** 2))
