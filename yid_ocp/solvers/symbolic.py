@@ -372,7 +372,7 @@ class _Maker:
             errors = ca.SX.sym("errors", 3 * len(places.first))
             if len(places.first):
                 # (of the first angles, w of the first step, b)
-                moved = ca.vertcat(posture[:nu] - errors[:nu], posture[nu:])
+                moved = posture - ca.vertcat(errors[:nu], ca.SX(ca.DM.zeros(posture.numel() - nu)))
                 true = held - errors[nu : 2 * nu] - errors[2 * nu :]
                 balance, state = ca.substitute([balance, state], [posture, held], [moved, true])
             inputs = [ca.vertcat(self._freed.free, sought, first, errors), ca.vertcat(posture, held), self._freed.fixed]
