@@ -8,9 +8,10 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from small_problems import PENDULUM, pendulum_step, taken
+from small_problems import PENDULUM, STEPS, pendulum_step, taken
 
 import yid_ocp
+from yid_ocp.errors import SolverError
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.solvers import GaussNewton, MultipleShooting, Status, solve
 from yid_ocp.solvers.symbolic import transcribe, unknown_vector
@@ -220,6 +221,38 @@ def test_it_solves_what_gauss_newton_solves(urdf_folder, case):
     single = solve(problem, GaussNewton(cost_tolerance=1e-12), start=solution.x, restarts=False)
     assert single.cost == pytest.approx(solution.cost, rel=1e-7)
     assert solution.cost < 0.97 * problem.evaluate(problem.start).cost
+
+
+def test_what_it_does_not_do_is_refused(urdf_folder):
+    late = (("camera_latency", "camera", {"delay": 0.0137}),)
+    step = pendulum_step(urdf_folder, late)
+    with pytest.raises(SolverError, match="an effect changes recorded inputs, times"):
+        transcribe(EstimationProblem(step, [taken(step, 1)], ("elbow.damping",)))
+    step = pendulum_step(urdf_folder)
+    with pytest.raises(SolverError, match="two recordings are called 'one'"):
+        transcribe(EstimationProblem(step, [taken(step, seed, name="one") for seed in (1, 2)], ("elbow.damping",)))
+    known = ProblemOptions(recording_values={"run_1": {"elbow.damping": 0.3}})
+    with pytest.raises(SolverError, match=r"elbow.damping is free and has a known value"):
+        transcribe(EstimationProblem(step, [taken(step, 1)], ("elbow.damping",), known))
+
+
+def test_blocks_are_named_after_what_they_hold(urdf_folder):
+    problem = problem_of(urdf_folder, "driven, proportional")
+    program = transcribe(problem)
+    with pytest.raises(SolverError, match="the program has 2 blocks 'q'"):
+        program["q"]
+    assert program["q[run_2]"].shape == (2, STEPS + 1)
+    assert program["torque[run_1]"].shape == (1, STEPS)
+    names = program.names()
+    assert len(set(names)) == len(names) == program.w.numel()
+    assert names[0] == "theta.elbow.damping"
+    assert "q[run_2].elbow.3" in names
+    rows = program.row_names()
+    assert len(set(rows)) == len(rows) == program.g.numel()
+    assert "step[run_1].del[shoulder].7" in rows
+    given = values_at(program, program.start, program["torque[run_1]"])[0]
+    np.testing.assert_array_equal(given, problem.episodes[0].torque.T)
+    np.testing.assert_array_equal(program.arguments["x0"], program.start)
 
 
 # -- noise that drives the motion -------------------------------------------------------------------------------------

@@ -61,12 +61,13 @@ def transcribe(
     NonlinearProgram
         With the variables `theta`, and of every recording `local[NAME]`, `rest[NAME]`, `q[NAME]`, `p[NAME]`, `z[NAME]`
         and `lam[NAME]`; with the parameters `theta[NAME]`, `torque[NAME]`, `gain[NAME]`, `reference[NAME]`,
-        `value.GROUP[NAME]`, `weight.GROUP[NAME]`, `start[NAME]`, `prior` and others where there are such.
+        `value.GROUP[NAME]`, `weight.GROUP[NAME]`, `start[NAME]` and others where there are such, see docs/program.md.
 
     Raises
     ------
     SolverError
-        An effect on recorded inputs or times is at work, or a free parameter has a known value in a recording.
+        An effect on recorded inputs or times is at work, a free parameter has a known value in a recording, or two
+        recordings have one name.
 
     References
     ----------
@@ -98,6 +99,14 @@ def check(problem: EstimationProblem, where: str) -> None:
             where=where,
             allowed="effects of the mechanics and of what sensors read",
             hint="use gauss_newton",
+        )
+    names = [episode.name for episode in problem.episodes]
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise SolverError(
+            f"two recordings are called '{twice[0]}'",
+            where=where,
+            hint="rename one of the files: blocks have their names",
         )
     for episode in problem.episodes:
         known = {**episode.values, **({} if episode.start is None else episode.start.values)}
