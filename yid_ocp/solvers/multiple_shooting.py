@@ -1,7 +1,8 @@
 """Multiple shooting: node states as unknowns of a nonlinear program, solved by IPOPT.
 
 The program is CasADi's own (`symbolic`), or its values and derivatives come from the compiled kernel (`compiled`),
-which also eliminates steps between nodes. Both have the same constraints at every step and the same objective.
+which also eliminates steps between nodes. With a node at every step both have the same constraints and, where no noise
+drives the motion, the same objective; the errors that do are unknowns of the first and left out of the second.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ SUCCESS = {"Solve_Succeeded", "Solved_To_Acceptable_Level"}
 class MultipleShooting:
     """Solve  min 1/2 |r(w)|^2  subject to the DEL equations of every step (or of every interval) and bounds.
 
-    The start is a rollout under the tracking filter; defects are scaled to order one, the cost by its initial value,
+    The start is that of `solvers.guess`; defects are scaled to order one, the cost by its initial value,
     and IPOPT's own scaling is off. In these units IPOPT's first bound multipliers, which are one, weigh as much as the
     cost, so that the first steps change no parameter by much more than a factor.
 
