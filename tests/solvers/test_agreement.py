@@ -205,6 +205,8 @@ def test_trial_points_that_cannot_be_worked_out_are_told_in_the_status_and_not_o
 def test_eliminated_steps_are_for_the_compiled_form(short):
     with pytest.raises(SolverError, match="node_interval = 10 with the symbolic transcription"):
         MultipleShooting(node_interval=10, transcription="symbolic").run(short, short.start, None)
+    with pytest.raises(SolverError, match="transcription = 'callback'"):
+        MultipleShooting(transcription="callback").run(short, short.start, None)
 
 
 def test_more_memory_than_there_is_ends_with_a_status(make_problem, monkeypatch, caplog):

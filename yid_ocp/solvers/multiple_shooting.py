@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import casadi as ca
 import numpy as np
@@ -104,6 +104,10 @@ class MultipleShooting:
                 where="solver.ipopt.hessian_approximation",
                 allowed="exact",
                 hint="the node states number in the thousands; use hessian: gauss_newton",
+            )
+        if self.form not in get_args(Form):
+            raise SolverError(
+                f"transcription = '{self.form}'", where="solver.transcription", allowed=", ".join(get_args(Form))
             )
         if self.form == "symbolic" and self.node_interval != 1:
             raise SolverError(
