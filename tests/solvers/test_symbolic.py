@@ -12,9 +12,14 @@ from small_problems import PENDULUM, STEPS, pendulum_step, taken
 
 import yid_ocp
 from yid_ocp.errors import SolverError
+from yid_ocp.integrator.rollout import simulate
+from yid_ocp.integrator.stage import stage
+from yid_ocp.integrator.statics import Statics
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.solvers import GaussNewton, MultipleShooting, Status, solve
+from yid_ocp.solvers.program import Block, NonlinearProgram
 from yid_ocp.solvers.symbolic import transcribe, unknown_vector
+from yid_ocp.solvers.terms import Local, Residual, Term
 from yid_ocp.solvers.transcription import Transcription
 
 TRACKED = {"feedback": "proportional", "gains": (9.0,)}
@@ -315,3 +320,57 @@ def test_a_fit_among_noise_is_judged_by_its_likelihood(urdf_folder):
     assert solution.cost == pytest.approx(single.cost, rel=0.02)
     assert left_out.problem.innovations == (None,)
     assert solution.problem.innovations != (None,)
+
+
+# -- without measurements ---------------------------------------------------------------------------------------------
+
+
+def test_a_motion_is_planned_with_the_same_stages(urdf_folder):
+    """Free torques bring a pendulum from rest to rest elsewhere, and the rollout under them goes there."""
+    step, count = pendulum_step(urdf_folder, driven=("shoulder",)), 80
+    one, nx = stage(step.equations, step.time_step), step.sizes["nx"]
+    none = ca.SX(0, 1)
+    v = ca.vertcat(one.x0, one.x1, one.lam, one.u)
+    slopes = ca.horzcat(*(one.slopes[name] for name in ("x0", "x1", "lam", "u")))
+    states = np.arange((count + 1) * nx).reshape(count + 1, nx)
+    torques = states.size + np.arange(count)[:, None]
+    theta = step.system.parameters.vector()
+    nothing = np.zeros((count, 0), int)
+    moved = Term(
+        "step",
+        one.names,
+        Local("step", [v, none, one.theta], one.rows, slopes),
+        np.hstack([states[:-1], states[1:], torques]),
+        nothing,
+        np.arange(len(theta)),
+    )
+    u = ca.SX.sym("u")
+    effort = Term("effort", ("u",), Local("effort", [u, none, none], 0.1 * u), torques, nothing, np.zeros(0, int))
+    start, end = np.zeros(4), np.array([0.6, 0.0, 0.0, 0.0])
+    rest = Statics(step).solve([0.0], theta)
+    start[:2] = rest.state[:2]
+    end[1] = Statics(step).solve([0.6], theta).state[1]
+    size = states.size + count
+    lower, upper = np.full(size, -np.inf), np.full(size, np.inf)
+    for at, state in ((states[0], start), (states[-1], end)):
+        lower[at] = upper[at] = state
+    lower[torques], upper[torques] = -8.0, 8.0
+    program = NonlinearProgram(
+        {"q": Block(states[:, :2].T, PENDULUM), "u": Block(torques.T, ("shoulder",), "N m")},
+        {},
+        (moved,),
+        (Residual(effort),),
+        lower,
+        upper,
+        np.zeros(size),
+        theta,
+        None,
+        ca.MX.sym("w", size),
+        ca.MX.sym("p", len(theta)),
+    )
+    solver = program.solver("ipopt", "exact", ipopt={"print_level": 0, "sb": "yes", "tol": 1e-10})
+    w = np.array(solver(**program.arguments)["x"]).ravel()
+    assert solver.stats()["success"]
+    rollout = simulate(step, theta, start, count, w[torques], np.zeros((count + 1, 0)))
+    np.testing.assert_allclose(rollout.state[-1], end, atol=1e-6)
+    assert np.ptp(w[torques]) > 0.5

@@ -31,6 +31,8 @@ log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 Form = Literal["symbolic", "compiled"]
 
+MUCH = 2e9
+"""Memory from which on whoever waits is told beforehand how much it will be [bytes]."""
 SUCCESS = {"Solve_Succeeded", "Solved_To_Acceptable_Level"}
 
 
@@ -125,7 +127,7 @@ class MultipleShooting:
         program = replace(program, ridge=replace(program.ridge, factor=_Factor(held, program.w.numel())))
         needed, free = program.memory(self.hessian), free_memory()
         size = f"{program.w.numel()} unknowns, {program.g.numel()} equations, about {needed / 1e9:.2g} GB of memory"
-        log.info("IPOPT on %s", size)
+        log.log(logging.WARNING if needed > MUCH else logging.INFO, "IPOPT on %s", size)
         if needed > free:
             message = f"{size}, of which {free / 1e9:.2g} GB are free; take a longer time_step, a shorter duration or "
             return Outcome(Status.FAILED, message + "gauss_newton", start, (), 0)
