@@ -39,7 +39,9 @@ def main(arguments: list[str] | None = None) -> int:
         "single_shooting": SingleShooting(),
         "lifted": Lifted(),
         "multiple_shooting, node every 10 steps": MultipleShooting(node_interval=10),
-        "multiple_shooting, node every step": MultipleShooting(node_interval=1),
+        "multiple_shooting, symbolic": MultipleShooting(),
+        "multiple_shooting, symbolic, exact": MultipleShooting(hessian="exact"),
+        "multiple_shooting, compiled": MultipleShooting(transcription="compiled"),
         "steepest_descent, as in the paper": SteepestDescent(),
         "steepest_descent, spectral": SteepestDescent(
             trial="spectral", memory=10, iterations=800, gradient_tolerance=1e-4

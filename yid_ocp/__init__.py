@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     from yid_ocp.solvers import Status as Status
     from yid_ocp.solvers import SteepestDescent as SteepestDescent
     from yid_ocp.solvers import solve as solve
+    from yid_ocp.solvers.program import NonlinearProgram as NonlinearProgram
+    from yid_ocp.solvers.symbolic import transcribe as transcribe
     from yid_ocp.workflow.build import load_problem as load_problem
     from yid_ocp.workflow.build import load_system as load_system
 
@@ -58,6 +60,8 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "integrator.step": ("compile_step",),
     "model": ("FlexibleObject", "Grasp", "Mechanism", "Segment", "System", "flexible_object"),
     "problem": ("EstimationProblem", "ProblemOptions", "SensorOptions"),
+    "solvers.program": ("NonlinearProgram",),
+    "solvers.symbolic": ("transcribe",),
     "workflow.build": ("load_problem", "load_system"),
     "solvers": (
         "GaussNewton",
@@ -81,6 +85,7 @@ __all__ = [
     "Lifted",
     "Mechanism",
     "MultipleShooting",
+    "NonlinearProgram",
     "ProblemOptions",
     "Recording",
     "Segment",
@@ -104,6 +109,7 @@ __all__ = [
     "read_recording",
     "simulate",
     "solve",
+    "transcribe",
     "what_if",
     "write_recording",
 ]

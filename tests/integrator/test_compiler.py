@@ -6,6 +6,7 @@ import logging
 import os
 import stat
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -176,3 +177,35 @@ def test_a_damaged_library_leaves_the_interpreter(cache, monkeypatch, caplog, pe
         step = compile_step(pendulum, 0.01)
     assert not step.compiled
     assert "cannot be loaded" in caplog.text
+
+
+def polynomial(scale=2.0):
+    x = ca.SX.sym("x", 3)
+    return ca.Function("polynomial", [x], [scale * x**2, ca.jacobian(x**3, x)])
+
+
+@needs_compiler
+def test_a_function_is_compiled_once_and_keeps_its_sparsity(cache, runs):
+    plain = polynomial()
+    made = [compiler.compiled_function(plain) for _ in range(2)]
+    assert len([command for command in runs if "-shared" in command]) == 1
+    for function in made:
+        assert not function.is_a("SXFunction")
+        assert function.sparsity_out(1) == plain.sparsity_out(1)
+        for actual, expected in zip(function([1.0, 2.0, 3.0]), plain([1.0, 2.0, 3.0]), strict=True):
+            np.testing.assert_allclose(np.array(actual), np.array(expected), rtol=1e-15)
+    other = compiler.compiled_function(polynomial(5.0))
+    assert float(other([1.0, 2.0, 3.0])[0][2]) == 45.0
+    assert float(made[0]([1.0, 2.0, 3.0])[0][2]) == 18.0
+
+
+@needs_compiler
+def test_a_function_that_cannot_be_compiled_is_as_it_was(cache, monkeypatch, caplog):
+    plain = polynomial()
+    with monkeypatch.context() as change:
+        change.setattr(compiler.os, "replace", lambda source, target: target.write_bytes(b"not a library"))
+        assert compiler.compiled_function(plain).is_a("SXFunction")
+    assert "cannot be loaded" in caplog.text
+    monkeypatch.setenv("CC", "none")
+    compiler.compiler.cache_clear()
+    assert compiler.compiled_function(polynomial(3.0)).is_a("SXFunction")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -12,6 +13,7 @@ from yid_ocp.errors import SolverError
 from yid_ocp.integrator.step import compile_alike, compile_step
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import GaussNewton, Lifted, MultipleShooting, SingleShooting, Status, SteepestDescent, solve
+from yid_ocp.solvers.symbolic import transcribe
 from yid_ocp.solvers.transcription import Transcription
 
 FREE = ("T1.bend", "T1.twist", "T2.bend", "T2.twist", "T3.bend", "T3.twist")
@@ -178,7 +180,8 @@ def test_recording_shorter_than_a_node_interval(short):
 
 def test_iteration_limit_is_a_status_with_the_best_point(make_problem):
     problem = make_problem(free=SEEN, duration=0.4)
-    for solver in (GaussNewton(iterations=1), MultipleShooting(node_interval=10, iterations=2)):
+    few = (MultipleShooting(node_interval=10, iterations=2), MultipleShooting(iterations=2))
+    for solver in (GaussNewton(iterations=1), *few):
         solution = solve(problem, solver)
         assert solution.status == Status.ITERATION_LIMIT
         assert np.all(np.isfinite(solution.x))
@@ -196,4 +199,37 @@ def test_trial_points_that_cannot_be_worked_out_are_told_in_the_status_and_not_o
     found = MultipleShooting(node_interval=10, iterations=3).run(short, short.start, None)
     assert found.status == Status.STALLED
     assert "trial points could not be worked out" in found.message
+    assert capfd.readouterr() == ("", "")
+
+
+def test_eliminated_steps_are_for_the_compiled_form(short):
+    with pytest.raises(SolverError, match="node_interval = 10 with the symbolic transcription"):
+        MultipleShooting(node_interval=10, transcription="symbolic").run(short, short.start, None)
+    with pytest.raises(SolverError, match="transcription = 'callback'"):
+        MultipleShooting(transcription="callback").run(short, short.start, None)
+
+
+def test_more_memory_than_there_is_ends_with_a_status(make_problem, monkeypatch, caplog):
+    problem = make_problem(free=("T1.bend",), duration=0.1)
+    monkeypatch.setattr("yid_ocp.solvers.multiple_shooting.free_memory", lambda: 1e6)
+    with caplog.at_level("INFO"):
+        found = MultipleShooting().run(problem, problem.start, None)
+    assert found.status == Status.FAILED
+    assert found.x == pytest.approx(problem.start)
+    assert "of memory, of which 0.001 GB are free" in found.message
+    assert "IPOPT on 1023 unknowns, 1022 equations" in caplog.text
+
+
+def test_a_program_that_ipopt_cannot_begin_is_a_status_and_silent(make_problem, monkeypatch, capfd):
+    problem = make_problem(free=("T1.bend", "T2.bend"), duration=0.05)
+
+    def lost(*arguments):
+        program = transcribe(*arguments)
+        return program.adding(ca.log(program["theta"][0] - 100.0))
+
+    monkeypatch.setattr("yid_ocp.solvers.multiple_shooting.transcribe", lost)
+    found = MultipleShooting(iterations=3).run(problem, problem.start, None)
+    assert found.status in (Status.STALLED, Status.FAILED)
+    assert "IPOPT: Invalid_Number_Detected" in found.message
+    assert np.all(np.isfinite(found.x))
     assert capfd.readouterr() == ("", "")

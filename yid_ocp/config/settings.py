@@ -236,7 +236,7 @@ def _compared() -> dict[str, Solver]:
         "steepest_descent": SteepestDescent(trial="spectral", memory=10, iterations=800, gradient_tolerance=1e-4),
         "single_shooting": SingleShooting(),
         "gauss_newton": GaussNewton(),
-        "multiple_shooting": MultipleShooting(node_interval=10),
+        "multiple_shooting": MultipleShooting(),
         "lifted": Lifted(),
     }
 

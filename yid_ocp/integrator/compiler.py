@@ -26,6 +26,9 @@ NATIVE = ("-march=native",)
 
 # -O2 takes minutes on single functions of tens of thousands of lines, for a gain of some 10 %.
 SHORT, LONG, LONG_FROM = "-O2", "-O1", 45_000
+# What runs for seconds in all and is new for every model is worth no more: -O1 takes a minute on 70 000 lines, this
+# three seconds, for code that is still two or three times as fast as CasADi's own machine.
+QUICK = "-O0"
 
 
 @functools.cache
@@ -91,29 +94,55 @@ def compile_library(source: str, straight_line: bool = False) -> ctypes.CDLL | N
     straight_line : bool
         Whether the text is one long function without loops, on which the compiler should not dwell.
     """
-    path = compiler()
-    if path is None:
+    target = _library_file(source, LONG if straight_line or source.count("\n") > LONG_FROM else SHORT)
+    if target is None:
         return None
-    level = LONG if straight_line or source.count("\n") > LONG_FROM else SHORT
-    key = hashlib.sha256(
-        "\0".join([source, level, *FLAGS, *NATIVE, _machine(), ca.CasadiMeta.version()]).encode()
-    ).hexdigest()[:32]
-    target = cache_folder() / f"{key}.so"
-    if not target.exists():
-        with tempfile.TemporaryDirectory(dir=target.parent) as work:
-            text, built = Path(work) / "source.c", Path(work) / "library.so"
-            text.write_text(source, encoding="utf-8")
-            for flags in ((*FLAGS, *NATIVE), FLAGS):
-                command = [path, level, *flags, str(text), "-o", str(built), "-lm"]
-                run = subprocess.run(command, capture_output=True, text=True, check=False)
-                if run.returncode == 0:
-                    break
-            else:
-                log.warning("the C compiler %s failed; going on without compiled code:\n%s", path, run.stderr[:2000])
-                return None
-            os.replace(built, target)
     try:
         return ctypes.CDLL(str(target))
     except OSError as error:
         log.warning("compiled code cannot be loaded (%s); going on without it", error)
         return None
+
+
+def compiled_function(function: ca.Function) -> ca.Function:
+    """The same function from compiled code, or as it is where nothing can compile it; it cannot be differentiated.
+
+    Parameters
+    ----------
+    function : casadi.Function
+        Compiled in a hurry: for functions of many operations that run for seconds in all.
+    """
+    generator = ca.CodeGenerator(function.name(), {"with_header": False, "indent": 0})
+    generator.add(function)
+    target = _library_file(generator.dump(), QUICK)
+    if target is None:
+        return function
+    try:
+        return ca.external(function.name(), str(target))
+    except RuntimeError as error:
+        log.warning("compiled code cannot be loaded (%s); going on without it", error)
+        return function
+
+
+def _library_file(source: str, level: str) -> Path | None:
+    """The library in the cache, compiled if it is not there yet; None where nothing can compile it."""
+    path = compiler()
+    if path is None:
+        return None
+    key = hashlib.sha256(
+        "\0".join([source, level, *FLAGS, *NATIVE, _machine(), ca.CasadiMeta.version()]).encode()
+    ).hexdigest()[:32]
+    target = cache_folder() / f"{key}.so"
+    if target.exists():
+        return target
+    with tempfile.TemporaryDirectory(dir=target.parent) as work:
+        text, built = Path(work) / "source.c", Path(work) / "library.so"
+        text.write_text(source, encoding="utf-8")
+        for flags in ((*FLAGS, *NATIVE), FLAGS):
+            command = [path, level, *flags, str(text), "-o", str(built), "-lm"]
+            run = subprocess.run(command, capture_output=True, text=True, check=False)
+            if run.returncode == 0:
+                os.replace(built, target)
+                return target
+    log.warning("the C compiler %s failed; going on without compiled code:\n%s", path, run.stderr[:2000])
+    return None

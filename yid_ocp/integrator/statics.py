@@ -69,6 +69,17 @@ class Statics:
     Parameters
     ----------
     step : Step
+
+    Attributes
+    ----------
+    known, unknown : tuple of int
+        Coordinates that are given (driven, then prescribed), and those that are sought.
+    inputs : list of casadi.SX
+        (sought, internal, forces), given coordinates, held torque, holding spring's stiffness, theta, time step.
+    residual : casadi.SX
+        Zero at rest: balance of the coordinates sought [N m], internal equations, constraints [m].
+    state : casadi.SX, shape (nx, 1)
+        (q, p, z) at rest.
     """
 
     def __init__(self, step: Step) -> None:
@@ -105,7 +116,7 @@ class Statics:
         state = ca.densify(ca.vertcat(q, p_rest, z))
         self._residual = ca.Function("rest", inputs, [residual, ca.jacobian(residual, w)])
         self._outcome = ca.Function("outcome", inputs, [state, u, potential, give])
-        self._symbols = (inputs, residual, state)
+        self.inputs, self.residual, self.state = inputs, residual, state
         self._derivatives: Once[tuple[str, ...], ca.Function] = Once(self._derivative)
 
     def solve(
@@ -199,7 +210,7 @@ class Statics:
         return total[:, : len(names)], total[:, len(names) :]
 
     def _derivative(self, names: tuple[str, ...]) -> ca.Function:
-        inputs, residual, state = self._symbols
+        inputs, residual, state = self.inputs, self.residual, self.state
         other = ca.vertcat(*(self.step.system.parameters[name].symbol for name in names), inputs[1])
         outputs = [ca.jacobian(f, x) for f in (residual, state) for x in (inputs[0], other)]
         return ca.Function("by", inputs, outputs)

@@ -211,7 +211,7 @@ def solve(
     start (a soft object snaps, an arm falls), the problem is first solved over its first seconds only, and then over
     longer and longer horizons. A poor fit is started again from other initial values. Where noise drives the motion,
     methods that can weigh residuals by it do so in several passes, its covariance frozen in each
-    (`EstimationProblem.weighted_at`).
+    (`EstimationProblem.weighted_at`); the answer of one that has its errors as unknowns is judged in the same way.
 
     Parameters
     ----------
@@ -268,7 +268,7 @@ def _solved(
         if _good_fit(problem, best[1]):
             break
         try_from(np.where(problem.positive, np.clip(first * factor, lower, upper), first), f"start x {factor:g}")
-    once = tried == 1 and restarts and problem.disturbed and carries_covariance(solver)
+    once = tried == 1 and restarts and problem.disturbed and carries_noise(solver)
     if once and np.any(_doubtful(best[2], best[1], best[0].x, first)):
         factor = RESTARTS[0]
         try_from(np.where(problem.positive, np.clip(first * factor, lower, upper), first), f"start x {factor:g}")
@@ -279,7 +279,7 @@ def _solved(
         near = np.where(problem.positive, np.clip(outcome.x * factor, lower, upper), outcome.x)
         try_from(near, f"best fit x {factor:g}")
     outcome, finish, weighted = best
-    if problem.disturbed and not carries_covariance(solver):
+    if problem.disturbed and not carries_noise(solver):
         remark = "; weighted by the sensors' noise alone, without the noise that drives the motion"
         outcome = replace(outcome, message=outcome.message + remark)
     problem = weighted
@@ -344,6 +344,9 @@ def _attempt(
         # the second pass is the first about torque offsets that are not guessed
         if number and len(outcome.history) < 2:
             break
+    if problem.disturbed and passes == 1 and carries_noise(solver):
+        # it had the errors themselves as unknowns; what is judged is their likelihood about its answer
+        weighted = problem.weighted_at(x, warm, rounds=2)
     return (outcome, weighted.evaluate(outcome.x, warm=outcome.warm), weighted), evaluations, history
 
 
@@ -359,6 +362,11 @@ def _doubtful(problem: EstimationProblem, finish: Evaluation, x: Array, first: A
 def carries_covariance(solver: Solver) -> bool:
     """Whether a method can weigh residuals by noise that drives the motion."""
     return bool(getattr(solver, "carries_covariance", False))
+
+
+def carries_noise(solver: Solver) -> bool:
+    """Whether a method knows of noise that drives the motion, as a covariance or with the errors as unknowns."""
+    return carries_covariance(solver) or bool(getattr(solver, "errors_are_unknowns", False))
 
 
 def _good_fit(problem: EstimationProblem, finish: Evaluation) -> bool:

@@ -107,6 +107,7 @@ class Lifted:
         guess = transcription.guess(start[: len(problem.shared)])
         nodes = [guess[layout.state] for layout in transcription.layouts]
         x = start.copy()
+        x[: len(problem.shared)] = guess[: len(problem.shared)]
         lower, upper = problem.bounds
         now = self._linearise(transcription, x, nodes)
         recorder.evaluations += 1

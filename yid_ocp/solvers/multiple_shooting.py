@@ -1,10 +1,16 @@
-"""Multiple shooting: the transcription solved by IPOPT, with compiled stage derivatives."""
+"""Multiple shooting: node states as unknowns of a nonlinear program, solved by IPOPT.
+
+The program is CasADi's own (`symbolic`), or its values and derivatives come from the compiled kernel (`compiled`),
+which also eliminates steps between nodes. With a node at every step both have the same constraints and, where no noise
+drives the motion, the same objective; the errors that do are unknowns of the first and left out of the second.
+"""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar, Literal
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import casadi as ca
 import numpy as np
@@ -16,14 +22,18 @@ from yid_ocp.errors import SolverError
 from yid_ocp.options import About, check
 from yid_ocp.problem.problem import EstimationProblem
 from yid_ocp.solvers.base import SOLVERS, Callback, Outcome, Recorder, Status
+from yid_ocp.solvers.program import SILENT, Hessian, NonlinearProgram, free_memory
+from yid_ocp.solvers.symbolic import RIDGE, transcribe, unknown_vector
 from yid_ocp.solvers.transcription import Transcription
 
-Array = NDArray[np.float64]
-Hessian = Literal["gauss_newton", "exact"]
+log = logging.getLogger(__name__)
 
+Array = NDArray[np.float64]
+Form = Literal["symbolic", "compiled"]
+
+MUCH = 2e9
+"""Memory from which on whoever waits is told beforehand how much it will be [bytes]."""
 SUCCESS = {"Solve_Succeeded", "Solved_To_Acceptable_Level"}
-# Least curvature for a change of a parameter by its size, over the mean square of the whitened residuals.
-RIDGE = 0.1
 
 
 @SOLVERS.register("multiple_shooting")
@@ -31,7 +41,7 @@ RIDGE = 0.1
 class MultipleShooting:
     """Solve  min 1/2 |r(w)|^2  subject to the DEL equations of every step (or of every interval) and bounds.
 
-    The start is a rollout under the tracking filter; defects are scaled to order one, the cost by its initial value,
+    The start is that of `solvers.guess`; defects are scaled to order one, the cost by its initial value,
     and IPOPT's own scaling is off. In these units IPOPT's first bound multipliers, which are one, weigh as much as the
     cost, so that the first steps change no parameter by much more than a factor.
 
@@ -47,8 +57,19 @@ class MultipleShooting:
     node_interval: Annotated[
         int, Ge(1), About("steps between nodes; 1 makes every equation of motion and multiplier part of the program")
     ] = 1
+    transcription: Annotated[
+        Form | None,
+        About(
+            "whether the program is CasADi's own or calls the compiled step; when absent symbolic with a node at every "
+            "step, else compiled, which alone can eliminate steps"
+        ),
+    ] = None
     hessian: Annotated[
-        Hessian, About("of the Lagrangian; exact adds the constraints' curvature, by differences of their Jacobian")
+        Hessian,
+        About(
+            "of the Lagrangian; exact adds the curvature of equations and sensors (compiled: of equations alone, by "
+            "differences of their Jacobian)"
+        ),
     ] = "gauss_newton"
     iterations: Annotated[int, Ge(1), About("limit on IPOPT's iterations")] = 200
     tolerance: Annotated[float, Gt(0), About("IPOPT's tol")] = 1e-6
@@ -59,6 +80,16 @@ class MultipleShooting:
 
     def __post_init__(self) -> None:
         check(self, f"solver {self.name}")
+
+    @property
+    def form(self) -> Form:
+        """Which transcription is used."""
+        return self.transcription or ("symbolic" if self.node_interval == 1 else "compiled")
+
+    @property
+    def errors_are_unknowns(self) -> bool:
+        """Whether errors of torques that drive the motion are among the unknowns."""
+        return self.form == "symbolic"
 
     def run(self, problem: EstimationProblem, start: Array, callback: Callback | None) -> Outcome:
         """See `Solver.run`."""
@@ -76,6 +107,46 @@ class MultipleShooting:
                 allowed="exact",
                 hint="the node states number in the thousands; use hessian: gauss_newton",
             )
+        if self.form not in get_args(Form):
+            raise SolverError(
+                f"transcription = '{self.form}'", where="solver.transcription", allowed=", ".join(get_args(Form))
+            )
+        if self.form == "symbolic" and self.node_interval != 1:
+            raise SolverError(
+                f"node_interval = {self.node_interval} with the symbolic transcription",
+                where="solver.transcription",
+                allowed="node_interval: 1",
+                hint="transcription: compiled eliminates the steps between nodes",
+            )
+        return (self._symbolic if self.form == "symbolic" else self._compiled)(problem, start, callback)
+
+    def _symbolic(self, problem: EstimationProblem, start: Array, callback: Callback | None) -> Outcome:
+        program = transcribe(problem, start)
+        assert program.ridge is not None
+        held = _Held(program.ridge.scale)
+        program = replace(program, ridge=replace(program.ridge, factor=_Factor(held, program.w.numel())))
+        needed, free = program.memory(self.hessian), free_memory()
+        size = f"{program.w.numel()} unknowns, {program.g.numel()} equations, about {needed / 1e9:.2g} GB of memory"
+        log.log(logging.WARNING if needed > MUCH else logging.INFO, "IPOPT on %s", size)
+        if needed > free:
+            message = f"{size}, of which {free / 1e9:.2g} GB are free; take a longer time_step, a shorter duration or "
+            return Outcome(Status.FAILED, message + "gauss_newton", start, (), 0)
+        functions = ca.Function("point", [program.w, program.p], [program.f, program.grad_f, program.g])
+        watch = _Watch(problem, program, functions, held, Recorder(callback))
+        options = self._options()
+        options["ipopt"] = {"obj_scaling_factor": 1.0 / watch.unit, **options["ipopt"]}
+        solver = program.solver("ipopt", self.hessian, iteration_callback=watch, **options)
+        w = np.array(solver(**program.arguments)["x"]).ravel()
+        w = w if np.all(np.isfinite(w)) else watch.best
+        defect = float(ca.norm_inf(functions(w, program.values)[2]))
+        stats = solver.stats()
+        status, message = self._ended(stats["return_status"], defect, 0)
+        history, n = tuple(watch.recorder.history), problem.step.sizes["n"]
+        warm = tuple(w[program.variables[f"q[{episode.name}]"].index[:n, 0]] for episode in problem.episodes)
+        x = unknown_vector(problem, program, w)
+        return Outcome(status, message, x, history, int(stats["n_call_nlp_g"]), warm)
+
+    def _compiled(self, problem: EstimationProblem, start: Array, callback: Callback | None) -> Outcome:
         transcription = Transcription(problem, self.node_interval)
         nlp = _Nlp(transcription, self.hessian, Recorder(callback))
         w0 = transcription.guess(start)
@@ -94,11 +165,8 @@ class MultipleShooting:
     def _options(self) -> dict[str, Any]:
         """Options of CasADi's IPOPT interface."""
         return {
-            "print_time": False,
+            **SILENT,
             "no_nlp_grad": True,
-            "error_on_fail": False,
-            # a trial point that cannot be worked out is counted and told in the status instead
-            "show_eval_warnings": False,
             "ipopt": {
                 "print_level": 0,
                 "sb": "yes",
@@ -134,6 +202,87 @@ class MultipleShooting:
             returned += f", {lost} trial points could not be worked out"
         remedy = "start nearer, use more nodes, or use gauss_newton"
         return Status.STALLED, f"IPOPT: {returned}, largest defect {defect:.1e}; {remedy}"
+
+
+class _Held:
+    """A ridge that rises where parameters swing to and fro, and falls where they keep going."""
+
+    def __init__(self, scale: Array) -> None:
+        self.factor = RIDGE
+        self._scale, self._change = scale, np.zeros(len(scale))
+
+    def moved(self, before: Array, after: Array) -> None:
+        """Take note of an iterate."""
+        change = (after - before) / np.maximum(np.abs(after), self._scale)
+        turned = float(change @ self._change) < 0
+        self.factor = 4.0 * self.factor if turned else max(0.5 * self.factor, RIDGE)
+        self._change = change
+
+
+class _Factor(ca.Callback):
+    """The factor of a ridge, as CasADi asks for it."""
+
+    def __init__(self, held: _Held, size: int) -> None:
+        ca.Callback.__init__(self)
+        self._held, self._size = held, size
+        self.construct("factor", {})
+
+    def get_sparsity_in(self, _: int) -> ca.Sparsity:
+        return ca.Sparsity.dense(self._size, 1)
+
+    def eval(self, _: Sequence[ca.DM]) -> list[float]:
+        """Whatever the point is."""
+        return [self._held.factor]
+
+
+class _Watch(ca.Callback):
+    """Told by CasADi of every iterate; enters it in the history."""
+
+    def __init__(
+        self,
+        problem: EstimationProblem,
+        program: NonlinearProgram,
+        functions: ca.Function,
+        held: _Held,
+        recorder: Recorder,
+    ) -> None:
+        ca.Callback.__init__(self)
+        self.recorder, self.best, self._held = recorder, program.start, held
+        self._problem, self._program, self._functions = problem, program, functions
+        cost = float(functions(program.start, program.values)[0])
+        self.unit = max(cost, 0.5 * program.residual.numel() * problem.noise**2)
+        self._sizes = {"x": program.w.numel(), "f": 1, "g": program.g.numel(), "lam_x": program.w.numel()}
+        self._sizes |= {"lam_g": program.g.numel(), "lam_p": program.p.numel()}
+        self.construct("watch", {})
+
+    def get_n_in(self) -> int:
+        return ca.nlpsol_n_out()
+
+    def get_n_out(self) -> int:
+        return 1
+
+    def get_name_in(self, i: int) -> str:
+        return str(ca.nlpsol_out(i))
+
+    def get_name_out(self, _: int) -> str:
+        return "stop"
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        return ca.Sparsity.dense(self._sizes[ca.nlpsol_out(i)], 1)
+
+    def eval(self, arguments: Sequence[ca.DM]) -> list[int]:
+        """Enter an iterate; never stops the solver."""
+        w = np.array(arguments[0]).ravel()
+        cost, slope, _ = self._functions(w, self._program.values)
+        assert self._program.ridge is not None
+        at = self._program.ridge.index
+        self._held.moved(self.best[at], w[at])
+        self.best = w
+        x = unknown_vector(self._problem, self._program, w)
+        self.recorder.evaluations += 1
+        note = "" if self.recorder.history else "start"
+        self.recorder.accept(float(cost), x, float(ca.norm_inf(slope)) / self.unit, note)
+        return [0]
 
 
 class _Function(ca.Callback):
@@ -192,8 +341,8 @@ class _Nlp:
         self.best = np.zeros(transcription.size)
         self.lost = 0
         self._asked = np.zeros(0)
-        self._ridge = RIDGE
-        self._change = np.zeros(len(transcription.problem.shared))
+        count = len(transcription.problem.shared)
+        self._held = _Held(transcription.problem.scales[:count])
         self._keep: list[_Function] = []
 
     def prepare(self, w0: Array) -> None:
@@ -264,17 +413,11 @@ class _Nlp:
         gradient = slope.T @ residual
         if not np.array_equal(w, self.best):
             # IPOPT may ask more than once for the gradient at the point that it accepted
-            self._hold(w)
+            count = len(self.transcription.problem.shared)
+            self._held.moved(self.best[:count], w[:count])
             self.best = w
             self.recorder.accept(cost, self.transcription.unknowns(w), float(np.max(np.abs(gradient))) / self._unit)
         return [cost / self._unit, gradient / self._unit]
-
-    def _hold(self, w: Array) -> None:
-        """Raise the ridge where parameters swing to and fro, lower it where they keep going."""
-        change = (w - self.best)[: len(self._change)] / self._size(w)
-        turned = float(change @ self._change) < 0
-        self._ridge = 4.0 * self._ridge if turned else max(0.5 * self._ridge, RIDGE)
-        self._change = change
 
     def _size(self, w: Array) -> Array:
         problem = self.transcription.problem
@@ -292,7 +435,7 @@ class _Nlp:
         size = self._size(w)
         # along weakly informed parameters the curvature that Gauss-Newton leaves out may be as large as its own
         ridge = np.zeros(len(w))
-        ridge[: len(size)] = self._ridge * 2 * cost / len(residual) / size**2
+        ridge[: len(size)] = self._held.factor * 2 * cost / len(residual) / size**2
         matrix = (slope.T @ slope + scipy.sparse.diags(ridge)) * (float(lam_f[0]) / self._unit)
         if self.hessian == "exact":
             matrix = matrix + self.transcription.curvature(w, lam_g)

@@ -20,19 +20,14 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from yid_ocp.errors import SolverError
-from yid_ocp.integrator.lqr import lqr_filter
-from yid_ocp.integrator.rollout import momentum_of, simulate
-from yid_ocp.integrator.step import Directions, Feedback, Rollout
-from yid_ocp.problem.episodes import Episode
-from yid_ocp.problem.low_pass import LowPass
+from yid_ocp.integrator.rollout import simulate
+from yid_ocp.integrator.step import Directions, Rollout
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.problem import EstimationProblem
+from yid_ocp.solvers.guess import guess
 
 Array = NDArray[np.float64]
 Sparse: TypeAlias = Any
-
-# Mean square whitened residual above which a rollout is not the best guess of the node states.
-POOR_GUESS = 100.0
 
 
 @dataclass(frozen=True)
@@ -133,26 +128,12 @@ class Transcription:
     # -- initial guess ------------------------------------------------------------------------------------------------
 
     def guess(self, x: Array) -> Array:
-        """Unknowns near a solution at the parameters `x`.
-
-        Either the rollout under the tracking filter, which has no defects, or, where that fails or strays far from what
-        was measured, every node at rest at the posture that the arms had then, which has defects but follows the data.
-        """
+        """Unknowns near a solution, at the parameters `x` or at multiples of them (see `solvers.guess`)."""
+        found = guess(self.problem, [layout.nodes for layout in self.layouts], self._unknowns(x), self._misfit)
         w = np.zeros(self.size)
-        count = len(self.problem.shared)
-        w[:count] = x[:count]
-        for i, (episode, layout) in enumerate(zip(self.problem.episodes, self.layouts, strict=True)):
-            theta = self._theta(w, i)
-            begin = self.problem.start_state(episode, theta, guess=self.warm[i])
-            start = begin.state
-            rollout = None if begin.message else self._tracked(episode, theta, start)
-            candidates = []
-            if rollout is not None and rollout.status.ok:
-                candidates.append((rollout.state[layout.nodes], rollout.multipliers))
-            if not candidates or self._misfit(w, i, *candidates[0]) > POOR_GUESS:
-                candidates.append(self._resting(episode, layout, theta, start))
-            state, multipliers = min(candidates, key=lambda pair: self._misfit(w, i, *pair))
-            self._place(w, i, state, multipliers)
+        w[: len(self.problem.shared)] = found.x[: len(self.problem.shared)]
+        for i, pair in enumerate(zip(found.states, found.multipliers, strict=True)):
+            self._place(w, i, *pair)
         return w
 
     def _place(self, w: Array, i: int, state: Array, multipliers: Array) -> None:
@@ -161,62 +142,13 @@ class Transcription:
         if self.has_multipliers:
             w[layout.multipliers.ravel()] = multipliers.ravel()
 
-    def _misfit(self, w: Array, i: int, state: Array, multipliers: Array) -> float:
+    def _misfit(self, i: int, state: Array, multipliers: Array, x: Array) -> float:
         """Mean square of one recording's whitened residuals at given node states."""
-        trial = w.copy()
+        trial = np.zeros(self.size)
+        trial[: len(self.problem.shared)] = x[: len(self.problem.shared)]
         self._place(trial, i, state, multipliers)
         values = [value for value, _, _ in self._sample_rows(trial, i, False)]
         return float(np.mean(np.concatenate(values) ** 2))
-
-    def _tracked(self, episode: Episode, theta: Array, start: Array) -> Rollout:
-        return simulate(
-            self.step,
-            theta,
-            start,
-            episode.grid.steps,
-            episode.torque,
-            episode.path,
-            self._tracking(episode, theta),
-        )
-
-    def _tracking(self, episode: Episode, theta: Array) -> Feedback | None:
-        feedback = episode.feedback
-        if feedback is None and self.problem.system.driven:
-            smooth = LowPass(self.problem.options.path_cutoff)(episode.grid.times, episode.measured_arm)
-            return lqr_filter(self.step, smooth, episode.torque, theta)
-        return feedback
-
-    def _resting(self, episode: Episode, layout: Layout, theta: Array, start: Array) -> tuple[Array, Array]:
-        """Node states at rest at the measured postures, with the momentum of moving from one to the next."""
-        problem, n = self.problem, self.n
-        statics, h = problem.functions.statics, self.step.time_step
-        state = np.tile(start, (len(layout.nodes), 1))
-        pull = np.zeros((len(layout.nodes), self.m))
-        shape: Array | None = None
-        # shapes change slowly: a tenth of a second between them is enough
-        every = max(1, round(0.1 / (h * self.interval)))
-        chosen = np.unique(np.append(np.arange(0, len(layout.nodes), every), len(layout.nodes) - 1))
-        for j in chosen:
-            node = layout.nodes[j]
-            posture = np.concatenate([episode.measured_arm[node], episode.path[node]])
-            torque = episode.torque[min(node, len(episode.torque) - 1)] if problem.system.driven else None
-            rest = statics.solve(posture, theta, torque, shape)
-            if rest.error < 1e-3:
-                shape = rest.state[:n]
-                state[j], pull[j] = rest.state, rest.constraint_force
-            else:
-                state[j], pull[j] = state[max(j - 1, 0)], pull[max(j - 1, 0)]
-        times = layout.nodes * h
-        for column in range(self.nx):
-            state[:, column] = np.interp(times, times[chosen], state[chosen, column])
-        force = np.zeros((len(times), self.m))
-        for column in range(self.m):
-            force[:, column] = np.interp(times, times[chosen], pull[chosen, column])
-        driven = list(problem.system.driven_indices)
-        state[:, driven] = episode.measured_arm[layout.nodes]
-        velocity = np.gradient(state[:, :n], times, axis=0)
-        state[:, n : 2 * n] += momentum_of(self.step, state[:, :n], velocity, theta)
-        return state, force[:-1] * h
 
     def _unknowns(self, theta_free: Array) -> Array:
         """The problem's unknown vector with the starts' offsets at zero."""

@@ -1,0 +1,82 @@
+"""Where methods with node states begin."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from yid_ocp.integrator.step import compile_alike
+from yid_ocp.problem import EstimationProblem, ProblemOptions
+from yid_ocp.solvers.guess import guess
+
+START = np.array([5.0, 4.0])
+
+
+@pytest.fixture(scope="module")
+def problem(make_problem):
+    return make_problem(free=("T1.bend", "T2.bend"), duration=0.1)
+
+
+def nodes_of(problem):
+    return [np.arange(problem.episodes[0].grid.steps + 1)]
+
+
+@pytest.mark.parametrize(
+    ("misfits", "taken", "tried"),
+    [
+        ({1.0: 9.0}, 1.0, [1.0]),
+        ({1.0: 50.0, 4.0: 9.0}, 4.0, [1.0, 4.0]),
+        ({1.0: 50.0, 4.0: 20.0, 2.0: 12.0, 10.0: 30.0}, 2.0, [1.0, 4.0, 2.0, 10.0]),
+        ({1.0: 11.0, 4.0: 20.0, 2.0: 12.0, 10.0: 30.0}, 1.0, [1.0, 4.0, 2.0, 10.0]),
+    ],
+)
+def test_larger_parameters_are_tried_until_states_fit(problem, misfits, taken, tried):
+    told = []
+
+    def misfit(i, state, pull, x):
+        factor = float(x[0] / START[0])
+        np.testing.assert_allclose(x, factor * START)
+        assert state.shape == (11, problem.step.sizes["nx"])
+        assert pull.shape == (10, problem.step.sizes["m"])
+        told.append(factor)
+        return misfits[factor]
+
+    found = guess(problem, nodes_of(problem), START, misfit)
+    np.testing.assert_allclose(found.x, taken * START)
+    assert list(dict.fromkeys(told)) == tried
+    rest = problem.start_state(problem.episodes[0], problem.split(found.x, 0)[0])
+    np.testing.assert_allclose(found.begins[0].state, rest.state, atol=1e-9)
+
+
+def test_what_fits_is_the_rollout_and_what_does_not_is_rest_where_the_arm_was(problem):
+    nodes, episode = nodes_of(problem), problem.episodes[0]
+    driven = list(problem.system.driven_indices)
+    rolled = problem.evaluate(START).episodes[0].rollout
+    found = guess(problem, nodes, START, lambda i, state, pull, x: 1.0)
+    np.testing.assert_allclose(found.states[0], rolled.state, atol=1e-9)
+    np.testing.assert_allclose(found.multipliers[0], rolled.multipliers, atol=1e-9)
+
+    def strays(i, state, pull, x):
+        return 1e3 * np.abs(state[:, driven] - episode.measured_arm).max() + 20.0
+
+    found = guess(problem, nodes, START, strays)
+    np.testing.assert_allclose(found.states[0][:, driven], episode.measured_arm, atol=1e-12)
+    assert np.abs(rolled.state[:, driven] - episode.measured_arm).max() > 1e-4
+
+
+def test_bounds_hold_larger_parameters_back(one_arm, recording):
+    parameters = one_arm.system.parameters.with_bounds({"T1.bend": (0.0, 12.0)})
+    system = replace(one_arm.system, parameters=parameters)
+    step = compile_alike(one_arm, system)
+    problem = EstimationProblem(step, [recording], ("T1.bend", "T2.bend"), ProblemOptions(duration=0.1))
+    told = []
+
+    def misfit(i, state, pull, x):
+        told.append(x.tolist())
+        return 1e3
+
+    guess(problem, nodes_of(problem), START, misfit)
+    tried = [list(pair) for pair in dict.fromkeys(map(tuple, told))]
+    assert tried == [[5.0, 4.0], [12.0, 16.0], [10.0, 8.0], [12.0, 40.0]]

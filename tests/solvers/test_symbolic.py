@@ -1,0 +1,376 @@
+"""An estimation problem as a program of CasADi: the numbers of the rollout and of the kernel's transcription."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from small_problems import PENDULUM, STEPS, pendulum_step, taken
+
+import yid_ocp
+from yid_ocp.errors import SolverError
+from yid_ocp.integrator.rollout import simulate
+from yid_ocp.integrator.stage import stage
+from yid_ocp.integrator.statics import Statics
+from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
+from yid_ocp.solvers import GaussNewton, MultipleShooting, Status, solve
+from yid_ocp.solvers.program import Block, NonlinearProgram
+from yid_ocp.solvers.symbolic import transcribe, unknown_vector
+from yid_ocp.solvers.terms import Local, Residual, Term
+from yid_ocp.solvers.transcription import Transcription
+
+TRACKED = {"feedback": "proportional", "gains": (9.0,)}
+CASES = {
+    "free": ((), {}, {}),
+    "robust": ((), {}, {"huber_threshold": 0.8}),
+    "paper": ((), {}, {"weighting": "paper"}),
+    "estimated": ((), {}, {"initial_state": "estimated"}),
+    "local": ((), {}, {"local": ("elbow.stiffness",)}),
+    "prior": ((), {}, {"priors": {"elbow.damping": 0.3}}),
+    "known start": ((), {}, {"known_start": {"run_1": [0.1, 0.2, 0.01, 0.02], "run_2": [0.0, 0.3, 0.0, -0.01]}}),
+    "prescribed": ((), {"prescribed": ("shoulder",)}, {}),
+    "all prescribed": ((), {"prescribed": PENDULUM}, {}),
+    "driven": ((), {"driven": ("shoulder",)}, {"feedback": "none"}),
+    "driven, proportional": ((), {"driven": ("shoulder",)}, TRACKED),
+    "driven, filtered": ((), {"driven": ("shoulder",)}, {"feedback": "lqr"}),
+    "driven and prescribed": ((), {"driven": ("elbow",), "prescribed": ("shoulder",)}, TRACKED),
+}
+
+
+def problem_of(folder, case, seeds=(1, 2), **more):
+    """The pendulum of a case and two recordings of it, efforts taken as true."""
+    effects, how, options = CASES[case]
+    step = pendulum_step(folder, effects, **how)
+    springs = [f"{joint}.stiffness" for joint in PENDULUM if f"{joint}.stiffness" in step.system.parameters.names]
+    names = ("elbow.damping", *springs, *(n for e in step.system.effects for n in e.parameters.names))
+    recordings = [taken(step, seed) for seed in seeds]
+    settings = ProblemOptions(path_cutoff=math.inf, **options | more)
+    return EstimationProblem(step, recordings, names, settings).without_input_errors()
+
+
+@pytest.fixture(scope="module", params=CASES)
+def problem(request, urdf_folder):
+    return problem_of(urdf_folder, request.param)
+
+
+def rolled_out(problem, program, x):
+    """The program's unknowns along the rollouts at an unknown vector."""
+    w, evaluation = program.start.copy(), problem.evaluate(x)
+    assert evaluation.ok, evaluation.message
+    n = problem.step.sizes["n"]
+    shared = len(problem.shared)
+    w[program.variables["theta"].index.ravel()] = x[:shared]
+    for i, (episode, result) in enumerate(zip(problem.episodes, evaluation.episodes, strict=True)):
+        state = result.rollout.state
+        own = x[problem.unknowns.columns(i)[shared:]]
+        parts = {"q": state[:, :n].T, "p": state[:, n : 2 * n].T, "z": state[:, 2 * n :].T}
+        parts |= {"lam": result.rollout.multipliers.T, "local": own[: len(problem.local), None]}
+        if result.rest is not None:
+            sought = list(problem.functions.statics.unknown)
+            rest = (result.rest.state[sought], result.rest.state[2 * n :], result.rest.constraint_force)
+            parts["rest"] = np.concatenate(rest)[:, None]
+        for name, values in parts.items():
+            if values.size:
+                w[program.variables[f"{name}[{episode.name}]"].index] = values
+    return w, evaluation
+
+
+def beside(problem):
+    x = problem.start
+    return x * (1 + 0.2 * np.sin(1 + np.arange(len(x)))) + 0.003 * np.cos(np.arange(len(x)))
+
+
+def values_at(program, w, *expressions):
+    found = ca.Function("f", [program.w, program.p], [ca.densify(e) for e in expressions]).call([w, program.values])
+    return [np.array(value) for value in found]
+
+
+def test_along_a_rollout_it_has_the_problems_cost_residual_and_no_defects(problem):
+    x = beside(problem)
+    program = transcribe(problem)
+    w, evaluation = rolled_out(problem, program, x)
+    cost, defects, residual = values_at(program, w, program.f, program.g, program.residual)
+    assert cost.item() == pytest.approx(evaluation.cost, rel=1e-9)
+    assert np.abs(defects).max() < 1e-7
+    if math.isinf(problem.options.huber_threshold):
+        np.testing.assert_allclose(np.sort(residual.ravel()), np.sort(evaluation.residual), rtol=0, atol=1e-8)
+    np.testing.assert_allclose(unknown_vector(problem, program, w), x, rtol=0, atol=1e-9)
+
+
+def test_its_reduced_gradient_is_the_problems(problem):
+    """dcost/dx when the equations eliminate the states, by their multipliers."""
+    x = beside(problem)
+    program = transcribe(problem)
+    w, _ = rolled_out(problem, program, x)
+    gradient, jacobian = values_at(program, w, program.grad_f, program.jac_g)
+    own = [program.variables["theta"].index.ravel()] if problem.shared else []
+    rows, n = list(problem.predictor.start_rows), problem.step.sizes["n"]
+    for episode in problem.episodes:
+        if problem.local:
+            own.append(program.variables[f"local[{episode.name}]"].index.ravel())
+        if rows:
+            first = np.concatenate([program.variables[f"{part}[{episode.name}]"].index[:, 0] for part in "qp"])
+            own.append(first[rows])
+    own = np.concatenate(own)
+    others = np.setdiff1d(np.flatnonzero(program.lower < program.upper), own)
+    assert len(others) == len(jacobian), "as many equations as unknowns that they fix"
+    pull = np.linalg.solve(jacobian[:, others].T, gradient[others, 0])
+    found = gradient[own, 0] - jacobian[:, own].T @ pull
+    expected = problem.gradient(x)[1]
+    if rows:
+        # the program holds the first state where the problem holds its offset from rest, which moves with theta
+        begin = [
+            problem.start_state(e, problem.split(x, i)[0]).by_unknowns[rows] for i, e in enumerate(problem.episodes)
+        ]
+        count = len(problem.shared)
+        for i, by in enumerate(begin):
+            at = problem.unknowns.columns(i)[len(problem.unknowns.parameters) :]
+            expected[:count] -= by[:, :count].T @ expected[at]
+        assert n > 0
+    np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-7 * np.abs(expected).max())
+
+
+def test_it_is_the_kernels_transcription(make_problem):
+    """Values and Jacobians of equations and residuals agree to 1e-9; starts do once the rest is eliminated."""
+    problem = make_problem(duration=0.15)
+    other = Transcription(problem, 1)
+    program = transcribe(problem)
+    rng = np.random.default_rng(1)
+    small = other.guess(problem.start)
+    small = small + 1e-3 * rng.standard_normal(len(small))
+    layout, n, count = other.layouts[0], other.n, len(problem.shared)
+    place = np.zeros(other.size, int)
+    place[:count] = program.block("theta").index.ravel()
+    place[layout.state[:, :n]], place[layout.state[:, n : 2 * n]] = (
+        program.block("q").index.T,
+        program.block("p").index.T,
+    )
+    place[layout.multipliers] = program.block("lam").index.T
+    w = program.start.copy()
+    w[place] = small
+    theta = problem.split(small[:count], 0)[0]
+    rest = problem.start_state(problem.episodes[0], theta, guess=other.warm[0]).rest
+    at = program.block("rest").index.ravel()
+    w[at] = np.concatenate([rest.state[list(problem.functions.statics.unknown)], rest.constraint_force])
+    expressions = (program.g, program.jac_g, program.residual, program.jac_r, program.f)
+    g, jac_g, r, jac_r, f = values_at(program, w, *expressions)
+    defects, slopes = other.constraints(small, True)
+    residual, by_w, cost = other.residual(small, True)
+    begins, first = program.constraints[0].size, len(defects) - program.constraints[1].size
+
+    def close(actual, expected):
+        scale = max(1.0, np.abs(expected).max())
+        np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-9 * scale)
+
+    assert f.item() == pytest.approx(cost, rel=1e-9)
+    close(r.ravel(), residual)
+    close(jac_r[:, place], by_w.toarray())
+    close(g[begins:].ravel(), defects[first:])
+    close(jac_g[begins:][:, place], slopes[first:].toarray())
+    close(g[:begins].ravel()[: len(at)], np.zeros(len(at)))
+    close(g[len(at) : begins].ravel(), defects[:first])
+    top, bottom = jac_g[: len(at)], jac_g[len(at) : begins]
+    eliminated = bottom[:, place] - bottom[:, at] @ np.linalg.solve(top[:, at], top[:, place])
+    close(eliminated, slopes[:first].toarray())
+
+
+def test_both_forms_have_one_solution(urdf_folder):
+    problem = problem_of(urdf_folder, "driven, proportional", seeds=(1,))
+    tight = {"tol": 1e-12, "acceptable_iter": 0, "mu_init": 1e-12, "mu_target": 1e-15}
+    forms = [MultipleShooting(transcription=form, ipopt=tight) for form in ("symbolic", "compiled")]
+    found = [one.run(problem, problem.start, None) for one in (*forms, MultipleShooting(hessian="exact", ipopt=tight))]
+    assert [one.status for one in found] == [Status.CONVERGED] * 3, [one.message for one in found]
+    std = np.sqrt(np.diag(solve(problem, GaussNewton(), start=found[1].x, restarts=False).covariance))
+    for one in (found[0], found[2]):
+        assert np.all(np.abs(one.x - found[1].x) <= 1e-9 * np.maximum(std, np.abs(one.x)))
+        assert one.history[-1].cost == pytest.approx(found[1].history[-1].cost, rel=1e-9)
+        assert one.history[0].note == "start"
+    assert len(found[2].history) <= len(found[0].history)
+
+
+@pytest.mark.slow
+def test_internal_coordinates_are_among_the_states(paper_systems, recording, one_arm):
+    system = paper_systems["single"]
+    effect = yid_ocp.effects.make_effect("standard_linear_solid", "T3", system, {"ratio": 0.5})
+    step = yid_ocp.compile_step(system.with_effects([effect]), 0.01, use_compiler=False)
+    problem = EstimationProblem(
+        step, [recording], ("T1.bend", effect.parameters.names[0]), ProblemOptions(duration=0.05)
+    )
+    program = transcribe(problem)
+    assert program.block("z").index.shape == (step.sizes["nz"], 6)
+    x = problem.start * 4
+    w, evaluation = rolled_out(problem, program, x)
+    cost, defects = values_at(program, w, program.f, program.g)
+    assert cost.item() == pytest.approx(evaluation.cost, rel=1e-8)
+    assert np.abs(defects).max() < 1e-6
+
+
+def test_several_recordings_with_efforts_as_gauss_newton_has_them(urdf_folder):
+    """Efforts of prescribed joints, which depend on whole steps, need no elimination here."""
+    problem = problem_of(urdf_folder, "all prescribed")
+    single = solve(problem, GaussNewton(cost_tolerance=1e-12))
+    solution = solve(problem, MultipleShooting(tolerance=1e-10, ipopt={"acceptable_iter": 0}))
+    assert solution.status == Status.CONVERGED, solution.message
+    np.testing.assert_allclose(solution.x, single.x, rtol=1e-5)
+    assert solution.cost == pytest.approx(single.cost, rel=1e-9)
+
+
+@pytest.mark.parametrize("case", ["local", "estimated", "known start", "driven, filtered"])
+def test_it_solves_what_gauss_newton_solves(urdf_folder, case):
+    problem = problem_of(urdf_folder, case)
+    solution = solve(problem, MultipleShooting(hessian="exact", ipopt={"acceptable_iter": 0}), restarts=False)
+    assert solution.status == Status.CONVERGED, solution.message
+    single = solve(problem, GaussNewton(cost_tolerance=1e-12), start=solution.x, restarts=False)
+    assert single.cost == pytest.approx(solution.cost, rel=1e-7)
+    assert solution.cost < 0.97 * problem.evaluate(problem.start).cost
+
+
+def test_what_it_does_not_do_is_refused(urdf_folder):
+    late = (("camera_latency", "camera", {"delay": 0.0137}),)
+    step = pendulum_step(urdf_folder, late)
+    with pytest.raises(SolverError, match="an effect changes recorded inputs, times"):
+        transcribe(EstimationProblem(step, [taken(step, 1)], ("elbow.damping",)))
+    step = pendulum_step(urdf_folder)
+    with pytest.raises(SolverError, match="two recordings are called 'one'"):
+        transcribe(EstimationProblem(step, [taken(step, seed, name="one") for seed in (1, 2)], ("elbow.damping",)))
+    known = ProblemOptions(recording_values={"run_1": {"elbow.damping": 0.3}})
+    with pytest.raises(SolverError, match=r"elbow.damping is free and has a known value"):
+        transcribe(EstimationProblem(step, [taken(step, 1)], ("elbow.damping",), known))
+
+
+def test_blocks_are_named_after_what_they_hold(urdf_folder):
+    problem = problem_of(urdf_folder, "driven, proportional")
+    program = transcribe(problem)
+    with pytest.raises(SolverError, match="the program has 2 blocks 'q'"):
+        program["q"]
+    assert program["q[run_2]"].shape == (2, STEPS + 1)
+    assert program["torque[run_1]"].shape == (1, STEPS)
+    names = program.names()
+    assert len(set(names)) == len(names) == program.w.numel()
+    assert names[0] == "theta.elbow.damping"
+    assert "q[run_2].elbow.3" in names
+    rows = program.row_names()
+    assert len(set(rows)) == len(rows) == program.g.numel()
+    assert "step[run_1].del[shoulder].7" in rows
+    given = values_at(program, program.start, program["torque[run_1]"])[0]
+    np.testing.assert_array_equal(given, problem.episodes[0].torque.T)
+    np.testing.assert_array_equal(program.arguments["x0"], program.start)
+
+
+# -- noise that drives the motion -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("encoders", [False, True])
+@pytest.mark.parametrize("feedback", [TRACKED, {"feedback": "none"}])
+def test_errors_as_unknowns_have_the_likelihood_of_innovations(urdf_folder, encoders, feedback):
+    """At fixed parameters, with errors so small that everything is linear, the best errors cost what innovations do."""
+    step = pendulum_step(urdf_folder, driven=("shoulder",))
+    made, size = taken(step, 3), 1e-5
+    group = replace(made.joints, effort_std=0.3 * size, effort_bias_std=0.2 * size, position_std=2e-3 * size)
+    # two steps a sample
+    group = replace(group, t=group.t[::2], position=group.position[::2], effort=group.effort[::2])
+    points = tuple(g for g in made.points if not encoders or g.name == "points_camera")
+    options = ProblemOptions(sensors={"joints.position": SensorOptions(use=encoders)}, **feedback)
+    first = EstimationProblem(step, [replace(made, joints=group, points=points)], ("elbow.damping",), options)
+    x, rng = first.start, np.random.default_rng(5)
+    episode, errors = first.episodes[0], first.episodes[0].errors
+    # measured is what an open loop does, which is then what the tracking filter follows, and some noise of all kinds
+    plain = first.on([replace(episode, feedback=None)], ()).evaluate(x).episodes[0]
+    if episode.feedback is not None:
+        index = episode.feedback.index
+        episode = replace(episode, feedback=replace(episode.feedback, reference=plain.rollout.state[:-1, index]))
+    samples = tuple(
+        replace(
+            s,
+            value=y + size * 1e-4 * rng.standard_normal(y.shape),
+            weight=np.where(s.seen, 1e4 / size, 0.0),
+        )
+        for s, y in zip(episode.samples, plain.predicted, strict=True)
+    )
+    wrong = errors.torque_std * rng.standard_normal(len(np.unique(errors.sample)))[errors.sample][:, None]
+    episode = replace(episode, samples=samples, torque=episode.torque + wrong + 1.5 * errors.bias_std)
+    problem = first.on([episode], ())
+    expected = problem.weighted_at(x).evaluate(x).cost
+    assert problem.weighted_by_sensors().evaluate(x).cost > 3 * expected
+    program = transcribe(problem)
+    arguments = program.arguments
+    theta = program.block("theta").index.ravel()
+    arguments["lbx"][theta] = arguments["ubx"][theta] = x
+    solver = program.solver("ipopt", "exact", ipopt={"print_level": 0, "sb": "yes", "tol": 1e-9, "max_iter": 50})
+    found = solver(**arguments)
+    assert solver.stats()["success"], solver.stats()["return_status"]
+    # beside encoders no torque is taken as better than a thousandth: errors are then not small enough to be linear
+    assert float(found["f"]) == pytest.approx(expected, rel=4e-3 if encoders else 1e-4)
+    assert ("angle_error[run_3]" in program.variables) is (not encoders and feedback is TRACKED)
+    assert program.block("torque_error").index.shape == (1, len(np.unique(errors.sample)))
+
+
+def test_a_fit_among_noise_is_judged_by_its_likelihood(urdf_folder):
+    step = pendulum_step(urdf_folder, driven=("shoulder",))
+    problem = EstimationProblem(step, [taken(step, 1)], ("elbow.damping", "elbow.stiffness"), ProblemOptions(**TRACKED))
+    assert problem.disturbed
+    single = solve(problem, GaussNewton(cost_tolerance=1e-10), restarts=False)
+    solution = solve(problem, MultipleShooting(), restarts=False)
+    left_out = solve(problem, MultipleShooting(transcription="compiled"), restarts=False)
+    assert "without the noise" not in solution.message
+    assert "without the noise" in left_out.message
+    assert solution.cost == pytest.approx(single.cost, rel=0.02)
+    assert left_out.problem.innovations == (None,)
+    assert solution.problem.innovations != (None,)
+
+
+# -- without measurements ---------------------------------------------------------------------------------------------
+
+
+def test_a_motion_is_planned_with_the_same_stages(urdf_folder):
+    """Free torques bring a pendulum from rest to rest elsewhere, and the rollout under them goes there."""
+    step, count = pendulum_step(urdf_folder, driven=("shoulder",)), 80
+    one, nx = stage(step.equations, step.time_step), step.sizes["nx"]
+    none = ca.SX(0, 1)
+    v = ca.vertcat(one.x0, one.x1, one.lam, one.u)
+    slopes = ca.horzcat(*(one.slopes[name] for name in ("x0", "x1", "lam", "u")))
+    states = np.arange((count + 1) * nx).reshape(count + 1, nx)
+    torques = states.size + np.arange(count)[:, None]
+    theta = step.system.parameters.vector()
+    nothing = np.zeros((count, 0), int)
+    moved = Term(
+        "step",
+        one.names,
+        Local("step", [v, none, one.theta], one.rows, slopes),
+        np.hstack([states[:-1], states[1:], torques]),
+        nothing,
+        np.arange(len(theta)),
+    )
+    u = ca.SX.sym("u")
+    effort = Term("effort", ("u",), Local("effort", [u, none, none], 0.1 * u), torques, nothing, np.zeros(0, int))
+    start, end = np.zeros(4), np.array([0.6, 0.0, 0.0, 0.0])
+    rest = Statics(step).solve([0.0], theta)
+    start[:2] = rest.state[:2]
+    end[1] = Statics(step).solve([0.6], theta).state[1]
+    size = states.size + count
+    lower, upper = np.full(size, -np.inf), np.full(size, np.inf)
+    for at, state in ((states[0], start), (states[-1], end)):
+        lower[at] = upper[at] = state
+    lower[torques], upper[torques] = -8.0, 8.0
+    program = NonlinearProgram(
+        {"q": Block(states[:, :2].T, PENDULUM), "u": Block(torques.T, ("shoulder",), "N m")},
+        {},
+        (moved,),
+        (Residual(effort),),
+        lower,
+        upper,
+        np.zeros(size),
+        theta,
+        None,
+        ca.MX.sym("w", size),
+        ca.MX.sym("p", len(theta)),
+    )
+    solver = program.solver("ipopt", "exact", ipopt={"print_level": 0, "sb": "yes", "tol": 1e-10})
+    w = np.array(solver(**program.arguments)["x"]).ravel()
+    assert solver.stats()["success"]
+    rollout = simulate(step, theta, start, count, w[torques], np.zeros((count + 1, 0)))
+    np.testing.assert_allclose(rollout.state[-1], end, atol=1e-6)
+    assert np.ptp(w[torques]) > 0.5

@@ -1,0 +1,154 @@
+"""A guess of node states and parameters, for methods that have states as unknowns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.integrator.lqr import lqr_filter
+from yid_ocp.integrator.rollout import momentum_of, simulate
+from yid_ocp.integrator.step import Feedback, Rollout
+from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.low_pass import LowPass
+from yid_ocp.problem.prediction import Start
+from yid_ocp.problem.problem import EstimationProblem
+
+Array = NDArray[np.float64]
+Misfit = Callable[[int, Array, Array, Array], float]
+"""Mean square whitened residual of one recording: which, node states, multipliers, unknowns of the problem."""
+
+# Mean square whitened residual above which another guess of the node states is tried.
+POOR_GUESS = 10.0
+# A soft object hangs in other shapes, and hops from one to another: positive parameters are tried that much larger.
+FACTORS = (1.0, 4.0, 2.0, 10.0)
+# Shapes change slowly: so far apart is enough [s].
+BETWEEN_SHAPES = 0.1
+
+
+@dataclass(frozen=True)
+class Guess:
+    """Where to begin.
+
+    Attributes
+    ----------
+    x : ndarray, shape (nx,)
+        Unknowns of the problem.
+    begins : tuple of Start
+        Starts of all recordings there.
+    states, multipliers : tuple of ndarray
+        Of every recording, (K + 1, nx) at the nodes and (K, m) or (N, m).
+    """
+
+    x: Array
+    begins: tuple[Start, ...]
+    states: tuple[Array, ...]
+    multipliers: tuple[Array, ...]
+
+
+def guess(problem: EstimationProblem, nodes: Sequence[NDArray[np.int64]], x: Array, misfit: Misfit) -> Guess:
+    """Node states near a solution, at an unknown vector or, where that is far from the data, at multiples of it.
+
+    A recording's states are the rollout under the tracking filter, which has no defects, or, where that fails or strays
+    from what was measured, every node at rest at the posture that the arms had then, which has defects but follows the
+    data.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    nodes : sequence of ndarray of int, shape (K + 1,)
+        Of every recording.
+    x : ndarray, shape (nx,)
+    misfit : callable
+    """
+    lower, upper = problem.bounds
+    best: tuple[float, Guess] | None = None
+    for factor in FACTORS:
+        moved = np.where(problem.positive, np.clip(factor * x, lower, upper), x)
+        begins, states, multipliers, total = [], [], [], 0.0
+        for i, episode in enumerate(problem.episodes):
+            theta = problem.predictor.own_theta(episode, problem.split(moved, i)[0])
+            begins.append(problem.start_state(episode, theta))
+
+            def judged(state: Array, pull: Array, i: int = i, moved: Array = moved) -> float:
+                return misfit(i, state, pull, moved)
+
+            size, state, pull = _node_states(problem, episode, nodes[i], theta, begins[-1], judged)
+            states.append(state)
+            multipliers.append(pull)
+            total += size / len(problem.episodes)
+        if best is None or total < best[0]:
+            best = total, Guess(moved, tuple(begins), tuple(states), tuple(multipliers))
+        if best[0] <= POOR_GUESS or not np.any(problem.positive):
+            break
+    assert best is not None
+    return best[1]
+
+
+def _node_states(
+    problem: EstimationProblem,
+    episode: Episode,
+    nodes: NDArray[np.int64],
+    theta: Array,
+    begin: Start,
+    misfit: Callable[[Array, Array], float],
+) -> tuple[float, Array, Array]:
+    """Misfit, node states and multipliers of one recording."""
+    found: list[tuple[float, Array, Array]] = []
+    rollout = None if begin.message else _tracked(problem, episode, theta, begin.state)
+    if rollout is not None and rollout.status.ok:
+        state = rollout.state[nodes]
+        found.append((misfit(state, rollout.multipliers), state, rollout.multipliers))
+    if not found or found[0][0] > POOR_GUESS:
+        state, pull = _resting(problem, episode, nodes, theta, begin.state)
+        found.append((misfit(state, pull), state, pull))
+    return min(found, key=lambda entry: entry[0])
+
+
+def _tracked(problem: EstimationProblem, episode: Episode, theta: Array, start: Array) -> Rollout:
+    feedback = _tracking(problem, episode, theta)
+    return simulate(problem.step, theta, start, episode.grid.steps, episode.torque, episode.path, feedback)
+
+
+def _tracking(problem: EstimationProblem, episode: Episode, theta: Array) -> Feedback | None:
+    feedback = episode.feedback
+    if feedback is None and problem.system.driven:
+        smooth = LowPass(problem.options.path_cutoff)(episode.grid.times, episode.measured_arm)
+        return lqr_filter(problem.step, smooth, episode.torque, theta)
+    return feedback
+
+
+def _resting(
+    problem: EstimationProblem, episode: Episode, nodes: NDArray[np.int64], theta: Array, start: Array
+) -> tuple[Array, Array]:
+    """Node states at rest at the measured postures, with the momentum of moving from one to the next."""
+    step, statics = problem.step, problem.functions.statics
+    n, m, h = step.sizes["n"], step.sizes["m"], step.time_step
+    state = np.tile(start, (len(nodes), 1))
+    pull = np.zeros((len(nodes), m))
+    shape: Array | None = None
+    every = max(1, round(BETWEEN_SHAPES * (len(nodes) - 1) / (h * max(int(nodes[-1]), 1))))
+    chosen = np.unique(np.append(np.arange(0, len(nodes), every), len(nodes) - 1))
+    for j in chosen:
+        node = nodes[j]
+        posture = np.concatenate([episode.measured_arm[node], episode.path[node]])
+        torque = episode.torque[min(node, len(episode.torque) - 1)] if problem.system.driven else None
+        rest = statics.solve(posture, theta, torque, shape)
+        if rest.error < 1e-3:
+            shape = rest.state[:n]
+            state[j], pull[j] = rest.state, rest.constraint_force
+        else:
+            state[j], pull[j] = state[max(j - 1, 0)], pull[max(j - 1, 0)]
+    times = nodes * h
+    for column in range(state.shape[1]):
+        state[:, column] = np.interp(times, times[chosen], state[chosen, column])
+    force = np.zeros((len(times), m))
+    for column in range(m):
+        force[:, column] = np.interp(times, times[chosen], pull[chosen, column])
+    driven = list(problem.system.driven_indices)
+    state[:, driven] = episode.measured_arm[nodes]
+    velocity = np.gradient(state[:, :n], times, axis=0)
+    state[:, n : 2 * n] += momentum_of(step, state[:, :n], velocity, theta)
+    return state, force[:-1] * h

@@ -1,0 +1,113 @@
+"""A stage driven by recorded torques, under the tracking filter, with the torques' errors among its unknowns.
+
+With the recorded torque ubar_k, its errors w (of a sample) and b (of a recording), the filter's gain K_k and reference
+xbar_k, and the errors v_k of the angles that the filter follows, the torque that acts is
+
+    u_k = ubar_k - w_k - b                               where encoders are measurements,
+    u_k = ubar_k - w_k - b - K_k (x_k[index] - xbar_k) - K_k v_k        where they are not,
+
+and without the errors where torques are taken as true. These are the two forms of `problem.noise`, with the errors
+themselves in the place of their covariance, so that nothing is linearised.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.integrator.stage import Stage
+from yid_ocp.solvers.terms import Local
+
+
+@dataclass(frozen=True, eq=False)
+class Freed:
+    """The parameters theta of a system, some of them free.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Free ones.
+    free : casadi.SX, shape (len(names), 1)
+    fixed : casadi.SX, shape (ntheta, 1)
+        Values of all, of which those of free ones are not used.
+    theta : casadi.SX, shape (ntheta, 1)
+        Each from where it belongs.
+    """
+
+    names: tuple[str, ...]
+    free: ca.SX
+    fixed: ca.SX
+    theta: ca.SX
+
+
+@dataclass(frozen=True, eq=False)
+class DrivenStage:
+    """A stage as a function of local variables v = (free, x_k, x_{k+1}, lam_k, errors) and data.
+
+    Attributes
+    ----------
+    local : Local
+        The stage's rows.
+    v, data : casadi.SX
+        Data are (ubar, K row by row, xbar).
+    before, after : casadi.SX, shape (nx, 1)
+        x_k and x_{k+1}.
+    effort, torque : (casadi.SX, casadi.SX)
+        Of prescribed and of driven joints, with their slopes by v.
+    """
+
+    local: Local
+    v: ca.SX
+    data: ca.SX
+    before: ca.SX
+    after: ca.SX
+    effort: tuple[ca.SX, ca.SX]
+    torque: tuple[ca.SX, ca.SX]
+
+
+def driven_stage(
+    stage: Stage, freed: Freed, followed: NDArray[np.int32] | None, noisy: bool, use_compiler: bool
+) -> DrivenStage:
+    """The stage under a tracking filter and with errors, where there are such.
+
+    Parameters
+    ----------
+    stage : Stage
+    freed : Freed
+    followed : ndarray of int, or None
+        Rows of the state that the filter follows, those of the driven joints' angles first; None without a filter.
+    noisy : bool
+        Whether errors are unknowns: w and b, and v where there is a filter.
+    use_compiler : bool
+    """
+    index = [] if followed is None else followed.tolist()
+    nx, nu, m = stage.x0.numel(), stage.u.numel(), stage.lam.numel()
+    before, after, lam = ca.SX.sym("x0", nx), ca.SX.sym("x1", nx), ca.SX.sym("lam", m)
+    nominal, gain = ca.SX.sym("torque", nu), ca.SX.sym("gain", nu * len(index))
+    reference = ca.SX.sym("reference", len(index))
+    errors = ca.SX.sym("errors", (2 + (followed is not None)) * nu if noisy else 0)
+    matrix = ca.reshape(gain, len(index), nu).T
+    by_errors = ca.horzcat(*([-ca.SX.eye(nu)] * 2), *([-matrix[:, :nu]] if index else [])) if noisy else ca.SX(nu, 0)
+    by_before = ca.SX(nu, nx)
+    torque = nominal + ca.mtimes(by_errors, errors)
+    if index:
+        torque -= ca.mtimes(matrix, before[index] - reference)
+        by_before[:, index] = -matrix
+    symbols = [stage.x0, stage.x1, stage.lam, stage.u, stage.theta]
+    by_free = stage.by_theta(freed.names)
+    made = []
+    for value, own, slopes in zip(
+        (stage.rows, stage.effort), by_free, (stage.slopes, stage.effort_slopes), strict=True
+    ):
+        parts = [value, own, *(slopes[name] for name in ("x0", "x1", "lam", "u"))]
+        value, own, first, second, pull, by_u = ca.substitute(parts, symbols, [before, after, lam, torque, freed.theta])
+        through = ca.mtimes(by_u, by_before), ca.mtimes(by_u, by_errors)
+        made.append((value, ca.horzcat(own, first + through[0], second, pull, through[1])))
+    (rows, by_v), effort = made
+    by_torque = ca.horzcat(ca.SX(nu, len(freed.names)), by_before, ca.SX(nu, nx + m), by_errors)
+    v, data = ca.vertcat(freed.free, before, after, lam, errors), ca.vertcat(nominal, gain, reference)
+    local = Local("step", [v, data, freed.fixed], rows, by_v, use_compiler)
+    return DrivenStage(local, v, data, before, after, effort, (torque, by_torque))

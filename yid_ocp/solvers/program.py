@@ -1,0 +1,413 @@
+"""A nonlinear program in CasADi, made of terms.
+
+    min f(w, p)   subject to   lower <= w <= upper,   g_lower <= g(w, p) <= g_upper
+
+f is half the sum of squares (or Huber's loss) of residuals, g the values of constraint terms. Nothing here knows
+mechanics or recordings.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from yid_ocp.errors import SolverError, nearest
+from yid_ocp.parallel import SYMBOLIC
+from yid_ocp.solvers.terms import Places, Residual, Ridge, Term, assembled, summed
+
+Array = NDArray[np.float64]
+Hessian = Literal["gauss_newton", "exact"]
+# Measured with IPOPT and MUMPS on 40 to 50 coordinates and 500 to 2000 steps [bytes an entry of Jacobian and Hessian].
+ENTRY = 250.0
+
+# A trial point that cannot be worked out is the solver's to reject, not for the screen; multipliers of the parameters,
+# which are thousands, are for whoever asks.
+SILENT = {"show_eval_warnings": False, "error_on_fail": False, "print_time": False, "calc_lam_p": False}
+
+# Options that fit programs of one size only.
+SIZED = ("iteration_callback", "discrete", "equality", "structure_detection", "N", "nx", "nu", "ng")
+
+
+@dataclass(frozen=True)
+class Block:
+    """A named part of a vector.
+
+    Attributes
+    ----------
+    index : ndarray of int, shape (rows, columns)
+        Places in the vector.
+    rows : tuple of str
+        Name of every row.
+    unit : str
+    """
+
+    index: Places
+    rows: tuple[str, ...]
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class Extra:
+    """A user's own part of a program: a term of the objective, rows of the constraints, or both."""
+
+    objective: ca.MX
+    constraints: ca.MX
+    lower: Array
+    upper: Array
+
+
+def free_memory() -> float:
+    """Memory that is free [bytes]; infinite where the system does not tell."""
+    told = Path("/proc/meminfo")
+    lines = told.read_text(encoding="ascii", errors="replace").splitlines() if told.is_file() else []
+    found = [float(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
+    return found[0] if found else math.inf
+
+
+@dataclass(frozen=True, eq=False)
+class NonlinearProgram:
+    """min f(w, p) subject to bounds and constraints, in CasADi.
+
+    `nlp[name]` is a block of `variables` or `parameters` as MX of its shape; where there is one recording, `nlp["q"]`
+    stands for `nlp["q[NAME]"]`.
+
+    Attributes
+    ----------
+    variables, parameters : mapping of str to Block
+        What `w` and `p` are made of.
+    constraints : tuple of Term
+        Equalities, one below the other in `g`.
+    residuals : tuple of Residual
+        Their losses make the objective.
+    lower, upper : ndarray, shape (nw,)
+        Bounds of `w`.
+    start : ndarray, shape (nw,)
+        Guess of `w`.
+    values : ndarray, shape (np,)
+        Of `p`.
+    ridge : Ridge or None
+    w, p : casadi.MX
+        Unknowns and parameters, columns.
+    extras : tuple of Extra
+        What `adding` added.
+    """
+
+    variables: Mapping[str, Block]
+    parameters: Mapping[str, Block]
+    constraints: tuple[Term, ...]
+    residuals: tuple[Residual, ...]
+    lower: Array
+    upper: Array
+    start: Array
+    values: Array
+    ridge: Ridge | None
+    w: ca.MX
+    p: ca.MX
+    extras: tuple[Extra, ...] = ()
+    _kept: dict[str, Any] = field(default_factory=dict, repr=False)
+
+    # -- what it is made of -------------------------------------------------------------------------------------------
+
+    def block(self, name: str) -> Block:
+        """A block by its name, or by what comes before the recording's name where there is one recording.
+
+        Raises
+        ------
+        SolverError
+            There is none, or more than one.
+        """
+        blocks = {**self.variables, **self.parameters}
+        if name in blocks:
+            return blocks[name]
+        alike = [key for key in blocks if key.startswith(f"{name}[")]
+        if len(alike) == 1:
+            return blocks[alike[0]]
+        raise SolverError(f"the program has {len(alike)} blocks '{name}'", hint=nearest(name, alike or blocks))
+
+    def __getitem__(self, name: str) -> ca.MX:
+        """See the class."""
+        block = self.block(name)
+        vector = self.w if any(block is own for own in self.variables.values()) else self.p
+        return ca.reshape(vector[block.index.T.ravel().tolist()], *block.index.shape)
+
+    def names(self) -> tuple[str, ...]:
+        """Name of every unknown: block, row and column."""
+        named = np.full(self.w.numel(), "", dtype=object)
+        for name, block in self.variables.items():
+            for row, places in zip(block.rows, block.index, strict=True):
+                several = len(places) > 1
+                named[places] = [f"{name}.{row}.{k}" if several else f"{name}.{row}" for k in range(len(places))]
+        return tuple(named)
+
+    def row_names(self) -> tuple[str, ...]:
+        """Name of every row of `g`: term, row and place; `added.I` for those of `adding`."""
+        terms = [f"{t.name}.{row}.{k}" for t in self.constraints for k in range(len(t.places)) for row in t.rows]
+        return (*terms, *(f"added.{i}" for i in range(sum(len(extra.lower) for extra in self.extras))))
+
+    @property
+    def f(self) -> ca.MX:
+        """Objective."""
+        return self._once("f", lambda: sum((self._loss(i) for i in range(len(self.residuals))), ca.MX(0)) + self._own())
+
+    @property
+    def g(self) -> ca.MX:
+        """Constraints, shape (ng, 1)."""
+
+        def made() -> ca.MX:
+            terms = (term.values(self.w, self.p) for term in self.constraints)
+            return ca.vertcat(ca.MX(0, 1), *terms, *(extra.constraints for extra in self.extras))
+
+        return self._once("g", made)
+
+    @property
+    def nlp(self) -> dict[str, ca.MX]:
+        """The program as `casadi.nlpsol` takes it."""
+        return {"x": self.w, "p": self.p, "f": self.f, "g": self.g}
+
+    @property
+    def arguments(self) -> dict[str, Array]:
+        """What a solver of it is called with: guess, parameters and bounds."""
+        zero = np.zeros(sum(term.size for term in self.constraints))
+        low, high = ([zero, *(getattr(extra, side) for extra in self.extras)] for side in ("lower", "upper"))
+        bounds = {"lbx": self.lower, "ubx": self.upper, "lbg": np.concatenate(low), "ubg": np.concatenate(high)}
+        return {"x0": self.start, "p": self.values, **bounds}
+
+    # -- derivatives --------------------------------------------------------------------------------------------------
+
+    @property
+    def residual(self) -> ca.MX:
+        """All residuals, shape (nr, 1)."""
+        parts = (self._residual(i) for i in range(len(self.residuals)))
+        return self._once("r", lambda: ca.vertcat(ca.MX(0, 1), *parts))
+
+    @property
+    def jac_r(self) -> ca.MX:
+        """dr/dw, sparse."""
+        parts = (self._slope(i) for i in range(len(self.residuals)))
+        return self._once("jac_r", lambda: ca.vertcat(ca.MX(0, self.w.numel()), *parts))
+
+    @property
+    def jac_g(self) -> ca.MX:
+        """dg/dw, sparse."""
+        return self._once("jac_g", self._jacobian)
+
+    @property
+    def grad_f(self) -> ca.MX:
+        """df/dw, shape (nw, 1)."""
+        return self._once("grad_f", self._gradient)
+
+    @property
+    def lam_f(self) -> ca.MX:
+        """Factor on the objective in the Lagrangian, of which `hessian` is an expression."""
+        return self._once("lam_f", lambda: ca.MX.sym("lam_f"))
+
+    @property
+    def lam_g(self) -> ca.MX:
+        """Multipliers of the constraints in the Lagrangian, shape (ng, 1)."""
+        return self._once("lam_g", lambda: ca.MX.sym("lam_g", self.g.numel()))
+
+    def hessian(self, kind: Hessian = "gauss_newton") -> ca.MX:
+        """Second derivative of lam_f f + lam_g . g, or what Gauss-Newton takes for it, sparse and symmetric.
+
+        Gauss-Newton leaves out the curvature of residuals and of the terms of `constraints`, not of what was added.
+        """
+        return self._once(kind, lambda: self._data_curvature(kind) + self._other_curvature(kind))
+
+    def _data_curvature(self, kind: Hessian) -> ca.MX:
+        size = self.w.numel()
+        total = ca.MX(size, size)
+        for i, residual in enumerate(self.residuals):
+            r, slope = self._residual(i), self._slope(i)
+            weight = residual.slope_weight(r, kind == "exact")
+            weighted = slope if weight is None else ca.mtimes(ca.diag(weight), slope)
+            total += self.lam_f * ca.mtimes(slope.T, weighted)
+            if kind == "exact":
+                matrix, pull = residual.by_values(self.p), residual.pull(r)
+                pull = pull if matrix is None else ca.mtimes(matrix.T, pull)
+                curved = residual.term.curvature(self.w, self.p, self.lam_f * pull)
+                total += 0 if curved is None else summed(*curved, size)
+        return total
+
+    def _other_curvature(self, kind: Hessian) -> ca.MX:
+        size, at = self.w.numel(), 0
+        total = ca.MX(size, size)
+        if kind == "gauss_newton" and self.ridge is not None:
+            total += self.lam_f * self._ridge(self.ridge)
+        for term in self.constraints:
+            weight = self.lam_g[at : at + term.size]
+            at += term.size
+            curved = term.curvature(self.w, self.p, weight) if kind == "exact" else None
+            total += 0 if curved is None else summed(*curved, size)
+        for extra in self.extras:
+            weight = self.lam_g[at : at + len(extra.lower)]
+            at += len(extra.lower)
+            total += ca.hessian(self.lam_f * extra.objective + ca.dot(weight, extra.constraints), self.w)[0]
+        return total
+
+    def _once(self, name: str, make: Any) -> Any:
+        with SYMBOLIC:
+            if name not in self._kept:
+                self._kept[name] = make()
+            return self._kept[name]
+
+    def _own(self) -> ca.MX:
+        return sum((extra.objective for extra in self.extras), ca.MX(0))
+
+    def _residual(self, i: int) -> ca.MX:
+        return self._once(f"r{i}", lambda: self.residuals[i].values(self.w, self.p))
+
+    def _slope(self, i: int) -> ca.MX:
+        return self._once(f"jac_r{i}", lambda: self.residuals[i].jacobian(self.w, self.p))
+
+    def _loss(self, i: int) -> ca.MX:
+        return self.residuals[i].loss(self._residual(i))
+
+    def _jacobian(self) -> ca.MX:
+        entries, rows, columns, at = [], [], [], 0
+        for term in self.constraints:
+            row, column = term.slots()
+            entries.append(term.entries(self.w, self.p))
+            rows.append(at + row)
+            columns.append(column)
+            at += term.size
+        if not entries:
+            placed = ca.MX(0, self.w.numel())
+        else:
+            where = np.concatenate(rows), np.concatenate(columns)
+            placed = assembled(ca.vertcat(*entries), *where, (at, self.w.numel()))
+        return ca.vertcat(placed, *(ca.jacobian(extra.constraints, self.w) for extra in self.extras))
+
+    def _gradient(self) -> ca.MX:
+        total = ca.gradient(self._own(), self.w) if self.extras else ca.MX.zeros(self.w.numel(), 1)
+        for i, residual in enumerate(self.residuals):
+            total += ca.mtimes(self._slope(i).T, residual.pull(self._residual(i)))
+        return total
+
+    def _ridge(self, ridge: Ridge) -> ca.MX:
+        count = sum(residual.size for residual in self.residuals)
+        cost = sum((self._loss(i) for i in range(len(self.residuals))), ca.MX(0))
+        at = ridge.index.tolist()
+        size = ca.fmax(ca.fabs(self.w[at]), ca.DM(ridge.scale))
+        pattern = ca.Sparsity.triplet(self.w.numel(), self.w.numel(), at, at)
+        factor = ridge.factor(self.w) if isinstance(ridge.factor, ca.Function) else ridge.factor
+        return ca.MX(pattern, factor * 2 * cost / count / size**2)
+
+    def memory(self, hessian: Hessian = "gauss_newton") -> float:
+        """About how much an interior-point method with a direct solver will need beside what there is [bytes]."""
+        return ENTRY * float(self.jac_g.nnz() + self.hessian(hessian).nnz())
+
+    # -- use ----------------------------------------------------------------------------------------------------------
+
+    def adding(
+        self,
+        objective: ca.MX | float = 0.0,
+        constraints: ca.MX | Sequence[ca.MX] = (),
+        lower: ArrayLike = 0.0,
+        upper: ArrayLike = 0.0,
+    ) -> NonlinearProgram:
+        """The program with a term more in its objective and rows more in its constraints.
+
+        Parameters
+        ----------
+        objective : casadi.MX
+            Scalar expression of `w` and `p`.
+        constraints : casadi.MX or sequence of them
+            Expressions of `w` and `p`.
+        lower, upper : array_like
+            Bounds of these rows; equalities to zero when absent.
+
+        Raises
+        ------
+        SolverError
+            An expression of other symbols, or bounds of another number than rows.
+        """
+        rows = [constraints] if isinstance(constraints, ca.MX) else list(constraints)
+        column = ca.vertcat(ca.MX(0, 1), *(ca.vec(ca.densify(row)) for row in rows))
+        scalar = ca.MX(objective)
+        strange = [s.name() for s in ca.symvar(ca.vertcat(scalar, column)) if not _is_of(s, self.w, self.p)]
+        if strange:
+            raise SolverError(
+                f"the symbol '{strange[0]}' is neither an unknown nor a parameter of the program",
+                where="NonlinearProgram.adding",
+                allowed="expressions of nlp.w, nlp.p and of nlp[NAME]",
+            )
+        bounds = []
+        for name, side in (("lower", lower), ("upper", upper)):
+            given = np.asarray(side, float).ravel()
+            if given.size not in (1, column.numel()):
+                raise SolverError(
+                    f"{given.size} {name} bounds for {column.numel()} constraints",
+                    where="NonlinearProgram.adding",
+                    allowed=f"one for all, or {column.numel()}",
+                )
+            bounds.append(np.broadcast_to(given, (column.numel(),)).copy())
+        return replace(self, extras=(*self.extras, Extra(scalar, column, *bounds)), _kept={})
+
+    def solver(self, plugin: str = "ipopt", hessian: Hessian = "gauss_newton", **options: Any) -> ca.Function:
+        """`casadi.nlpsol` of the program, with the placed derivatives.
+
+        Parameters
+        ----------
+        plugin : str
+            Any of CasADi's.
+        hessian : "gauss_newton" or "exact"
+        **options
+            Of `casadi.nlpsol`.
+
+        Returns
+        -------
+        casadi.Function
+            To be called with `arguments`.
+
+        Raises
+        ------
+        SolverError
+            CasADi does not have the plug-in, or refuses the options.
+        """
+        with SYMBOLIC:
+            options = {**SILENT, **options}
+            try:
+                asked = _asked_for(plugin, options)
+                made = {name: self._derivatives(name, *ends, hessian) for name, ends in asked.items()}
+                cache = {name: function for name, function in made.items() if function is not None}
+                return ca.nlpsol("program", plugin, self.nlp, {**options, "cache": cache})
+            except RuntimeError as error:
+                raise SolverError(
+                    f"CasADi cannot make the solver '{plugin}': {str(error).strip().splitlines()[-1]}",
+                    hint="see casadi.doc_nlpsol for its options",
+                ) from error
+
+    def _derivatives(self, name: str, inputs: list[str], outputs: list[str], hessian: Hessian) -> ca.Function | None:
+        symbols = {"x": self.w, "p": self.p, "lam_f": self.lam_f, "lam_g": self.lam_g}
+        known = {
+            "f": lambda: self.f,
+            "g": lambda: self.g,
+            "grad_f_x": lambda: self.grad_f,
+            "jac_g_x": lambda: self.jac_g,
+            "grad_gamma_x": lambda: self.lam_f * self.grad_f + ca.mtimes(self.jac_g.T, self.lam_g),
+            "hess_gamma_x_x": lambda: self.hessian(hessian),
+            "triu_hess_gamma_x_x": lambda: ca.triu(self.hessian(hessian)),
+        }
+        if not set(outputs) <= set(known) or not set(inputs) <= set(symbols):
+            return None
+        return ca.Function(name, [symbols[i] for i in inputs], [known[o]() for o in outputs], inputs, outputs)
+
+
+def _is_of(symbol: ca.MX, *vectors: ca.MX) -> bool:
+    return any(ca.is_equal(symbol, vector) for vector in vectors)
+
+
+def _asked_for(plugin: str, options: Mapping[str, Any]) -> dict[str, tuple[list[str], list[str]]]:
+    """Inputs and outputs of the functions that a plug-in asks for, learnt on a program of one unknown."""
+    x, p = ca.MX.sym("x"), ca.MX.sym("p")
+    fitting = {name: value for name, value in options.items() if name not in SIZED}
+    tiny = ca.nlpsol("tiny", plugin, {"x": x, "p": p, "f": x**2, "g": x}, fitting)
+    functions = {name: tiny.get_function(name) for name in tiny.get_function()}
+    return {name: (f.name_in(), f.name_out()) for name, f in functions.items()}

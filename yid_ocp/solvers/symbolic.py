@@ -1,0 +1,509 @@
+"""An estimation problem as a nonlinear program in CasADi alone: every step's equations, nothing eliminated.
+
+The unknowns are, in this order,
+
+    (shared parameters | recording 1: local parameters, its rest, x_0, lam_0, x_1, lam_1, ... x_N | recording 2: ... )
+
+with x = (q, p, z). `rest` is the equilibrium at the first posture (coordinates sought, internal ones, forces of the
+grasps), of which x_0 is a function; it is absent where a start is given. The constraints are the equations of that
+equilibrium and the rows of every `Stage`; the objective has the whitened samples, interpolated between nodes, and the
+priors. What was recorded are parameters. Where noise drives the motion its errors are unknowns too, after
+the states of their recording, with their standard deviations as priors: at the optimum this is the likelihood of
+`problem.noise`, but for what that linearises.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import casadi as ca
+import numpy as np
+import scipy.sparse
+from numpy.typing import ArrayLike, NDArray
+
+from yid_ocp.errors import SolverError
+from yid_ocp.integrator.stage import stage
+from yid_ocp.integrator.statics import HOLD_STIFFNESS, HOLD_STIFFNESS_WITH_TORQUE
+from yid_ocp.parallel import SYMBOLIC
+from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.measurements import Measurements
+from yid_ocp.problem.problem import EstimationProblem
+from yid_ocp.problem.unknowns import SMALL_RATIO
+from yid_ocp.sensors import Sensor, sensor_function
+from yid_ocp.solvers.guess import Guess, guess
+from yid_ocp.solvers.motion import DrivenStage, Freed, driven_stage
+from yid_ocp.solvers.program import Block, NonlinearProgram
+from yid_ocp.solvers.terms import Local, Places, Residual, Ridge, Term
+
+Array = NDArray[np.float64]
+
+# Least curvature for a change of a parameter by its size, over the mean square of the whitened residuals.
+RIDGE = 0.1
+
+
+def transcribe(
+    problem: EstimationProblem, start: ArrayLike | None = None, use_compiler: bool | None = None
+) -> NonlinearProgram:
+    """The nonlinear program of an estimation problem, with a node at every step.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+    start : array_like, optional, shape (nx,)
+        Unknown vector of the problem near which the guess of the program's unknowns is made; the problem's when absent.
+    use_compiler : bool, optional
+        Whether the derivatives of a stage are compiled where that is possible; as the problem's step when absent.
+
+    Returns
+    -------
+    NonlinearProgram
+        With the variables `theta`, and of every recording `local[NAME]`, `rest[NAME]`, `q[NAME]`, `p[NAME]`, `z[NAME]`
+        and `lam[NAME]`; with the parameters `theta[NAME]`, `torque[NAME]`, `gain[NAME]`, `reference[NAME]`,
+        `value.GROUP[NAME]`, `weight.GROUP[NAME]`, `start[NAME]` and others where there are such, see docs/program.md.
+
+    Raises
+    ------
+    SolverError
+        An effect on recorded inputs or times is at work, a free parameter has a known value in a recording, or two
+        recordings have one name.
+
+    References
+    ----------
+    Johnson and Murphey (2009), IEEE Trans. Robotics 25(6):1249, doi:10.1109/TRO.2009.2032955.
+    """
+    problem = _about_zero(problem)
+    check(problem, "transcribe")
+    compiled = problem.step.compiled if use_compiler is None else use_compiler
+    with SYMBOLIC:
+        return _Maker(problem, compiled).program(problem.start if start is None else np.asarray(start, float))
+
+
+def _about_zero(problem: EstimationProblem) -> EstimationProblem:
+    """The problem with torques as recorded: no offset of theirs is known yet, as it is an unknown."""
+    if not any(episode.errors is not None and np.any(episode.errors.offset) for episode in problem.episodes):
+        return problem
+    episodes = [
+        episode if (e := episode.errors) is None else replace(episode, errors=replace(e, offset=0.0 * e.offset))
+        for episode in problem.episodes
+    ]
+    return problem.on(episodes, problem.held_out)
+
+
+def check(problem: EstimationProblem, where: str) -> None:
+    """Refuse what no transcription with nodes does."""
+    if not problem.as_recorded:
+        raise SolverError(
+            "an effect changes recorded inputs, times or what the tracking filter follows",
+            where=where,
+            allowed="effects of the mechanics and of what sensors read",
+            hint="use gauss_newton",
+        )
+    names = [episode.name for episode in problem.episodes]
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise SolverError(
+            f"two recordings are called '{twice[0]}'",
+            where=where,
+            hint="rename one of the files: blocks have their names",
+        )
+    for episode in problem.episodes:
+        known = {**episode.values, **({} if episode.start is None else episode.start.values)}
+        both = [name for name in problem.free if name in known]
+        if both:
+            raise SolverError(
+                f"{both[0]} is free and has a known value in a recording", where=f"{where}: {episode.name}"
+            )
+
+
+def unknown_vector(problem: EstimationProblem, program: NonlinearProgram, w: Array) -> Array:
+    """The problem's unknown vector that belongs to a point of its program."""
+    x = problem.start.copy()
+    shared, own = len(problem.shared), len(problem.local)
+    x[:shared] = w[program.variables["theta"].index.ravel()] if shared else 0.0
+    rows = list(problem.predictor.start_rows)
+    for i, episode in enumerate(problem.episodes):
+        columns = problem.unknowns.columns(i)[shared:]
+        if own:
+            x[columns[:own]] = w[program.variables[f"local[{episode.name}]"].index.ravel()]
+        if rows:
+            blocks = (program.variables.get(f"{part}[{episode.name}]") for part in "qpz")
+            first = w[np.concatenate([block.index[:, 0] for block in blocks if block is not None])]
+            begin = problem.start_state(episode, problem.split(x, i)[0], guess=first[: problem.step.sizes["n"]])
+            x[columns[own:]] = (first - begin.state)[rows]
+    return x
+
+
+@dataclass
+class _Vector:
+    """Blocks laid one after the other, with values and bounds."""
+
+    size: int = 0
+    blocks: dict[str, Block] = field(default_factory=dict)
+    values: list[Array] = field(default_factory=list)
+    lower: list[Array] = field(default_factory=list)
+    upper: list[Array] = field(default_factory=list)
+
+    def extend(self, values: Array, lower: float | Array = -math.inf, upper: float | Array = math.inf) -> Places:
+        """Lay values down; their places."""
+        self.values.append(values)
+        self.lower.append(np.broadcast_to(lower, values.shape).astype(float))
+        self.upper.append(np.broadcast_to(upper, values.shape).astype(float))
+        self.size += len(values)
+        return np.arange(self.size - len(values), self.size)
+
+    def name(self, name: str, index: Places, rows: Sequence[str], unit: str = "") -> None:
+        """Name places, unless there are none."""
+        if index.size:
+            self.blocks[name] = Block(index, tuple(rows), unit)
+
+    def add(self, name: str, values: Array, rows: Sequence[str], unit: str = "") -> Places:
+        """Lay a block down, column by column; its places, (rows, columns)."""
+        table = np.asarray(values, float)
+        table = table[:, None] if table.ndim == 1 else table
+        index = self.extend(table.ravel(order="F")).reshape(table.shape, order="F")
+        self.name(name, index, rows, unit)
+        return index
+
+
+@dataclass(frozen=True)
+class _Places:
+    """Where the unknowns of one recording stand, and the parameters that drive it.
+
+    `errors` are those of the torque of every step, (N, ne), `first` those of the first angles, as `DrivenStage` wants.
+    """
+
+    free: Places
+    rest: Places
+    state: Places
+    multipliers: Places
+    errors: Places
+    first: Places
+    theta: Places
+    torque: Places
+    gain: Places
+    reference: Places
+
+    def stages(self) -> Places:
+        """(free, x_k, x_{k+1}, lam_k, errors) of every step, (N, nv)."""
+        steps = len(self.multipliers)
+        free = np.broadcast_to(self.free, (steps, len(self.free)))
+        return np.hstack([free, self.state[:-1], self.state[1:], self.multipliers, self.errors])
+
+    def inputs(self) -> Places:
+        """(torque, gain, reference) of every step, (N, nd)."""
+        return np.hstack([self.torque.T, self.gain.T, self.reference.T])
+
+
+class _Maker:
+    """Lays out unknowns and parameters of a problem, and makes the terms about them."""
+
+    def __init__(self, problem: EstimationProblem, compiled: bool) -> None:
+        self._problem, self._compiled = problem, compiled
+        self._step, self._sizes = problem.step, problem.step.sizes
+        self._names = problem.unknowns.parameters
+        self._w, self._p = _Vector(), _Vector()
+        system = problem.system
+        free, fixed = ca.SX.sym("free", len(self._names)), ca.SX.sym("theta", len(system.parameters))
+        theta = ca.SX(fixed)
+        for k, name in enumerate(self._names):
+            theta[system.parameters.index(name)] = free[k]
+        self._freed = Freed(self._names, free, fixed, theta)
+        self._stage = stage(self._step.equations, self._step.time_step)
+        self._stages: dict[tuple[bool, bool], DrivenStage] = {}
+        self._sensors: dict[tuple[Sensor, bool, bool], tuple[Local, bool]] = {}
+
+    def program(self, x: Array) -> NonlinearProgram:
+        """The program, its guess made near the problem's unknown vector `x`."""
+        problem, low, high = self._problem, *self._problem.bounds
+        nodes = [np.arange(episode.grid.steps + 1) for episode in problem.episodes]
+        found = guess(problem, nodes, x, self._misfit)
+        x = found.x
+        shared = len(problem.shared)
+        theta = self._w.extend(x[:shared], low[:shared], high[:shared])
+        self._w.name("theta", theta[:, None], problem.shared)
+        constraints: list[Term] = []
+        residuals: list[Residual] = []
+        ridge, columns = [theta], {k: int(place) for k, place in enumerate(theta)}
+        for i, episode in enumerate(problem.episodes):
+            at = problem.unknowns.columns(i)[shared : shared + len(problem.local)]
+            local = self._w.extend(x[at], low[at], high[at])
+            self._w.name(f"local[{episode.name}]", local[:, None], problem.local)
+            columns |= {int(k): int(place) for k, place in zip(at, local, strict=True)}
+            ridge.append(local)
+            places, errors = self._laid_out(i, found, np.concatenate([theta, local]))
+            begun, prior = self._begun(episode, places)
+            constraints += [begun, self._moved(episode, places)]
+            residuals += [self._sampled(episode, samples, places) for samples in episode.samples if samples.count]
+            residuals += [*prior, *errors]
+        residuals += self._priors(columns)
+        index = np.concatenate(ridge)
+        order = [k for k, _ in sorted(columns.items(), key=lambda entry: entry[1])]
+        lower, upper, start = (np.concatenate(part) for part in (self._w.lower, self._w.upper, self._w.values))
+        return NonlinearProgram(
+            self._w.blocks,
+            self._p.blocks,
+            tuple(constraints),
+            tuple(residuals),
+            lower,
+            upper,
+            start,
+            np.concatenate([np.zeros(0), *self._p.values]),
+            Ridge(index, problem.scales[order], RIDGE),
+            ca.MX.sym("w", self._w.size),
+            ca.MX.sym("p", self._p.size),
+        )
+
+    # -- layout -------------------------------------------------------------------------------------------------------
+
+    def _laid_out(self, i: int, found: Guess, free: Places) -> tuple[_Places, list[Residual]]:
+        """The unknowns of a recording at their guess and what drives it; priors of errors."""
+        problem, episode = self._problem, self._problem.episodes[i]
+        system, name, n, nx, m = problem.system, episode.name, *(self._sizes[key] for key in ("n", "nx", "m"))
+        begin, state, pull = found.begins[i], found.states[i], found.multipliers[i]
+        theta = problem.predictor.own_theta(episode, problem.split(found.x, i)[0])
+        rest = np.zeros(0)
+        if begin.rest is not None:
+            sought = list(problem.functions.statics.unknown)
+            rest = np.concatenate([begin.rest.state[sought], begin.rest.state[2 * n :], begin.rest.constraint_force])
+        joints = system.mechanism.joint_names
+        grasped = [f"{grasp.name}.{k}" for grasp in system.grasps for k in range(grasp.equations)]
+        at_rest = [*(joints[k] for k in problem.functions.statics.unknown), *system.internal, *grasped]
+        rest_at = self._w.extend(rest)
+        self._w.name(f"rest[{name}]", rest_at[:, None], at_rest if len(rest) else ())
+        table = np.zeros((3, len(state), nx + m))
+        table[0, :, :nx], table[0, :-1, nx:] = state, pull
+        table[1], table[2] = -np.inf, np.inf
+        for column, joint in enumerate(system.prescribed_indices):
+            table[:, :, joint] = episode.path[:, column]
+        # the last node has no multipliers
+        at = self._w.extend(*(part.ravel()[: part.size - m] for part in table))
+        index = np.append(at, np.zeros(m, np.int64)).reshape(len(state), nx + m)
+        states, multipliers = index[:, :nx], index[:-1, nx:]
+        for label, part, rows in (("q", states[:, :n], joints), ("p", states[:, n : 2 * n], joints)):
+            self._w.name(f"{label}[{name}]", part.T, rows)
+        self._w.name(f"z[{name}]", states[:, 2 * n :].T, tuple(system.internal))
+        self._w.name(f"lam[{name}]", multipliers.T, grasped)
+        known = self._p.add(f"theta[{name}]", theta, system.parameters.names)
+        torque = self._p.add(f"torque[{name}]", episode.torque.T, system.driven, "N m")
+        gain, reference = self._followed(episode)
+        errors, first, priors = self._erring(episode)
+        return _Places(free, rest_at, states, multipliers, errors, first, known[:, 0], torque, gain, reference), priors
+
+    def _followed(self, episode: Episode) -> tuple[Places, Places]:
+        """Gains (row by row) and reference of the tracking filter at every step."""
+        feedback, steps = episode.feedback, episode.grid.steps
+        if feedback is None or not _kind(episode)[0]:
+            return np.zeros((0, steps), np.int64), np.zeros((0, steps), np.int64)
+        driven, joints, n = self._problem.system.driven, self._problem.system.mechanism.joint_names, self._sizes["n"]
+        followed = [f"{'q' if row < n else 'p'}.{joints[row % n]}" for row in feedback.index]
+        pairs = [f"{joint}, {other}" for joint in driven for other in followed]
+        gain = self._p.add(f"gain[{episode.name}]", feedback.gain.reshape(steps, -1).T, pairs)
+        return gain, self._p.add(f"reference[{episode.name}]", feedback.reference.T, followed)
+
+    def _misfit(self, i: int, state: Array, _: Array, x: Array) -> float:
+        """Mean square whitened residual of what node states alone predict."""
+        problem, episode = self._problem, self._problem.episodes[i]
+        theta = problem.predictor.own_theta(episode, problem.split(x, i)[0])
+        flat, parts = np.zeros((*state.shape, len(self._names))), [np.zeros(1)]
+        for samples in episode.samples:
+            if not samples.sensor.efforts:
+                predicted, _ = problem.predictor.along(samples, state, flat, theta)
+                parts.append(samples.rows(predicted, threshold=problem.options.huber_threshold).residual)
+        return float(np.mean(np.concatenate(parts) ** 2))
+
+    def _driven(self, episode: Episode) -> DrivenStage:
+        """The stage as a recording drives it."""
+        key = _kind(episode)
+        if key not in self._stages:
+            followed = episode.feedback.index if key[0] and episode.feedback is not None else None
+            self._stages[key] = driven_stage(self._stage, self._freed, followed, key[1], self._compiled)
+        return self._stages[key]
+
+    def _erring(self, episode: Episode) -> tuple[Places, Places, list[Residual]]:
+        """Places of the torque's errors at every step and of the first angles', and their priors."""
+        errors, steps, name = episode.errors, episode.grid.steps, episode.name
+        if errors is None:
+            return np.zeros((steps, 0), np.int64), np.zeros(0, np.int64), []
+        driven, nu = self._problem.system.driven, self._sizes["nu"]
+        sample, of_step = np.unique(errors.sample, return_inverse=True)
+        spread = errors.angle_std * np.sqrt(errors.spread)
+        wanted = [("torque_error", errors.torque_std, len(sample)), ("torque_offset", errors.bias_std, 1)]
+        wanted += [("angle_error", spread, steps)] if _kind(episode)[0] else []
+        wanted += [("first_angle_error", errors.angle_std, 1)] if episode.start is None else []
+        places, priors = {}, []
+        for label, std, count in wanted:
+            none = np.tile(std <= 0, count)
+            zero = np.zeros(nu * count)
+            at = self._w.extend(zero, np.where(none, 0.0, -np.inf), np.where(none, 0.0, np.inf))
+            places[label] = at.reshape(count, nu)
+            self._w.name(f"{label}[{name}]", places[label].T, driven)
+            weight = self._p.add(f"weight.{label}[{name}]", 1.0 / np.where(std > 0, std, 1.0), driven)
+            term = Term(
+                f"{label}[{name}]", driven, _itself(nu), places[label], np.zeros((count, 0), np.int64), weight[:0, 0]
+            )
+            priors.append(Residual(term, ca.DM.eye(nu * count), np.tile(weight[:, 0], count)))
+        offset = np.broadcast_to(places["torque_offset"], (steps, nu))
+        per_step = [places["torque_error"][of_step.ravel()], offset]
+        per_step += [places["angle_error"]] if "angle_error" in places else []
+        first = places.get("first_angle_error", np.zeros((1, 0), np.int64))[0]
+        return np.hstack(per_step), first, priors
+
+    # -- terms --------------------------------------------------------------------------------------------------------
+
+    def _moved(self, episode: Episode, places: _Places) -> Term:
+        """Every step's equations."""
+        local = self._driven(episode).local
+        return Term(f"step[{episode.name}]", self._stage.names, local, places.stages(), places.inputs(), places.theta)
+
+    def _begun(self, episode: Episode, places: _Places) -> tuple[Term, list[Residual]]:
+        """What fixes the first state, and the prior of what is free of it."""
+        problem, name, nx = self._problem, episode.name, self._sizes["nx"]
+        loose = list(problem.predictor.start_rows)
+        fixed = [k for k in range(nx) if k not in {*problem.system.prescribed_indices, *loose}]
+        joints = problem.system.mechanism.joint_names
+        rows = [*(f"q.{joint}" for joint in joints), *(f"p.{joint}" for joint in joints), *problem.system.internal]
+        first = ca.SX.sym("x0", nx)
+        if episode.start is not None:
+            given = self._p.add(f"start[{name}]", episode.start.state, rows)
+            state, balance = ca.SX.sym("given", nx), ca.SX(0, 1)
+            inputs = [first, state, ca.SX(0, 1)]
+            at, data, shared = places.state[:1], given.T, np.zeros(0, np.int64)
+        else:
+            statics = problem.functions.statics
+            sought, held = statics.inputs[0], statics.inputs[2]
+            stiffness = HOLD_STIFFNESS_WITH_TORQUE if problem.system.driven else HOLD_STIFFNESS
+            symbols = [statics.inputs[3], statics.inputs[4], statics.inputs[5]]
+            values = [ca.SX(stiffness), self._freed.theta, ca.SX(self._step.time_step)]
+            balance, state = ca.substitute([statics.residual, statics.state], symbols, values)
+            posture, nu = statics.inputs[1], held.numel()
+            errors = ca.SX.sym("errors", 3 * len(places.first))
+            if len(places.first):
+                # (of the first angles, w of the first step, b)
+                moved = posture - ca.vertcat(errors[:nu], ca.SX(ca.DM.zeros(posture.numel() - nu)))
+                true = held - errors[nu : 2 * nu] - errors[2 * nu :]
+                balance, state = ca.substitute([balance, state], [posture, held], [moved, true])
+            inputs = [ca.vertcat(self._freed.free, sought, first, errors), ca.vertcat(posture, held), self._freed.fixed]
+            known = [problem.system.mechanism.joint_names[k] for k in statics.known]
+            given = self._p.add(f"posture[{name}]", episode.posture, known)
+            wrong = [places.first, places.errors[0, : 2 * nu]] if len(places.first) else []
+            at = np.concatenate([places.free, places.rest, places.state[0], *wrong])[None, :]
+            data, shared = np.concatenate([given[:, 0], places.torque[:, 0]])[None, :], places.theta
+        labels = [f"rest.{k}" for k in range(balance.numel())] + [f"start.{rows[k]}" for k in fixed]
+        value = ca.densify(ca.vertcat(balance, (first - state)[fixed]))
+        term = Term(f"start[{name}]", tuple(labels), Local("start", inputs, value), at, data, shared)
+        if not loose:
+            return term, []
+        offset = Local("offset", inputs, ca.densify((first - state)[loose]))
+        weight = self._p.add(f"weight.start[{name}]", 1.0 / problem.start_std, [rows[k] for k in loose])
+        named = tuple(f"offset.{rows[k]}" for k in loose)
+        free = Term(f"offset[{name}]", named, offset, at, data, shared)
+        return term, [Residual(free, ca.DM.eye(len(loose)), weight[:, 0])]
+
+    def _sampled(self, episode: Episode, samples: Measurements, places: _Places) -> Residual:
+        """Samples of one sensor, predicted linearly between the two nodes beside them."""
+        sensor, nodes, n = samples.sensor, samples.nodes, self._sizes["n"]
+        read, loaded = self._reading(sensor, episode)
+        if loaded:
+            # after the last step the effort is that of this step
+            step = np.minimum(nodes, len(places.multipliers) - 1)
+            ends = self._p.add(f"last.{sensor.group}[{episode.name}]", (nodes > step).astype(float)[None, :], ["last"])
+            at, data = places.stages()[step], np.hstack([places.inputs()[step], ends.T])
+        else:
+            free = np.broadcast_to(places.free, (len(nodes), len(places.free)))
+            states = places.state[nodes]
+            at, data = np.hstack([free, states[:, :n], states[:, 2 * n :]]), np.zeros((len(nodes), 0), np.int64)
+        parts = [f".{axis}" for axis in "xyz"] if sensor.width == 3 else [""] * sensor.width
+        rows = tuple(f"{channel}{part}" for channel in sensor.channels for part in parts)
+        term = Term(f"{sensor.group}[{episode.name}]", rows, read, at, data, places.theta)
+        seen = samples.seen
+        value = self._p.add(f"value.{term.name}", np.where(seen, samples.value, 0.0).T, rows, sensor.unit)
+        weight = self._p.add(f"weight.{term.name}", samples.weight.T, rows)
+        threshold = self._problem.options.huber_threshold
+        return Residual(term, _between(samples), weight.T[seen], value.T[seen], threshold)
+
+    def _reading(self, sensor: Sensor, episode: Episode) -> tuple[Local, bool]:
+        """What a sensor reads at a node, and whether it depends on efforts, that is, on the step from there."""
+        key = (sensor, *_kind(episode))
+        if key not in self._sensors:
+            n, nz = self._sizes["n"], self._sizes["nz"]
+            function = sensor_function(self._problem.system, sensor, self._names)
+            loaded = function.nnz_out(3) > 0
+            made = self._loaded(function, self._driven(episode)) if loaded else self._unloaded(function, n, nz)
+            self._sensors[key] = made, loaded
+        return self._sensors[key]
+
+    def _unloaded(self, function: ca.Function, n: int, nz: int) -> Local:
+        q, z = ca.SX.sym("q", n), ca.SX.sym("z", nz)
+        y, by_q, by_z, _, by_free = function(q, z, ca.SX(ca.DM.zeros(n)), self._freed.theta)
+        inputs = [ca.vertcat(self._freed.free, q, z), ca.SX(0, 1), self._freed.fixed]
+        return Local("reading", inputs, y, ca.horzcat(by_free, by_q, by_z))
+
+    def _loaded(self, function: ca.Function, step: DrivenStage) -> Local:
+        system, n, nx = self._problem.system, self._sizes["n"], self._sizes["nx"]
+        last, size = ca.SX.sym("last"), step.v.numel()
+        node = (1 - last) * step.before + last * step.after
+        load, by_v = ca.SX(ca.DM.zeros(n)), ca.SX(n, size)
+        pairs = ((system.prescribed_indices, *step.effort), (system.driven_indices, *step.torque))
+        for index, values, by_these in pairs:
+            for k, row in enumerate(index):
+                load[row], by_v[row, :] = values[k], by_these[k, :]
+        y, by_q, by_z, by_load, by_free = function(node[:n], node[2 * n :], load, self._freed.theta)
+        at_node = ca.horzcat(by_q, ca.SX(y.numel(), n), by_z)
+        rest = ca.SX(y.numel(), size - len(self._names) - 2 * nx)
+        slopes = ca.mtimes(by_load, by_v) + ca.horzcat(by_free, (1 - last) * at_node, last * at_node, rest)
+        return Local("reading_under_load", [step.v, ca.vertcat(step.data, last), self._freed.fixed], y, slopes)
+
+    def _priors(self, columns: dict[int, int]) -> list[Residual]:
+        """Stated priors of parameters, and the weak ones."""
+        problem = self._problem
+        _, slopes = problem.prior(problem.start)
+        v, about = ca.SX.sym("v"), ca.SX.sym("about")
+        ratio = v / about
+        below = (ratio - SMALL_RATIO) / SMALL_RATIO
+        soft = ca.log(ca.fmax(ratio, SMALL_RATIO)) + ca.if_else(ratio < SMALL_RATIO, below - below**2 / 2, 0)
+        stated = problem.rows.stated_priors.stop - problem.rows.stated_priors.start
+        found = []
+        kinds = (("prior", slice(0, stated), v - about), ("weak_prior", slice(stated, None), soft))
+        for name, part, value in kinds:
+            row, unknown = np.nonzero(slopes[part])
+            kept = np.isin(unknown, list(columns))
+            weight, unknown = slopes[part][row, unknown][kept], unknown[kept]
+            if not len(unknown):
+                continue
+            if name == "weak_prior":
+                weight = weight * problem.start[unknown]
+            names = [problem.names[k] for k in unknown]
+            start = self._p.add(f"{name}.start", problem.start[unknown], names)
+            weights = self._p.add(f"{name}.weight", weight, names)
+            local = Local(name, [v, about, ca.SX(0, 1)], value)
+            at = np.array([[columns[int(k)]] for k in unknown])
+            term = Term(name, (name,), local, at, start, np.zeros(0, np.int64))
+            found.append(Residual(term, ca.DM.eye(len(unknown)), weights[:, 0]))
+        return found
+
+
+def _kind(episode: Episode) -> tuple[bool, bool]:
+    """Whether a recording's stage is under the tracking filter, and whether errors of torques are unknowns."""
+    errors = episode.errors
+    return episode.feedback is not None and (errors is None or not errors.encoders), errors is not None
+
+
+def _itself(size: int) -> Local:
+    v = ca.SX.sym("v", size)
+    return Local("itself", [v, ca.SX(0, 1), ca.SX(0, 1)], v)
+
+
+def _between(samples: Measurements) -> ca.DM:
+    """What makes predictions of samples, those that count, from readings at nodes, node by node."""
+    width, nodes = samples.value.shape[1], samples.nodes
+    sample, column = np.nonzero(samples.seen)
+    row, before = np.arange(len(sample)), np.searchsorted(nodes, samples.node[sample])
+    fraction = samples.fraction[sample]
+    after = np.minimum(before + 1, len(nodes) - 1)
+    entries = np.concatenate([1 - fraction, fraction])
+    at = np.concatenate([before * width + column, after * width + column])
+    matrix = scipy.sparse.csc_matrix((entries, (np.tile(row, 2), at)), shape=(len(sample), width * len(nodes)))
+    matrix.eliminate_zeros()
+    return ca.DM(matrix)

@@ -1,0 +1,260 @@
+"""Functions at many places of a nonlinear program, with their derivatives placed by hand.
+
+A term is one function of local variables and data, its Jacobian and its curvature, and the places at which it holds.
+CasADi would find the same derivatives of the whole by colouring its band, in many times the time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.integrator.compiler import compiled_function
+from yid_ocp.parallel import Once
+
+Array = NDArray[np.float64]
+Places = NDArray[np.int64]
+
+
+class Local:
+    """A function y(v; d, s) of local variables v, data d and data s that all places share, with its derivatives.
+
+    Parameters
+    ----------
+    name : str
+    inputs : sequence of casadi.SX
+        (v, d, s), columns.
+    value : casadi.SX, shape (ny, 1)
+    jacobian : casadi.SX, shape (ny, nv), optional
+        dy/dv; differentiated from the value when absent.
+    use_compiler : bool
+        Whether the derivatives are compiled where that is possible; the value stays CasADi's own, so that whoever
+        builds upon it can differentiate it.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        inputs: Sequence[ca.SX],
+        value: ca.SX,
+        jacobian: ca.SX | None = None,
+        use_compiler: bool = False,
+    ) -> None:
+        self.name, self._inputs, self._expression, self._use_compiler = name, list(inputs), value, use_compiler
+        self.value = ca.Function(name, self._inputs, [value])
+        slopes = ca.jacobian(value, inputs[0]) if jacobian is None else jacobian
+        self.jacobian = self._compiled(ca.Function(f"{name}_slope", self._inputs, ca.cse([ca.sparsify(slopes)])))
+        self._curvature: Once[None, ca.Function | None] = Once(lambda _: self._curved())
+
+    @property
+    def curvature(self) -> ca.Function | None:
+        """Second derivative of weight . y by v at (v, d, s, weight), sparse; None where y is linear."""
+        return self._curvature(None)
+
+    def _compiled(self, function: ca.Function) -> ca.Function:
+        return compiled_function(function) if self._use_compiler else function
+
+    def _curved(self) -> ca.Function | None:
+        """One product with a direction, for each colour of the pattern: the whole would be millions of operations."""
+        v, weight = self._inputs[0], ca.SX.sym("weight", self._expression.numel())
+        gradient = ca.gradient(ca.dot(weight, self._expression), v)
+        pattern = ca.jacobian_sparsity(gradient, v)
+        if not pattern.nnz():
+            return None
+        direction = ca.SX.sym("direction", v.numel())
+        product = ca.cse([ca.densify(ca.jtimes(gradient, v, direction))])
+        times = self._compiled(ca.Function(f"{self.name}_product", [*self._inputs, weight, direction], product))
+        group = pattern.uni_coloring()
+        colour = np.zeros(v.numel(), int)
+        members, column = group.get_triplet()
+        colour[members] = column
+        row, at = (np.array(x) for x in pattern.get_triplet())
+        symbols = [ca.MX.sym(f"a{i}", times.sparsity_in(i)) for i in range(4)]
+        columns = times.map(f"{self.name}_products", "serial", group.size2(), [0, 1, 2, 3], [])
+        products = ca.vec(columns(*symbols, ca.DM(group, 1.0)))
+        entries = products[(row + v.numel() * colour[at]).tolist()]
+        return ca.Function(f"{self.name}_curvature", symbols, [ca.MX(pattern, entries)])
+
+
+@dataclass(frozen=True)
+class Term:
+    """One function at K places of a program.
+
+    Attributes
+    ----------
+    name : str
+    rows : tuple of str
+        Names of the ny outputs.
+    local : Local
+    places : ndarray of int, shape (K, nv)
+        Where the local variables of every place stand among the unknowns; none twice in a row.
+    data : ndarray of int, shape (K, nd)
+        Where its data stand among the parameters.
+    shared : ndarray of int, shape (ns,)
+        Where the data stand that all places share.
+    """
+
+    name: str
+    rows: tuple[str, ...]
+    local: Local
+    places: Places
+    data: Places
+    shared: Places
+
+    @property
+    def size(self) -> int:
+        """Number of values at all places."""
+        return len(self.rows) * len(self.places)
+
+    def arguments(self, w: ca.MX, p: ca.MX) -> tuple[ca.MX, ca.MX, ca.MX]:
+        """Local variables (nv, K), data (nd, K) and shared data (ns, 1)."""
+
+        def gathered(vector: ca.MX, index: Places) -> ca.MX:
+            return ca.reshape(vector[index.ravel().tolist()], index.shape[1], index.shape[0])
+
+        return gathered(w, self.places), gathered(p, self.data), p[self.shared.tolist()]
+
+    def mapped(self, function: ca.Function, *arguments: ca.MX) -> ca.MX:
+        """A function of the local ones at every place, its results side by side."""
+        return function.map(f"{function.name()}_{len(self.places)}", "serial", len(self.places), [2], [])(*arguments)
+
+    def values(self, w: ca.MX, p: ca.MX) -> ca.MX:
+        """Values place by place, shape (ny K, 1)."""
+        return ca.vec(self.mapped(self.local.value, *self.arguments(w, p)))
+
+    def entries(self, w: ca.MX, p: ca.MX) -> ca.MX:
+        """Entries of the Jacobian, in the order of `slots`."""
+        return nonzeros(self.mapped(self.local.jacobian, *self.arguments(w, p)))
+
+    def slots(self) -> tuple[Places, Places]:
+        """Row and column of the entries of the Jacobian."""
+        row, column = (np.array(x, np.int64) for x in self.local.jacobian.sparsity_out(0).get_triplet())
+        first = len(self.rows) * np.arange(len(self.places))[:, None]
+        return (first + row).ravel(), self.places[:, column].ravel()
+
+    def curvature(self, w: ca.MX, p: ca.MX, weight: ca.MX) -> tuple[ca.MX, Places, Places] | None:
+        """Second derivative of weight . values: entries, rows and columns, which may repeat; None where it is zero."""
+        function = self.local.curvature
+        if function is None:
+            return None
+        weights = ca.reshape(weight, len(self.rows), len(self.places))
+        entries = nonzeros(self.mapped(function, *self.arguments(w, p), weights))
+        row, column = (np.array(x, np.int64) for x in function.sparsity_out(0).get_triplet())
+        return entries, self.places[:, row].ravel(), self.places[:, column].ravel()
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Weighted differences of combined values and data: r = weight (combination values - target).
+
+    Attributes
+    ----------
+    term : Term
+    combination : casadi.DM, shape (nr, ny K), or None
+        None takes the values as they are.
+    weight, target : ndarray of int, shape (nr,), or None
+        Where they stand among the parameters; None for ones and for zeros.
+    threshold : float
+        Beyond which Huber's loss is linear.
+    """
+
+    term: Term
+    combination: ca.DM | None = None
+    weight: Places | None = None
+    target: Places | None = None
+    threshold: float = math.inf
+
+    @property
+    def size(self) -> int:
+        """Number of residuals."""
+        return self.term.size if self.combination is None else self.combination.size1()
+
+    def by_values(self, p: ca.MX) -> ca.MX | None:
+        """dr/dvalues, sparse; None for the identity."""
+        if self.combination is None and self.weight is None:
+            return None
+        combination = ca.DM.eye(self.size) if self.combination is None else self.combination
+        if self.weight is None:
+            return ca.MX(combination)
+        row, _ = combination.sparsity().get_triplet()
+        factors = p[self.weight[np.array(row, int)].tolist()]
+        return ca.MX(combination.sparsity(), factors * ca.MX(ca.DM(combination.nonzeros())))
+
+    def values(self, w: ca.MX, p: ca.MX) -> ca.MX:
+        """r, shape (nr, 1)."""
+        matrix, value = self.by_values(p), self.term.values(w, p)
+        result = value if matrix is None else ca.mtimes(matrix, value)
+        if self.target is None:
+            return result
+        target = p[self.target.tolist()]
+        return result - (target if self.weight is None else p[self.weight.tolist()] * target)
+
+    def jacobian(self, w: ca.MX, p: ca.MX) -> ca.MX:
+        """dr/dw, shape (nr, nw), sparse."""
+        placed = assembled(self.term.entries(w, p), *self.term.slots(), (self.term.size, w.numel()))
+        matrix = self.by_values(p)
+        return placed if matrix is None else ca.mtimes(matrix, placed)
+
+    def loss(self, r: ca.MX) -> ca.MX:
+        """Half the sum of squares, or Huber's loss."""
+        if math.isinf(self.threshold):
+            return ca.sumsqr(r) / 2
+        size, limit = ca.fabs(r), self.threshold
+        return ca.sum1(ca.if_else(size <= limit, r**2 / 2, limit * (size - limit / 2)))
+
+    def pull(self, r: ca.MX) -> ca.MX:
+        """Derivative of the loss by r."""
+        return r if math.isinf(self.threshold) else ca.fmax(ca.fmin(r, self.threshold), -self.threshold)
+
+    def slope_weight(self, r: ca.MX, exact: bool) -> ca.MX | None:
+        """Factor on the slopes' squares in a Hessian; None for ones.
+
+        Exactly it is one or zero; Gauss-Newton's, that of weighted squares with the same gradient, is never zero.
+        """
+        if math.isinf(self.threshold):
+            return None
+        size = ca.fabs(r)
+        if exact:
+            return ca.if_else(size <= self.threshold, 1.0, 0.0)
+        return ca.fmin(1.0, self.threshold / ca.fmax(size, 1e-300))
+
+
+@dataclass(frozen=True)
+class Ridge:
+    """Curvature added to Gauss-Newton's Hessian: factor * mean square residual / max(|w_i|, scale_i)^2.
+
+    Along unknowns that the data hardly inform the curvature that Gauss-Newton leaves out may be as large as its own.
+    The factor is a number, or a function of the unknowns that gives one, which may change from iterate to iterate.
+    """
+
+    index: Places
+    scale: Array
+    factor: float | ca.Function
+
+
+def nonzeros(matrix: ca.MX) -> ca.MX:
+    """Entries of a sparse expression as a column."""
+    return ca.MX(ca.Sparsity.dense(matrix.nnz(), 1), matrix.nz[:])
+
+
+def assembled(entries: ca.MX, row: Places, column: Places, shape: tuple[int, int]) -> ca.MX:
+    """A sparse matrix from its entries, each at a place of its own."""
+    order = np.lexsort((row, column))
+    start = np.concatenate([[0], np.cumsum(np.bincount(column, minlength=shape[1]))])
+    sparsity = ca.Sparsity(*shape, start.tolist(), row[order].tolist())
+    return ca.MX(sparsity, entries[order.tolist()])
+
+
+def summed(entries: ca.MX, row: Places, column: Places, size: int) -> ca.MX:
+    """A sparse square matrix from entries that share places."""
+    keys, place = np.unique(column * size + row, return_inverse=True)
+    start = np.concatenate([[0], np.cumsum(np.bincount(keys // size, minlength=size))])
+    sparsity = ca.Sparsity(size, size, start.tolist(), (keys % size).tolist())
+    # one column for every entry, its only row being where it goes
+    columns = ca.Sparsity(len(keys), len(place), list(range(len(place) + 1)), place.ravel().tolist())
+    return ca.MX(sparsity, ca.mtimes(ca.MX(ca.DM(columns, 1.0)), entries))
