@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from formula_reader import FUNCTIONS, read
 
-from yid_ocp.analysis.symbols import StepSymbols, constraint_names, latex_text
+from yid_ocp.analysis.symbols import StepSymbols, latex_text
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ConfigError
 from yid_ocp.integrator.discrete import discrete_equations
@@ -75,7 +75,7 @@ def test_rows_and_columns_stand_where_the_equations_have_them(symbols):
 @pytest.mark.parametrize("kind", ["point", "axis", "weld"])
 def test_every_equation_of_a_grasp_has_a_name(kind):
     grasp = Grasp("left", "a", "b", kind)
-    names = constraint_names(grasp)
+    names = grasp.equation_names
     assert len(set(names)) == len(names) == grasp.equations
     assert names[:3] == ("left.x", "left.y", "left.z")
 

@@ -56,7 +56,7 @@ def test_slopes_in_closed_form_are_those_that_casadi_finds(case, made):
 def test_every_row_and_every_slope_has_its_name(case, made):
     system, s = case.step.system, case.step.sizes
     kinds = [name.partition("[")[0] for name in made.names]
-    counts = {"del": s["n"] - s["nc"], "internal": s["nz"], "phi": s["m"], "p": s["n"]}
+    counts = {"del": s["n"] - s["nc"], "internal": s["nz"], "constraint": s["m"], "p1": s["n"]}
     assert {kind: kinds.count(kind) for kind in counts} == counts
     assert kinds == [kind for kind, count in counts.items() for _ in range(count)]
     assert made.names[0] == f"del[{system.mechanism.joint_names[system.free_indices[0]]}]"

@@ -13,15 +13,7 @@ from numpy.typing import NDArray
 from yid_ocp.analysis.formulas import Formula, Name, formula, operations
 from yid_ocp.errors import ConfigError, nearest
 from yid_ocp.integrator.discrete import DiscreteEquations
-from yid_ocp.model.flexible import AXES
-from yid_ocp.model.system import Grasp
 
-TURNS: dict[str, tuple[str, ...]] = {
-    "point": (),
-    "axis": ("tilt_x", "tilt_y"),
-    "weld": tuple(f"turn_{axis}" for axis in AXES),
-}
-"""What the equations of a grasp after the three of its position are called."""
 SHORT = 80  # operations up to which an equation is written out without being asked for
 MANY = 6  # names of one block that are still listed one by one
 
@@ -129,7 +121,7 @@ class StepSymbols:
         """Name the equations and variables of a step."""
         e, system = equations, equations.system
         joints, internal = system.mechanism.joint_names, tuple(system.internal)
-        closed = tuple(name for grasp in system.grasps for name in constraint_names(grasp))
+        closed = tuple(name for grasp in system.grasps for name in grasp.equation_names)
         k, after = r"_{k,\,#}", r"_{k+1,\,#}"
         rows = (
             Block("del", joints, e.momentum_balance, "DEL equation, balance of momentum", "R" + k),
@@ -261,11 +253,6 @@ class StepSymbols:
             "",
             *(f"{block.name} ({block.meaning}): {', '.join(block.names)}" for block in blocks),
         ]
-
-
-def constraint_names(grasp: Grasp) -> tuple[str, ...]:
-    """Names of a grasp's equations: `left.x`, ..., then tilts of an axis or turns of a weld."""
-    return tuple(f"{grasp.name}.{part}" for part in (*AXES, *TURNS[grasp.kind]))
 
 
 def latex_text(name: str) -> str:

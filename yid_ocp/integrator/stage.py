@@ -39,7 +39,7 @@ class Stage:
     rows : casadi.SX, shape (nr, 1)
         Zero where the step is taken.
     names : tuple of str
-        Of the rows: `del[JOINT]`, `internal[NAME]`, `phi[GRASP.i]`, `p[JOINT]`.
+        Of the rows: `del[JOINT]`, `internal[NAME]`, `constraint[GRASP.x]`, `p1[JOINT]`.
     slopes : mapping of str to casadi.SX
         Derivatives of `rows` by `x0`, `x1`, `lam` and `u`, sparse.
     effort : casadi.SX, shape (nc, 1)
@@ -88,8 +88,8 @@ def stage(equations: DiscreteEquations, time_step: float) -> Stage:
     x0, x1 = ca.vertcat(e.q0, e.p0, e.z0), ca.vertcat(e.q1, p1, e.z1)
     names = [f"del[{system.mechanism.joint_names[i]}]" for i in free]
     names += [f"internal[{name}]" for name in system.internal]
-    names += [f"phi[{grasp.name}.{i}]" for grasp in system.grasps for i in range(grasp.equations)]
-    names += [f"p[{name}]" for name in system.mechanism.joint_names]
+    names += [f"constraint[{name}]" for grasp in system.grasps for name in grasp.equation_names]
+    names += [f"p1[{name}]" for name in system.mechanism.joint_names]
     rows = ca.vertcat(e.momentum_balance[free] / h, e.internal, e.constraint, (p1 - e.p1) / h)
     effort = -e.momentum_balance[fixed] / e.h
     balance, end = _slopes(e)

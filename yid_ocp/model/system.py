@@ -19,7 +19,12 @@ from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.rotations import roll_pitch_yaw, transform
 
 GraspKind = Literal["point", "axis", "weld"]
-EQUATIONS: dict[str, int] = {"point": 3, "axis": 5, "weld": 6}
+EQUATIONS: dict[str, tuple[str, ...]] = {
+    "point": ("x", "y", "z"),
+    "axis": ("x", "y", "z", "tilt_x", "tilt_y"),
+    "weld": ("x", "y", "z", "turn_x", "turn_y", "turn_z"),
+}
+"""What the equations of a grasp are called, by its kind."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +64,12 @@ class Grasp:
     @property
     def equations(self) -> int:
         """Number of scalar constraints."""
-        return EQUATIONS[self.kind]
+        return len(EQUATIONS[self.kind])
+
+    @property
+    def equation_names(self) -> tuple[str, ...]:
+        """`left.x`, ..., then tilts of an axis or turns of a weld."""
+        return tuple(f"{self.name}.{part}" for part in EQUATIONS[self.kind])
 
     def mapped(self, change: Callable[[ca.SX], ca.SX]) -> Grasp:
         """Every expression replaced by what `change` makes of it."""

@@ -268,7 +268,7 @@ class _Maker:
             sought = list(problem.functions.statics.unknown)
             rest = np.concatenate([begin.rest.state[sought], begin.rest.state[2 * n :], begin.rest.constraint_force])
         joints = system.mechanism.joint_names
-        grasped = [f"{grasp.name}.{k}" for grasp in system.grasps for k in range(grasp.equations)]
+        grasped = [name for grasp in system.grasps for name in grasp.equation_names]
         at_rest = [*(joints[k] for k in problem.functions.statics.unknown), *system.internal, *grasped]
         rest_at = self._w.extend(rest)
         self._w.name(f"rest[{name}]", rest_at[:, None], at_rest if len(rest) else ())
