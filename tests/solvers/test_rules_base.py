@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -324,3 +326,31 @@ def test_without_noise_that_drives_the_motion_there_is_one_pass():
     solver = Carrying([[1.0], [2.0]], [[3.0]])
     solve(MadeUp(linear(np.eye(1), [-2.0])), solver)
     assert len(solver.runs) == 1
+
+
+# -- predictions ------------------------------------------------------------------------------------------------------
+
+
+def test_a_recording_that_its_torques_as_they_are_cannot_follow_has_the_reason_in_place_of_a_prediction():
+    """Weights are about smoothed torques, which may be followed where the recorded ones are not."""
+    smoothed = SimpleNamespace(ok=True, warm="warm", episodes=("smoothed a", "smoothed b"))
+
+    def run(episode, theta, offset, derivatives):
+        assert (theta, offset, derivatives) == (f"theta {episode}", "offset", False)
+        return f"{episode} falls" if episode == "b" else {"episode": episode}
+
+    def known(ok):
+        plain = SimpleNamespace(
+            episodes=("a", "b"),
+            predictor=SimpleNamespace(run=run),
+            split=lambda x, i: (f"theta {'ab'[i]}", "offset"),
+            evaluate=lambda x, derivatives, warm: SimpleNamespace(ok=ok, episodes=("plain a", "plain b") if ok else ()),
+        )
+        return SimpleNamespace(disturbed=True, weighted_by_sensors=lambda: plain)
+
+    fitted = solve(MadeUp(misfit(lambda x: 1.0)), Steps())
+    assert replace(fitted, evaluation=smoothed, problem=known(True)).predicted == ("plain a", "plain b")
+    assert replace(fitted, evaluation=smoothed, problem=known(False)).predicted == ({"episode": "a"}, "b falls")
+    calm = SimpleNamespace(disturbed=False)
+    assert replace(fitted, evaluation=smoothed, problem=calm).predicted == ("smoothed a", "smoothed b")
+    assert replace(fitted, evaluation=None, problem=calm).predicted == ()

@@ -142,6 +142,9 @@ def with_intervals(
     progress : callable, optional
         Told what takes time.
     """
+    usable = solution.evaluation is not None and problem.options.weighting != "paper"
+    if not usable or not small(problem):
+        return solution
     sizes = typical_sizes(problem, solution.x)
     asked = {
         name: sizes[name.split("[")[0]]
@@ -149,8 +152,7 @@ def with_intervals(
         if entry.verdict in ("identifiable", "weak")
         and (not stands_by_itself(entry) or entry.value < SMALL * sizes[name.split("[")[0]])
     }
-    usable = solution.evaluation is not None and problem.options.weighting != "paper"
-    if not asked or not usable or not small(problem):
+    if not asked:
         return solution
     if progress is not None:
         progress(f"intervals of {', '.join(asked)} by profile likelihood")

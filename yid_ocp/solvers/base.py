@@ -118,13 +118,22 @@ class Solution:
         return {name: entry.std for name, entry in self.parameters.items() if entry.free}
 
     @property
-    def predicted(self) -> tuple[EpisodeResult, ...]:
-        """What the model makes of every recording's torques as they are, less their offsets; empty without a point."""
-        found = self.evaluation
-        if found is not None and self.problem is not None and self.problem.disturbed:
-            # weights are about torques without the noise that the measurements told of
-            found = self.problem.weighted_by_sensors().evaluate(self.x, False, found.warm)
-        return () if found is None else found.episodes
+    def predicted(self) -> tuple[EpisodeResult | str, ...]:
+        """What the model makes of every recording's torques as they are, less their offsets; empty without a point.
+
+        Weights are about torques without the noise that the measurements told of: a recording that can be followed by
+        those may not be by the torques as they are, and then has the reason in place of a prediction.
+        """
+        if self.evaluation is None or self.problem is None or not self.problem.disturbed:
+            return () if self.evaluation is None else self.evaluation.episodes
+        problem = self.problem.weighted_by_sensors()
+        found = problem.evaluate(self.x, False, self.evaluation.warm)
+        if found.ok:
+            return found.episodes
+        return tuple(
+            problem.predictor.run(episode, *problem.split(self.x, i), False)
+            for i, episode in enumerate(problem.episodes)
+        )
 
 
 Callback = Callable[[Iterate], None]

@@ -135,7 +135,8 @@ def solve_result(
     fitted: list[dict[str, Any]] = []
     if solution.evaluation is not None:
         done = solution.predicted
-        residuals = channel_errors(done, problem.episodes)
+        able = [(r, e) for r, e in zip(done, problem.episodes, strict=True) if not isinstance(r, str)]
+        residuals = channel_errors([result for result, _ in able], [episode for _, episode in able])
         fitted = [held_out_entry(problem, *pair, cable) for pair in zip(problem.episodes, done, strict=True)]
     predicted = [held_out_entry(problem, episode, outcome, cable) for episode, outcome in held_out]
     units = {channel: entry["unit"] for channel, entry in residuals.items()}

@@ -52,7 +52,8 @@ class Findings:
         found: list[tuple[str, Episode, EpisodeResult]] = []
         if self.problem is not None and self.solution is not None and self.solution.evaluation is not None:
             done = self.solution.predicted
-            found += [("estimate", e, r) for e, r in zip(self.problem.episodes, done, strict=True)]
+            pairs = zip(self.problem.episodes, done, strict=True)
+            found += [("estimate", e, r) for e, r in pairs if not isinstance(r, str)]
         return found + [("held_out", e, r) for e, r in self.held_out if not isinstance(r, str)]
 
 
