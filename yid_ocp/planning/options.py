@@ -59,4 +59,4 @@ class PlanOptions:
     ] = False
     parameter: Annotated[str | None, About("of `information`: the weak one; the volume of all free ones")] = None
     limits: Annotated[PlanLimits, About("of joints and springs")] = field(default_factory=PlanLimits)
-    iterations: Annotated[int, Ge(1), About("limit on IPOPT's iterations")] = 100
+    iterations: Annotated[int, Ge(1), About("limit on evaluations of a search, each time the limits are sharpened")] = 100

@@ -67,7 +67,7 @@ class Plan:
     std : ndarray, shape (3,), or None
         Of the point's place in the end, from the parameters' covariance [m]; None without one.
     unknowns : ndarray, shape (K, nc)
-    iterations : int
+    evaluations : int
     mover : Mover
     """
 
@@ -86,7 +86,7 @@ class Plan:
     swing: float
     std: Array | None
     unknowns: Array
-    iterations: int
+    evaluations: int
     mover: Mover
 
 
@@ -227,16 +227,16 @@ def _attempt(
     start, end = ends
     path = SplinePath(options.duration, options.knots)
     mover = Mover(step, theta, start, path, options.settle)
-    rows = Rows(mover, options, points[0], place, points[1])
-    cases = [rows, *_scenarios(rows, known, end)] if options.spread else [rows]
-    lower, upper = (np.tile(side - mover.first, (options.knots, 1)) for side in joint_range(step.system))
     straight = path.straight(end.posture - mover.first)
+    rows = Rows(mover, options, points[0], place, straight, points[1])
+    cases = [rows, *_scenarios(rows, known)] if options.spread else [rows]
+    lower, upper = (np.tile(side - mover.first, (options.knots, 1)) for side in joint_range(step.system))
     shooting = Shooting(cases, straight.shape)
     shot = shooting.solve(straight, lower, upper, options.iterations)
     return _outcome(rows, shot, known), rows
 
 
-def _scenarios(rows: Rows, known: Known, end: End) -> list[Rows]:
+def _scenarios(rows: Rows, known: Known) -> list[Rows]:
     """The same motion with parameters a standard deviation off, along the axes that move the point's rest most."""
     mover, system = rows.mover, rows.mover.step.system
     if not len(known.names):
@@ -245,8 +245,7 @@ def _scenarios(rows: Rows, known: Known, end: End) -> list[Rows]:
         )
     values, vectors = np.linalg.eigh(known.covariance)
     axes = vectors * np.sqrt(np.maximum(values, 0.0))
-    straight = mover.path.straight(end.posture - mover.first)
-    slope = _point_slopes(rows, mover.roll(straight, names=known.names), len(known.names))
+    slope = _point_slopes(rows, mover.roll(rows.simple, names=known.names), len(known.names))
     moved = np.linalg.norm((slope @ axes).reshape(-1, axes.shape[1]), axis=0)
     found = []
     for k in np.argsort(-moved)[:2]:
@@ -258,7 +257,7 @@ def _scenarios(rows: Rows, known: Known, end: End) -> list[Rows]:
                 floor = max(entry.lower, 0.2 * theta[i]) if theta[i] > 0 else entry.lower
                 theta[i] = np.clip(theta[i] + change, floor, entry.upper)
             rest = first_rest(mover.step, theta, mover.first)
-            found.append(Rows(replace(mover, theta=theta, start=rest), rows.options, rows.point, rows.target, None))
+            found.append(Rows(replace(mover, theta=theta, start=rest), rows.options, rows.point, rows.target, rows.simple))
     return found
 
 
@@ -296,7 +295,7 @@ def _outcome(rows: Rows, shot: Shot, known: Known) -> Plan:
         reached, message, step.system.prescribed, mover.times, mover.positions(shot.w),
         mover.path.basis(mover.times, 1) @ shot.w, mover.path.basis(mover.times, 2) @ shot.w,
         np.vstack([rollout.effort, rollout.effort[-1:]]), rollout.state,
-        {name: at[:, i] for i, name in enumerate(names)}, rows.target, error, swing, std, shot.w, shot.iterations, mover,
+        {name: at[:, i] for i, name in enumerate(names)}, rows.target, error, swing, std, shot.w, shot.evaluations, mover,
     )  # fmt: skip
 
 

@@ -17,6 +17,7 @@ from yid_ocp.planning.points import Points
 Array = NDArray[np.float64]
 
 EVERY = 2  # nodes between those at which limits on what moves freely are asked for
+NEAR = 0.3  # root mean square distance of the joints from the quasi-static motion that counts as one [rad or m]
 CALM = 1e-2  # weight of the accelerations' mean square, in parts of their limit: of equal motions the calmer one
 
 
@@ -75,14 +76,23 @@ class Rows:
         Of the frame that is to arrive, and of all frames that are to rest.
     target : ndarray, shape (3,)
         Where it is to arrive [m].
+    simple : ndarray, shape (K, nc)
+        Unknowns of the quasi-static motion; of motions that do equally well, the one nearest to it is wanted.
     inside : Points, optional
         Frames that stay in the box.
     """
 
     def __init__(
-        self, mover: Mover, options: PlanOptions, point: Points, target: Array, inside: Points | None = None
+        self,
+        mover: Mover,
+        options: PlanOptions,
+        point: Points,
+        target: Array,
+        simple: Array,
+        inside: Points | None = None,
     ) -> None:
         self.mover, self.options, self.point, self.target, self.inside = mover, options, point, target, inside
+        self.simple = simple
         self.joints = [mover.step.system.mechanism.joints[i] for i in mover.joints]
         self.effort_limit = options.limits.effort * np.array([joint.effort_limit for joint in self.joints])
         self._springs = sorted(
@@ -125,6 +135,7 @@ class Rows:
         bend = mover.path.controls(2) / options.limits.acceleration
         nc = w.shape[1]
         parts.append(_rows(bend @ w, np.einsum("tk,ji->tjki", bend, np.eye(nc)).reshape(-1, nc, size), CALM**-0.5))
+        parts.append(_rows(w - self.simple, np.eye(size), NEAR))
         if options.effort:
             finite = np.isfinite(self.effort_limit)
             unit = self.effort_limit[finite] / np.sqrt(options.effort)

@@ -22,7 +22,6 @@ from yid_ocp.errors import SolverError
 from yid_ocp.options import About, check
 from yid_ocp.problem.problem import EstimationProblem
 from yid_ocp.solvers.base import SOLVERS, Callback, Outcome, Recorder, Status
-from yid_ocp.solvers.numeric import NumericFunction
 from yid_ocp.solvers.program import SILENT, Hessian, NonlinearProgram, free_memory
 from yid_ocp.solvers.symbolic import RIDGE, transcribe, unknown_vector
 from yid_ocp.solvers.transcription import Transcription
@@ -286,6 +285,52 @@ class _Watch(ca.Callback):
         return [0]
 
 
+class _Function(ca.Callback):
+    """A CasADi function computed in Python."""
+
+    def __init__(
+        self,
+        name: str,
+        inputs: Sequence[str],
+        outputs: Sequence[str],
+        sparsity: dict[str, ca.Sparsity],
+        compute: Callable[..., list],
+    ) -> None:
+        ca.Callback.__init__(self)
+        self._inputs, self._outputs, self._sparsity, self._compute = list(inputs), list(outputs), sparsity, compute
+        self.construct(name, {})
+
+    def get_n_in(self) -> int:
+        return len(self._inputs)
+
+    def get_n_out(self) -> int:
+        return len(self._outputs)
+
+    def get_name_in(self, i: int) -> str:
+        return self._inputs[i]
+
+    def get_name_out(self, i: int) -> str:
+        return self._outputs[i]
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        return self._sparsity[self._inputs[i]]
+
+    def get_sparsity_out(self, i: int) -> ca.Sparsity:
+        return self._sparsity[self._outputs[i]]
+
+    def has_eval_buffer(self) -> bool:
+        return True
+
+    def eval_buffer(self, arguments: Sequence[memoryview | None], results: Sequence[memoryview | None]) -> int:
+        """Compute on CasADi's own memory: a Jacobian of millions of entries is not copied to and fro."""
+        # the arguments' memory is CasADi's only as long as this call lasts
+        values = self._compute(*(np.zeros(0) if a is None else np.frombuffer(a).copy() for a in arguments))
+        for place, value in zip(results, values, strict=True):
+            if place is not None:
+                np.frombuffer(place)[:] = value
+        return 0
+
+
 class _Nlp:
     """Objective, constraints and their derivatives in the form that CasADi's IPOPT interface takes."""
 
@@ -298,7 +343,7 @@ class _Nlp:
         self._asked = np.zeros(0)
         count = len(transcription.problem.shared)
         self._held = _Held(transcription.problem.scales[:count])
-        self._keep: list[NumericFunction] = []
+        self._keep: list[_Function] = []
 
     def prepare(self, w0: Array) -> None:
         """Fix scaling and sparsity from the start and from random points about it."""
@@ -342,10 +387,8 @@ class _Nlp:
             "hess_lag": self._h.sparsity,
         }
 
-        def make(
-            name: str, inputs: Sequence[str], outputs: Sequence[str], compute: Callable[..., list]
-        ) -> NumericFunction:
-            self._keep.append(NumericFunction(name, inputs, outputs, sparsity, compute))
+        def make(name: str, inputs: Sequence[str], outputs: Sequence[str], compute: Callable[..., list]) -> _Function:
+            self._keep.append(_Function(name, inputs, outputs, sparsity, compute))
             return self._keep[-1]
 
         return {

@@ -186,7 +186,7 @@ def plan_result(run: Run, found: Plan, source: dict[str, Any]) -> dict[str, Any]
         "tolerance": run.plan.tolerance,
         "joints": shares,
         "from": source,
-        "iterations": found.iterations,
+        "evaluations": found.evaluations,
     }
 
 
