@@ -58,7 +58,9 @@ def start_posture(system: System, posture: Mapping[str, float]) -> Array:
     """
     for name in posture:
         if name not in system.prescribed:
-            raise ConfigError(f"'{name}' is no joint that moves", where="plan.posture", hint=nearest(name, system.prescribed))
+            raise ConfigError(
+                f"'{name}' is no joint that moves", where="plan.posture", hint=nearest(name, system.prescribed)
+            )
     missing = [name for name in system.prescribed if name not in posture]
     if missing:
         raise ConfigError(
@@ -140,7 +142,9 @@ def check_reached(end: End, name: str, place: Array, tolerance: float) -> None:
     """
     if end.distance <= REACHED * tolerance:
         return
-    off = f"{1e3 * end.distance:.3g} mm off" if np.isfinite(end.distance) else "nowhere, as no posture near it is at rest"
+    off = (
+        f"{1e3 * end.distance:.3g} mm off" if np.isfinite(end.distance) else "nowhere, as no posture near it is at rest"
+    )
     limits = f", with {', '.join(end.at_limit)} at the joint's limit" if end.at_limit else ""
     raise ConfigError(
         f"the goal is out of reach: '{name}' comes to rest {off}{limits}",

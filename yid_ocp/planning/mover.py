@@ -48,17 +48,17 @@ class Mover:
     @property
     def first(self) -> Array:
         """Where they start, shape (nc,)."""
-        return self.start.state[self.joints]
+        return np.asarray(self.start.state[self.joints])
 
     @cached_property
     def times(self) -> Array:
         """Nodes, shape (N + 1,) [s]."""
         moving = round(self.path.duration / self.step.time_step)
         standing = max(1, round(self.settle / self.step.time_step))
-        return self.step.time_step * np.arange(moving + standing + 1)
+        return np.asarray(self.step.time_step * np.arange(moving + standing + 1))
 
     @cached_property
-    def standing(self) -> Array:
+    def standing(self) -> NDArray[np.int64]:
         """Nodes at which the joints stand still in the end."""
         return np.flatnonzero(self.times >= self.path.duration - 1e-9)
 

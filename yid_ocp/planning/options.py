@@ -11,7 +11,7 @@ from annotated_types import Ge, Gt, Le
 from yid_ocp.options import About
 
 Triple = tuple[float, float, float]
-Goal = Literal["place", "path", "box", "information"]
+Goal = Literal["place", "path", "box"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,10 +30,7 @@ class PlanOptions:
 
     goal: Annotated[
         Goal,
-        About(
-            "bring a point to a place, along a path, or there with points kept inside a box; or move so that a parameter "
-            "can be found"
-        ),
+        About("bring a point to a place, there along a path, or there with points kept inside a box"),
     ] = "place"
     point: Annotated[str | None, About("frame that is to arrive: a tip of the object, T3:50%, a gripper")] = None
     place: Annotated[Triple | None, About("where to, in the world; or give a shift", "m")] = None
@@ -54,9 +51,10 @@ class PlanOptions:
     effort: Annotated[
         float, Ge(0), About("weight of the mean squared effort in parts of its limit; raise it for calm motions")
     ] = 0.0
-    spread: Annotated[
-        bool, About("whether the error that comes of the parameters' uncertainty is minimised along")
-    ] = False
-    parameter: Annotated[str | None, About("of `information`: the weak one; the volume of all free ones")] = None
+    spread: Annotated[bool, About("whether the error that comes of the parameters' uncertainty is minimised along")] = (
+        False
+    )
     limits: Annotated[PlanLimits, About("of joints and springs")] = field(default_factory=PlanLimits)
-    iterations: Annotated[int, Ge(1), About("limit on evaluations of a search, each time the limits are sharpened")] = 100
+    iterations: Annotated[int, Ge(1), About("limit on evaluations of a search, each time the limits are sharpened")] = (
+        100
+    )

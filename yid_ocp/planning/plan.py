@@ -12,8 +12,9 @@ from yid_ocp.errors import ConfigError, nearest
 from yid_ocp.integrator.statics import Rest
 from yid_ocp.integrator.step import Step
 from yid_ocp.integrator.step_model import Rollout
+from yid_ocp.model.system import System
 from yid_ocp.options import check
-from yid_ocp.planning.ends import End, check_reached, end_at, first_rest, joint_range, start_posture
+from yid_ocp.planning.ends import REACHED, End, check_reached, end_at, first_rest, joint_range, start_posture
 from yid_ocp.planning.mover import Mover
 from yid_ocp.planning.options import PlanOptions
 from yid_ocp.planning.path import SplinePath
@@ -46,7 +47,7 @@ class Plan:
     Attributes
     ----------
     reached : bool
-        Whether the search ended well and the motion keeps its limits.
+        Whether the point arrives, by a motion within the limits.
     message : str
     joints : tuple of str
     t : ndarray, shape (N + 1,)
@@ -90,10 +91,30 @@ class Plan:
     mover: Mover
 
 
+@dataclass(frozen=True, eq=False)
+class PlannedMovement:
+    """A plan as the virtual robot's controller follows it (`virtual.motion.Movement`)."""
+
+    joints: tuple[str, ...]
+    path: SplinePath
+    unknowns: Array
+
+    def at(self, t: float) -> tuple[Array, Array, Array]:
+        """Offset from the start, velocity and acceleration at time t [s], three arrays of shape (nj,)."""
+        offset, rate, bend = (self.path.basis(np.array([t]), order)[0] @ self.unknowns for order in range(3))
+        return offset, rate, bend
+
+
 Told = Callable[[str], None]
 
 
-def plan(step: Step, options: PlanOptions, theta: Array | None = None, known: Known | None = None, told: Told = str) -> Plan:
+def _untold(_: str) -> None:
+    """For whoever does not want to know."""
+
+
+def plan(
+    step: Step, options: PlanOptions, theta: Array | None = None, known: Known | None = None, told: Told = _untold
+) -> Plan:
     """Plan a motion of a step's prescribed joints.
 
     Parameters
@@ -126,7 +147,10 @@ def plan(step: Step, options: PlanOptions, theta: Array | None = None, known: Kn
     system = step.system
     if system.driven or not system.prescribed:
         raise ConfigError(
-            "no joint is prescribed", where="plan", allowed="a robot whose arms move", hint="set model.robot and model.arms"
+            "no joint is prescribed",
+            where="plan",
+            allowed="a robot whose arms move",
+            hint="set model.robot and model.arms",
         )
     known = Known() if known is None else known
     values = system.parameters.vector() if theta is None else np.asarray(theta, float)
@@ -151,7 +175,7 @@ def plan(step: Step, options: PlanOptions, theta: Array | None = None, known: Kn
     return found
 
 
-def _posture(system, options: PlanOptions, theta: Array) -> Array:
+def _posture(system: System, options: PlanOptions, theta: Array) -> Array:
     if options.posture is not None:
         return start_posture(system, options.posture)
     by_name = dict(zip(system.parameters.names, map(float, theta), strict=True))
@@ -174,7 +198,9 @@ def _points(step: Step, options: PlanOptions) -> tuple[Points, Points | None]:
 def _place(options: PlanOptions, begin: Array) -> Array:
     if (options.place is None) == (options.shift is None):
         raise ConfigError(
-            "where the point is to arrive is said twice" if options.place else "nothing says where the point is to arrive",
+            "where the point is to arrive is said twice"
+            if options.place
+            else "nothing says where the point is to arrive",
             where="plan.place",
             allowed="one of place and shift",
         )
@@ -183,9 +209,7 @@ def _place(options: PlanOptions, begin: Array) -> Array:
     return np.array(options.place, float) if options.place is not None else begin + np.array(options.shift, float)
 
 
-def _check_box(
-    options: PlanOptions, inside: Points | None, start: Rest, n: int, theta: Array, place: Array
-) -> None:
+def _check_box(options: PlanOptions, inside: Points | None, start: Rest, n: int, theta: Array, place: Array) -> None:
     if inside is None:
         return
     if options.box is None:
@@ -205,11 +229,11 @@ def _check_box(
             continue
         over = np.maximum(low - where, where - high)
         if np.any(over > 0):
-            axis = int(np.argmax(over))
+            row = int(np.argmax(over))
             raise ConfigError(
-                f"'{name}' {when} {1e3 * over[axis]:.3g} mm outside the box along {'xyz'[axis]}",
+                f"'{name}' {when} {1e3 * over[row]:.3g} mm outside the box along {'xyz'[row]}",
                 where="plan.box",
-                allowed=f"{low[axis]:.4g} to {high[axis]:.4g} m, it is at {where[axis]:.4g} m",
+                allowed=f"{low[row]:.4g} to {high[row]:.4g} m, it is at {where[row]:.4g} m",
                 hint="enlarge the box, or name the frames to keep in it under plan.inside",
             )
 
@@ -257,7 +281,9 @@ def _scenarios(rows: Rows, known: Known) -> list[Rows]:
                 floor = max(entry.lower, 0.2 * theta[i]) if theta[i] > 0 else entry.lower
                 theta[i] = np.clip(theta[i] + change, floor, entry.upper)
             rest = first_rest(mover.step, theta, mover.first)
-            found.append(Rows(replace(mover, theta=theta, start=rest), rows.options, rows.point, rows.target, rows.simple))
+            found.append(
+                Rows(replace(mover, theta=theta, start=rest), rows.options, rows.point, rows.target, rows.simple)
+            )
     return found
 
 
@@ -290,12 +316,18 @@ def _outcome(rows: Rows, shot: Shot, known: Known) -> Plan:
         message += "; the model could not be stepped to the end of the motion"
     if broken:
         message += "; take a longer plan.duration, a nearer place, or a higher plan.limits where the machine allows it"
-    reached = shot.finished and not broken and not failed(rollout)
+    far = not error <= REACHED * rows.options.tolerance
+    if shot.finished and far:
+        message += (
+            f"; the point comes no nearer than {1e3 * error:.3g} mm; take a longer plan.duration or a nearer place"
+        )
+    reached = shot.finished and not broken and not far
     return Plan(
         reached, message, step.system.prescribed, mover.times, mover.positions(shot.w),
         mover.path.basis(mover.times, 1) @ shot.w, mover.path.basis(mover.times, 2) @ shot.w,
         np.vstack([rollout.effort, rollout.effort[-1:]]), rollout.state,
-        {name: at[:, i] for i, name in enumerate(names)}, rows.target, error, swing, std, shot.w, shot.evaluations, mover,
+        {name: at[:, i] for i, name in enumerate(names)}, rows.target, error, swing, std, shot.w, shot.evaluations,
+        mover,
     )  # fmt: skip
 
 
@@ -306,7 +338,7 @@ def _shortest(
     h = found.mover.step.time_step
 
     def good(one: Plan) -> bool:
-        return one.reached and one.error <= options.tolerance and one.swing <= options.swing
+        return one.reached and one.swing <= options.swing
 
     if not good(found):
         return found, rows

@@ -85,7 +85,9 @@ def run_plan(run: Run, out: str | Path | None = None, progress: Progress = SILEN
         recording = as_recording(run, found, step)
         write_recording(recording, folder.path / "recording.h5")
         export_csv(recording, folder.path / "csv")
-        trajectory = joint_trajectory(found.joints, found.t, found.position, found.velocity, found.acceleration, found.effort)
+        trajectory = joint_trajectory(
+            found.joints, found.t, found.position, found.velocity, found.acceleration, found.effort
+        )
         folder.write("trajectory.json", json.dumps(trajectory, indent=1) + "\n")
         folder.log("end", reached=found.reached, message=found.message)
         written = folder.finish(plan_result(run, found, source))
@@ -122,12 +124,18 @@ def identified(run: Run, step: Step) -> tuple[Array, Known, dict[str, Any]]:
     file, solved = folder / "result.json", folder / "trajectories.h5"
     if not file.is_file() or not solved.is_file():
         raise run.refuse(
-            f"there is no finished run of `solve` in {folder}", "plan", "run", hint="give the run folder that it printed"
+            f"there is no finished run of `solve` in {folder}",
+            "plan",
+            "run",
+            hint="give the run folder that it printed",
         )
     result = json.loads(file.read_text(encoding="utf-8"))
     if not str(result.get("format", "")).startswith("yid-solve/"):
         raise run.refuse(
-            f"{folder} is a run folder of another command ({result.get('format')})", "plan", "run", allowed="yid-solve/1"
+            f"{folder} is a run folder of another command ({result.get('format')})",
+            "plan",
+            "run",
+            allowed="yid-solve/1",
         )
     if result["status"] == "failed":
         raise DataError(f"the solve in {folder} failed: {result['message']}", where=run.where("plan", "run"))
