@@ -198,7 +198,7 @@ def solve(
     start (a soft object snaps, an arm falls), the problem is first solved over its first seconds only, and then over
     longer and longer horizons. A poor fit is started again from other initial values. Where noise drives the motion,
     methods that can weigh residuals by it do so in several passes, its covariance frozen in each
-    (`EstimationProblem.weighted_at`).
+    (`EstimationProblem.weighted_at`); the answer of one that has its errors as unknowns is judged in the same way.
 
     Parameters
     ----------
