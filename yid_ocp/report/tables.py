@@ -140,7 +140,7 @@ def blind_table(result: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def plan_rows(result: Mapping[str, Any]) -> list[tuple[str, ...]]:
+def plan_rows(result: Mapping[str, Any]) -> Sequence[tuple[str, ...]]:
     """What a `yid-plan/1` asks of every joint, with a head."""
 
     def percent(share: float | None) -> str:
