@@ -31,7 +31,7 @@ from yid_ocp.workflow.folder import new_run_folder
 from yid_ocp.workflow.progress import SILENT, Progress
 
 FORMAT = "yid-plan/1"
-POINT_STD = 1e-3  # stated in the recording of a plan, for whoever estimates on it [m]
+EFFORT_STD, POINT_STD = 0.1, 1e-3  # stated in the recording of a plan, for whoever estimates on it [N m], [m]
 Array = NDArray[np.float64]
 
 
@@ -157,7 +157,8 @@ def as_recording(run: Run, found: Plan, step: Step) -> Recording:
     """The plan as if it had been recorded: joints, and the points of the object as the model predicts them."""
     joints = JointGroup(
         found.joints, found.t, found.position, found.velocity, found.effort,
-        position_command=found.position, velocity_command=found.velocity, effort_kind="sample", clock="nominal",
+        position_command=found.position, velocity_command=found.velocity, effort_kind="sample",
+        effort_std=EFFORT_STD, clock="nominal",
     )  # fmt: skip
     names = tuple(found.points)
     position = np.stack([found.points[name] for name in names], axis=1)
