@@ -28,6 +28,7 @@ LAYERS = (
     ("solvers",),
     ("analysis",),
     ("diagnosis",),
+    ("planning",),
     ("export", "report"),
     ("config",),
     ("workflow",),

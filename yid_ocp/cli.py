@@ -134,6 +134,7 @@ COMMANDS: tuple[Command, ...] = (
         "blind",
         _blind,
     ),
+    Command("plan", "plan a motion of the arms with the identified model", "plan", _configured),
     Command("simulate", "write what the model says would be recorded", "simulate", _simulate),
     Command("check", "validate a configuration, its recordings and the model before a long run", "check", _configured),
     Command("inspect", "show the model's equations: names, patterns, single entries, numbers", "inspect", _inspect),

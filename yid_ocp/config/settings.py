@@ -21,6 +21,7 @@ from yid_ocp.errors import ConfigError
 from yid_ocp.integrator.discrete import ConstraintForce, ForceSplit
 from yid_ocp.model.cable import CableOptions
 from yid_ocp.options import About, Among, options_of, stripped
+from yid_ocp.planning.options import PlanOptions
 from yid_ocp.problem.null_test import GapLimits
 from yid_ocp.problem.options import ProblemOptions, SensorOptions
 from yid_ocp.solvers import SOLVERS, GaussNewton, Lifted, MultipleShooting, SingleShooting, SteepestDescent
@@ -295,6 +296,15 @@ class TrackSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class PlanSettings(PlanOptions):
+    """What `plan` plans, and where the parameters come from."""
+
+    run: Annotated[
+        FilePath | None, About("run folder of `solve` with parameters and covariance; the initial values when absent")
+    ] = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class OutputSettings:
     """Where results go."""
 
@@ -339,6 +349,7 @@ class Run:
     compare: Annotated[CompareSettings, About("which methods are compared")] = field(default_factory=CompareSettings)
     diagnosis: Annotated[DiagnosisSettings, About("how a gap is diagnosed")] = field(default_factory=DiagnosisSettings)
     track: Annotated[TrackSettings, About("how a camera's frames are tracked")] = field(default_factory=TrackSettings)
+    plan: Annotated[PlanSettings, About("which motion is planned")] = field(default_factory=PlanSettings)
     output: Annotated[OutputSettings, About("where results go")] = field(default_factory=OutputSettings)
     name: str = "run"
     file: str = field(default="", compare=False)

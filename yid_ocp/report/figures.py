@@ -124,6 +124,21 @@ def over_time(curves: Sequence[Curve], dots: str, lines: Mapping[str, str]) -> p
     return figure
 
 
+def lines_over_time(curve: Curve) -> plotly.graph_objects.Figure:
+    """The lines of one curve, each in a color of its own."""
+    import plotly.graph_objects as go
+
+    figure = go.Figure()
+    for i, (name, (t, value)) in enumerate(curve.lines.items()):
+        keep, style = _thinned(len(t)), {"color": COLORS[i % len(COLORS)], "width": 1.5}
+        style |= {"dash": "dash"} if i >= len(COLORS) else {}
+        figure.add_scatter(x=t[keep].tolist(), y=_listed(value[keep]), mode="lines", name=name, line=style)
+    if curve.band is not None:
+        shade = {"fillcolor": PALE, "opacity": 0.7, "line_width": 0, "layer": "below"}
+        figure.add_hrect(y0=-curve.band, y1=curve.band, **shade)
+    return _styled(figure, 300, "time [s]", curve.title)
+
+
 def residual_histogram(residuals: Mapping[str, Array]) -> plotly.graph_objects.Figure:
     """Whitened residuals of every group beside the standard normal density they should follow."""
     import plotly.graph_objects as go

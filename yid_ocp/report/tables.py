@@ -138,3 +138,37 @@ def blind_table(result: Mapping[str, Any]) -> list[str]:
             )
         )
     return lines
+
+
+def plan_rows(result: Mapping[str, Any]) -> Sequence[tuple[str, ...]]:
+    """What a `yid-plan/1` asks of every joint, with a head."""
+
+    def percent(share: float | None) -> str:
+        return "" if share is None else f"{100 * share:.0f} %"
+
+    rows = [("joint", "travel", "largest velocity, of its limit", "largest effort, of its limit")]
+    for name, own in result["joints"].items():
+        rows.append((name, f"{own['travel']:.3g}", percent(own["velocity"]), percent(own["effort"])))
+    return rows
+
+
+def plan_sentences(result: Mapping[str, Any]) -> list[str]:
+    """What a `yid-plan/1` says of the point in the end."""
+    if result["error"] is None or result["swing"] is None:
+        return [
+            "the motion at which the search ended cannot be simulated to its end; nothing is known of where it leads"
+        ]
+    place = ", ".join(f"{x:.4g}" for x in result["place"])
+    said = [
+        f"in {result['duration']:g} s '{result['point']}' goes to ({place}) m; in the {result['settle']:g} s after "
+        f"that it is at most {1e3 * result['error']:.3g} mm from there, and no point of the object is faster than "
+        f"{1e3 * result['swing']:.3g} mm/s, as the model has it"
+    ]
+    if result["std"] is not None:
+        std = ", ".join(f"{1e3 * x:.2g}" for x in result["std"])
+        said.append(f"what is not known of the parameters makes that uncertain by ({std}) mm, one standard deviation")
+        lost = result["from"]["uncertainty_unknown"]
+        said += [f"not counted, as their uncertainty is not known: {', '.join(lost)}"] if lost else []
+    elif result["from"]["run"] is None:
+        said.append("the parameters are those of the configuration, so nothing is said of how uncertain that is")
+    return said

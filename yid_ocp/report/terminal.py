@@ -7,7 +7,15 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from yid_ocp.data import Recording
-from yid_ocp.report.tables import blind_table, guess_sentences, held_out_rows, medians, offset_rows
+from yid_ocp.report.tables import (
+    blind_table,
+    guess_sentences,
+    held_out_rows,
+    medians,
+    offset_rows,
+    plan_rows,
+    plan_sentences,
+)
 from yid_ocp.solvers.words import VERDICT_WORDS, fit_words, interval_words, parameter_words
 
 Rows = list[Sequence[str]]
@@ -95,6 +103,12 @@ def _moved_lines(result: Mapping[str, Any]) -> list[str]:
 def _offset_lines(result: Mapping[str, Any]) -> list[str]:
     rows = offset_rows(result)
     return [*table(rows), ""] if rows else []
+
+
+def plan_summary(result: Mapping[str, Any]) -> list[str]:
+    """Lines that tell a person what a `yid-plan/1` result says."""
+    lines = [*table(list(plan_rows(result))), ""]
+    return [*lines, *plan_sentences(result), f"{result['status']}: {result['message']}"]
 
 
 def track_summary(result: Mapping[str, Any]) -> list[str]:

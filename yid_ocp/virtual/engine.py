@@ -21,7 +21,7 @@ from yid_ocp.data.recording import EffortKind
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model.system import System
 from yid_ocp.virtual.mjcf import compiled_model, mujoco_module, mujoco_xml
-from yid_ocp.virtual.motion import Motion
+from yid_ocp.virtual.motion import Movement
 from yid_ocp.virtual.posture import initial_posture
 
 Array = NDArray[np.float64]
@@ -158,7 +158,7 @@ class SimulatedRun:
 def simulate_in_mujoco(
     system: System,
     values: Mapping[str, float] | None,
-    motion: Motion,
+    motion: Movement,
     simulation: Simulation | None = None,
     *,
     posture: Mapping[str, float] | None = None,
@@ -172,7 +172,7 @@ def simulate_in_mujoco(
     system : System
     values : mapping of str to float or None
         Parameter values; nominal where absent.
-    motion : Motion
+    motion : Movement
         Of exactly the driven joints.
     simulation : Simulation, optional
     posture : mapping of str to float, optional
@@ -294,12 +294,12 @@ class _Controller:
     ----------
     scene : _Scene
         At rest, before the motion.
-    motion : Motion
+    motion : Movement
     balance : ndarray, shape (nu,)
         Torques that hold the scene at rest [N m].
     """
 
-    def __init__(self, scene: _Scene, motion: Motion, balance: Array) -> None:
+    def __init__(self, scene: _Scene, motion: Movement, balance: Array) -> None:
         self._scene, self._motion = scene, motion
         self._free = copy.copy(scene.model)
         self._free.opt.disableflags |= int(scene.mujoco.mjtDisableBit.mjDSBL_EQUALITY)

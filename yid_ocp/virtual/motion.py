@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import casadi as ca
 import numpy as np
@@ -15,6 +16,19 @@ from yid_ocp.model.system import System
 from yid_ocp.virtual.posture import initial_posture
 
 Array = NDArray[np.float64]
+
+
+class Movement(Protocol):
+    """How driven joints move about their initial posture, from rest."""
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Their names."""
+        ...
+
+    def at(self, t: float) -> tuple[Array, Array, Array]:
+        """Offset, velocity and acceleration at time t [s], three arrays of shape (nj,)."""
+        ...
 
 
 @dataclass(frozen=True)

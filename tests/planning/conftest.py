@@ -1,0 +1,24 @@
+"""A pendulum whose shoulder is moved and whose elbow is a spring, within limits."""
+
+from __future__ import annotations
+
+import pytest
+
+LIMITS = '<limit lower="-1.2" upper="1.2" effort="40" velocity="6"/>'
+
+
+@pytest.fixture(scope="session")
+def limited_urdf(urdf_folder, tmp_path_factory):
+    text = (urdf_folder / "double_pendulum.urdf").read_text()
+    head, tail = text.split('<joint name="shoulder" type="continuous">')
+    tail = tail.replace('<axis xyz="1 0 0"/>', f'<axis xyz="1 0 0"/>{LIMITS}', 1)
+    file = tmp_path_factory.mktemp("limited") / "double_pendulum.urdf"
+    file.write_text(f'{head}<joint name="shoulder" type="revolute">{tail}')
+    return file
+
+
+@pytest.fixture(scope="session")
+def moved(limited_urdf):
+    from small_problems import pendulum_step
+
+    return pendulum_step(limited_urdf.parent, prescribed=("shoulder",))

@@ -1,0 +1,126 @@
+"""The command `plan`: files that others read, parameters from a run of `solve`, exit codes."""
+
+from __future__ import annotations
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+
+from yid_ocp.cli import main
+from yid_ocp.config.reader import load_config
+from yid_ocp.data import read_recording
+from yid_ocp.workflow.plan import identified, planning_step, run_plan
+from yid_ocp.workflow.simulate import run_simulate
+
+CONFIG = """\
+model:
+  robot: {urdf}
+  springs:
+    elbow: {{stiffness: 3.0, rest: 0.1}}
+  arms: {{mode: prescribed, passive: [elbow]}}
+  damping: 0.2
+  points: [tip]
+parameters:
+  elbow.stiffness: {{free: true}}
+problem: {{compiler: false, path_cutoff: .inf}}
+plan: {{point: tip, shift: [0.0, 0.15, 0.04], posture: {{shoulder: 0.2}}, duration: 0.7, settle: 0.3, tolerance: 0.02}}
+"""
+
+
+@pytest.fixture
+def config(limited_urdf, tmp_path):
+    file = tmp_path / "pendulum.yaml"
+    file.write_text(CONFIG.format(urdf=limited_urdf))
+    return file
+
+
+def solved(folder, stiffness, std, status="converged"):
+    """What `solve` leaves, as far as a plan reads it."""
+    folder.mkdir()
+    entry = {"value": stiffness, "free": True}
+    result = {"format": "yid-solve/1", "status": status, "message": "made up", "parameters": {"elbow.stiffness": entry}}
+    (folder / "result.json").write_text(json.dumps(result))
+    with h5py.File(folder / "trajectories.h5", "w") as file:
+        unknowns = file.create_group("unknowns")
+        unknowns.attrs["names"] = np.array(["elbow.stiffness"], dtype=h5py.string_dtype())
+        unknowns.create_dataset("covariance", data=[[std**2]])
+    return folder
+
+
+def test_the_run_folder_is_what_simulate_and_robots_read(config, tmp_path):
+    outcome = run_plan(load_config(config), tmp_path / "out")
+    assert outcome.ok, outcome.result["message"]
+    assert outcome.result["format"] == "yid-plan/1"
+    assert {path.name for path in outcome.folder.iterdir()} >= {
+        "recording.h5", "csv", "trajectory.json", "result.json", "report.html", "config.yaml", "log.jsonl"
+    }  # fmt: skip
+    page = (outcome.folder / "report.html").read_text()
+    assert '<section id="plan">' in page
+    assert "of how uncertain that is" in page
+    message = json.loads((outcome.folder / "trajectory.json").read_text())
+    assert message["joint_names"] == ["shoulder"]
+    assert [p["positions"][0] for p in message["points"]] == pytest.approx(outcome.plan.position[:, 0].tolist())
+    times = [p["time_from_start"]["sec"] + 1e-9 * p["time_from_start"]["nanosec"] for p in message["points"]]
+    assert times == pytest.approx(outcome.plan.t.tolist())
+
+    file = outcome.folder / "recording.h5"
+    planned = read_recording(file)
+    again = load_config(config, [f"recordings.estimate=[{file}]"])
+    done = run_simulate(again, tmp_path / "again")
+    assert done.ok, done.result["message"]
+    np.testing.assert_allclose(done.recording.points[0].position, planned.points[0].position, atol=1e-6)
+
+
+def test_parameters_and_their_uncertainty_come_from_a_run_of_solve(config, tmp_path):
+    folder = solved(tmp_path / "solved", 4.0, 0.25)
+    run = load_config(config, [f"plan.run={folder}"])
+    step = planning_step(run)
+    theta, known, source = identified(run, step)
+    assert theta[step.system.parameters.index("elbow.stiffness")] == 4.0
+    assert known.names == ("elbow.stiffness",)
+    assert known.covariance.tolist() == [[0.0625]]
+    assert source["parameters"] == {"elbow.stiffness": 4.0}
+    outcome = run_plan(run, tmp_path / "out")
+    assert max(outcome.result["std"]) > 1e-4
+
+
+def test_what_is_not_known_is_not_counted_and_said(config, tmp_path):
+    folder = solved(tmp_path / "solved", 4.0, np.inf)
+    run = load_config(config, [f"plan.run={folder}"])
+    _, known, source = identified(run, planning_step(run))
+    assert known.names == ()
+    assert source["uncertainty_unknown"] == ["elbow.stiffness"]
+
+
+def test_a_plan_that_fails_says_so(config, tmp_path, capsys):
+    assert main(["plan", str(config), "--out", str(tmp_path / "out"), "--set", "plan.duration=0.1"]) == 1
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert result["status"] == "failed"
+    assert result["message"] in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (["plan.shift=[0, 3, 0]"], ("out of reach", "mm off", "pendulum.yaml")),
+        (["plan.run=nowhere"], ("no finished run of `solve`", "plan.run")),
+        (["plan.goal=throw"], ("plan.goal", "place, path, box")),
+        (["plan.limits.velocity=2"], ("plan.limits.velocity", "up to 1")),
+        (["plan.point=tup"], ("no frame 'tup'", "did you mean 'tip'?")),
+    ],
+)
+def test_wrong_input_leaves_nothing(config, tmp_path, capsys, settings, words):
+    arguments = [part for setting in settings for part in ("--set", setting)]
+    assert main(["plan", str(config), "--out", str(tmp_path / "out"), *arguments]) == 2
+    told = capsys.readouterr().err
+    for word in words:
+        assert word in told, told
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_of_another_kind_is_refused(config, tmp_path, capsys):
+    failed = solved(tmp_path / "failed", 4.0, 0.1, status="failed")
+    assert main(["plan", str(config), "--out", str(tmp_path / "out"), "--set", f"plan.run={failed}"]) == 2
+    assert "failed: made up" in capsys.readouterr().err

@@ -1,0 +1,1 @@
+"""Motions planned with the identified model."""

@@ -1,0 +1,154 @@
+"""Where a motion begins and where it can end: equilibria of the system with its arms at rest."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from yid_ocp.errors import ConfigError, ModelError, nearest
+from yid_ocp.integrator.statics import Rest, Statics
+from yid_ocp.integrator.step import Step
+from yid_ocp.model.system import System
+from yid_ocp.planning.points import Points
+
+Array = NDArray[np.float64]
+
+NEAR = 1e-2  # weight of a joint's travel [rad] beside the distance to the place in units of what counts as reached
+REACHED = 1.5  # of that unit: beyond it a place is out of reach
+
+
+@dataclass(frozen=True)
+class End:
+    """A posture at which the point rests near a place.
+
+    Attributes
+    ----------
+    posture : ndarray, shape (nc,)
+        Moved joints [rad or m].
+    rest : Rest
+    distance : float
+        Of the point from the place [m].
+    at_limit : tuple of str
+        Joints that stand at a limit of theirs.
+    """
+
+    posture: Array
+    rest: Rest
+    distance: float
+    at_limit: tuple[str, ...]
+
+
+def joint_range(system: System) -> tuple[Array, Array]:
+    """Lower and upper limits of the moved joints, shape (nc,) each."""
+    joints = [system.mechanism.joints[i] for i in system.prescribed_indices]
+    return np.array([joint.lower for joint in joints]), np.array([joint.upper for joint in joints])
+
+
+def start_posture(system: System, posture: Mapping[str, float]) -> Array:
+    """Moved joints of a posture by name, shape (nc,).
+
+    Raises
+    ------
+    ConfigError
+        A joint is missing, does not exist, or stands outside its range.
+    """
+    for name in posture:
+        if name not in system.prescribed:
+            raise ConfigError(
+                f"'{name}' is no joint that moves", where="plan.posture", hint=nearest(name, system.prescribed)
+            )
+    missing = [name for name in system.prescribed if name not in posture]
+    if missing:
+        raise ConfigError(
+            f"the posture says nothing of {', '.join(missing)}",
+            where="plan.posture",
+            allowed="every joint that moves",
+            hint="leave plan.posture out to begin where the arms first grasp the undeformed object",
+        )
+    chosen = np.array([float(posture[name]) for name in system.prescribed])
+    for name, value, low, high in zip(system.prescribed, chosen, *joint_range(system), strict=True):
+        if not low - 1e-9 <= value <= high + 1e-9:
+            over = low - value if value < low else value - high
+            raise ConfigError(
+                f"{name} starts at {value:.4g}, {over:.3g} beyond its limit",
+                where="plan.posture",
+                allowed=f"{low:.4g} to {high:.4g}",
+            )
+    return chosen
+
+
+def first_rest(step: Step, theta: Array, posture: Array) -> Rest:
+    """The equilibrium from which a motion begins.
+
+    Raises
+    ------
+    ModelError
+        There is none, for example because a grasp cannot be closed.
+    """
+    rest = Statics(step).solve(posture, theta)
+    if not rest.converged:
+        raise ModelError(
+            f"the motion cannot begin: {rest.message}",
+            where="plan.posture",
+            allowed="a posture at which every grasp holds the object at rest",
+            hint="give plan.posture (a recording's first angles), or correct model.grasp",
+        )
+    return rest
+
+
+def end_at(step: Step, theta: Array, start: Rest, point: Points, place: Array, tolerance: float) -> End:
+    """The posture within the joints' range, not far from the start, at which the point rests nearest to a place."""
+    statics, system = Statics(step), step.system
+    joints, n = list(system.prescribed_indices), system.size
+    first = start.state[joints]
+    guess = [start.state[:n]]
+
+    def at(x: Array) -> tuple[Array, Array]:
+        rest = statics.solve(x, theta, guess=guess[0])
+        if not rest.converged:
+            return np.full(3 + len(x), 1e3), np.zeros((3 + len(x), len(x)))
+        guess[0] = rest.state[:n]
+        where, by_q = point.at(rest.state[None, :n], theta)
+        slope = by_q[0, :3] @ rest.by_posture[:n]
+        return (
+            np.concatenate([(where[0, :3] - place) / tolerance, NEAR * (x - first)]),
+            np.vstack([slope / tolerance, NEAR * np.eye(len(x))]),
+        )
+
+    lower, upper = joint_range(system)
+    begin = np.clip(first, lower + 1e-6, upper - 1e-6)
+    found = least_squares(
+        lambda x: at(x)[0], begin, jac=lambda x: at(x)[1], bounds=(lower, upper), x_scale=1.0, max_nfev=100
+    )
+    rest = statics.solve(found.x, theta, guess=guess[0])
+    where, _ = point.at(rest.state[None, :n], theta)
+    distance = float(np.linalg.norm(where[0, :3] - place)) if rest.converged else np.inf
+    near = (found.x - lower < 1e-3) | (upper - found.x < 1e-3)
+    limits = tuple(name for name, one in zip(system.prescribed, near, strict=True) if one)
+    return End(found.x, rest, distance, limits)
+
+
+def check_reached(end: End, name: str, place: Array, tolerance: float) -> None:
+    """Refuse a place at which the point cannot rest.
+
+    Raises
+    ------
+    ConfigError
+        Saying how far off it remains, and which joints stand at their limits.
+    """
+    if end.distance <= REACHED * tolerance:
+        return
+    off = (
+        f"{1e3 * end.distance:.3g} mm off" if np.isfinite(end.distance) else "nowhere, as no posture near it is at rest"
+    )
+    limits = f", with {', '.join(end.at_limit)} at the joint's limit" if end.at_limit else ""
+    raise ConfigError(
+        f"the goal is out of reach: '{name}' comes to rest {off}{limits}",
+        where=f"plan.place ({', '.join(f'{x:.4g}' for x in place)} m in the world)",
+        allowed="a place at which the point can rest",
+        hint="take a nearer place, a smaller plan.shift, or another plan.posture to begin with",
+    )

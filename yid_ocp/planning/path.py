@@ -1,0 +1,72 @@
+"""Joint paths as splines of few unknowns that start and end at rest.
+
+A spline of degree 5 with clamped ends lies within the hull of its control points, and so do its derivatives: limits on
+these hold at all times, not at nodes alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline
+
+Array = NDArray[np.float64]
+
+DEGREE = 5
+STILL = 3  # control points alike at either end: no velocity and no acceleration there
+
+
+@dataclass(frozen=True)
+class SplinePath:
+    """q(t) = first + sum_k basis_k(t) w_k; after `duration` it stays.
+
+    Attributes
+    ----------
+    duration : float
+        [s]
+    unknowns : int
+        K, of each joint; the last one is where it ends.
+    """
+
+    duration: float
+    unknowns: int
+
+    @property
+    def knots(self) -> Array:
+        """Knots of the spline."""
+        inner = np.linspace(0.0, self.duration, self._controls - DEGREE + 1)
+        return np.concatenate([np.zeros(DEGREE), inner, np.full(DEGREE, self.duration)])
+
+    @property
+    def _controls(self) -> int:
+        return 2 * STILL + self.unknowns - 1
+
+    def controls(self, order: int = 0) -> Array:
+        """From the unknowns to the control points of a derivative, shape (..., K)."""
+        spread = np.zeros((self._controls, self.unknowns))
+        spread[STILL : STILL + self.unknowns - 1, :-1] = np.eye(self.unknowns - 1)
+        spread[-STILL:, -1] = 1.0
+        knots = self.knots
+        for i in range(order):
+            degree = DEGREE - i
+            width = knots[degree + 1 + i : len(knots) - 1 - i] - knots[1 + i : len(knots) - degree - 1 - i]
+            spread = degree * np.diff(spread, axis=0) / width[:, None]
+        return spread
+
+    def basis(self, t: Array, order: int = 0) -> Array:
+        """Values of basis_k, or of a derivative, at times, shape (N, K)."""
+        knots = self.knots
+        own = knots[order : len(knots) - order]
+        inside = np.minimum(np.asarray(t, float), self.duration)
+        values = BSpline(own, self.controls(order), DEGREE - order)(inside)
+        return np.asarray(np.where((np.asarray(t) > self.duration)[:, None] & (order > 0), 0.0, values))
+
+    def straight(self, change: Array) -> Array:
+        """Unknowns of a motion by `change` (nj,) along a straight line in joint space, shape (K, nj)."""
+        t = np.linspace(0.0, self.duration, 200)
+        s = t / self.duration
+        smooth = s**3 * (10 - 15 * s + 6 * s**2)
+        share = np.linalg.lstsq(self.basis(t)[:, :-1], smooth - self.basis(t)[:, -1], rcond=None)[0]
+        return np.append(share, 1.0)[:, None] * np.asarray(change, float)[None, :]

@@ -1,0 +1,225 @@
+"""What a motion is to do and to keep within, as residuals and as bounded rows, with their derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from yid_ocp.integrator.step_model import Rollout
+from yid_ocp.planning.mover import Mover
+from yid_ocp.planning.options import PlanOptions
+from yid_ocp.planning.points import Points
+
+Array = NDArray[np.float64]
+
+EVERY = 2  # nodes between those at which limits on what moves freely are asked for
+NEAR = 0.3  # root mean square distance of the joints from the quasi-static motion that counts as one [rad or m]
+CALM = 1e-2  # weight of the accelerations' mean square, in parts of their limit: of equal motions the calmer one
+
+
+@dataclass(frozen=True)
+class Values:
+    """Numbers and their derivative by the unknowns.
+
+    Attributes
+    ----------
+    value : ndarray, shape (nr,)
+    slope : ndarray, shape (nr, nw), or None
+    """
+
+    value: Array
+    slope: Array | None
+
+
+@dataclass(frozen=True, eq=False)
+class Bounded:
+    """Rows that a motion keeps within bounds.
+
+    Attributes
+    ----------
+    what : str
+        In words, with the unit.
+    lower, upper : ndarray, shape (rows,)
+    unit : ndarray, shape (rows,)
+        By which they are divided to be of order one.
+    names : tuple of str
+        Whose each row is.
+    """
+
+    what: str
+    lower: Array
+    upper: Array
+    unit: Array
+    names: tuple[str, ...]
+
+
+def stacked(parts: list[Values]) -> Values:
+    """Rows one below the other."""
+    slopes = [part.slope for part in parts]
+    known = [slope for slope in slopes if slope is not None]
+    value = np.concatenate([part.value for part in parts]) if parts else np.zeros(0)
+    return Values(value, np.vstack(known) if len(known) == len(slopes) and known else None)
+
+
+class Rows:
+    """Residuals and bounded rows of one goal.
+
+    Parameters
+    ----------
+    mover : Mover
+    options : PlanOptions
+    point : Points
+        Of the frame that is to arrive, and of all frames that are to rest.
+    target : ndarray, shape (3,)
+        Where it is to arrive [m].
+    simple : ndarray, shape (K, nc)
+        Unknowns of the quasi-static motion; of motions that do equally well, the one nearest to it is wanted.
+    inside : Points, optional
+        Frames that stay in the box.
+    """
+
+    def __init__(
+        self,
+        mover: Mover,
+        options: PlanOptions,
+        point: Points,
+        target: Array,
+        simple: Array,
+        inside: Points | None = None,
+    ) -> None:
+        self.mover, self.options, self.point, self.target, self.inside = mover, options, point, target, inside
+        self.simple = simple
+        self.joints = [mover.step.system.mechanism.joints[i] for i in mover.joints]
+        self.effort_limit = options.limits.effort * np.array([joint.effort_limit for joint in self.joints])
+        self._springs = sorted(
+            {mover.step.system.mechanism.joint_index(spring.joint) for spring in mover.step.system.elastic}
+        )
+        self.bounded = self._bounded()
+
+    # -- what is wanted -----------------------------------------------------------------------------------------------
+
+    @property
+    def course(self) -> Array | None:
+        """Where the point is to be at every node, shape (N + 1, 3); None where only the end counts."""
+        if self.options.goal != "path":
+            return None
+        first = self.point.at(self.mover.start.state[None, : self.mover.step.system.size], self.mover.theta)[0][0, :3]
+        places = np.vstack([first, *(first + np.asarray(via) for via in self.options.via), self.target])
+        at = np.linspace(0.0, self.mover.path.duration, len(places))
+        # the clock starts and stops gently as well, so that the way is one that can be followed
+        return np.array(CubicSpline(at, places, bc_type="clamped")(np.minimum(self.mover.times, at[-1])))
+
+    def residual(self, rollout: Rollout, w: Array) -> Values:
+        """Distances and speeds in units of what counts as reached and as rest, mean squared; and what keeps calm."""
+        mover, options, h = self.mover, self.options, self.mover.step.time_step
+        n, size = mover.step.system.size, w.size
+        at, by_q = self.point.at(rollout.state[:, :n], mover.theta)
+        by_w = None
+        if rollout.by_state is not None:
+            by_w = np.einsum("tiq,tqd->tid", by_q, rollout.by_state[:, :n, -size:])
+        end, course = mover.standing, self.course
+        parts = [_rows(at[end, :3] - self.target, None if by_w is None else by_w[end, :3], options.tolerance)]
+        parts.append(
+            _rows(
+                (at[end[1:]] - at[end[1:] - 1]) / h,
+                None if by_w is None else (by_w[end[1:]] - by_w[end[1:] - 1]) / h,
+                options.swing,
+            )
+        )
+        if course is not None:
+            parts.append(_rows(at[:, :3] - course, None if by_w is None else by_w[:, :3], options.tolerance))
+        bend = mover.path.controls(2) / options.limits.acceleration
+        nc = w.shape[1]
+        parts.append(_rows(bend @ w, np.einsum("tk,ji->tjki", bend, np.eye(nc)).reshape(-1, nc, size), CALM**-0.5))
+        parts.append(_rows(w - self.simple, np.eye(size), NEAR))
+        if options.effort:
+            finite = np.isfinite(self.effort_limit)
+            unit = self.effort_limit[finite] / np.sqrt(options.effort)
+            by_effort = None if rollout.by_effort is None else rollout.by_effort[:, finite, -size:]
+            if by_effort is not None:
+                by_effort = by_effort / unit[:, None]
+            parts.append(_rows(rollout.effort[:, finite] / unit, by_effort, 1.0))
+        return stacked(parts)
+
+    # -- what is kept within ------------------------------------------------------------------------------------------
+
+    def limits(self, rollout: Rollout, w: Array) -> Values:
+        """The rows of `bounded`, in their own units."""
+        mover, size, nc = self.mover, w.size, w.shape[1]
+        n = mover.step.system.size
+        moved = rollout.by_state
+        parts = []
+        for order in (1, 2):
+            controls = mover.path.controls(order)
+            slope = np.einsum("tk,ji->tjki", controls, np.eye(nc)).reshape(-1, size)
+            parts.append(Values((controls @ w).ravel(), slope))
+        every = slice(None, None, EVERY)
+        finite = np.isfinite(self.effort_limit)
+        by_effort = None if rollout.by_effort is None else rollout.by_effort[every, finite, -size:].reshape(-1, size)
+        parts.append(Values(rollout.effort[every, finite].ravel(), by_effort))
+        if self.options.limits.spring_angle is not None:
+            slope = None if moved is None else moved[every, self._springs, -size:].reshape(-1, size)
+            parts.append(Values(rollout.state[every, self._springs].ravel(), slope))
+        if self.inside is not None:
+            at, by_q = self.inside.at(rollout.state[every, :n], mover.theta)
+            slope = None if moved is None else np.einsum("tiq,tqd->tid", by_q, moved[every, :n, -size:])
+            parts.append(Values(at.ravel(), None if slope is None else slope.reshape(-1, size)))
+        return stacked(parts)
+
+    def _bounded(self) -> list[Bounded]:
+        mover, limits = self.mover, self.options.limits
+        names = tuple(joint.name for joint in self.joints)
+        speed = limits.velocity * np.array([joint.velocity_limit for joint in self.joints])
+        sharp = np.full(len(names), limits.acceleration)
+        count = len(mover.path.controls())
+        found = [_even("velocity [rad/s or m/s]", names, speed, count - 1)]
+        found.append(_even("acceleration [rad/s^2 or m/s^2]", names, sharp, count - 2))
+        finite = np.isfinite(self.effort_limit)
+        steps = len(range(0, len(mover.times) - 1, EVERY))
+        able = tuple(name for name, one in zip(names, finite, strict=True) if one)
+        found.append(_even("effort [N m or N]", able, self.effort_limit[finite], steps))
+        nodes = len(range(0, len(mover.times), EVERY))
+        if limits.spring_angle is not None:
+            springs = tuple(mover.step.system.mechanism.joint_names[i] for i in self._springs)
+            found.append(_even("angle [rad]", springs, np.full(len(springs), limits.spring_angle), nodes))
+        if self.inside is not None and self.options.box is not None:
+            low, high = (np.tile(corner, len(self.inside.names) * nodes) for corner in self.options.box)
+            axes = tuple(f"{name}, {axis}" for name in self.inside.names for axis in "xyz")
+            found.append(Bounded("place [m]", low, high, np.full(len(low), 0.1), axes * nodes))
+        return found
+
+    def broken(self, value: Array) -> dict[str, tuple[str, float, float]]:
+        """By how much each kind of row leaves its bounds, by what it is: whose, its value, its bound."""
+        found, at = {}, 0
+        for rows in self.bounded:
+            own = value[at : at + len(rows.names)]
+            at += len(rows.names)
+            if not len(own):
+                continue
+            over = np.maximum(own - rows.upper, rows.lower - own) / rows.unit
+            worst = int(np.argmax(over))
+            if over[worst] > 1e-4:
+                bound = rows.upper[worst] if own[worst] > rows.upper[worst] else rows.lower[worst]
+                found[rows.what] = (rows.names[worst], float(own[worst]), float(bound))
+        return found
+
+    def largest(self, rollout: Rollout) -> Mapping[str, float]:
+        """Largest effort of every joint over its limit in the URDF."""
+        limit = np.array([joint.effort_limit for joint in self.joints])
+        top = np.max(np.abs(rollout.effort), axis=0) / limit
+        return {joint.name: float(one) for joint, one in zip(self.joints, top, strict=True)}
+
+
+def _rows(value: Array, slope: Array | None, unit: float) -> Values:
+    """Rows of nodes (N, m), so that the sum of their squares is the mean over the nodes in squares of the unit."""
+    scale = 1.0 / (unit * np.sqrt(len(value)))
+    return Values(scale * value.ravel(), None if slope is None else scale * slope.reshape(value.size, -1))
+
+
+def _even(what: str, names: tuple[str, ...], limit: Array, count: int) -> Bounded:
+    upper = np.tile(limit, count)
+    return Bounded(what, -upper, upper, np.where(np.isfinite(upper), upper, 1.0), names * count)

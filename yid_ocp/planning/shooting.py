@@ -1,0 +1,148 @@
+"""A plan's nonlinear program with the object's motion eliminated: least squares within limits.
+
+Bounds of the unknowns are kept by the trust region, all other limits by an augmented Lagrangian: a row g <= u adds
+rho/2 max(0, g - u + lam/rho)^2 to the cost, and lam is raised until no row is passed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from yid_ocp.integrator.step_model import Rollout
+from yid_ocp.planning.rows import Rows, Values, stacked
+
+Array = NDArray[np.float64]
+
+FIRST_PENALTY, STEEPER, MOST_PENALTY = 1e3, 10.0, 1e8
+KEPT = 1e-4  # largest violation of a limit, in parts of it, that counts as none
+ROUNDS = 12
+LOST = 1e4  # residual of a motion that cannot be stepped: the trust region shrinks
+
+
+@dataclass(frozen=True)
+class Shot:
+    """Where the search ended.
+
+    Attributes
+    ----------
+    w : ndarray, shape (K, nc)
+    cost : float
+    finished : bool
+        Whether it is a minimum within the limits.
+    message : str
+    evaluations : int
+    """
+
+    w: Array
+    cost: float
+    finished: bool
+    message: str
+    evaluations: int
+
+
+class Shooting:
+    """Residuals of several cases (the likely parameters, and others around them) and the limits of the first.
+
+    Parameters
+    ----------
+    cases : sequence of Rows
+    shape : (int, int)
+        Of the unknowns, (K, nc).
+    """
+
+    def __init__(self, cases: Sequence[Rows], shape: tuple[int, int]) -> None:
+        self._cases, self._shape = list(cases), shape
+        self._last: tuple[Array, tuple[Values, Values]] | None = None
+        rows = self._cases[0].bounded
+        self._unit, lower, upper = (np.concatenate([getattr(b, k) for b in rows]) for k in ("unit", "lower", "upper"))
+        self._lower, self._upper = lower / self._unit, upper / self._unit
+        self.evaluations = 0
+
+    def at(self, x: Array) -> tuple[Values, Values]:
+        """Residual, and limits divided by their units, with slopes; not finite where a rollout fails."""
+        if self._last is None or not np.array_equal(self._last[0], x):
+            self.evaluations += 1
+            w = x.reshape(self._shape)
+            rollouts = [case.mover.roll(w, True) for case in self._cases]
+            parts = [case.residual(rollout, w) for case, rollout in zip(self._cases, rollouts, strict=True)]
+            whole, scale = stacked(parts), 1.0 / np.sqrt(len(self._cases))
+            limits = self._cases[0].limits(rollouts[0], w)
+            assert whole.slope is not None
+            assert limits.slope is not None
+            residual = Values(scale * whole.value, scale * whole.slope)
+            self._last = (
+                np.array(x),
+                (residual, Values(limits.value / self._unit, limits.slope / self._unit[:, None])),
+            )
+        return self._last[1]
+
+    def solve(self, start: Array, lower: Array, upper: Array, iterations: int) -> Shot:
+        """The best motion from a start, all (K, nc), the unknowns within bounds.
+
+        References
+        ----------
+        Rockafellar (1973), Math. Programming 5:354, doi:10.1007/BF01580138.
+        Branch, Coleman and Li (1999), SIAM J. Sci. Comput. 21(1):1, doi:10.1137/S1064827595289108.
+        """
+        low, high = lower.ravel(), upper.ravel()
+        x = np.clip(start.ravel(), low + 1e-9, high - 1e-9)
+        pull = np.zeros((2, len(self._unit)))
+        penalty, before, ended = FIRST_PENALTY, np.inf, False
+        for _ in range(ROUNDS):
+            found = least_squares(
+                lambda x: self._penalised(x, pull, penalty)[0],  # noqa: B023
+                x,
+                jac=lambda x: self._penalised(x, pull, penalty)[1],  # noqa: B023
+                bounds=(low, high),
+                x_scale=1.0,
+                max_nfev=iterations,
+                ftol=1e-6,
+                xtol=1e-7,
+                gtol=1e-8,
+            )
+            x, ended = found.x, found.status > 0
+            value = self.at(x)[1].value
+            over = np.vstack([value - self._upper, self._lower - value])
+            passed = float(np.max(over, initial=0.0))
+            if passed <= KEPT or not np.isfinite(passed):
+                break
+            pull = np.maximum(0.0, pull + penalty * over)
+            if passed > 0.25 * before:
+                penalty = min(STEEPER * penalty, MOST_PENALTY)
+            before = passed
+        residual = self.at(x)[0].value
+        finished = bool(ended and passed <= KEPT)
+        if finished:
+            message = "the motion was found"
+        elif passed > KEPT:
+            message = "no motion within the limits was found"
+        else:
+            message = f"the search was stopped after {iterations} evaluations; raise plan.iterations"
+        cost = 0.5 * float(residual @ residual)
+        return Shot(x.reshape(self._shape), cost, finished, message, self.evaluations)
+
+    def _penalised(self, x: Array, pull: Array, penalty: float) -> tuple[Array, Array]:
+        residual, limits = self.at(x)
+        assert residual.slope is not None
+        assert limits.slope is not None
+        root = np.sqrt(penalty)
+        sides = ((1.0, limits.value - self._upper, pull[0]), (-1.0, self._lower - limits.value, pull[1]))
+        values, slopes = [residual.value], [residual.slope]
+        for sign, over, raised in sides:
+            shifted = np.maximum(over + raised / penalty, 0.0)
+            values.append(root * shifted)
+            slopes.append(sign * root * np.where(shifted > 0, 1.0, 0.0)[:, None] * limits.slope)
+        value, slope = np.concatenate(values), np.vstack(slopes)
+        if np.all(np.isfinite(value)) and np.all(np.isfinite(slope)):
+            return value, slope
+        return np.full(len(value), LOST), np.zeros_like(slope)
+
+
+def failed(rollout: Rollout) -> bool:
+    """Whether a rollout did not reach its end."""
+    return not bool(np.all(np.isfinite(rollout.state)))

@@ -1,0 +1,203 @@
+"""The command `plan`: a motion of the arms by the identified model, written for simulation and for a robot."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.config.reader import load_config
+from yid_ocp.config.settings import Run
+from yid_ocp.data.hdf5 import write_recording
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate
+from yid_ocp.errors import DataError
+from yid_ocp.export.csv import export_csv
+from yid_ocp.export.trajectory import joint_trajectory
+from yid_ocp.integrator.step import Step
+from yid_ocp.planning.plan import Known, Plan, plan
+from yid_ocp.report.html import write_report
+from yid_ocp.report.sections import Findings
+from yid_ocp.report.terminal import plan_summary
+from yid_ocp.workflow.build import build_step, located, parameter_settings
+from yid_ocp.workflow.command import DONE, FAILED, carry_out
+from yid_ocp.workflow.folder import new_run_folder
+from yid_ocp.workflow.progress import SILENT, Progress
+
+FORMAT = "yid-plan/1"
+EFFORT_STD, POINT_STD = 0.1, 1e-3  # stated in the recording of a plan, for whoever estimates on it [N m], [m]
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PlanOutcome:
+    """What `run_plan` leaves: the finished run folder, the contents of result.json, the plan."""
+
+    folder: Path
+    result: dict[str, Any]
+    plan: Plan
+
+    @property
+    def ok(self) -> bool:
+        """Whether the search ended well, within all limits."""
+        return self.plan.reached
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """The command."""
+    settings = load_config(arguments.config, arguments.overrides)
+    outcome = carry_out(lambda shown: run_plan(settings, arguments.out, shown), plan_summary, arguments.quiet)
+    return DONE if outcome.ok else FAILED
+
+
+def run_plan(run: Run, out: str | Path | None = None, progress: Progress = SILENT) -> PlanOutcome:
+    """Plan the motion of `plan` and write `recording.h5`, CSV tables, `trajectory.json`, result.json and the report.
+
+    Parameters
+    ----------
+    run : Run
+    out : str or Path, optional
+        The run folder; see `new_run_folder`.
+    progress : Progress, optional
+
+    Returns
+    -------
+    PlanOutcome
+        Also where no motion within the limits was found: the run folder then says why.
+
+    Raises
+    ------
+    ConfigError, DataError, ModelError, OutputError
+    """
+    with new_run_folder(run, out, "plan") as folder:
+        folder.begin(run, "plan")
+        progress.stage("building the model and its compiled step")
+        step = planning_step(run)
+        theta, known, source = identified(run, step)
+        with located(run, "plan"):
+            found = plan(step, run.plan, theta, known, progress.stage)
+        recording = as_recording(run, found, step)
+        write_recording(recording, folder.path / "recording.h5")
+        export_csv(recording, folder.path / "csv")
+        trajectory = joint_trajectory(
+            found.joints, found.t, found.position, found.velocity, found.acceleration, found.effort
+        )
+        folder.write("trajectory.json", json.dumps(trajectory, indent=1) + "\n")
+        folder.log("end", reached=found.reached, message=found.message)
+        written = folder.finish(plan_result(run, found, source))
+        if run.output.report:
+            progress.stage("writing the report")
+            write_report(
+                folder.path / "report.html", Findings(run.name, run.description, written, more={"plan": found})
+            )
+    return PlanOutcome(folder.path, written, found)
+
+
+def planning_step(run: Run) -> Step:
+    """The compiled step of a run with its arms prescribed: what a plan decides is where they go."""
+    arms = replace(run.model.arms, mode="prescribed")
+    model = replace(run.model, arms=arms)
+    recordings = run.recordings if run.model.robot is None else replace(run.recordings, estimate=(), held_out=())
+    return build_step(replace(run, model=model, recordings=recordings))
+
+
+def identified(run: Run, step: Step) -> tuple[Array, Known, dict[str, Any]]:
+    """Parameters, their covariance, and where both come from: a run folder of `solve`, or the settings.
+
+    Raises
+    ------
+    ConfigError, DataError
+        The folder is none of `solve`, or its solve failed.
+    """
+    parameters = step.system.parameters
+    theta = parameters.vector()
+    if run.plan.run is None:
+        free = [name for name, said in parameter_settings(run, parameters).items() if said.free]
+        return theta, Known(), {"run": None, "parameters": {name: parameters[name].value for name in free}}
+    folder = Path(run.plan.run)
+    file, solved = folder / "result.json", folder / "trajectories.h5"
+    if not file.is_file() or not solved.is_file():
+        raise run.refuse(
+            f"there is no finished run of `solve` in {folder}",
+            "plan",
+            "run",
+            hint="give the run folder that it printed",
+        )
+    result = json.loads(file.read_text(encoding="utf-8"))
+    if not str(result.get("format", "")).startswith("yid-solve/"):
+        raise run.refuse(
+            f"{folder} is a run folder of another command ({result.get('format')})",
+            "plan",
+            "run",
+            allowed="yid-solve/1",
+        )
+    if result["status"] == "failed":
+        raise DataError(f"the solve in {folder} failed: {result['message']}", where=run.where("plan", "run"))
+    found = {name: entry["value"] for name, entry in result["parameters"].items() if name in parameters}
+    for name, value in found.items():
+        theta[parameters.index(name)] = value
+    with h5py.File(solved, "r") as data:
+        names = [str(name) for name in data["unknowns"].attrs["names"]]
+        covariance = np.array(data["unknowns/covariance"])
+    usable = [i for i, name in enumerate(names) if name in found and np.all(np.isfinite(covariance[i, i]))]
+    lost = sorted(name for name, entry in result["parameters"].items() if entry["free"] and name in found)
+    lost = [name for name in lost if name not in [names[i] for i in usable]]
+    chosen = np.nan_to_num(covariance[np.ix_(usable, usable)])
+    source = {"run": str(folder), "parameters": found, "uncertainty_unknown": lost}
+    return theta, Known(tuple(names[i] for i in usable), chosen), source
+
+
+def as_recording(run: Run, found: Plan, step: Step) -> Recording:
+    """The plan as if it had been recorded: joints, and the points of the object as the model predicts them."""
+    joints = JointGroup(
+        found.joints, found.t, found.position, found.velocity, found.effort,
+        position_command=found.position, velocity_command=found.velocity, effort_kind="sample",
+        effort_std=EFFORT_STD, clock="nominal",
+    )  # fmt: skip
+    names = tuple(found.points)
+    position = np.stack([found.points[name] for name in names], axis=1)
+    points = PointGroup("points_planned", names, found.t, position, np.full(position.shape, POINT_STD), sensor="plan")
+    truth = dict(zip(step.system.parameters.names, map(float, found.mover.theta), strict=True))
+    text = f"{run.description} Planned motion, goal {run.plan.goal}.".strip()
+    return validate(Recording(joints, (points,), text, "yid_ocp plan", "recording", truth=truth))
+
+
+def plan_result(run: Run, found: Plan, source: dict[str, Any]) -> dict[str, Any]:
+    """`yid-plan/1` without inputs and versions."""
+    joints = found.mover.step.system.mechanism.joints
+    limits = [joints[i] for i in found.mover.joints]
+    shares = {
+        joint.name: {
+            "velocity": _share(found.velocity[:, i], joint.velocity_limit),
+            "effort": _share(found.effort[:, i], joint.effort_limit),
+            "travel": float(np.ptp(found.position[:, i])),
+        }
+        for i, joint in enumerate(limits)
+    }
+    return {
+        "format": FORMAT,
+        "status": "done" if found.reached else "failed",
+        "message": found.message,
+        "goal": run.plan.goal,
+        "point": run.plan.point,
+        "place": found.place.tolist(),
+        "duration": found.mover.path.duration,
+        "settle": run.plan.settle,
+        "error": found.error,
+        "swing": found.swing,
+        "std": None if found.std is None else found.std.tolist(),
+        "tolerance": run.plan.tolerance,
+        "joints": shares,
+        "from": source,
+        "evaluations": found.evaluations,
+    }
+
+
+def _share(values: Array, limit: float) -> float | None:
+    return float(np.max(np.abs(values)) / limit) if math.isfinite(limit) and limit > 0 else None
