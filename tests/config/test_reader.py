@@ -208,6 +208,7 @@ def test_refused_settings_over_the_file(setting, message):
 
 # Numbers that may have any value: places, angles, offsets.
 ANY_NUMBER = {
+    "plan.posture.NAME",
     "model.arms.locked.NAME",
     "model.springs.NAME.rest",
     "model.effects.values.NAME",
