@@ -6,29 +6,19 @@ import casadi as ca
 import numpy as np
 import pytest
 from formula_reader import FUNCTIONS, read
+from held_rod import held_rod
 
 from yid_ocp.analysis.symbols import StepSymbols, latex_text
-from yid_ocp.effects import make_effect
 from yid_ocp.errors import ConfigError
 from yid_ocp.integrator.discrete import discrete_equations
-from yid_ocp.model import Grasp, Segment, System, flexible_object
+from yid_ocp.model import Grasp
 from yid_ocp.model.system import Spring
-from yid_ocp.model.urdf import read_urdf
 
 
 @pytest.fixture(scope="module")
 def symbols(urdf_folder):
     """A driven shoulder, a springy elbow whose tip is tied to a rod; a relaxing branch on the rod."""
-    robot = read_urdf(urdf_folder / "double_pendulum.urdf")
-    rod = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=2, bend=4.0, twist=3.0)])
-    system = System.build(
-        robot,
-        objects=[(rod, None, None)],
-        grasps=[Grasp("hand", "tip", "w_T1", "axis")],
-        driven=["shoulder"],
-        springs={"elbow": Spring(3.0)},
-    )
-    system = system.with_effects([make_effect("standard_linear_solid", "T1", system, {})])
+    system = held_rod(urdf_folder, kind="axis", driven=["shoulder"], springs={"elbow": Spring(3.0)})
     return StepSymbols.of(discrete_equations(system))
 
 

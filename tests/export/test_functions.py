@@ -9,17 +9,15 @@ import subprocess
 import casadi as ca
 import numpy as np
 import pytest
+from held_rod import held_rod
 
 from yid_ocp.analysis.symbols import StepSymbols
-from yid_ocp.effects import make_effect
 from yid_ocp.errors import OutputError
 from yid_ocp.export import functions as exported
 from yid_ocp.export.functions import export_functions, step_exports
 from yid_ocp.integrator.statics import Statics
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.model import Grasp, Segment, System, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics
-from yid_ocp.model.urdf import read_urdf
 
 FUNCTIONS = ("rows", "rows_by_theta", "rows_by_unknowns", "points", "mechanics")
 
@@ -27,16 +25,7 @@ FUNCTIONS = ("rows", "rows_by_theta", "rows_by_unknowns", "points", "mechanics")
 @pytest.fixture(scope="module")
 def step(urdf_folder):
     """Two motors that take the end of a rod with a relaxing branch; a point half way along it."""
-    robot = read_urdf(urdf_folder / "double_pendulum.urdf")
-    rod = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=2, bend=4.0, twist=3.0)])
-    system = System.build(
-        robot,
-        objects=[(rod, None, None)],
-        grasps=[Grasp("hand", "tip", "w_T1")],
-        driven=["shoulder", "elbow"],
-        points=["w_T1", "T1:50%"],
-    )
-    system = system.with_effects([make_effect("standard_linear_solid", "T1", system, {"ratio": 0.4})])
+    system = held_rod(urdf_folder, ratio=0.4, driven=["shoulder", "elbow"], points=["w_T1", "T1:50%"])
     return compile_step(system, 0.01, use_compiler=False)
 
 

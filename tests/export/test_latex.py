@@ -7,12 +7,13 @@ import shutil
 import subprocess
 
 import pytest
+from held_rod import held_rod
 
 from yid_ocp.analysis.symbols import StepSymbols
 from yid_ocp.effects import make_effect
 from yid_ocp.export.latex import write_sheet
 from yid_ocp.integrator.discrete import discrete_equations
-from yid_ocp.model import Grasp, Segment, System, flexible_object
+from yid_ocp.model import System
 from yid_ocp.model.system import Spring
 from yid_ocp.model.urdf import read_urdf
 
@@ -20,16 +21,7 @@ from yid_ocp.model.urdf import read_urdf
 @pytest.fixture(scope="module")
 def symbols(urdf_folder):
     """A driven shoulder, an elbow with a spring and an effect with inner coordinates on a rod that is held."""
-    robot = read_urdf(urdf_folder / "double_pendulum.urdf")
-    rod = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=1, bend=4.0, twist=3.0)])
-    system = System.build(
-        robot,
-        objects=[(rod, None, None)],
-        grasps=[Grasp("hand", "tip", "w_T1")],
-        driven=["shoulder"],
-        springs={"elbow": Spring(3.25)},
-    )
-    system = system.with_effects([make_effect("standard_linear_solid", "T1", system, {"ratio": 0.4})])
+    system = held_rod(urdf_folder, links=1, ratio=0.4, driven=["shoulder"], springs={"elbow": Spring(3.25)})
     return StepSymbols.of(discrete_equations(system))
 
 

@@ -262,7 +262,7 @@ def _profiles(
         profiles[name] = found = profile_likelihood(problem, best, index, float(std[view.names.index(name)]), there)
         said[name] = sure_of_small(problem, best, index, judged[name], size, there)
         if said[name].verdict == judged[name].verdict:
-            said[name] = by_profile(judged[name], (found.lower, found.upper), size)
+            said[name] = by_profile(judged[name], found.interval, size)
     return profiles, said
 
 

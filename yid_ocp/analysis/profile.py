@@ -16,6 +16,7 @@ from yid_ocp.solvers import Solution
 from yid_ocp.solvers.gauss_newton import GaussNewton
 from yid_ocp.solvers.judgement import (
     Estimate,
+    Interval,
     by_profile,
     parameter_names,
     stands_by_itself,
@@ -71,6 +72,11 @@ class Profile:
     values: Array
     delta_chi2: Array
     notes: tuple[str, ...] = ()
+
+    @property
+    def interval(self) -> Interval:
+        """Both ends."""
+        return self.lower, self.upper
 
 
 def profile_likelihood(
@@ -160,10 +166,10 @@ def with_intervals(
     judged = dict(solution.parameters)
     for name, size in asked.items():
         index = problem.names.index(name)
-        judged[name] = sure_of_small(problem, best, index, judged[name], size, there)
-        if judged[name].verdict != "not_identifiable" and not stands_by_itself(judged[name]):
-            found = profile_likelihood(problem, best, index, judged[name].std, there)
-            judged[name] = by_profile(judged[name], (found.lower, found.upper), size)
+        entry = sure_of_small(problem, best, index, judged[name], size, there)
+        if entry.verdict != "not_identifiable" and not stands_by_itself(entry):
+            entry = by_profile(entry, profile_likelihood(problem, best, index, entry.std, there).interval, size)
+        judged[name] = entry
     return replace(solution, parameters=judged)
 
 

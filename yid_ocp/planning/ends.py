@@ -106,8 +106,15 @@ def end_at(step: Step, theta: Array, start: Rest, point: Points, place: Array, t
     joints, n = list(system.prescribed_indices), system.size
     first = start.state[joints]
     guess = [start.state[:n]]
+    last: list[tuple[Array, tuple[Array, Array]]] = []
 
     def at(x: Array) -> tuple[Array, Array]:
+        # the search asks for residual and slope of a point one after the other
+        if not last or not np.array_equal(last[-1][0], x):
+            last[:] = [(np.array(x), rows(x))]
+        return last[-1][1]
+
+    def rows(x: Array) -> tuple[Array, Array]:
         rest = statics.solve(x, theta, guess=guess[0])
         if not rest.converged:
             return np.full(3 + len(x), 1e3), np.zeros((3 + len(x), len(x)))

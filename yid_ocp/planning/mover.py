@@ -85,9 +85,7 @@ class Mover:
                 start[:, : len(names)] = rest.by_theta
             directions = Directions(tuple(names), start, None, by_path)
         steps = len(self.times) - 1
-        return simulate(
-            self.step, self.theta, self.start.state, steps, path=self.positions(w), directions=directions
-        )  # fmt: skip
+        return simulate(self.step, self.theta, self.start.state, steps, path=self.positions(w), directions=directions)
 
     @property
     def _configuration(self) -> Array:
