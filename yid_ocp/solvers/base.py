@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -117,7 +118,7 @@ class Solution:
         """Standard deviation of every shared free parameter."""
         return {name: entry.std for name, entry in self.parameters.items() if entry.free}
 
-    @property
+    @cached_property
     def predicted(self) -> tuple[EpisodeResult | str, ...]:
         """What the model makes of every recording's torques as they are, less their offsets; empty without a point.
 
