@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import logging
+import os
 import sys
 import tempfile
 import traceback
@@ -16,7 +17,8 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
-from yid_ocp.errors import YidError
+from yid_ocp import interruption
+from yid_ocp.errors import OutputError, ResourceError, YidError
 
 WRONG_INPUT, BUG, INTERRUPTED = 2, 3, 130
 
@@ -162,6 +164,16 @@ def parser() -> argparse.ArgumentParser:
     return top
 
 
+def _refused(what: str, hint: str, error: OSError | None = None) -> int:
+    where = str(error.filename) if error is not None and error.filename is not None else ""
+    return _wrong(OutputError(what, where=where, hint=hint))
+
+
+def _wrong(error: YidError) -> int:
+    print(f"error: {error}", file=sys.stderr)
+    return WRONG_INPUT
+
+
 @contextlib.contextmanager
 def _notices() -> Iterator[None]:
     """Show the library's warnings on standard error while a command runs."""
@@ -182,22 +194,54 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        0 done; 1 the solve failed, the run folder says why; 2 the input is wrong; 3 a bug; 130 interrupted.
+        0 done; 1 the solve failed, the run folder says why; 2 the input is wrong, or the system refused something; 3 a
+        bug; 128 and the signal's number where one ended it, as 130 for an interruption.
     """
     try:
         arguments = parser().parse_args(argv)
     except SystemExit as error:
         return int(error.code or 0)
     try:
-        with _notices():
-            return int(import_module(f"yid_ocp.workflow.{arguments.module}").run(arguments))
+        with interruption.signals_raised(), _notices():
+            return _carried_out(arguments)
+    except KeyboardInterrupt as error:
+        name = str(error) or "SIGINT"
+        print(f"interrupted ({name}); nothing half-finished was left", file=sys.stderr)
+        return error.number + 128 if isinstance(error, interruption.Interrupted) else INTERRUPTED
+
+
+def _carried_out(arguments: argparse.Namespace) -> int:
+    """Exit code of a command."""
+    if sys.stdout is None:  # closed by who started the program
+        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
+    try:
+        os.getcwd()
+    except OSError as error:
+        return _wrong(
+            OutputError(f"the working directory is not there: {error.strerror or error}", hint="cd to one that is")
+        )
+    try:
+        code = int(import_module(f"yid_ocp.workflow.{arguments.module}").run(arguments))
+        sys.stdout.flush()
+        return code
     except YidError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return WRONG_INPUT
-    except KeyboardInterrupt:
-        print("interrupted; no finished run folder was left", file=sys.stderr)
-        return INTERRUPTED
+        return _wrong(error)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python fails again when it ends
+        return _refused("standard output was closed before all was printed", "read it to its end")
+    except OSError as error:
+        where = str(error.filename or "")
+        return _wrong(
+            OutputError(f"the system refused: {error.strerror or error}", where=where, hint="see what it says")
+        )
+    except MemoryError as error:
+        return _wrong(
+            ResourceError(f"there is not enough memory: {error}", hint="shorten the run, or take fewer links")
+        )
     except Exception as error:  # whatever else comes up here is a mistake of ours
+        number = interruption.asked()
+        if number is not None:  # or the words of a library that was interrupted
+            raise interruption.Interrupted(number) from error
         with tempfile.NamedTemporaryFile("w", prefix="yid-ocp-", suffix=".log", delete=False, encoding="utf-8") as file:
             traceback.print_exc(file=file)
         print(f"bug: {type(error).__name__}: {error}\n  please report it with {file.name}", file=sys.stderr)

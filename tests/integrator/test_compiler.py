@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from yid_ocp.errors import OutputError
+from yid_ocp.errors import ConfigError, OutputError
 from yid_ocp.integrator import compiler
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
@@ -171,7 +171,56 @@ def test_a_compiler_that_fails_leaves_the_interpreter(cache, tmp_path, monkeypat
 
 
 @needs_compiler
-def test_a_damaged_library_leaves_the_interpreter(cache, monkeypatch, caplog, pendulum):
+@pytest.mark.parametrize("damage", ["truncated", "flipped", "unreadable"])
+def test_a_damaged_library_is_made_again(cache, caplog, damage):
+    """Loading one would end the process with a signal."""
+    assert compiler.compile_library(SOURCE % 42).yid_answer() == 42
+    (path,) = cache.iterdir()
+    whole = path.read_bytes()
+    path.unlink()  # a new file: the old one stays loaded
+    if damage == "unreadable":
+        path.symlink_to(cache.parent / "nowhere")
+    else:
+        path.write_bytes(whole[:900] if damage == "truncated" else whole[:700] + bytes([whole[700] ^ 8]) + whole[701:])
+    assert compiler.compile_library(SOURCE % 42).yid_answer() == 42
+    assert "damaged" in caplog.text
+
+
+@needs_compiler
+@pytest.mark.parametrize("text", ["exit 0", 'while [ "$1" != -o ]; do shift; done; echo nothing > "$2"', "sleep 60"])
+def test_a_compiler_that_makes_no_library_leaves_the_interpreter(cache, tmp_path, monkeypatch, caplog, pendulum, text):
+    odd = tmp_path / "odd_cc"
+    odd.write_text(f'#!/bin/sh\n[ "$1" = --version ] && exit\n{text}\n', encoding="utf-8")
+    odd.chmod(0o755)
+    monkeypatch.setenv("CC", str(odd))
+    monkeypatch.setattr(compiler, "PATIENCE", 0.5)
+    compiler.compiler.cache_clear()
+    compiler._machine.cache_clear()
+    assert not compile_step(pendulum, 0.01).compiled
+    assert "going on without compiled code" in caplog.text
+    assert list(cache.iterdir()) == []
+
+
+def test_a_compiler_that_is_not_there_is_said(cache, monkeypatch):
+    monkeypatch.setenv("CC", "no_such_cc")
+    compiler.compiler.cache_clear()
+    with pytest.raises(ConfigError, match="no_such_cc"):
+        compiler.compiler()
+
+
+@needs_compiler
+def test_a_cache_without_room_leaves_the_interpreter(cache, monkeypatch, caplog, pendulum):
+    def full(source, target):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(compiler.os, "replace", full)
+    assert not compile_step(pendulum, 0.01).compiled
+    assert str(cache) in caplog.text
+    assert "No space left" in caplog.text
+
+
+@needs_compiler
+def test_a_library_that_cannot_be_loaded_leaves_the_interpreter(cache, monkeypatch, caplog, pendulum):
     monkeypatch.setattr(compiler.os, "replace", lambda source, target: target.write_bytes(b"not a library"))
     with caplog.at_level(logging.INFO, logger="yid_ocp"):
         step = compile_step(pendulum, 0.01)

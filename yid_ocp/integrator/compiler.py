@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
 import hashlib
@@ -17,7 +18,8 @@ from pathlib import Path
 import casadi as ca
 import platformdirs
 
-from yid_ocp.errors import OutputError
+from yid_ocp.errors import ConfigError, DataError, OutputError
+from yid_ocp.files import file_sha256
 
 log = logging.getLogger(__name__)
 
@@ -31,12 +33,30 @@ SHORT, LONG, LONG_FROM = "-O2", "-O1", 45_000
 QUICK = "-O0"
 
 
+# Ten times what the longest of our functions takes; a compiler that hangs would hang the run.
+PATIENCE, VERSION_PATIENCE = 900.0, 30.0  # [s]
+MARK = "yid_compiled"
+
+
 @functools.cache
 def compiler() -> str | None:
-    """Path of the C compiler, or None with one notice; the variable CC chooses one, `CC=none` means none."""
+    """Path of the C compiler, or None with one notice; the variable CC chooses one, `CC=none` means none.
+
+    Raises
+    ------
+    ConfigError
+        CC names a program that is not there.
+    """
     wanted = os.environ.get("CC")
-    names = () if wanted == "none" else (wanted, "cc", "gcc", "clang")
-    path = next((found for name in names if name and (found := shutil.which(name))), None)
+    names = () if wanted == "none" else (wanted,) if wanted else ("cc", "gcc", "clang")
+    path = next((found for name in names if (found := shutil.which(name))), None)
+    if path is None and wanted not in (None, "", "none"):
+        raise ConfigError(
+            f"there is no compiler '{wanted}'",
+            where="the environment's variable CC",
+            allowed="name or path of a C compiler, without options; none",
+            hint="unset CC to have cc, gcc or clang found",
+        )
     if path is None:
         log.warning("no C compiler: everything works without compiled code, about ten times slower")
     return path
@@ -73,7 +93,7 @@ def cache_folder() -> Path:
 @functools.cache
 def _machine() -> str:
     path = compiler() or "none"
-    version = subprocess.run([path, "--version"], capture_output=True, text=True, check=False).stdout
+    version = _said([path, "--version"], VERSION_PATIENCE)[1]
     processor = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.is_file():
@@ -132,17 +152,65 @@ def _library_file(source: str, level: str) -> Path | None:
     key = hashlib.sha256(
         "\0".join([source, level, *FLAGS, *NATIVE, _machine(), ca.CasadiMeta.version()]).encode()
     ).hexdigest()[:32]
-    target = cache_folder() / f"{key}.so"
-    if target.exists():
-        return target
-    with tempfile.TemporaryDirectory(dir=target.parent) as work:
-        text, built = Path(work) / "source.c", Path(work) / "library.so"
-        text.write_text(source, encoding="utf-8")
-        for flags in ((*FLAGS, *NATIVE), FLAGS):
-            command = [path, level, *flags, str(text), "-o", str(built), "-lm"]
-            run = subprocess.run(command, capture_output=True, text=True, check=False)
-            if run.returncode == 0:
-                os.replace(built, target)
-                return target
-    log.warning("the C compiler %s failed; going on without compiled code:\n%s", path, run.stderr[:2000])
+    folder = cache_folder()
+    kept = _kept(folder, key)
+    if kept is not None:
+        return kept
+    said = ""
+    try:
+        with tempfile.TemporaryDirectory(dir=folder) as work:
+            text, built = Path(work) / "source.c", Path(work) / "library.so"
+            text.write_text(f"{source}\nint {MARK}(void) {{ return 1; }}\n", encoding="utf-8")
+            for flags in ((*FLAGS, *NATIVE), FLAGS):
+                good, said = _said([path, level, *flags, str(text), "-o", str(built), "-lm"], PATIENCE)
+                if good and _is_ours(built):
+                    target = folder / f"{key}-{file_sha256(built)[:32]}.so"
+                    os.replace(built, target)
+                    return target
+    except OSError as error:
+        hint = "set YID_OCP_CACHE to a folder with room, or CC=none"
+        log.warning(
+            "compiled code cannot be kept in %s (%s); going on without it: %s", folder, error.strerror or error, hint
+        )
+        return None
+    log.warning("the C compiler %s failed; going on without compiled code:\n%s", path, said[:2000])
     return None
+
+
+def _kept(folder: Path, key: str) -> Path | None:
+    """The whole library of a key; what was damaged since it was made would end the process, and is removed."""
+    for path in sorted(folder.glob(f"{key}-*.so")):
+        with contextlib.suppress(OSError, DataError):
+            if path.stem.partition("-")[2] == file_sha256(path)[:32]:
+                return path
+        log.warning("compiled code in the cache is damaged or cannot be read, and is made again: %s", path)
+        with contextlib.suppress(OSError):
+            path.unlink()
+    return None
+
+
+def _said(command: list[str], patience: float) -> tuple[bool, str]:
+    """Whether a program ended well, and what it said."""
+    try:
+        run = subprocess.run(
+            command,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            check=False,
+            timeout=patience,
+            stdin=subprocess.DEVNULL,
+        )
+    except subprocess.TimeoutExpired:
+        return False, f"it did not end within {patience:g} s"
+    except OSError as error:
+        return False, str(error)
+    return run.returncode == 0, run.stdout + run.stderr
+
+
+def _is_ours(built: Path) -> bool:
+    """Whether what a compiler left is a library with our symbols."""
+    try:
+        return bool(getattr(ctypes.CDLL(str(built)), MARK)() == 1)
+    except (OSError, AttributeError):
+        return False

@@ -7,19 +7,24 @@ import json
 import logging
 import os
 import platform
-import secrets
 import shutil
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
 from typing import Any, TextIO
 
+from filelock import FileLock, Timeout
+
+from yid_ocp import interruption
 from yid_ocp.config.settings import Run, dump_config
 from yid_ocp.errors import OutputError
-from yid_ocp.files import file_sha256, jsonable, write_text
+from yid_ocp.files import file_sha256, jsonable, reason, write_text
 from yid_ocp.workflow.build import input_files
+
+log = logging.getLogger(__name__)
+_UNFINISHED, _LOCK, _NAMES = ".partial", "lock", 1000
 
 
 @dataclass
@@ -58,8 +63,12 @@ class RunFolder:
     def log(self, event: str, **entries: Any) -> None:
         """Add a line to log.jsonl."""
         line = {"seconds": round(time.perf_counter() - self._begun, 4), "event": event, **entries}
-        self._log.write(json.dumps(jsonable(line), allow_nan=False) + "\n")
-        self._log.flush()
+        try:
+            self._log.write(json.dumps(jsonable(line), allow_nan=False) + "\n")
+            self._log.flush()
+        except OSError as error:
+            hint = "choose a folder on a disk with room, with --out"
+            raise _refusal("written", error, self.target, hint) from error
 
     def write(self, name: str, text: str) -> None:
         """Write a text file."""
@@ -99,6 +108,9 @@ def _grouped(notes: list[str]) -> list[str]:
 def new_run_folder(run: Run, out: str | Path | None = None, command: str = "") -> Iterator[RunFolder]:
     """Make a run folder that appears under its name when the block ends, and not at all when it is left by an error.
 
+    The name is reserved first: two runs never write to one folder, and a run that ends finds its name free. What
+    killed runs left beside it is cleared away.
+
     Parameters
     ----------
     run : Run
@@ -114,35 +126,129 @@ def new_run_folder(run: Run, out: str | Path | None = None, command: str = "") -
     Raises
     ------
     OutputError
-        The folder exists and is not empty, or cannot be made or written to.
+        The folder exists and is not empty, another run is making it, or it cannot be made or written to.
     """
-    target = _target(run, out, command)
-    made = [parent for parent in (target.parent, *target.parent.parents) if not parent.exists()]
-    temporary = target.parent / f".{target.name}.{secrets.token_hex(4)}.partial"
-    try:
-        temporary.mkdir(parents=True)
-        log = (temporary / "log.jsonl").open("w", encoding="utf-8")
-    except OSError as error:
-        _clear(temporary, made)
-        raise _refusal("made", error, target, "choose a writable folder with --out") from error
+    targets = _targets(run, out, command)
+    made = [parent for parent in targets[0].parents if not parent.exists()]
+    with interruption.deferred():  # no folder without anybody who knows of it
+        try:
+            target, lock = _reserved(targets)
+            temporary = Path(lock.lock_file).parent
+            lines = (temporary / "log.jsonl").open("w", encoding="utf-8")
+        except OSError as error:
+            _clear(None, made)
+            raise _refusal("made", error, targets[0], "choose a writable folder with --out") from error
     partial = target.with_name(f"{_stem(run, command) if out is None else target.name}.partial")
-    folder = RunFolder(target, temporary, partial, log)
+    folder = RunFolder(target, temporary, partial, lines)
+    with contextlib.ExitStack() as held:
+        held.callback(lock.release)
+        held.enter_context(interruption.removed_by_force(temporary))
+        try:
+            with _logged(folder):
+                yield folder
+            with interruption.deferred():
+                _publish(folder, lock)
+        except BaseException as error:
+            if not Path(lock.lock_file).exists():  # the run is complete
+                raise
+            with interruption.deferred(), contextlib.suppress(OSError):
+                lines.close()
+            _clear(temporary, made)
+            if isinstance(error, OutputError) and str(temporary) in error.where:
+                raise _in_words_of(error, temporary, target) from error
+            raise
+
+
+def _publish(folder: RunFolder, lock: FileLock) -> None:
+    """Give the complete folder its name, or the next free one where somebody took it: nothing finished is lost."""
+    temporary, number = folder.path, 1
     try:
-        with _logged(folder):
-            yield folder
-        log.close()
-        if target.is_dir():
-            target.rmdir()
-        os.replace(temporary, target)
-        folder.path = target
+        folder._log.close()
     except OSError as error:
-        log.close()
-        _clear(temporary, made)
-        raise _refusal("written", error, target, "choose a folder on a disk with room, with --out") from error
-    except BaseException:
-        log.close()
-        _clear(temporary, made)
-        raise
+        hint = "choose a folder on a disk with room, with --out"
+        raise _refusal("written", error, folder.target, hint) from error
+    Path(lock.lock_file).unlink(missing_ok=True)
+    target = folder.target
+    while True:
+        try:
+            if target.is_dir():
+                target.rmdir()
+            os.replace(temporary, target)
+            break
+        except OSError as error:
+            if not os.path.lexists(target) or number > _NAMES:
+                what = f"the run is complete but its folder cannot be renamed: {reason(error)}"
+                raise OutputError(what, where=str(target), hint=f"its results stay in {temporary}") from error
+            number += 1
+            target = folder.target.with_name(f"{folder.target.name}-{number}")
+    if target != folder.target:
+        log.warning("%s was taken while the run went on: its folder is %s", folder.target, target)
+    folder.path = target
+
+
+def _in_words_of(error: OutputError, temporary: Path, target: Path) -> OutputError:
+    """An error on a file of the unfinished folder with the name that its reader knows."""
+    where = error.where.replace(str(temporary), str(target))
+    hint = "choose a folder on a disk with room, with --out"
+    return OutputError(error.what, where=where, allowed=error.allowed, hint=hint)
+
+
+def _reserved(targets: Sequence[Path]) -> tuple[Path, FileLock]:
+    """The first name that no other run has or makes, and the lock that keeps it; it stands in the unfinished folder.
+
+    The system frees a lock when its process ends, however it ends: a folder whose lock is free was left by a killed
+    run.
+    """
+    _clear_left(targets[0].parent)
+    for target in targets:
+        if len(targets) > 1 and os.path.lexists(target):
+            continue
+        temporary = target.parent / f".{target.name}{_UNFINISHED}"
+        temporary.mkdir(parents=True, exist_ok=True)
+        lock = _locked(temporary)
+        if lock is None:
+            continue
+        if len(targets) > 1 and os.path.lexists(target):  # its run ended meanwhile
+            _clear(temporary, [])
+            lock.release()
+            continue
+        for entry in temporary.iterdir():
+            if entry.name != _LOCK:
+                shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+        return target, lock
+    raise OutputError(
+        "another run is making this folder",
+        where=str(targets[0]),
+        allowed="a name of its own for every run",
+        hint="choose another name with --out, or wait for the other run",
+    )
+
+
+def _locked(temporary: Path) -> FileLock | None:
+    """The lock of an unfinished folder, None where another process holds it or clears the folder away."""
+    lock = FileLock(temporary / _LOCK, is_singleton=False, thread_local=False)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        return None
+    except FileNotFoundError:
+        return None
+    if not Path(lock.lock_file).exists():
+        lock.release()
+        return None
+    return lock
+
+
+def _clear_left(parent: Path) -> None:
+    """Remove what killed runs left in a folder."""
+    for temporary in parent.glob(f".*{_UNFINISHED}") if parent.is_dir() else ():
+        if not (temporary / _LOCK).is_file():  # not ours, or complete but for its name
+            continue
+        with contextlib.suppress(OSError):
+            lock = _locked(temporary)
+            if lock is not None:
+                _clear(temporary, [])
+                lock.release()
 
 
 @contextlib.contextmanager
@@ -160,37 +266,49 @@ def _logged(folder: RunFolder) -> Iterator[None]:
 
 
 def _refusal(what: str, error: OSError, target: Path, hint: str) -> OutputError:
-    return OutputError(f"the run folder cannot be {what}: {error.strerror or error}", where=str(target), hint=hint)
+    return OutputError(f"the run folder cannot be {what}: {reason(error)}", where=str(target), hint=hint)
 
 
-def _target(run: Run, out: str | Path | None, command: str) -> Path:
-    if out is not None:
+def _targets(run: Run, out: str | Path | None, command: str) -> list[Path]:
+    """Names that the folder may get, the first that is free first."""
+    if out is None:
+        parent = Path(run.output.folder) if run.output.folder is not None else Path.cwd() / "runs"
+        stem = _stem(run, command, time.strftime("%Y%m%d-%H%M%S"))
+        return [parent / name for name in (stem, *(f"{stem}-{i}" for i in range(2, _NAMES)))]
+    if not str(out).strip():
+        raise OutputError("the run folder has no name", where="--out", allowed="a new name, or an empty folder")
+    try:
         target = Path(out).expanduser().absolute()
-        if target.is_dir() and any(target.iterdir()):
-            raise OutputError(
-                "the run folder exists and is not empty",
-                where=str(target),
-                allowed="a new name, or an empty folder",
-                hint="choose another name with --out, or leave it out for a numbered one",
-            )
-        if target.exists() and not target.is_dir():
-            raise OutputError("the run folder's name is that of a file", where=str(target), hint="choose another --out")
-        return target
-    parent = Path(run.output.folder) if run.output.folder is not None else Path.cwd() / "runs"
-    stem = _stem(run, command, time.strftime("%Y%m%d-%H%M%S"))
-    names = (stem, *(f"{stem}-{i}" for i in range(2, 1000)))
-    return next(parent / name for name in names if not (parent / name).exists())
+        is_folder = target.is_dir()
+        filled = is_folder and any(target.iterdir())
+        is_file = not is_folder and target.exists()
+    except (OSError, ValueError, RuntimeError) as error:  # too long, a NUL, an unknown user's home
+        what = f"this cannot be a run folder: {reason(error)}"
+        raise OutputError(what, where=str(out)[:200], hint="choose a writable folder with --out") from error
+    if filled:
+        raise OutputError(
+            "the run folder exists and is not empty",
+            where=str(target),
+            allowed="a new name, or an empty folder",
+            hint="choose another name with --out, or leave it out for a numbered one",
+        )
+    if is_file:
+        raise OutputError("the run folder's name is that of a file", where=str(target), hint="choose another --out")
+    return [target]
 
 
 def _stem(run: Run, *parts: str) -> str:
     return "-".join(part for part in (run.name, *parts) if part)
 
 
-def _clear(temporary: Path, made: list[Path]) -> None:
-    shutil.rmtree(temporary, ignore_errors=True)
-    for parent in made:
-        with contextlib.suppress(OSError):
-            parent.rmdir()
+def _clear(temporary: Path | None, made: Sequence[Path]) -> None:
+    """Remove an unfinished folder, and those around it that were made for it and are empty."""
+    with interruption.deferred():
+        if temporary is not None:
+            shutil.rmtree(temporary, ignore_errors=True)
+        for parent in made:
+            with contextlib.suppress(OSError):
+                parent.rmdir()
 
 
 def versions() -> dict[str, str]:

@@ -1,0 +1,134 @@
+"""Signals that end a command: raised in the main thread, again where that was swallowed, and by force in the end."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import signal
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from types import FrameType
+
+PATIENCE = 2.0
+"""Time until an interruption that something swallowed is raised again [s]."""
+
+LAST_RESORT = 10.0
+"""Time after which a process that does not end, as in a long call of a library, is ended [s]."""
+
+_NAMES = ("SIGINT", "SIGTERM", "SIGHUP")
+
+
+class Interrupted(KeyboardInterrupt):
+    """A signal asked the command to end.
+
+    Parameters
+    ----------
+    number : int
+        The signal's.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        self.number = number
+
+
+class _State:
+    """What a process knows of interruptions; one for all, as signals are."""
+
+    def __init__(self) -> None:
+        self.asked: int | None = None
+        self.deferring = 0
+        self.unfinished: set[Path] = set()
+
+
+_STATE = _State()
+
+
+def asked() -> int | None:
+    """The signal that asked the running command to end, None where none did."""
+    return _STATE.asked
+
+
+@contextlib.contextmanager
+def deferred() -> Iterator[None]:
+    """Let a short block end before an interruption is raised."""
+    _STATE.deferring += 1
+    before = _STATE.asked
+    try:
+        yield
+    finally:
+        _STATE.deferring -= 1
+    if not _STATE.deferring and _STATE.asked is not None and before is None:
+        raise Interrupted(_STATE.asked)
+
+
+@contextlib.contextmanager
+def removed_by_force(folder: Path) -> Iterator[None]:
+    """Have a folder removed should the process have to be ended while the block runs."""
+    _STATE.unfinished.add(folder)
+    try:
+        yield
+    finally:
+        _STATE.unfinished.discard(folder)
+
+
+@contextlib.contextmanager
+def signals_raised() -> Iterator[None]:
+    """Raise `Interrupted` for interrupts, requests to end and lost terminals while the block runs.
+
+    An exception can get lost: in what collects garbage, in callbacks of libraries, in a call that does not come back.
+    So it is raised again every `PATIENCE` seconds, and after `LAST_RESORT` seconds the process is ended with the exit
+    code that shells expect, when nothing but the folders of `removed_by_force` has to be cleared away. Signals that the
+    parent had ignored stay so, as under `nohup`. Outside the main thread nothing is changed.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    numbers = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
+    before = {number: signal.getsignal(number) for number in numbers}
+    taken = {number: handler for number, handler in before.items() if handler not in (signal.SIG_IGN, None)}
+    told, tell = socket.socketpair()
+    tell.setblocking(False)
+    ended = threading.Event()
+    _STATE.asked = None
+    wakeup = signal.set_wakeup_fd(tell.fileno(), warn_on_full_buffer=False)
+    for number in taken:
+        signal.signal(number, _raise)
+    watcher = threading.Thread(target=_watch, args=(told, ended, threading.get_ident()), daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        for number, handler in taken.items():
+            signal.signal(number, handler)
+        signal.set_wakeup_fd(wakeup)
+        tell.close()
+        watcher.join()
+        told.close()
+
+
+def _raise(number: int, frame: FrameType | None) -> None:
+    _STATE.asked = number
+    if not _STATE.deferring:
+        raise Interrupted(number)
+
+
+def _watch(told: socket.socket, ended: threading.Event, main: int) -> None:
+    """Wait for a signal of ours; see that it is obeyed."""
+    numbers = {int(getattr(signal, name)) for name in _NAMES if hasattr(signal, name)}
+    while not (numbers & set(received := told.recv(64))):
+        if not received:
+            return
+    number = next(iter(numbers & set(received)))
+    waited = 0.0
+    while not ended.wait(PATIENCE):
+        waited += PATIENCE
+        if waited >= LAST_RESORT or not hasattr(signal, "pthread_kill"):
+            for folder in tuple(_STATE.unfinished):
+                shutil.rmtree(folder, ignore_errors=True)
+            os._exit(128 + number)
+        signal.pthread_kill(main, number)
