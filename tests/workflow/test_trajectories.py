@@ -66,7 +66,7 @@ def test_a_diagnosis_without_a_gap_has_predictions_alone(solved, tmp_path):
 
 
 def test_a_file_that_cannot_be_written(solved, tmp_path):
-    with pytest.raises(OutputError, match="trajectories cannot be written"):
+    with pytest.raises(OutputError, match="does not exist"):
         write_trajectories(tmp_path / "no" / "t.h5", *solved)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import io
 import json
 import math
 import re
@@ -17,6 +18,7 @@ from pydantic import TypeAdapter, ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent, ScalarEvent
 
 from yid_ocp.config.keys import Sections, sections_of, unknown_key
 from yid_ocp.config.settings import Run
@@ -26,6 +28,9 @@ from yid_ocp.options import About, entries_of, members, options_of, stripped, va
 KeyPath = tuple[str | int, ...]
 DEFAULT = "dual_arm_vision.yaml"
 DIAGNOSIS_DEFAULT = "diagnosis.yaml"
+
+DEPTH, LARGEST = 40, 100_000
+"""Levels and entries of a configuration, far beyond what any needs."""
 
 
 def load_config(path: str | Path | None = None, overrides: Sequence[str] = (), default: str = DEFAULT) -> Run:
@@ -83,8 +88,26 @@ def _read(path: Path) -> str:
 
 
 def _parse(text: str, origin: str) -> tuple[dict[str, Any], dict[KeyPath, str]]:
+    data = _loaded(text, origin)
+    if data is None:
+        data = CommentedMap()
+    if not isinstance(data, CommentedMap):
+        raise ConfigError("the file does not hold keys and values", where=origin, allowed="sections such as `model:`")
+    places: dict[KeyPath, str] = {}
+    return _unwrap(data, (), places, origin), places
+
+
+def _loaded(text: str, origin: str) -> Any:
+    """What the YAML reader makes of a text that is not too deep and asks for no types of its own."""
     try:
-        data = YAML(typ="rt").load(text)
+        depth = 0
+        for event in YAML(typ="rt").parse(io.StringIO(text)):
+            depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
+            if depth > DEPTH:
+                raise _odd(f"more than {DEPTH} levels stand in one another", origin, event)
+            if isinstance(event, (ScalarEvent, CollectionStartEvent)) and event.tag is not None:
+                raise _odd(f"the tag '{event.tag}' asks for a type", origin, event)
+        return YAML(typ="rt").load(text)
     except MarkedYAMLError as error:
         line = f", line {error.problem_mark.line + 1}" if error.problem_mark is not None else ""
         problem = str(error.problem or error.context).split("\n")[0]
@@ -94,33 +117,53 @@ def _parse(text: str, origin: str) -> tuple[dict[str, Any], dict[KeyPath, str]]:
             where=f"{origin}{line}",
             hint="check indentation, brackets, colons and duplicated keys",
         ) from error
-    except YAMLError as error:
-        raise ConfigError(f"the file is not valid YAML: {str(error).splitlines()[0]}", where=origin) from error
-    if data is None:
-        data = CommentedMap()
-    if not isinstance(data, CommentedMap):
-        raise ConfigError("the file does not hold keys and values", where=origin, allowed="sections such as `model:`")
-    places: dict[KeyPath, str] = {}
-    return _unwrap(data, (), places, origin), places
+    except (YAMLError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError) as error:
+        # the reader's own mistakes on odd text: numbers of thousands of digits, keys that are lists
+        problem = next(iter(str(error).splitlines()), type(error).__name__)
+        raise ConfigError(f"the file is not valid YAML: {problem}", where=origin) from error
+
+
+def _odd(what: str, origin: str, event: Any) -> ConfigError:
+    return ConfigError(
+        what,
+        where=f"{origin}, line {event.start_mark.line + 1}",
+        allowed="keys with numbers, text, true or false, [lists] and sections",
+        hint="write it without",
+    )
 
 
 def _unwrap(node: Any, path: KeyPath, places: dict[KeyPath, str], origin: str) -> Any:
     """Plain Python values in place of the YAML reader's own; their lines go into `places`."""
+    if len(places) > LARGEST or len(path) > DEPTH:
+        what = f"aliases make more than {LARGEST} entries, or stand for themselves"
+        raise ConfigError(what, where=origin, hint="write what the aliases stand for")
     if isinstance(node, CommentedMap):
         result: dict[str, Any] = {}
         for key, value in node.items():
             name = str(key)
-            places[(*path, name)] = f"{origin}, line {node.lc.key(key)[0] + 1}"
+            places[(*path, name)] = f"{origin}, line {_line(node, key)}"
             result[name] = _unwrap(value, (*path, name), places, origin)
         return result
     if isinstance(node, CommentedSeq):
         for i in range(len(node)):
-            places[(*path, i)] = f"{origin}, line {node.lc.item(i)[0] + 1}"
+            places[(*path, i)] = f"{origin}, line {_line(node, i)}"
         return [_unwrap(value, (*path, i), places, origin) for i, value in enumerate(node)]
+    if isinstance(node, str) and "\0" in node:
+        raise ConfigError("the text holds a NUL", where=places.get(path, origin), hint="leave it out")
+    if isinstance(node, int) and node.bit_length() > 1023:
+        raise ConfigError("the number is too large", where=places.get(path, origin), allowed="numbers below 1e308")
     for kind in (bool, int, float, str):
         if isinstance(node, kind):
             return kind(node)
     return node
+
+
+def _line(node: CommentedMap | CommentedSeq, key: Any) -> int:
+    """Line of an entry; of the section where a merge brought it there."""
+    try:
+        return int((node.lc.key(key) if isinstance(node, CommentedMap) else node.lc.item(key))[0]) + 1
+    except (KeyError, TypeError):
+        return int(node.lc.line) + 1
 
 
 def _override(data: dict[str, Any], places: dict[KeyPath, str], text: str) -> None:
@@ -132,10 +175,12 @@ def _override(data: dict[str, Any], places: dict[KeyPath, str], text: str) -> No
         )
     path = _key_path(Run, key.strip().split("."), origin, data)
     try:
-        value = YAML(typ="rt").load(value_text) if value_text.strip() else None
-    except YAMLError as error:
+        value = _loaded(value_text, origin) if value_text.strip() else None
+    except ConfigError as error:
         raise ConfigError(
-            f"the value '{value_text}' is not valid YAML", where=origin, allowed="a number, text, [list], {key: value}"
+            f"the value '{value_text[:80]}' is not valid YAML: {error.what}",
+            where=origin,
+            allowed="a number, text, [list], {key: value}",
         ) from error
     parent = data
     for part in path[:-1]:

@@ -11,6 +11,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from yid_ocp.data.hdf5_file import new_hdf5, open_hdf5
 from yid_ocp.data.recording import (
     JOINT_CHANNELS,
     JOINT_STD,
@@ -24,7 +25,7 @@ from yid_ocp.data.recording import (
     validate,
 )
 from yid_ocp.errors import DataError, nearest
-from yid_ocp.files import file_sha256, new_file, reason
+from yid_ocp.files import file_sha256
 
 FORMAT = "yid-recording/1"
 
@@ -60,12 +61,8 @@ def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = Fal
     digest = file_sha256(path)
     hint = "read other formats (CSV, rosbag, MCAP) with `yid-ocp import` or yid_ocp.data.read_any"
     require(h5py.is_hdf5(path), "the file is not an HDF5 file", str(path), f"HDF5 in the format {FORMAT}", hint)
-    try:
-        with h5py.File(path, "r") as file:
-            recording = _from_file(file, path, digest)
-    except (OSError, RuntimeError, KeyError, TypeError) as error:  # all of them come from h5py on damaged files
-        what = f"the HDF5 file is truncated or damaged ({reason(error)})"
-        raise DataError(what, where=str(path), hint="copy or record it again") from error
+    with open_hdf5(path) as file:
+        recording = _from_file(file, path, digest)
     return validate(recording, allow_nan_effort=allow_nan_effort, where=str(path))
 
 
@@ -87,7 +84,7 @@ def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
         If the file cannot be written; one that was there before is left as it was.
     """
     validate(recording, allow_nan_effort=True)
-    with new_file(Path(path)) as temporary, h5py.File(temporary, "x") as file:
+    with new_hdf5(path) as file:
         file.attrs.update(format=FORMAT, description=recording.description, source=recording.source)
         if recording.truth:
             file.attrs["truth"] = json.dumps({key: float(value) for key, value in recording.truth.items()})

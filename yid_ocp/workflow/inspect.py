@@ -19,6 +19,7 @@ from yid_ocp.analysis.patterns import Pattern, kkt_pattern, kkt_size, stages, st
 from yid_ocp.analysis.symbols import Entry, StepSymbols
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import Run
+from yid_ocp.data.hdf5_file import new_hdf5
 from yid_ocp.errors import ModelError
 from yid_ocp.export.functions import export_functions
 from yid_ocp.export.latex import write_sheet
@@ -306,7 +307,7 @@ def _variables(step: Step) -> list[dict[str, str]]:
 
 
 def _write_matrices(path: Path, step: Step, linearisation: Linearisation, torque: Array) -> None:
-    with h5py.File(path, "w") as file:
+    with new_hdf5(path) as file:
         file.attrs["format"] = "yid-linearisation/1"
         file.attrs["time_step"] = step.time_step
         text = h5py.string_dtype()

@@ -9,13 +9,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import Run
 from yid_ocp.data.hdf5 import write_recording
+from yid_ocp.data.hdf5_file import open_hdf5
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate
 from yid_ocp.errors import DataError
 from yid_ocp.export.csv import export_csv
@@ -142,7 +142,7 @@ def identified(run: Run, step: Step) -> tuple[Array, Known, dict[str, Any]]:
     found = {name: entry["value"] for name, entry in result["parameters"].items() if name in parameters}
     for name, value in found.items():
         theta[parameters.index(name)] = value
-    with h5py.File(solved, "r") as data:
+    with open_hdf5(solved) as data:
         names = [str(name) for name in data["unknowns"].attrs["names"]]
         covariance = np.array(data["unknowns/covariance"])
     usable = [i for i, name in enumerate(names) if name in found and np.all(np.isfinite(covariance[i, i]))]

@@ -10,9 +10,9 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from yid_ocp.data.hdf5_file import new_hdf5
 from yid_ocp.diagnosis import Finding
 from yid_ocp.diagnosis.localise import units
-from yid_ocp.errors import OutputError
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.problem import Episode, EpisodeResult
@@ -106,12 +106,9 @@ def write_diagnosis_trajectories(path: Path, finding: Finding, predicted: Sequen
 
 @contextlib.contextmanager
 def _file(path: Path, form: str) -> Iterator[h5py.File]:
-    try:
-        with h5py.File(path, "w") as file:
-            file.attrs["format"] = form
-            yield file
-    except OSError as error:
-        raise OutputError(f"the trajectories cannot be written: {error}", where=str(path)) from error
+    with new_hdf5(path) as file:
+        file.attrs["format"] = form
+        yield file
 
 
 def _store_sensor(

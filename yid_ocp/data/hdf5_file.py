@@ -1,0 +1,158 @@
+"""HDF5 files as such: written from memory as a whole, read only after another process came through them unharmed.
+
+The HDF5 library ends the process that meets a full disk while it writes, or certain damage while it reads, and takes
+links into other files for its own. None of this can be caught, so it is kept away from the process that does the work.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+from collections.abc import Iterator
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import h5py
+
+from yid_ocp.errors import DataError
+from yid_ocp.files import new_file, reason
+
+TRIAL_TIME = 20.0
+"""How long reading a whole file may take [s]."""
+
+DEPTH = 10
+"""How deep groups may stand in one another."""
+
+LARGEST = 1 << 30
+"""Bytes that all datasets of a file may have together when they are unpacked."""
+
+
+@contextlib.contextmanager
+def new_hdf5(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
+    """An HDF5 file in memory, written as a whole when the block ends without error.
+
+    Parameters
+    ----------
+    path : path-like
+        The file to make or replace.
+
+    Yields
+    ------
+    h5py.File
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written; one that was there before is left as it was.
+    """
+    with new_file(Path(path)) as temporary:
+        with h5py.File(str(temporary), "w", driver="core", backing_store=False) as file:
+            yield file
+            file.flush()
+            image = file.id.get_file_image()
+        temporary.write_bytes(image)
+
+
+@contextlib.contextmanager
+def open_hdf5(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
+    """An HDF5 file to read, after a trial.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Yields
+    ------
+    h5py.File
+
+    Raises
+    ------
+    DataError
+        The file is damaged, holds more than `LARGEST`, takes longer than `TRIAL_TIME` to read, or refers to other
+        files, whose contents no hash of this one covers; errors of the library in the block, too.
+    """
+    _try(Path(path))
+    try:
+        with h5py.File(path, "r") as file:
+            yield file
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:  # all of them come from h5py
+        what = f"the HDF5 file is truncated or damaged ({reason(error)})"
+        raise DataError(what, where=str(path), hint="copy or record it again") from error
+
+
+def _try(path: Path) -> None:
+    """Read a file in another process."""
+    if "fork" not in multiprocessing.get_all_start_methods():
+        return
+    context = multiprocessing.get_context("fork")
+    here, there = context.Pipe(duplex=False)
+    process = context.Process(target=_read_all, args=(str(path), there), daemon=True)
+    process.start()
+    there.close()
+    try:
+        complaint = here.recv_bytes().decode() if here.poll(TRIAL_TIME) else None
+    except EOFError:
+        process.join()
+        number = -(process.exitcode or 0)
+        name = signal.Signals(number).name if number > 0 else f"exit code {process.exitcode}"
+        complaint = f"the HDF5 file is damaged (it ends the HDF5 library with {name})"
+    finally:
+        process.kill()
+        process.join()
+        here.close()
+    if complaint is None:
+        what = f"the HDF5 file cannot be read within {TRIAL_TIME:g} s: it is damaged, or far too large"
+        raise DataError(what, where=str(path), hint="copy or record it again")
+    if complaint:
+        raise DataError(complaint, where=str(path), hint="copy or record it again, as one file of its own")
+
+
+def _read_all(path: str, there: Connection) -> None:
+    """Say what stands against reading a file; nothing where all of it can be read."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # allocators print before they abort
+    try:
+        with h5py.File(path, "r") as file:
+            complaint = _foreign(file) or _excess(file)
+            if not complaint:
+                dict(file.attrs)
+                file.visititems(_read)
+    except Exception as error:  # whatever h5py says of damaged files
+        complaint = f"the HDF5 file is truncated or damaged ({reason(error)})"
+    there.send_bytes(complaint.encode(errors="replace")[:2000])
+
+
+def _read(name: str, item: h5py.Group | h5py.Dataset) -> None:
+    dict(item.attrs)
+    if isinstance(item, h5py.Dataset):
+        item[()]
+
+
+def _foreign(group: h5py.Group, depth: int = 0) -> str:
+    """Which entry stands in another file."""
+    for name in group:
+        link = group.get(name, getlink=True)
+        item = None if isinstance(link, h5py.ExternalLink) else group.get(name)
+        if item is None:
+            return f"'{name}' in the HDF5 file is a link into another file, or into nowhere"
+        if isinstance(item, h5py.Dataset) and (item.is_virtual or item.external):
+            return f"the values of '{name}' in the HDF5 file stand in another file"
+        if isinstance(item, h5py.Group):
+            found = _foreign(item, depth + 1) if depth < DEPTH else "groups in the HDF5 file stand in one another"
+            if found:
+                return found
+    return ""
+
+
+def _excess(file: h5py.File) -> str:
+    """Whether a file declares more than can be meant."""
+    size = 0
+
+    def count(name: str, item: h5py.Group | h5py.Dataset) -> None:
+        nonlocal size
+        if isinstance(item, h5py.Dataset) and item.shape is not None:
+            size += item.dtype.itemsize * item.size
+
+    file.visititems(count)
+    return f"the HDF5 file declares {size / 2**30:.1f} GiB, more than can be meant" if size > LARGEST else ""
