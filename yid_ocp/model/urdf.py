@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import logging
 import math
 import site
 import sys
@@ -24,6 +25,11 @@ from yid_ocp.model.rotations import Matrix, angles_of, snapped, transform, turn
 
 # Stands for no limit where URDF asks for a number.
 UNLIMITED = 1e9
+
+# Of digits in the file: how far principal moments may miss what they have to be.
+ROUNDED = 1e-2
+
+log = logging.getLogger(__name__)
 
 MOVABLE = {"revolute", "continuous", "prismatic"}
 
@@ -100,7 +106,8 @@ def read_urdf(
     for joint in robot.joints:
         if joint.child in dropped and joint.name in (*(kept or ()), *locked):
             raise ModelError(f"joint '{joint.name}' carries a link that is left out", where=str(file))
-    movable = [joint.name for joint in robot.joints if joint.type in MOVABLE]
+    following = _mimicked(robot, kept, locked, str(file))
+    movable = [joint.name for joint in robot.joints if joint.type in MOVABLE and joint.name not in following]
     found = _walk(links, dropped, movable if kept is None else kept, locked, str(file))
     order = _parents_first(found.joints, movable if kept is None else kept)
 
@@ -160,13 +167,105 @@ def _parsed(file: Path) -> Any:
     import yourdfpy
 
     try:
-        ElementTree.parse(file)  # yourdfpy would read what it can of a broken file and say nothing
+        _check_numbers(ElementTree.parse(file).getroot(), str(file))  # yourdfpy reads what it can and says nothing
         with contextlib.redirect_stderr(io.StringIO()):
             return yourdfpy.URDF.load(
                 str(file), build_scene_graph=False, load_meshes=False, load_collision_meshes=False
             ).robot
+    except ModelError:
+        raise
     except Exception as error:  # yourdfpy and lxml raise many kinds for a malformed file
         raise ModelError(f"the URDF cannot be read: {error}", where=str(file)) from error
+
+
+def _check_numbers(robot: ElementTree.Element, where: str) -> None:
+    """Refuse numbers that are missing, too many or none, which the reader would take as zeros or leave to chance."""
+    for owner in robot:
+        if owner.tag not in ("link", "joint"):
+            continue
+        name = f"{owner.tag} '{owner.get('name')}'"
+        inertials = owner.findall("inertial")
+        if len(inertials) > 1:
+            raise ModelError(f"{name} has {len(inertials)} inertials", where=where, allowed="one, or none")
+        parts = (*owner.findall("origin"), *owner.findall("axis"), *owner.findall("inertial/origin"))
+        for part in parts:
+            for key in {"xyz", "rpy"} & set(part.attrib):
+                _numbers(part.attrib[key], 3, f"{name}: {part.tag} {key}", where)
+        for limit in owner.findall("limit"):
+            for key, text in limit.attrib.items():
+                _numbers(text, 1, f"{name}: limit {key}", where, infinite=True)
+        for inertial in inertials:
+            mass = inertial.find("mass")
+            if mass is None or _numbers(mass.get("value", ""), 1, f"{name}: mass", where)[0] < 0:
+                what = "has an inertial without a mass" if mass is None else "has a negative mass"
+                raise ModelError(f"{name} {what}", where=where, allowed="a mass of zero or more [kg]")
+            tensor = inertial.find("inertia")
+            if tensor is not None:
+                for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"):
+                    _numbers(tensor.get(key, ""), 1, f"{name}: inertia {key}", where)
+
+
+def _numbers(text: str, count: int, what: str, where: str, infinite: bool = False) -> list[float]:
+    words = text.split()
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        numbers = []
+    wrong = any(math.isnan(value) or (math.isinf(value) and not infinite) for value in numbers)
+    if len(numbers) != count or wrong:
+        allowed = "one number" if count == 1 else f"{count} numbers"
+        raise ModelError(f"{what} is '{text[:60]}'", where=where, allowed=f"{allowed}, finite, with blanks between")
+    return numbers
+
+
+def _check_bodies(link: str, tensor: Matrix, where: str) -> None:
+    """Refuse moments of inertia that are negative; say it where no distribution of mass has them, as in real files."""
+    least, middle, most = np.linalg.eigvalsh(0.5 * (tensor + tensor.T))
+    values = ", ".join(f"{value:.3g}" for value in (least, middle, most))
+    if least < -ROUNDED * max(most, -least):
+        raise ModelError(
+            f"link '{link}' has a negative moment of inertia (principal moments {values} kg m^2)",
+            where=where,
+            allowed="three that are zero or more",
+            hint="correct the inertia, or leave the link out",
+        )
+    if least + middle < (1 - ROUNDED) * most:
+        log.warning(
+            "%s: link '%s' has principal moments of inertia of %s kg m^2, which no body has: the largest is at most "
+            "the sum of the others",
+            where,
+            link,
+            values,
+        )
+
+
+def _mimicked(robot: Any, wanted: Collection[str] | None, locked: dict[str, float], where: str) -> set[str]:
+    """Joints that follow others: locked where the others stand, as the model has no such couplings."""
+    joints = {joint.name: joint for joint in robot.joints}
+    following = {name: joint.mimic for name, joint in joints.items() if joint.mimic is not None}
+    for name, mimic in following.items():
+        if wanted is not None and name in wanted:
+            raise ModelError(
+                f"joint '{name}' follows '{mimic.joint}' (mimic) and cannot move on its own",
+                where=where,
+                hint=f"leave it out of the joints; it is locked then, at the place that belongs to '{mimic.joint}'",
+            )
+        if mimic.joint not in joints:
+            raise ModelError(
+                f"joint '{name}' follows a joint '{mimic.joint}' that is not there",
+                where=where,
+                hint=nearest(str(mimic.joint), joints),
+            )
+        if name in locked:
+            continue
+        if wanted is None or mimic.joint in wanted:
+            log.warning(
+                "%s: joint '%s' follows '%s'; couplings are not modelled, so it is locked", where, name, mimic.joint
+            )
+        factor = 1.0 if mimic.multiplier is None else float(mimic.multiplier)
+        offset = 0.0 if mimic.offset is None else float(mimic.offset)
+        locked[name] = factor * _locked_value(joints[mimic.joint], locked) + offset
+    return set(following)
 
 
 def _checked(robot: Any, file: Path, wanted: Sequence[str]) -> dict[str, _Link]:
@@ -224,6 +323,8 @@ def _walk(
         if inertial is not None and inertial.mass:
             origin = np.eye(4) if inertial.origin is None else np.asarray(inertial.origin, float)
             tensor = np.zeros((3, 3)) if inertial.inertia is None else np.asarray(inertial.inertia, float)
+            if carrier is not None:
+                _check_bodies(link, tensor, where)
             body = Inertia.of(float(inertial.mass), np.zeros(3), tensor)
             found.bodies.setdefault(carrier, []).append(body.moved(Placement.of(at @ origin)))
         for joint in links[link].joints:
@@ -278,16 +379,21 @@ def _joint(source: Any, parent: int, placement: Placement, bodies: tuple[Inertia
 def _locked_motion(joint: Any, locked: Mapping[str, float]) -> Matrix:
     if joint.type == "fixed":
         return np.eye(4)
+    value = _locked_value(joint, locked)
+    axis = _unit_axis(joint)
+    if joint.type == "prismatic":
+        return transform(np.eye(3), value * axis)
+    return transform(turn(axis, math.sin(value), math.cos(value)), np.zeros(3))
+
+
+def _locked_value(joint: Any, locked: Mapping[str, float]) -> float:
+    """Where a joint is locked: as asked for, or at zero, or at the nearest bound."""
     limit = joint.limit
     low = -math.inf if limit is None or limit.lower is None else float(limit.lower)
     high = math.inf if limit is None or limit.upper is None else float(limit.upper)
     if joint.type == "continuous" or low > high:
         low, high = -math.inf, math.inf
-    value = locked.get(joint.name, min(max(0.0, low), high))
-    axis = _unit_axis(joint)
-    if joint.type == "prismatic":
-        return transform(np.eye(3), value * axis)
-    return transform(turn(axis, math.sin(value), math.cos(value)), np.zeros(3))
+    return locked.get(joint.name, min(max(0.0, low), high))
 
 
 def _with_all_below(without: Sequence[str], links: Mapping[str, _Link], where: str) -> set[str]:

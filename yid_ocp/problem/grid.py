@@ -14,6 +14,10 @@ from yid_ocp.errors import DataError
 Array = NDArray[np.float64]
 
 
+MOST_STEPS = 200_000
+"""Steps of a rollout: half an hour in steps of 10 ms; a clock in milliseconds or one that jumps asks for more."""
+
+
 @dataclass(frozen=True)
 class Grid:
     """Nodes of a rollout: t_k = start + k time_step, k = 0..steps."""
@@ -42,11 +46,18 @@ def make_grid(recording: Recording, time_step: float, duration: float | None = N
     Raises
     ------
     DataError
-        The recording is shorter than two steps.
+        The recording is shorter than two steps, or longer than `MOST_STEPS`.
     """
     t = recording.joints.t if recording.joints is not None else recording.points[0].t
     span = float(t[-1] - t[0]) if duration is None else min(duration, float(t[-1] - t[0]))
     steps = math.floor(span / time_step + 1e-6)
+    if steps > MOST_STEPS:
+        raise DataError(
+            f"{span:.3g} s of data, {len(t)} samples, are {steps:.3g} time steps of {time_step:g} s",
+            where=recording.name,
+            allowed=f"at most {MOST_STEPS}",
+            hint="see whether times are in seconds and the clock does not jump; else cut the recording",
+        )
     if steps < 2:
         raise DataError(
             f"{span:.3g} s of data are shorter than two time steps of {time_step:g} s",

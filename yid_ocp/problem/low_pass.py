@@ -14,6 +14,7 @@ from yid_ocp.errors import DataError
 
 Array = NDArray[np.float64]
 
+LEAST = 1e-4  # of half the sampling rate; below it the filter's sections are singular to rounding
 FILTER_ORDER = 4
 
 
@@ -78,8 +79,10 @@ class LowPass:
 
     def _sections(self, step: float) -> Array:
         nyquist = 0.5 / step
-        if not 0 < self.cutoff < nyquist:
+        least = LEAST * nyquist
+        if not least < self.cutoff < nyquist:
             raise DataError(
-                f"path_cutoff = {self.cutoff:g} Hz", allowed=f"above 0 and below {nyquist:g} Hz for this recording"
+                f"path_cutoff = {self.cutoff:g} Hz",
+                allowed=f"above {least:.2g} and below {nyquist:g} Hz for this recording",
             )
         return np.asarray(scipy.signal.butter(FILTER_ORDER, self.cutoff / nyquist, output="sos"))
