@@ -285,3 +285,38 @@ def test_a_number_outside_its_bounds_is_refused(written, key, data, option):
     assert "line" in caught.value.where
     last = [part for part in key.split(".") if part != "NAME"][-1]
     assert last in caught.value.where
+
+
+ALIASES = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
+    f"{two}: &{two} [{', '.join(['*' + one] * 9)}]\n" for one, two in zip("abcdefghij", "bcdefghijk", strict=True)
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (ALIASES, "aliases"),
+        ("description: &a [*a]\n", "not allowed"),
+        ("description: " + "[" * 3000 + "]" * 3000, "levels"),
+        ("{a: " * 2000 + "1" + "}" * 2000, "levels"),
+        ("model: !!python/object:os.system {a: 1}", "tag"),
+        ("problem: {time_step: !odd 0.01}", "tag"),
+        ("problem: {time_step: " + "9" * 5000 + "}", "digits"),
+        ("problem: {time_step: 0x" + "f" * 6000 + "}", "too large"),
+        ('description: "a\\0b"', "NUL"),
+        ("? [a, b]\n: 3", "no key"),
+        ("a: 1\n---\nb: 2", "not valid YAML"),
+    ],
+)
+def test_odd_yaml_is_refused_at_once(tmp_path, text, said):
+    file = tmp_path / "odd.yaml"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError, match=said):
+        load_config(file)
+
+
+def test_merged_sections_have_their_lines(tmp_path):
+    file = tmp_path / "merged.yaml"
+    file.write_text("problem:\n  <<: {time_step: 0.02}\n  compiler: 3\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"line 3: problem\.compiler"):
+        load_config(file)

@@ -247,3 +247,73 @@ def test_a_tool_that_is_not_mounted_is_left_out(tmp_path):
         read_urdf(path, exclude_links=["hands"])
     with pytest.raises(ModelError, match="joint 'grip' carries a link that is left out"):
         read_urdf(path, joints=["turn", "grip"], exclude_links=["hand"])
+
+
+BODY = '<link name="tip"><inertial><mass value="{mass}"/><inertia {tensor}/></inertial></link>'
+TENSOR = 'ixx="{0}" iyy="{1}" izz="{2}" ixy="0" ixz="0" iyz="0"'
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (BODY.format(mass="1", tensor=TENSOR.format(1, -2, 1)), "negative moment of inertia"),
+        (BODY.format(mass="1", tensor=TENSOR.format("nan", 1, 1)), "inertia ixx is 'nan'"),
+        (BODY.format(mass="1", tensor=TENSOR.format(1, "inf", 1)), "inertia iyy is 'inf'"),
+        (BODY.format(mass="1", tensor='ixx="1" iyy="1"'), "inertia ixy is ''"),
+        (BODY.format(mass="-1", tensor=TENSOR.format(1, 1, 1)), "negative mass"),
+        (BODY.format(mass="1 kg", tensor=TENSOR.format(1, 1, 1)), "mass is '1 kg'"),
+        (BODY.format(mass="1", tensor=TENSOR.format(1, 1, 1)).replace('<mass value="1"/>', ""), "without a mass"),
+        (BODY.format(mass="1", tensor=TENSOR.format(1, 1, 1)).replace("</link>", "<inertial/></link>"), "2 inertials"),
+    ],
+)
+def test_bodies_that_cannot_be_are_refused(tmp_path, wrong, said):
+    with pytest.raises(ModelError, match=said):
+        read_urdf(urdf(tmp_path, link("base"), wrong, joint("turn", "base", "tip")))
+
+
+@pytest.mark.parametrize("axis", ["1", "1 0", "nan 0 1", "1 0 0 0", ""])
+def test_an_axis_has_three_numbers(tmp_path, axis):
+    with pytest.raises(ModelError, match="axis xyz"):
+        read_urdf(urdf(tmp_path, link("base"), link("tip"), joint("turn", "base", "tip", axis=axis)))
+
+
+def test_an_origin_has_three_numbers(tmp_path):
+    moved = joint("turn", "base", "tip").replace("</joint>", '<origin xyz="1 2 3 4"/></joint>')
+    with pytest.raises(ModelError, match="origin xyz is '1 2 3 4'"):
+        read_urdf(urdf(tmp_path, link("base"), link("tip"), moved))
+
+
+def test_moments_that_no_body_has_are_said(tmp_path, caplog):
+    """Robots that people use have them: PR2, Allegro, Romeo."""
+    read_urdf(
+        urdf(tmp_path, link("base"), BODY.format(mass="1", tensor=TENSOR.format(1, 1, 3)), joint("turn", "base", "tip"))
+    )
+    assert "'tip' has principal moments" in caplog.text
+    caplog.clear()
+    read_urdf(
+        urdf(tmp_path, link("base"), BODY.format(mass="1", tensor=TENSOR.format(1, 2, 3)), joint("turn", "base", "tip"))
+    )
+    assert caplog.text == ""
+
+
+def follower(tmp_path, following="first"):
+    second = joint("second", "middle", "tip").replace(
+        "</joint>", f'<mimic joint="{following}" multiplier="-2" offset="0.5"/></joint>'
+    )
+    return urdf(tmp_path, link("base"), link("middle"), link("tip"), joint("first", "base", "middle"), second)
+
+
+def test_a_joint_that_follows_is_locked_where_its_leader_stands(tmp_path, caplog):
+    file = follower(tmp_path)
+    assert read_urdf(file).joint_names == ("first",)
+    assert "'second' follows 'first'" in caplog.text
+    pose = np.array(ca.DM(read_urdf(file, joints=(), locked={"first": 0.2}).frames["tip"].placement.matrix()))
+    angle = 0.2 + (0.5 - 2 * 0.2)
+    np.testing.assert_allclose(pose[:2, :2], [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+
+
+def test_a_joint_that_follows_cannot_be_chosen(tmp_path):
+    with pytest.raises(ModelError, match="follows 'first'"):
+        read_urdf(follower(tmp_path), joints=("first", "second"))
+    with pytest.raises(ModelError, match="follows a joint 'frist'"):
+        read_urdf(follower(tmp_path, "frist"))

@@ -7,6 +7,7 @@ links into other files for its own. None of this can be caught, so it is kept aw
 from __future__ import annotations
 
 import contextlib
+import faulthandler
 import multiprocessing
 import os
 import signal
@@ -111,6 +112,7 @@ def _try(path: Path) -> None:
 
 def _read_all(path: str, there: Connection) -> None:
     """Say what stands against reading a file; nothing where all of it can be read."""
+    faulthandler.disable()
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # allocators print before they abort
     try:
         with h5py.File(path, "r") as file:

@@ -1,0 +1,89 @@
+"""Signals end a run: at once, where they were swallowed, and where a call does not come back."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from yid_ocp import interruption
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals as on POSIX")
+
+HEAD = """
+import signal, sys, time
+from pathlib import Path
+from yid_ocp import interruption
+interruption.PATIENCE, interruption.LAST_RESORT = 0.2, {last}
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have had it ignored
+folder = Path(sys.argv[1])
+folder.mkdir()
+try:
+    with interruption.signals_raised(), interruption.removed_by_force(folder):
+        print("READY", flush=True)
+{body}
+except interruption.Interrupted as error:
+    print("ENDED", error, flush=True)
+    sys.exit(128 + error.number)
+"""
+
+
+def ended(tmp_path, body, number, last=5.0):
+    """Exit code, what was printed, and whether the folder is still there."""
+    text = HEAD.format(body="\n".join(" " * 8 + line for line in body.splitlines()), last=last)
+    folder = tmp_path / "folder"
+    process = subprocess.Popen([sys.executable, "-c", text, str(folder)], stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline().strip() == "READY"
+    process.send_signal(number)
+    out, _ = process.communicate(timeout=30)
+    return process.returncode, out.strip(), folder.exists()
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_a_signal_is_raised_by_its_name(tmp_path, name):
+    number = getattr(signal, name)
+    assert ended(tmp_path, "time.sleep(20)", number) == (128 + number, f"ENDED {name}", True)
+
+
+def test_what_was_swallowed_is_raised_again(tmp_path):
+    swallowing = "try:\n    time.sleep(20)\nexcept BaseException:\n    pass\ntime.sleep(20)"
+    assert ended(tmp_path, swallowing, signal.SIGINT) == (130, "ENDED SIGINT", True)
+
+
+def test_a_call_that_does_not_come_back_is_ended_by_force(tmp_path):
+    stuck = "while True:\n    try:\n        time.sleep(20)\n    except BaseException:\n        pass"
+    code, out, there = ended(tmp_path, stuck, signal.SIGTERM, last=0.8)
+    assert (code, out, there) == (143, "", False)
+
+
+def test_a_deferred_block_ends_first(tmp_path):
+    deferring = "with interruption.deferred():\n    time.sleep(1)\n    print('WHOLE', flush=True)\ntime.sleep(20)"
+    code, out, _ = ended(tmp_path, deferring, signal.SIGINT)
+    assert (code, out.split("\n")) == (130, ["WHOLE", "ENDED SIGINT"])
+
+
+def test_handlers_are_put_back_and_a_second_use_is_new():
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    for _ in range(2):
+        with pytest.raises(interruption.Interrupted), interruption.signals_raised():
+            signal.raise_signal(signal.SIGTERM)
+        assert interruption.asked() == signal.SIGTERM
+    assert {number: signal.getsignal(number) for number in before} == before
+    assert signal.set_wakeup_fd(-1) == -1
+
+
+def test_other_threads_do_without():
+    done = []
+
+    def work():
+        with interruption.signals_raised():
+            done.append(True)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert done == [True]
