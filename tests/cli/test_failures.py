@@ -126,3 +126,29 @@ def test_a_full_disk_is_the_users_business(cli, pendulum, left_nothing, monkeypa
     assert done.code == 2
     assert "No space left on device" in done.err
     left_nothing()
+
+
+def ran(code: str, *arguments: object, **options: object) -> subprocess.CompletedProcess[str]:
+    """`yid-ocp` in a shell."""
+    text = " ".join([f"'{sys.executable}' -m yid_ocp", *map(str, arguments)])
+    return subprocess.run(["sh", "-c", code.format(text)], capture_output=True, text=True, timeout=120, **options)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="a POSIX shell")
+def test_a_reader_that_stops_reading(tmp_path):
+    done = ran("({}; echo $? > code) | true", "schema", cwd=tmp_path)
+    assert (tmp_path / "code").read_text().strip() == "2"
+    assert "standard output was closed" in done.stderr
+    assert "Traceback" not in done.stderr
+    done = ran("{} >&-", "schema", cwd=tmp_path)
+    assert done.returncode in (0, 2)
+    assert "bug" not in done.stderr
+
+
+@pytest.mark.skipif(os.name != "posix", reason="a POSIX shell")
+def test_a_working_directory_that_is_gone(pendulum, tmp_path):
+    (tmp_path / "gone").mkdir()
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    done = ran("rmdir ../gone; {}", "check", pendulum, cwd=tmp_path / "gone", env=environment)
+    assert done.returncode == 2
+    assert "working directory" in done.stderr

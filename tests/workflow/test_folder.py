@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import math
@@ -82,3 +83,76 @@ def test_a_folder_in_use_is_refused_and_an_unnamed_one_is_numbered(settings, tmp
         with new_run_folder(settings, None, "check"):
             pass
     assert {path.name for path in (tmp_path / "runs").iterdir()} == {"pendulum-check-now", "pendulum-check-now-2"}
+
+
+def test_a_name_is_reserved_from_the_start(settings, tmp_path, monkeypatch):
+    monkeypatch.setattr("yid_ocp.workflow.folder.time.strftime", lambda _: "now")
+    monkeypatch.chdir(tmp_path)
+    with contextlib.ExitStack() as runs:
+        folders = [runs.enter_context(new_run_folder(settings, None, "check")) for _ in range(3)]
+        for i, folder in enumerate(folders):
+            folder.write("number.txt", str(i))
+    names = ["pendulum-check-now", "pendulum-check-now-2", "pendulum-check-now-3"]
+    assert [(tmp_path / "runs" / name / "number.txt").read_text() for name in names] == ["0", "1", "2"]
+
+
+def test_a_name_that_another_run_has_is_refused_before_the_work(settings, tmp_path):
+    with (
+        new_run_folder(settings, tmp_path / "run"),
+        pytest.raises(OutputError, match="another run"),
+        new_run_folder(settings, tmp_path / "run"),
+    ):
+        pass
+    assert (tmp_path / "run" / "log.jsonl").is_file()
+
+
+@pytest.mark.parametrize("kind", ["folder", "file"])
+def test_a_result_is_not_lost_because_its_name_was_taken(settings, tmp_path, caplog, kind):
+    with new_run_folder(settings, tmp_path / "run") as folder:
+        folder.write("a.txt", "mine")
+        taken = tmp_path / "run" / "theirs" if kind == "folder" else tmp_path / "run"
+        taken.parent.mkdir(exist_ok=True)
+        taken.write_text("theirs")
+    assert taken.read_text() == "theirs"
+    assert folder.path == tmp_path / "run-2"
+    assert (tmp_path / "run-2" / "a.txt").read_text() == "mine"
+    assert "was taken" in caplog.text
+
+
+def test_what_a_killed_run_left_is_cleared_away_and_what_lives_stays(settings, tmp_path):
+    left = tmp_path / ".left.partial"
+    left.mkdir()
+    (left / "lock").touch()
+    (left / "big").write_text("x")
+    foreign = tmp_path / ".foreign.partial"
+    foreign.mkdir()
+    with new_run_folder(settings, tmp_path / "lives") as alive:
+        alive.write("a.txt", "a")
+        with new_run_folder(settings, tmp_path / "other"):
+            assert (alive.path / "a.txt").is_file()
+    assert {path.name for path in tmp_path.iterdir() if path.is_dir()} >= {"lives", "other", ".foreign.partial"}
+    assert not left.exists()
+
+
+@pytest.mark.parametrize("name", ["", "  ", "x" * 300, "a\0b", "~nobody_of_this_name/run"])
+def test_impossible_names_are_refused(settings, tmp_path, monkeypatch, name):
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    monkeypatch.chdir(empty)
+    with pytest.raises(OutputError), new_run_folder(settings, name):
+        pass
+    assert list(empty.iterdir()) == []
+
+
+def test_a_full_disk_names_the_folder_that_was_asked_for(settings, tmp_path, monkeypatch):
+    def full(*arguments):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("yid_ocp.files.os.replace", full)
+    with (
+        pytest.raises(OutputError, match="No space left") as caught,
+        new_run_folder(settings, tmp_path / "runs" / "run") as folder,
+    ):
+        folder.write("a.txt", "a")
+    assert caught.value.where == str(tmp_path / "runs" / "run" / "a.txt")
+    assert not (tmp_path / "runs").exists()

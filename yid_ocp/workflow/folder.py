@@ -275,8 +275,8 @@ def _targets(run: Run, out: str | Path | None, command: str) -> list[Path]:
         parent = Path(run.output.folder) if run.output.folder is not None else Path.cwd() / "runs"
         stem = _stem(run, command, time.strftime("%Y%m%d-%H%M%S"))
         return [parent / name for name in (stem, *(f"{stem}-{i}" for i in range(2, _NAMES)))]
-    if not str(out).strip():
-        raise OutputError("the run folder has no name", where="--out", allowed="a new name, or an empty folder")
+    if not str(out).strip() or "\0" in str(out):
+        raise OutputError("this is no name of a folder", where="--out", allowed="a new name, or an empty folder")
     try:
         target = Path(out).expanduser().absolute()
         is_folder = target.is_dir()

@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -123,7 +124,8 @@ def _bag_messages(path: Path) -> tuple[dict[str, list[_Message]], list[str]]:
             for connection, logged, data in reader.messages(wanted) if wanted else ():
                 content: Any = reader.deserialize(data, connection.msgtype)
                 stamp = content.header.stamp.sec * 10**9 + content.header.stamp.nanosec
-                messages[connection.msgtype].append(_Message(connection.topic, logged, stamp, content))
+                plain = _plain(content, connection.msgtype)
+                messages[connection.msgtype].append(_Message(connection.topic, int(logged), int(stamp), plain))
     except Exception as error:  # rosbags lets through whatever a damaged file makes struct, sqlite3 or zstd raise
         raise DataError(
             f"the bag cannot be read ({type(error).__name__}: {error})",
@@ -132,6 +134,17 @@ def _bag_messages(path: Path) -> tuple[dict[str, list[_Message]], list[str]]:
             hint="check with `ros2 bag info` or `rosbag info`; a bag cut off by a crash needs `ros2 bag reindex`",
         ) from error
     return messages, others
+
+
+def _plain(content: Any, kind: str) -> SimpleNamespace:
+    """What is needed of a message, in Python's types: a bag brings definitions of its own, which may be damaged."""
+    frame = str(content.header.frame_id)
+    if kind == _POINT_STAMPED:
+        x, y, z = (float(getattr(content.point, axis)) for axis in "xyz")
+        return SimpleNamespace(frame=frame, point=(x, y, z))
+    names = [str(name) for name in content.name]
+    values = {key: np.asarray(getattr(content, key), float).ravel() for key in ("position", "velocity", "effort")}
+    return SimpleNamespace(frame=frame, name=names, **values)
 
 
 def _joint_states(
@@ -210,7 +223,7 @@ def _stamped_points(
     groups: dict[str, list[tuple[str, _Message]]] = {}
     for message in messages:
         if message.topic in names:
-            frame = message.content.header.frame_id.strip("/") or "unknown"
+            frame = message.content.frame.strip("/") or "unknown"
             groups.setdefault(frame, []).append((names[message.topic], message))
     return groups
 
@@ -228,7 +241,7 @@ def _point_group(
         key, position = (seconds(message), point), message.content.point
         if key in seen:
             raise DataError(f"point '{point}' comes twice at {key[0]:g} s", where=f"{where}: {message.topic}")
-        seen[key] = (position.x, position.y, position.z)
+        seen[key] = position
     times, names = sorted({time for time, _ in seen}), sorted({point for _, point in seen})
     rows, columns = ({key: index for index, key in enumerate(keys)} for keys in (times, names))
     array = np.full((len(times), len(names), 3), np.nan)
