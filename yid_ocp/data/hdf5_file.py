@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import contextlib
 import faulthandler
-import multiprocessing
 import os
+import select
 import signal
+import warnings
 from collections.abc import Iterator
-from multiprocessing.connection import Connection
 from pathlib import Path
 
 import h5py
@@ -84,34 +84,41 @@ def open_hdf5(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
 
 
 def _try(path: Path) -> None:
-    """Read a file in another process."""
-    if "fork" not in multiprocessing.get_all_start_methods():
+    """Read a file in another process, a fork: a new one would take a second, and one of a pool may have no children."""
+    if not hasattr(os, "fork"):
         return
-    context = multiprocessing.get_context("fork")
-    here, there = context.Pipe(duplex=False)
-    process = context.Process(target=_read_all, args=(str(path), there), daemon=True)
-    process.start()
-    there.close()
+    here, there = os.pipe()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of threads, none of which the fork needs
+        child = os.fork()
+    if child == 0:
+        try:
+            os.write(there, f".{_complaint(path)}".encode(errors="replace")[:2000])
+        finally:
+            os._exit(0)
+    os.close(there)
     try:
-        complaint = here.recv_bytes().decode() if here.poll(TRIAL_TIME) else None
-    except EOFError:
-        process.join()
-        number = -(process.exitcode or 0)
-        name = signal.Signals(number).name if number > 0 else f"exit code {process.exitcode}"
-        complaint = f"the HDF5 file is damaged (it ends the HDF5 library with {name})"
+        ready, _, _ = select.select([here], [], [], TRIAL_TIME)
+        said = os.read(here, 4000).decode(errors="replace") if ready else None
     finally:
-        process.kill()
-        process.join()
-        here.close()
-    if complaint is None:
+        os.close(here)
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(child, signal.SIGKILL)
+        _, status = os.waitpid(child, 0)
+    if said is None:
         what = f"the HDF5 file cannot be read within {TRIAL_TIME:g} s: it is damaged, or far too large"
-        raise DataError(what, where=str(path), hint="copy or record it again")
-    if complaint:
-        raise DataError(complaint, where=str(path), hint="copy or record it again, as one file of its own")
+    elif not said:
+        number = os.WTERMSIG(status) if os.WIFSIGNALED(status) else 0
+        how = signal.Signals(number).name if number else "an exit"
+        what = f"the HDF5 file is damaged (it ends the HDF5 library with {how})"
+    else:
+        what = said[1:]
+    if what:
+        raise DataError(what, where=str(path), hint="copy or record it again, as one file of its own")
 
 
-def _read_all(path: str, there: Connection) -> None:
-    """Say what stands against reading a file; nothing where all of it can be read."""
+def _complaint(path: Path) -> str:
+    """What stands against reading a file; nothing where all of it can be read."""
     faulthandler.disable()
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # allocators print before they abort
     try:
@@ -120,9 +127,9 @@ def _read_all(path: str, there: Connection) -> None:
             if not complaint:
                 dict(file.attrs)
                 file.visititems(_read)
+            return complaint
     except Exception as error:  # whatever h5py says of damaged files
-        complaint = f"the HDF5 file is truncated or damaged ({reason(error)})"
-    there.send_bytes(complaint.encode(errors="replace")[:2000])
+        return f"the HDF5 file is truncated or damaged ({reason(error)})"
 
 
 def _read(name: str, item: h5py.Group | h5py.Dataset) -> None:

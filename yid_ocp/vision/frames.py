@@ -7,6 +7,7 @@ import ctypes
 import json
 import math
 import os
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from functools import cache
@@ -30,6 +31,8 @@ UNITS: Mapping[str, float] = {"m": 1.0, "mm": 1e-3}
 """Units in which a folder's clouds may be, and their size in metres."""
 
 _KEYS = ("format", "pose", "frame", "unit", "intrinsics", "depth_unit", "description")
+_HEAD = 10_000  # [bytes]; where a cloud's file says how many points it has
+_COUNT = re.compile(rb"^(?:element vertex|POINTS)\s+(\d{1,18})\b", re.MULTILINE)
 _LARGEST_DEPTH = 65.535  # [m]; what sixteen bits of millimetres hold
 
 
@@ -379,9 +382,18 @@ def _read_cloud(path: Path) -> Array:
     o3d = open3d_module()
     if not path.is_file():
         raise DataError("the file of the cloud is missing", where=str(path))
+    with path.open("rb") as file:
+        declared = _COUNT.search(file.read(_HEAD))
+    if declared is not None and int(declared[1]) > path.stat().st_size:  # each takes several bytes
+        what = f"the cloud is damaged: it declares {int(declared[1]):.3g} points in {path.stat().st_size} bytes"
+        raise DataError(what, where=str(path), hint="copy or record it again")
     # Open3D says what is wrong on the standard output and returns an empty cloud
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        cloud = o3d.io.read_point_cloud(str(path))
+    try:
+        with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+            cloud = o3d.io.read_point_cloud(str(path))
+    except (MemoryError, RuntimeError) as error:
+        what = f"the cloud is damaged: it declares more points than fit into memory ({error})"
+        raise DataError(what, where=str(path), hint="copy or record it again") from error
     points = np.asarray(cloud.points, dtype=np.float64)
     if not len(points):
         raise DataError("the cloud is empty or cannot be read", where=str(path))

@@ -1,0 +1,493 @@
+"""Damaged inputs of every kind, each read by a process of its own: whether anything crashes, hangs or leaks out.
+
+    python benchmarks/fuzz.py [KIND ...] [--inputs 20000] [--seconds 3600] [--jobs 2] [--first 0]
+    python benchmarks/fuzz.py KIND --only SEED --keep FOLDER
+
+An input is a valid file (configuration, setting, recording, table, bag, robot, camera frames) that was damaged by a
+rule and a seed: bits, blocks, lines, numbers, names, datasets, attributes, types. It is read as the program reads it.
+Sound is what it takes, and what it refuses with an error that says what is wrong; anything else is printed with the
+kind and the seed that make it again: an exception of another kind, a signal, more than 20 s, more than 2 GiB, a file
+left where the process stands. Exit code 1 where there is anything to print.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import multiprocessing
+import os
+import re
+import resource
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from yid_ocp.cli import main as command
+from yid_ocp.config.reader import load_config
+from yid_ocp.data import JointGroup, PointGroup, Recording, read_recording, write_recording
+from yid_ocp.data.readers import read_any
+from yid_ocp.errors import YidError
+from yid_ocp.model.system import System
+from yid_ocp.model.urdf import read_urdf
+from yid_ocp.vision import FrameSequence, look_at, read_frames, write_frames
+
+PATIENCE = 20.0  # [s]
+MEMORY = 2 << 30
+REPOSITORY = Path(__file__).resolve().parents[1]
+
+Random = np.random.Generator
+Array = npt.NDArray[np.float64]
+
+CONFIG = """\
+description: A double pendulum, moved as measured.
+model:
+  robot: {urdf}
+  arms: {{mode: prescribed}}
+  springs:
+    shoulder: {{stiffness: 1.0, rest: 0.2}}
+recordings:
+  estimate: [recording.h5]
+  held_out: []
+sensors:
+  joints: {{effort: {{std: 0.01}}}}
+parameters:
+  shoulder.stiffness: {{free: true, bounds: [0.0, 100.0]}}
+  elbow.damping: {{free: true}}
+problem: {{path_cutoff: 8, compiler: false, time_step: 0.01}}
+solver: {{name: gauss_newton, iterations: 2}}
+output: {{report: false}}
+"""
+
+NUMBERS = (
+    *("0", "-1", "1e308", "-1e308", "1e-308", "1e-9", "1e400", "2000000000", "3.0000001", "0x10", "1_000", "1:30"),
+    *("1,5", "0.1.2", "+", "nan", ".nan", "inf", ".inf", "-.inf", "one", "true", "null", "[1]", "{a: 1}", ""),
+    *("9" * 40, "9" * 5000),
+)
+PIECES = (
+    *("\0", "\t", "\ufeff", "é" * 300, "---\n", "\n\n", "<<: ", "{" * 60, "[" * 60),
+    *["*a", "&a", "!!set", "'", '"', "..", "/"],
+)
+SETTINGS = (
+    "problem.time_step",
+    "problem.path_cutoff",
+    "model.springs.shoulder.stiffness",
+    "model.robot",
+    "model.locked",
+    "solver.iterations",
+    "parameters.elbow.damping.bounds",
+    "recordings.estimate",
+    "sensors.joints.effort.std",
+)
+
+
+# -- what is damaged --------------------------------------------------------------------------------------------------
+
+
+def made_recording() -> Recording:
+    """Two joints and a point for half a second."""
+    t: Array = 0.01 * np.arange(51, dtype=np.float64)
+    position: Array = 0.4 * np.stack([np.sin(5 * t), np.cos(4 * t)], axis=1)
+    effort = 0.2 + 0.1 * position
+    joints = JointGroup(("shoulder", "elbow"), t, position, effort=effort, effort_std=0.01, position_std=1e-4)
+    seen: Array = np.stack([position[:, :1], position[:, 1:], position[:, :1]], axis=2)
+    points = PointGroup("points_arm", ("forearm",), t, seen, np.full(seen.shape, 1e-3), "mocap", "world")
+    return Recording(joints, (points,), "half a second", "made up", "recording")
+
+
+def originals(folder: Path) -> None:
+    """Write one valid input of every kind."""
+    write_recording(made_recording(), folder / "recording.h5")
+    shutil.copy(REPOSITORY / "models" / "urdf" / "double_pendulum.urdf", folder / "robot.urdf")
+    (folder / "config.yaml").write_text(CONFIG.format(urdf="robot.urdf"), encoding="utf-8")
+    rows = ["t,q_shoulder,q_elbow,effort_shoulder,effort_elbow,tip_x,tip_y,tip_z"]
+    rows += [",".join(f"{value:.6g}" for value in (0.01 * i, *np.sin(np.arange(7) + 0.1 * i))) for i in range(40)]
+    (folder / "table.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    cloud = np.random.default_rng(0).normal((0.0, 0.0, 2.0), size=(30, 3))
+    write_frames(FrameSequence.of([0.1, 0.2], [cloud, cloud], look_at([2, 0, 0], [0, 0, 0])), folder / "frames")
+    write_bag(folder / "bag")
+
+
+def write_bag(folder: Path) -> None:
+    """A short MCAP with joint states."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    kinds: Any = store.types
+    with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        kind = "sensor_msgs/msg/JointState"
+        connection = writer.add_connection("/joint_states", kind, typestore=store)
+        for i in range(20):
+            stamp = kinds["builtin_interfaces/msg/Time"](sec=1, nanosec=10_000_000 * i)
+            head = kinds["std_msgs/msg/Header"](stamp=stamp, frame_id="")
+            values = [np.array([0.1 * i, 0.2]) for _ in range(3)]
+            message = kinds[kind](head, ["shoulder", "elbow"], *values)
+            writer.write(connection, 10**9 + 10_000_000 * i, store.serialize_cdr(message, kind))
+
+
+# -- how it is damaged ------------------------------------------------------------------------------------------------
+
+
+def damaged_bytes(data: bytes, rng: Random) -> bytes:
+    """Flip, zero, cut, repeat or insert, once or a few times."""
+    work = bytearray(data)
+    for _ in range(int(rng.integers(1, 5))):
+        if not work:
+            break
+        at, size = int(rng.integers(len(work))), int(2 ** rng.uniform(0, 9))
+        match int(rng.integers(6)):
+            case 0 | 1:
+                work[at] ^= 1 << int(rng.integers(8))
+            case 2:
+                work[at : at + size] = bytes(len(work[at : at + size]))
+            case 3:
+                del work[at if rng.random() < 0.5 else len(work) - size :]
+            case 4:
+                work[at:at] = work[at : at + size]
+            case _:
+                work[at : at + size] = rng.bytes(len(work[at : at + size]))
+    return bytes(work)
+
+
+def damaged_text(text: str, rng: Random) -> str:
+    """Change numbers, words and lines, once or a few times."""
+    for _ in range(int(rng.integers(1, 4))):
+        lines = text.splitlines(keepends=True) or [""]
+        line = int(rng.integers(len(lines)))
+        match int(rng.integers(8)):
+            case 0 | 1 | 2:
+                found = list(re.finditer(r"-?\d+\.?\d*(?:e-?\d+)?", text))
+                if found:
+                    one = found[int(rng.integers(len(found)))]
+                    text = text[: one.start()] + str(rng.choice(NUMBERS)) + text[one.end() :]
+                continue
+            case 3:
+                words = list(re.finditer(r"[A-Za-z_.]+", text))
+                if len(words) > 1:
+                    one, other = (words[int(i)] for i in rng.integers(len(words), size=2))
+                    text = text[: one.start()] + other[0] + text[one.end() :]
+                continue
+            case 4:
+                at = int(rng.integers(len(text) + 1))
+                text = text[:at] + str(rng.choice(PIECES)) + text[at:]
+                continue
+            case 5:
+                lines.insert(line, lines[int(rng.integers(len(lines)))])
+            case 6:
+                del lines[line]
+            case _:
+                return damaged_bytes(text.encode(), rng).decode(errors="surrogateescape")
+        text = "".join(lines)
+    return text
+
+
+def write_damaged(path: Path, rng: Random) -> None:
+    """Damage a text file."""
+    text = damaged_text(path.read_text(encoding="utf-8"), rng)
+    path.write_bytes(text.encode(errors="surrogateescape"))
+
+
+def damage_hdf5(path: Path, rng: Random) -> None:
+    """Damage the bytes of a recording, or what it holds."""
+    if rng.random() < 0.5:
+        path.write_bytes(damaged_bytes(path.read_bytes(), rng))
+        return
+    with h5py.File(path, "a") as file:
+        sets: list[str] = []
+        file.visit(lambda name: sets.append(name) if isinstance(file[name], h5py.Dataset) else None)
+        name = sets[int(rng.integers(len(sets)))]
+        values = np.array(file[name])
+        match int(rng.integers(9)):
+            case 0:
+                values.flat[int(rng.integers(values.size))] = float(rng.choice([math.nan, math.inf, 1e300, -1e9, 0.0]))
+                file[name][...] = values
+            case 1:
+                del file[name]
+                file[name] = values[: int(rng.integers(len(values)))]
+            case 2:
+                del file[name]
+                file[name] = values.astype(str(rng.choice(["f2", "i1", "c16", "S5", "?"])))
+            case 3:
+                del file[name]
+                file.create_dataset(name, (10 ** int(rng.integers(3, 12)), *values.shape[1:]), "f8", chunks=True)
+            case 4:
+                del file[name]
+                file[name] = h5py.ExternalLink("/etc/passwd", "x") if rng.random() < 0.5 else h5py.SoftLink(f"/{name}")
+            case 5:
+                file[name][...] = values * 10.0 ** rng.integers(-12, 13)
+            case 6:
+                owner = file[name].parent if rng.random() < 0.5 else file
+                keys = list(owner.attrs)
+                if keys:
+                    owner.attrs[keys[int(rng.integers(len(keys)))]] = rng.choice(
+                        np.array([math.nan, "", b"\xff", 10**12, "a: b"], dtype=object)
+                    )
+            case 7:
+                group = file[name].parent
+                if "t" in group and group["t"].size:
+                    group["t"][...] = np.array(group["t"]) * float(rng.choice([1e3, 1e9, -1.0, 0.0])) + float(
+                        rng.choice([0.0, 1.7e9])
+                    )
+            case _:
+                file.move(name, f"{name}_{rng.integers(10)}" if rng.random() < 0.5 else f"extra/{name}")
+
+
+def damage_folder(folder: Path, rng: Random) -> None:
+    """Damage one of a folder's files, or take it away."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    file = files[int(rng.integers(len(files)))]
+    if rng.random() < 0.1:
+        file.unlink()
+    elif file.suffix in (".json", ".csv", ".yaml") and rng.random() < 0.7:
+        write_damaged(file, rng)
+    else:
+        head, tail = file.read_bytes()[:300], file.read_bytes()[300:]
+        if file.suffix == ".ply" and rng.random() < 0.5:  # its head is text
+            head = damaged_text(head.decode("latin-1"), rng).encode("latin-1", errors="replace")
+            file.write_bytes(head + tail)
+        else:
+            file.write_bytes(damaged_bytes(head + tail, rng))
+
+
+# -- how it is read ---------------------------------------------------------------------------------------------------
+
+
+def probe_yaml(folder: Path, rng: Random) -> None:
+    """A configuration, and what `check` says of those that can be read."""
+    write_damaged(folder / "config.yaml", rng)
+    load_config(folder / "config.yaml")
+    if rng.random() < 0.5:
+        checked(folder)
+
+
+def probe_set(folder: Path, rng: Random) -> None:
+    """A setting of the command line."""
+    value = damaged_text(str(rng.choice([*NUMBERS, "[0.1, 0.2]", "{a: [1, 2]}", "text"])), rng)
+    setting = f"{rng.choice(SETTINGS)}={value}".replace("\0", "")
+    load_config(folder / "config.yaml", [setting])
+    if rng.random() < 0.5:
+        checked(folder, "--set", setting)
+
+
+def probe_hdf5(folder: Path, rng: Random) -> None:
+    """A recording, and what `check` says of those that can be read."""
+    damage_hdf5(folder / "recording.h5", rng)
+    read_recording(folder / "recording.h5")
+    checked(folder)
+
+
+def probe_csv(folder: Path, rng: Random) -> None:
+    """A table."""
+    write_damaged(folder / "table.csv", rng)
+    read_any(folder / "table.csv")
+
+
+def probe_bag(folder: Path, rng: Random) -> None:
+    """A bag."""
+    damage_folder(folder / "bag", rng)
+    read_any(folder / "bag" if rng.random() < 0.5 else next((folder / "bag").glob("*.mcap"), folder / "bag"))
+
+
+def probe_urdf(folder: Path, rng: Random) -> None:
+    """A robot, and the system that is built of it."""
+    write_damaged(folder / "robot.urdf", rng)
+    System.build(read_urdf(folder / "robot.urdf"))
+
+
+def probe_frames(folder: Path, rng: Random) -> None:
+    """Camera frames."""
+    damage_folder(folder / "frames", rng)
+    sequence = read_frames(folder / "frames")
+    for index in range(len(sequence)):
+        sequence.world(index)
+
+
+KINDS: Mapping[str, Callable[[Path, Random], None]] = {
+    "yaml": probe_yaml,
+    "set": probe_set,
+    "hdf5": probe_hdf5,
+    "csv": probe_csv,
+    "bag": probe_bag,
+    "urdf": probe_urdf,
+    "frames": probe_frames,
+}
+SHARES = {"yaml": 3, "set": 3, "hdf5": 3, "csv": 4, "bag": 3, "urdf": 4, "frames": 2}
+
+
+class UnsoundError(Exception):
+    """What the program did that it should not do."""
+
+
+def checked(folder: Path, *settings: str) -> None:
+    """Run the command `check`."""
+    shutil.rmtree(folder / "run", ignore_errors=True)
+    arguments = ["check", str(folder / "config.yaml"), "--quiet", "--out", str(folder / "run"), *settings]
+    code = command(arguments)
+    if code not in (0, 1, 2):
+        raise UnsoundError(f"exit code {code}")
+
+
+# -- workers ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Case:
+    """An input: its kind, and the seed of its damage."""
+
+    kind: str
+    seed: int
+
+
+def tried(case: Case, originals_folder: Path, work: Path) -> str:
+    """What is wrong with how an input was taken; nothing where it was refused in words or read."""
+    shutil.rmtree(work, ignore_errors=True)
+    shutil.copytree(originals_folder, work)
+    stand = work.parent / "stand"
+    stand.mkdir(exist_ok=True)
+    os.chdir(stand)
+    rng = np.random.default_rng([sorted(KINDS).index(case.kind), case.seed])
+    begun = time.monotonic()
+    try:
+        KINDS[case.kind](work, rng)
+    except YidError as error:
+        if not error.what or "Traceback" in str(error):
+            return f"an error without words: {error!r}"
+    except UnsoundError as error:
+        return str(error)
+    except Exception as error:  # whatever else comes up is what is looked for
+        return f"{type(error).__name__}: {error}"[:500]
+    if time.monotonic() - begun > PATIENCE:
+        return f"{time.monotonic() - begun:.1f} s"
+    if left := [path.name for path in stand.iterdir()]:
+        return f"left where the process stands: {left}"
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    return f"{peak / 2**30:.1f} GiB" if peak > MEMORY else ""
+
+
+def serve(there: Connection, originals_folder: str, work: str) -> None:
+    """Try inputs until told to end."""
+    quiet = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(quiet, 1)
+    os.dup2(quiet, 2)
+    room = Path(work)
+    room.mkdir(parents=True)
+    os.environ["TMPDIR"] = str(room)
+    while (case := there.recv()) is not None:
+        there.send(tried(case, Path(originals_folder), room / "work"))
+
+
+@dataclass
+class Worker:
+    """A process that tries inputs."""
+
+    process: BaseProcess
+    pipe: Connection
+    case: Case | None = None
+    since: float = 0.0
+
+
+def hunt(cases: Iterator[Case], seconds: float, jobs: int) -> tuple[int, list[tuple[Case, str]]]:
+    """Try inputs until they or the time end; returns how many were tried, and those taken wrongly."""
+    context = multiprocessing.get_context("spawn")
+    found: list[tuple[Case, str]] = []
+    count, begun, number = 0, time.monotonic(), 0
+    with tempfile.TemporaryDirectory(prefix="yid-fuzz-") as folder:
+        valid = Path(folder) / "valid"
+        valid.mkdir()
+        originals(valid)
+
+        def started() -> Worker:
+            nonlocal number
+            number += 1
+            here, there = context.Pipe()
+            work = str(Path(folder) / f"worker_{number}")
+            process = context.Process(target=serve, args=(there, str(valid), work), daemon=True)
+            process.start()
+            there.close()
+            return Worker(process, here)
+
+        workers = [started() for _ in range(jobs)]
+        going = True
+        while going or any(worker.case is not None for worker in workers):
+            for i, worker in enumerate(workers):
+                if worker.case is None:
+                    case = next(cases, None) if going and time.monotonic() - begun < seconds else None
+                    going = going and case is not None
+                    if case is not None:
+                        worker.case, worker.since = case, time.monotonic()
+                        worker.pipe.send(case)
+                    continue
+                said: str | None = None
+                if worker.pipe.poll():
+                    try:
+                        said = worker.pipe.recv()
+                    except EOFError:
+                        worker.process.join()
+                        said = f"its process ended with {worker.process.exitcode}"
+                elif time.monotonic() - worker.since > 1.5 * PATIENCE + (30 if count < jobs else 0):
+                    said = f"no end after {1.5 * PATIENCE:g} s"
+                if said is None:
+                    continue
+                count += 1
+                if said:
+                    found.append((worker.case, said))
+                    print(f"{worker.case.kind} --only {worker.case.seed}: {said}", flush=True)
+                worker.case = None
+                if said.startswith(("its process", "no end", f"{MEMORY}")) or "GiB" in said:
+                    worker.process.kill()
+                    worker.process.join()
+                    workers[i] = started()
+            wait([worker.pipe for worker in workers if worker.case is not None], timeout=0.2)
+        for worker in workers:
+            worker.process.kill()
+            worker.process.join()
+    return count, found
+
+
+def drawn(kinds: Sequence[str], inputs: int, first: int = 0) -> Iterator[Case]:
+    """So many inputs, more of those kinds that take less time."""
+    order = [kind for kind in kinds for _ in range(SHARES[kind])]
+    for seed in range(first, first + inputs):
+        yield Case(order[seed % len(order)], seed)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Hunt, or make one input again and read it with its traceback."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("kinds", nargs="*", metavar="KIND", help=", ".join(KINDS))
+    parser.add_argument("--inputs", type=int, default=20_000)
+    parser.add_argument("--seconds", type=float, default=3600.0)
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--first", type=int, default=0, help="seed to begin with")
+    parser.add_argument("--only", type=int, metavar="SEED", help="read this input alone, with its traceback")
+    parser.add_argument("--keep", type=Path, default=Path("fuzz"), help="folder for the files of --only")
+    given = parser.parse_args(argv)
+    kinds = given.kinds or list(KINDS)
+    if unknown := [kind for kind in kinds if kind not in KINDS]:
+        parser.error(f"there is no kind '{unknown[0]}'; known: {', '.join(KINDS)}")
+    if given.only is not None:
+        given.keep.mkdir(parents=True)
+        originals(given.keep)
+        rng = np.random.default_rng([sorted(KINDS).index(kinds[0]), given.only])
+        KINDS[kinds[0]](given.keep, rng)
+        return 0
+    begun = time.monotonic()
+    count, found = hunt(drawn(kinds, given.inputs, given.first), given.seconds, given.jobs)
+    print(json.dumps({"inputs": count, "found": len(found), "seconds": round(time.monotonic() - begun, 1)}))
+    return 1 if found else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

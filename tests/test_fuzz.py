@@ -1,0 +1,82 @@
+"""Damaged inputs are read or refused in words: a minute of them, and many as a slow test; see benchmarks/fuzz.py."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rosbags", reason="bags need rosbags: pip install 'yid-ocp[bags]'")
+pytest.importorskip("open3d", reason="clouds need Open3D: pip install 'yid-ocp[vision]'")
+
+FOLDER = Path(__file__).parents[1] / "benchmarks"
+
+
+@pytest.fixture(scope="module")
+def fuzz() -> Iterator[ModuleType]:
+    path = list(sys.path)
+    sys.path.insert(0, str(FOLDER))  # its workers find it by its name
+    spec = importlib.util.spec_from_file_location("fuzz", FOLDER / "fuzz.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["fuzz"] = module
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules["fuzz"]
+    sys.path[:] = path
+
+
+def assert_sound(fuzz: ModuleType, inputs: int, seconds: float, first: int) -> int:
+    count, found = fuzz.hunt(fuzz.drawn(list(fuzz.KINDS), inputs, first), seconds, 1)
+    assert [f"{case.kind} --only {case.seed}: {said}" for case, said in found] == []
+    return int(count)
+
+
+def test_a_minute_of_damaged_inputs(fuzz):
+    assert assert_sound(fuzz, 2000, 40.0, 0) >= 20
+
+
+@pytest.mark.slow
+def test_twenty_thousand_damaged_inputs(fuzz):
+    count, found = fuzz.hunt(fuzz.drawn(list(fuzz.KINDS), 20_000, 100_000), 7200.0, 2)
+    assert found == []
+    assert count == 20_000
+
+
+def test_what_is_wrong_is_found(fuzz, tmp_path, monkeypatch):
+    """Exceptions that are not ours, and files that are left."""
+    (tmp_path / "valid").mkdir()
+    fuzz.originals(tmp_path / "valid")
+    monkeypatch.chdir(tmp_path)
+
+    def said(probe) -> str:
+        monkeypatch.setitem(fuzz.KINDS, "csv", probe)
+        monkeypatch.setattr(fuzz, "MEMORY", 1 << 60)
+        return fuzz.tried(fuzz.Case("csv", 1), tmp_path / "valid", tmp_path / "room" / "work")
+
+    (tmp_path / "room").mkdir()
+    assert said(lambda folder, rng: None) == ""
+    assert said(lambda folder, rng: 1 / 0).startswith("ZeroDivisionError")
+    assert "left" in said(lambda folder, rng: Path("left.txt").touch())
+    (tmp_path / "room" / "stand" / "left.txt").unlink()
+    assert said(fuzz.probe_csv) == ""
+
+
+def test_a_process_that_dies_is_said_and_the_others_go_on(fuzz):
+    cases = iter([fuzz.Case("csv", 1), fuzz.Case("no such kind", 1), fuzz.Case("csv", 2)])
+    count, found = fuzz.hunt(cases, 60.0, 1)
+    assert count == 3
+    assert [(case.kind, said) for case, said in found] == [("no such kind", "its process ended with 1")]
+
+
+def test_damage_is_made_by_its_seed(fuzz):
+    data = bytes(range(200))
+    one, two, other = (fuzz.damaged_bytes(data, np.random.default_rng(seed)) for seed in (3, 3, 4))
+    assert one == two != other
+    assert other != data
