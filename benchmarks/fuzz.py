@@ -60,12 +60,10 @@ model:
 recordings:
   estimate: [recording.h5]
   held_out: []
-sensors:
-  joints: {{effort: {{std: 0.01}}}}
 parameters:
   shoulder.stiffness: {{free: true, bounds: [0.0, 100.0]}}
   elbow.damping: {{free: true}}
-problem: {{path_cutoff: 8, compiler: false, time_step: 0.01}}
+problem: {{path_cutoff: 20, compiler: false, time_step: 0.01}}
 solver: {{name: gauss_newton, iterations: 2}}
 output: {{report: false}}
 """
@@ -88,7 +86,7 @@ SETTINGS = (
     "solver.iterations",
     "parameters.elbow.damping.bounds",
     "recordings.estimate",
-    "sensors.joints.effort.std",
+    "sensors.joints.std",
 )
 
 
@@ -96,14 +94,14 @@ SETTINGS = (
 
 
 def made_recording() -> Recording:
-    """Two joints and a point for half a second."""
-    t: Array = 0.01 * np.arange(51, dtype=np.float64)
+    """Two joints and a point for a second."""
+    t: Array = 0.01 * np.arange(101, dtype=np.float64)
     position: Array = 0.4 * np.stack([np.sin(5 * t), np.cos(4 * t)], axis=1)
     effort = 0.2 + 0.1 * position
     joints = JointGroup(("shoulder", "elbow"), t, position, effort=effort, effort_std=0.01, position_std=1e-4)
     seen: Array = np.stack([position[:, :1], position[:, 1:], position[:, :1]], axis=2)
-    points = PointGroup("points_arm", ("forearm",), t, seen, np.full(seen.shape, 1e-3), "mocap", "world")
-    return Recording(joints, (points,), "half a second", "made up", "recording")
+    points = PointGroup("points_arm", ("tip",), t, seen, np.full(seen.shape, 1e-3), "mocap", "world")
+    return Recording(joints, (points,), "a second", "made up", "recording")
 
 
 def originals(folder: Path) -> None:

@@ -192,7 +192,7 @@ def _text(value: object, where: str) -> str:
 def _truth(text: str, where: str) -> dict[str, float]:
     try:
         truth = json.loads(text)
-    except json.JSONDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise DataError(f"the text is not JSON ({error})", where=where) from error
     if not isinstance(truth, dict):
         raise DataError("the JSON text is not an object", where=where, allowed='{"name": number, ...}')

@@ -311,7 +311,7 @@ def _read_camera(path: Path) -> dict[str, Any]:
         head = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return {}
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:  # not UTF-8, not JSON, numbers of thousands of digits
         raise DataError(f"the camera's file cannot be read ({error})", where=str(path), allowed="JSON") from error
     if not isinstance(head, dict):
         raise DataError("the camera's file is not an object", where=str(path), allowed='{"pose": ..., ...}')

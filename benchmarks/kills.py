@@ -1,0 +1,224 @@
+"""Runs that are killed, run side by side, or meet a full disk: whether anything finished is lost or looks whole.
+
+    python benchmarks/kills.py [--kills 200] [--pairs 20] [--disks 40] [--caches 10] [--seed 0]
+
+Commands run on a double pendulum, whose runs take seconds: solve, compare, diagnose, check, simulate. A run is ended by
+a random signal at a random moment; two runs share one second or one `--out`; files cannot grow beyond a random size, as
+on a full disk; compiled code in the cache is damaged. Afterwards every folder that bears a name has to be whole, only a
+killed process may leave its hidden folder, no exit code may say that it was our mistake, and running again has to give
+the numbers of an undisturbed run. Exit code 1 where something does not hold.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from fuzz import CONFIG, REPOSITORY, originals
+
+COMMANDS = ("solve", "compare", "diagnose", "check", "simulate")
+SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+FULL = (50_000.0, 3_000.0)  # geometric mean and least of the sizes of a file on a full disk [bytes]
+Random = np.random.Generator
+
+
+@dataclass
+class Room:
+    """A folder with a configuration, its runs, and what was found wrong.
+
+    Attributes
+    ----------
+    folder : Path
+    usual : dict of str to (numbers, seconds)
+        What an undisturbed run of each command leaves, and how long it takes.
+    wrong : list of str
+    """
+
+    folder: Path
+    usual: dict[str, tuple[Any, float]] = field(default_factory=dict)
+    wrong: list[str] = field(default_factory=list)
+
+    def start(self, command: str, *arguments: str, limit: int | None = None) -> subprocess.Popen[bytes]:
+        """Begin a run; `limit` is the largest size of a file [bytes]."""
+
+        def limited() -> None:
+            for number in SIGNALS[1:]:  # a shell in the background has them ignored
+                signal.signal(number, signal.SIG_DFL)
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            if limit is not None:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+
+        line = [sys.executable, "-m", "yid_ocp", command, "pendulum.yaml", *arguments]
+        environment = {**os.environ, "YID_OCP_CACHE": str(self.folder / "cache"), "PYTHONPATH": str(REPOSITORY)}
+        with (self.folder / "said.txt").open("wb") as said:
+            return subprocess.Popen(
+                line, cwd=self.folder, env=environment, stdout=said, stderr=said, preexec_fn=limited
+            )
+
+    def run(self, command: str, *arguments: str) -> Any:
+        """Run to the end; returns the numbers that it left."""
+        begun = time.monotonic()
+        process = self.start(command, *arguments, "--out", "whole")
+        code = process.wait(timeout=600)
+        if code not in (0, 1):
+            raise RuntimeError(f"{command} {arguments} ended with {code}: {self.said()}")
+        found = numbers(json.loads((self.folder / "whole" / "result.json").read_text()))
+        subprocess.run(["rm", "-r", str(self.folder / "whole")], check=True)
+        self.usual.setdefault(command, (found, time.monotonic() - begun))
+        return found
+
+    def again(self, command: str, after: str) -> None:
+        """Whether a run gives the numbers of an undisturbed one."""
+        if self.run(command) != self.usual[command][0]:
+            self.wrong.append(f"after {after}, {command} gives other numbers")
+
+    def said(self) -> str:
+        return (self.folder / "said.txt").read_text(errors="replace")[-600:]
+
+    def look(self, after: str, hidden: bool) -> None:
+        """Whether what stands in the room is whole; `hidden`: whether a killed run may have left its hidden folder."""
+        for path in self.folder.iterdir():
+            if path.name.startswith(".") and path.is_dir() and not hidden:
+                self.wrong.append(f"after {after}, {path.name} is left")
+        runs = [*self.folder.glob("runs/*"), *self.folder.glob("mine*")]
+        for path in runs:
+            if path.name.endswith(".partial"):
+                if path.name.startswith(".") and not hidden:
+                    self.wrong.append(f"after {after}, {path.name} is left")
+                continue
+            try:
+                json.loads((path / "result.json").read_text())
+            except (OSError, ValueError) as error:
+                self.wrong.append(f"after {after}, {path.name} looks whole: {error}")
+        subprocess.run(["rm", "-rf", *map(str, runs), str(self.folder / "runs")], check=True)
+
+
+def numbers(result: Mapping[str, Any]) -> Any:
+    """What has to be the same in two runs: all but times, places and versions."""
+    dropped = ("seconds", "inputs", "versions", "folder", "peak_memory", "cpu", "memory")
+
+    def kept(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {key: kept(entry) for key, entry in value.items() if not any(word in key for word in dropped)}
+        if isinstance(value, list):
+            return [kept(entry) for entry in value]
+        return None if isinstance(value, str) else value
+
+    return kept(result)
+
+
+def killed(room: Room, rng: Random) -> str:
+    """End a run at a random moment."""
+    command, number = str(rng.choice(COMMANDS)), SIGNALS[int(rng.integers(len(SIGNALS)))]
+    delay = float(rng.uniform(0.0, 1.1 * room.usual[command][1]))
+    process = room.start(command)
+    time.sleep(delay)
+    process.send_signal(number)
+    what = f"{command} and {number.name} after {delay:.2f} s"
+    try:
+        code = process.wait(timeout=30)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+        room.wrong.append(f"{what}: no end within 30 s")
+        return what
+    if code not in (0, 1, -number, 128 + number):
+        room.wrong.append(f"{what}: ended with {code}: {room.said()}")
+    room.look(what, hidden=code == -number)
+    return what
+
+
+def pair(room: Room, rng: Random) -> str:
+    """Two runs at once, with names of their own or one `--out`."""
+    command, named = str(rng.choice(COMMANDS)), bool(rng.random() < 0.5)
+    arguments = ("--out", "mine") if named else ()
+    both = [room.start(command, *arguments) for _ in range(2)]
+    codes = sorted(process.wait(timeout=600) for process in both)
+    what = f"two runs of {command} {' '.join(arguments)}"
+    runs = [path for path in (*room.folder.glob("runs/*"), *room.folder.glob("mine*")) if not path.name.startswith(".")]
+    runs = [path for path in runs if not path.name.endswith(".partial")]
+    finished = sum(code in (0, 1) for code in codes)
+    if len(runs) != finished or any(code not in (0, 1, 2) for code in codes) or (not named and finished != 2):
+        room.wrong.append(f"{what}: exit codes {codes}, folders {[path.name for path in runs]}: {room.said()}")
+    room.look(what, hidden=False)
+    return what
+
+
+def full(room: Room, rng: Random) -> str:
+    """A run whose files cannot grow."""
+    command = str(rng.choice(COMMANDS))
+    limit = int(max(FULL[1], FULL[0] * np.exp(rng.normal())))
+    process = room.start(command, limit=limit)
+    code = process.wait(timeout=600)
+    what = f"{command} with files of at most {limit} bytes"
+    if code not in (0, 1, 2):
+        room.wrong.append(f"{what}: ended with {code}: {room.said()}")
+    if code == 2 and ".partial/" in room.said():
+        room.wrong.append(f"{what}: an error names the unfinished folder: {room.said()}")
+    room.look(what, hidden=False)
+    return what
+
+
+def damaged(room: Room, rng: Random) -> str:
+    """Compiled code with a block of zeros, cut off, or unreadable."""
+    libraries = sorted((room.folder / "cache").glob("*.so"))
+    if libraries:
+        one = libraries[int(rng.integers(len(libraries)))]
+        data = one.read_bytes()
+        at = int(rng.integers(len(data)))
+        one.unlink()
+        one.write_bytes(data[:at] if rng.random() < 0.5 else data[:at] + bytes(4096) + data[at + 4096 :])
+    what = "damage of compiled code"
+    room.again("solve", what)
+    return what
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Disturb runs, print what does not hold."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kills", type=int, default=200)
+    parser.add_argument("--pairs", type=int, default=20)
+    parser.add_argument("--disks", type=int, default=40)
+    parser.add_argument("--caches", type=int, default=10)
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args(argv)
+    rng = np.random.default_rng(given.seed)
+    with tempfile.TemporaryDirectory(prefix="yid-kills-") as folder:
+        room = Room(Path(folder))
+        originals(room.folder)
+        text = CONFIG.format(urdf="robot.urdf").replace("compiler: false", "compiler: true")
+        (room.folder / "pendulum.yaml").write_text(text.replace("held_out: []", "held_out: [recording.h5]"))
+        for command in COMMANDS:
+            room.run(command)
+            room.again(command, "nothing")
+        tests: Sequence[tuple[int, Callable[[Room, Random], str]]] = (
+            (given.kills, killed),
+            (given.pairs, pair),
+            (given.disks, full),
+            (given.caches, damaged),
+        )
+        for count, disturb in tests:
+            for i in range(count):
+                before = len(room.wrong)
+                what = disturb(room, rng)
+                print(f"{i + 1} of {count}: {what}", file=sys.stderr, flush=True)
+                print("\n".join(room.wrong[before:]), end="\n" if room.wrong[before:] else "", flush=True)
+            room.again("solve", f"{count} times '{disturb.__name__}'")
+        print(json.dumps({"kills": given.kills, "pairs": given.pairs, "disks": given.disks, "wrong": len(room.wrong)}))
+        return 1 if room.wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
