@@ -93,10 +93,10 @@ SETTINGS = (
 # -- what is damaged --------------------------------------------------------------------------------------------------
 
 
-def made_recording() -> Recording:
+def made_recording(phase: float = 0.0) -> Recording:
     """Two joints and a point for a second."""
     t: Array = 0.01 * np.arange(101, dtype=np.float64)
-    position: Array = 0.4 * np.stack([np.sin(5 * t), np.cos(4 * t)], axis=1)
+    position: Array = 0.4 * np.stack([np.sin(5 * t + phase), np.cos(4 * t)], axis=1)
     effort = 0.2 + 0.1 * position
     joints = JointGroup(("shoulder", "elbow"), t, position, effort=effort, effort_std=0.01, position_std=1e-4)
     seen: Array = np.stack([position[:, :1], position[:, 1:], position[:, :1]], axis=2)

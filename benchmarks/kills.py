@@ -26,7 +26,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from fuzz import CONFIG, REPOSITORY, originals
+from fuzz import CONFIG, REPOSITORY, made_recording, originals
+
+from yid_ocp.data import write_recording
 
 COMMANDS = ("solve", "compare", "diagnose", "check", "simulate")
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
@@ -198,8 +200,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     with tempfile.TemporaryDirectory(prefix="yid-kills-") as folder:
         room = Room(Path(folder))
         originals(room.folder)
+        write_recording(made_recording(1.0), room.folder / "held_out.h5")
         text = CONFIG.format(urdf="robot.urdf").replace("compiler: false", "compiler: true")
-        (room.folder / "pendulum.yaml").write_text(text.replace("held_out: []", "held_out: [recording.h5]"))
+        (room.folder / "pendulum.yaml").write_text(text.replace("held_out: []", "held_out: [held_out.h5]"))
         for command in COMMANDS:
             room.run(command)
             room.again(command, "nothing")
