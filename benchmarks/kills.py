@@ -202,6 +202,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         originals(room.folder)
         write_recording(made_recording(1.0), room.folder / "held_out.h5")
         text = CONFIG.format(urdf="robot.urdf").replace("compiler: false", "compiler: true")
+        text += "compare: {methods: {gauss_newton: {}, steepest_descent: {iterations: 20}}}\n"
         (room.folder / "pendulum.yaml").write_text(text.replace("held_out: []", "held_out: [held_out.h5]"))
         for command in COMMANDS:
             room.run(command)
