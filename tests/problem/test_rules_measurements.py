@@ -286,3 +286,18 @@ def test_a_late_sample_changes_by_the_slope_on_its_node_by_the_mean_of_two(node,
     all_late = several.late(np.array([steps]))
     at_nodes = np.array([[float(k**2)] for k in all_late.nodes])
     np.testing.assert_allclose(all_late.slope(at_nodes, several, np.array([steps]))[1], [rate])
+
+
+@pytest.mark.parametrize(("t", "time_step"), [(np.linspace(0.0, 3e3, 400), 0.01), (np.arange(0.0, 3e3, 10.0), 0.01)])
+def test_a_clock_in_other_units_does_not_make_an_endless_rollout(t, time_step):
+    made = recording(joints(["a"], t, np.zeros((len(t), 1))))
+    with pytest.raises(DataError, match="times are in seconds"):
+        make_grid(made, time_step)
+    assert make_grid(made, 0.1).steps > 2
+
+
+def test_a_clock_that_jumps_does_not_make_an_endless_rollout():
+    t = np.append(np.arange(0.0, 20.0, 0.001), 1e6)
+    made = recording(joints(["a"], t, np.zeros((len(t), 1))))
+    with pytest.raises(DataError, match="does not jump"):
+        make_grid(made, 0.1)

@@ -17,6 +17,9 @@ Array = NDArray[np.float64]
 MOST_STEPS = 200_000
 """Steps of a rollout: half an hour in steps of 10 ms; a clock in milliseconds or one that jumps asks for more."""
 
+MOST_PER_SAMPLE = 500
+"""Steps from one sample to the next, on average; a clock in milliseconds read as seconds asks for a thousand."""
+
 
 @dataclass(frozen=True)
 class Grid:
@@ -46,16 +49,16 @@ def make_grid(recording: Recording, time_step: float, duration: float | None = N
     Raises
     ------
     DataError
-        The recording is shorter than two steps, or longer than `MOST_STEPS`.
+        The recording is shorter than two steps, or longer than `MOST_STEPS`, or has too few samples for its length.
     """
     t = recording.joints.t if recording.joints is not None else recording.points[0].t
     span = float(t[-1] - t[0]) if duration is None else min(duration, float(t[-1] - t[0]))
     steps = math.floor(span / time_step + 1e-6)
-    if steps > MOST_STEPS:
+    if steps > MOST_STEPS or steps > MOST_PER_SAMPLE * len(t):
         raise DataError(
             f"{span:.3g} s of data, {len(t)} samples, are {steps:.3g} time steps of {time_step:g} s",
             where=recording.name,
-            allowed=f"at most {MOST_STEPS}",
+            allowed=f"at most {MOST_STEPS}, and {MOST_PER_SAMPLE} from one sample to the next",
             hint="see whether times are in seconds and the clock does not jump; else cut the recording",
         )
     if steps < 2:
