@@ -259,6 +259,7 @@ TENSOR = 'ixx="{0}" iyy="{1}" izz="{2}" ixy="0" ixz="0" iyz="0"'
         (BODY.format(mass="1", tensor=TENSOR.format(1, -2, 1)), "negative moment of inertia"),
         (BODY.format(mass="1", tensor=TENSOR.format("nan", 1, 1)), "inertia ixx is 'nan'"),
         (BODY.format(mass="1", tensor=TENSOR.format(1, "inf", 1)), "inertia iyy is 'inf'"),
+        (BODY.format(mass="1", tensor=TENSOR.format("1e308", 1, 1)), "inertia ixx is '1e308'"),
         (BODY.format(mass="1", tensor='ixx="1" iyy="1"'), "inertia ixy is ''"),
         (BODY.format(mass="-1", tensor=TENSOR.format(1, 1, 1)), "negative mass"),
         (BODY.format(mass="1 kg", tensor=TENSOR.format(1, 1, 1)), "mass is '1 kg'"),

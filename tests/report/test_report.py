@@ -146,7 +146,7 @@ def test_without_the_extra_there_is_a_notice_and_no_report(solved, tmp_path, mon
 
 
 def test_a_report_that_cannot_be_written(solved, tmp_path):
-    with pytest.raises(OutputError, match="report cannot be written"):
+    with pytest.raises(OutputError, match="does not exist"):
         write_report(tmp_path / "no" / "r.html", findings(solved))
 
 

@@ -26,6 +26,9 @@ from yid_ocp.model.rotations import Matrix, angles_of, snapped, transform, turn
 # Stands for no limit where URDF asks for a number.
 UNLIMITED = 1e9
 
+# Of metres, radians, kilograms and kg m^2; squares of more would not be finite for long.
+LARGEST = 1e12
+
 # Of digits in the file: how far principal moments may miss what they have to be.
 ROUNDED = 1e-2
 
@@ -211,10 +214,12 @@ def _numbers(text: str, count: int, what: str, where: str, infinite: bool = Fals
         numbers = [float(word) for word in words]
     except ValueError:
         numbers = []
-    wrong = any(math.isnan(value) or (math.isinf(value) and not infinite) for value in numbers)
+    wrong = any(math.isnan(value) or (abs(value) > LARGEST and not infinite) for value in numbers)
     if len(numbers) != count or wrong:
         allowed = "one number" if count == 1 else f"{count} numbers"
-        raise ModelError(f"{what} is '{text[:60]}'", where=where, allowed=f"{allowed}, finite, with blanks between")
+        raise ModelError(
+            f"{what} is '{text[:60]}'", where=where, allowed=f"{allowed}, at most {LARGEST:g}, with blanks between"
+        )
     return numbers
 
 

@@ -6,7 +6,7 @@ import logging
 from importlib import util
 from pathlib import Path
 
-from yid_ocp.errors import OutputError
+from yid_ocp.files import write_text
 from yid_ocp.report.sections import SECTIONS, Findings, written_sections
 
 log = logging.getLogger(__name__)
@@ -43,10 +43,7 @@ def write_report(path: Path, findings: Findings) -> bool:
     page = environment.get_template("page.html").render(
         findings=findings, sections=sections, script=plotly.offline.get_plotlyjs()
     )
-    try:
-        path.write_text(page, encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"the report cannot be written: {error.strerror}", where=str(path)) from error
+    write_text(path, page)
     return True
 
 

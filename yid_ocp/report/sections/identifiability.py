@@ -8,7 +8,7 @@ from typing import Any
 from yid_ocp.analysis.profile import LEVEL
 from yid_ocp.report import figures
 from yid_ocp.report.sections.base import Findings, section
-from yid_ocp.solvers.words import VERDICT_WORDS, fit_words
+from yid_ocp.solvers.words import VERDICT_WORDS, fit_words, interval_words
 
 
 @section("identifiability", 10, "What can be told")
@@ -26,6 +26,7 @@ def prepare(findings: Findings) -> Mapping[str, Any] | None:
     return {
         "result": result,
         "words": VERDICT_WORDS,
+        "interval_words": interval_words,
         "misfit": None if fit.get("explains", True) else fit_words(fit["chi2_per_dof"], False),
         "hidden": [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"],
         "picture": figures.html(figures.profiles(curves, LEVEL)) if curves else None,
