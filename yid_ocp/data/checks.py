@@ -350,7 +350,7 @@ def _velocities(recording: Recording) -> Iterator[Doubt]:
         if np.std(x) > floor and np.std(y) > 0:
             ratio[j] = np.sign(x @ y) * math.sqrt(float(y @ y) / float(x @ x))
             fit[j] = float(np.corrcoef(x, y)[0, 1])
-    known = np.flatnonzero(np.isfinite(ratio) & (np.abs(fit) > 0.8))
+    known = [j for j in range(len(names)) if math.isfinite(ratio[j]) and abs(fit[j]) > 0.8]
     wrong = [j for j in known if not 1 / LIMITS.rate <= ratio[j] <= LIMITS.rate]
     if not wrong:
         yield from _exchanged(names, by_angle, by_velocity, fit, ratio)
@@ -389,7 +389,7 @@ def _velocities(recording: Recording) -> Iterator[Doubt]:
 
 def _exchanged(names: Sequence[str], by_angle: Array, by_velocity: Array, fit: Array, ratio: Array) -> Iterator[Doubt]:
     """Two angles that turn as each other's velocity says."""
-    off = [j for j in np.flatnonzero(np.isfinite(ratio)) if abs(fit[j]) < 0.5]
+    off = [j for j in range(len(names)) if math.isfinite(ratio[j]) and abs(fit[j]) < 0.5]
     for place, i in enumerate(off):
         for j in off[place + 1 :]:
             across = [float(np.corrcoef(by_angle[:, a], by_velocity[:, b])[0, 1]) for a, b in ((i, j), (j, i))]

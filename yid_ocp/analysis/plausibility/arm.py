@@ -201,7 +201,7 @@ def check_limits(arm: Arm, recording: Recording) -> Iterator[Doubt]:
                 "position",
             )
             return
-        for j in np.flatnonzero(beyond > BEYOND):
+        for j in (int(j) for j in np.flatnonzero(beyond > BEYOND)):
             yield Doubt(
                 "angle_limits",
                 f"{arm.names[j]} goes {beyond[j]:.3g} {arm.joints[j].unit} beyond its limits of {low[j]:.3g} to "

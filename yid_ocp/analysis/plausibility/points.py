@@ -13,7 +13,7 @@ import scipy.interpolate
 from numpy.typing import NDArray
 
 from yid_ocp.analysis.plausibility.arm import Arm
-from yid_ocp.data.checks import Doubt, Limits, Weight, period
+from yid_ocp.data.checks import Doubt, Weight, period
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.model.cable import Cable
 from yid_ocp.model.system import System
@@ -145,10 +145,10 @@ def _changed_names(seen: Array, place: Array, names: Sequence[str]) -> Iterator[
 
 
 def _changed_times(
-    arm: Arm, frames: tuple[str, ...], course: Callable[..., Array], t: Array, seen: Array
+    arm: Arm, frames: tuple[str, ...], course: scipy.interpolate.CubicSpline, t: Array, seen: Array
 ) -> Iterator[_Change]:
     """Points recorded earlier or later than the angles: a coarse search, then a fine one."""
-    knots = course.x  # type: ignore[attr-defined]
+    knots = course.x
     dense = np.linspace(knots[0], knots[-1], 400)
     path = scipy.interpolate.CubicSpline(dense, arm.places(frames, course(dense))[0], axis=0)
 
@@ -350,7 +350,7 @@ def _changed_pose(seen: Array, place: Array, pose: Array) -> Iterator[_Change]:
 # -- a cable's points -------------------------------------------------------------------------------------------------
 
 
-def check_cable(cable: Cable, recording: Recording, limits: Limits, gravity: Array) -> Iterator[Doubt]:
+def check_cable(cable: Cable, recording: Recording, gravity: Array) -> Iterator[Doubt]:
     """Measured edges of a cable beside those of its undeformed shape, and on which side of its clamps it hangs."""
     for group in recording.points:
         at = {name: group.position[:, group.names.index(name)] for name in cable.vertices if name in group.names}
