@@ -30,6 +30,8 @@ CLOCK_UNITS: Mapping[str, float] = {"milliseconds": 1e-3, "microseconds": 1e-6, 
 EPOCH = 1e8
 """A clock that counts from 1970 is beyond this, one that counts from when a robot was switched on is not [s]."""
 DEGREE = math.degrees(1.0)
+FEWEST = 30
+"""Differences from which noise can be told."""
 
 
 @dataclass(frozen=True)
@@ -346,7 +348,7 @@ def _velocities(recording: Recording) -> Iterator[Doubt]:
     ratio, fit = np.full(len(names), np.nan), np.zeros(len(names))
     for j in range(len(names)):
         x, y = by_velocity[:, j], by_angle[:, j]
-        floor = max(0.02, 2 * _white(joints.velocity[:, j]))
+        floor = max(0.02, 2 * _white(joints.t, joints.velocity[:, j]))
         if np.std(x) > floor and np.std(y) > 0:
             ratio[j] = np.sign(x @ y) * math.sqrt(float(y @ y) / float(x @ x))
             fit[j] = float(np.corrcoef(x, y)[0, 1])
@@ -412,7 +414,8 @@ def _standstill(recording: Recording) -> Iterator[Doubt]:
         size = float(np.max(np.ptp(_smoothed(joints.position), axis=0)))
         moved.append(size / LIMITS.motion)
     for group in recording.points:
-        size = float(np.nanmax(np.nanmax(group.position, axis=0) - np.nanmin(group.position, axis=0), initial=0.0))
+        seen = group.position[:, np.isfinite(group.position).any(axis=(0, 2))]
+        size = float(np.max(np.nanmax(seen, axis=0) - np.nanmin(seen, axis=0), initial=0.0))
         noise = 0.0 if group.std is None else 6 * float(np.nanmedian(group.std))
         moved.append(size / max(LIMITS.travel, noise))
     if max(moved, default=2.0) < 1.0:
@@ -506,12 +509,16 @@ def _longest_run(same: NDArray[np.bool_]) -> tuple[int, int]:
     return int(begins[longest]), int(ends[longest])
 
 
-def _white(values: Array) -> float:
-    """Noise that is white from sample to sample, robustly; zero for a channel with long rests."""
-    if len(values) <= DIFFERENCES + 2:
+def _white(t: Array, values: Array) -> float:
+    """Noise that is white from sample to sample, robustly; zero for a channel with long rests or an uneven clock."""
+    even = np.abs(np.diff(t) / max(period(t), 1e-12) - 1) < 0.2
+    if len(t) < DIFFERENCES + FEWEST:
+        return 0.0
+    together = np.lib.stride_tricks.sliding_window_view(even, DIFFERENCES).all(axis=1)
+    if together.sum() < FEWEST:
         return 0.0
     size = math.sqrt(float(scipy.special.comb(2 * DIFFERENCES, DIFFERENCES)))
-    return float(1.4826 * np.median(np.abs(np.diff(values, DIFFERENCES, axis=0))) / size)
+    return float(1.4826 * np.median(np.abs(np.diff(values, DIFFERENCES)[together])) / size)
 
 
 def quantum(values: Array) -> float:
@@ -576,7 +583,7 @@ def _steps_and_noise(recording: Recording, choice: Choices) -> Iterator[Doubt]:
                 setting=f"{setting}: {size:.2g}",
             )
             continue
-        seen = max(_white(column) for column in columns)
+        seen = max(_white(t, column) for column in columns)
         if _clock(recording, group) == "nominal":
             # when a sample was taken is known to half a period, which looks like noise wherever something moves
             seen -= min(seen, 0.5 * max(float(np.mean(np.abs(np.diff(column)))) for column in columns))
@@ -599,28 +606,31 @@ def _clock(recording: Recording, name: str) -> str:
 
 
 def _saturated(recording: Recording) -> Iterator[Doubt]:
-    """Efforts that differ from sample to sample but meet their extreme again and again, to the last digit."""
+    """Efforts that meet their extreme again and again, to the last digit."""
     if recording.joints is not None and recording.joints.effort_taken_as == "command":
         return  # a controller's own bound is no sensor's
     for group, channel, t, values in _channels(recording, "effort"):
-        if len(np.unique(values)) < 0.3 * len(values):
-            continue
-        for extreme in (float(np.max(values)), float(np.min(values))):
-            at = values == extreme
-            inner = float(np.mean(np.diff(values) == 0))
-            begin, end = _longest_run(at[:-1] & at[1:])
-            if at.sum() >= LIMITS.clipped and end - begin >= 2 and inner < 0.7:
+        for sign in (1.0, -1.0):
+            levels, counts = np.unique(sign * values, return_counts=True)
+            near = (levels > levels[-1] - 0.05 * np.ptp(levels)) & (levels < levels[-1])
+            at = sign * values == levels[-1]
+            # a value that many samples share while none of its neighbours has a fifth as many, held again and again
+            held = int(np.sum(np.diff(np.flatnonzero(at)) == 1))
+            apart = int(np.sum(np.diff(np.flatnonzero(at)) > 1)) + 1
+            alone = at.sum() >= LIMITS.clipped and at.sum() > 5 * np.max(counts[near], initial=0)
+            if alone and len(levels) > FEWEST and held >= LIMITS.clipped / 2 and apart >= 2:
+                first, last = np.flatnonzero(at)[[0, -1]]
                 yield Doubt(
                     "saturated",
-                    f"{channel} is exactly {extreme:.4g} N m in {at.sum()} samples and never beyond",
+                    f"{channel} is exactly {sign * levels[-1]:.4g} N m in {at.sum()} samples and never beyond",
                     "not_trusted",
                     at.sum() / LIMITS.clipped,
                     "leave what is cut off out, or record within the sensor's range",
                     "",
                     group,
                     channel,
-                    float(t[np.argmax(at)]),
-                    float(t[len(at) - 1 - np.argmax(at[::-1])]),
+                    float(t[first]),
+                    float(t[last]),
                 )
 
 

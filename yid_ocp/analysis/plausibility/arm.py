@@ -189,7 +189,7 @@ def check_limits(arm: Arm, recording: Recording) -> Iterator[Doubt]:
     beyond = np.maximum(low - position, position - high).max(axis=0)
     if np.any(beyond > BEYOND):
         inside = np.all((position / DEGREE > low - BEYOND) & (position / DEGREE < high + BEYOND))
-        if inside and np.max(np.abs(position)) > 2 * math.pi:
+        if inside and np.median(np.max(np.abs(position), axis=0)) > 2 * math.pi:
             yield Doubt(
                 "degrees",
                 f"angles reach {np.max(np.abs(position)):.3g} rad; taken as degrees all are within their limits",

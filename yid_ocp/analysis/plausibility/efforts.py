@@ -42,7 +42,7 @@ SURE = 5.0
 SLOW = 1.0
 """Samples further apart than half of its inverse count as independent [Hz]."""
 LAG = 0.1
-"""Lag of efforts behind the motion that counts [s]."""
+"""Steps in which a lag of efforts behind the motion is looked for; a shorter one is no gross error [s]."""
 ABOVE_LIMIT = 1.3
 """Factor by which an effort may exceed the URDF's limit, which some makers state for continuous use."""
 
@@ -149,7 +149,8 @@ def _by_joint(arm: Arm, motion: Motion, needed: Array, size: Array) -> Iterator[
             recording="",
         )
     turned = sound & (fit.inverse < -SURE * fit.std / 2) & (fit.inverse < -0.3)
-    if turned.any() and turned.sum() == told.sum() and told.sum() >= 2:
+    upright = told & (fit.inverse > SURE * fit.std / 2) & (fit.inverse > 0.3)
+    if turned.sum() >= 2 and not upright.any():
         depth = float(np.max(-fit.inverse[turned] / fit.std[turned])) / (SURE / 2)
         yield _sign("all efforts have", depth, arm.names[int(np.argmax(turned))], "effort")
     else:
@@ -223,7 +224,7 @@ def _sign(who: str, depth: float, joint: str, channel: str) -> Doubt:
 def _late(arm: Arm, motion: Motion, needed: Array, size: Array) -> Iterator[Doubt]:
     """Efforts that follow the motion late or early, all alike."""
     assert motion.effort is not None
-    trials = np.array([-0.4, -0.2, -0.1, 0.0, 0.1, 0.2, 0.4])
+    trials = LAG * np.arange(-5, 6)
     if motion.t[-1] - motion.t[0] < 4 * trials[-1]:
         return
     inside = (motion.t >= motion.t[0] + trials[-1]) & (motion.t <= motion.t[-1] - trials[-1])
@@ -234,7 +235,7 @@ def _late(arm: Arm, motion: Motion, needed: Array, size: Array) -> Iterator[Doub
         costs.append(_fitted(arm, kept, moved, needed[inside], size).cost)
     at = int(np.argmin(costs))
     # twice over, so that what friction and grasp take up of a lag does not count
-    if abs(trials[at]) >= LAG and costs[at] < 0.4 * costs[len(trials) // 2]:
+    if abs(trials[at]) > 0.5 * LAG and costs[at] < 0.4 * costs[len(trials) // 2]:
         yield Doubt(
             "effort_lag",
             f"efforts fit the motion best {abs(trials[at]):.2g} s {'earlier' if trials[at] > 0 else 'later'} than "

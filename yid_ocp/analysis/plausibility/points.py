@@ -30,7 +30,7 @@ FAR = 0.25
 """Part of the object's length by which points may be elsewhere than a model with unknown stiffness says."""
 BETTER = 0.5
 """A change explains points where it leaves less than this part of their distance."""
-SCALES = (1e-3, 1e-2, 0.0254, 0.1, 0.3048, 10.0, 100.0, 1e3)
+SCALES = (1e-3, 1e-2, 0.0254, 0.1, 0.3048, 1 / 0.3048, 10.0, 1 / 0.0254, 100.0, 1e3)
 """By what lengths are wrong that are in another unit, or read so, and a power of ten for what was typed wrongly."""
 LATE = 0.05
 """Offset between two clocks that counts [s]."""
