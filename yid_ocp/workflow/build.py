@@ -31,7 +31,7 @@ from yid_ocp.model.y_object import Y_FOOT, y_segments
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.sensors.joints import POSITION, of_arm
-from yid_ocp.workflow.doubts import examined, object_doubts, stop_at
+from yid_ocp.workflow.doubts import blaming, examined, object_doubts, stop_at
 
 GIVEN_FRAMES = 2  # of a cable's free points, from which every prediction starts
 LARGEST_GAP = 0.01  # what encoder noise and a slightly wrong length of the object can make of a grasp [m]
@@ -487,7 +487,8 @@ def build_problem(run: Run, step: Step | None = None) -> EstimationProblem:
     step = build_step(run, system) if step is None else step
     said = replace(options, doubts=seen.doubts)
     problem = EstimationProblem(step, seen.estimate, free, said, None, seen.held_out)
-    check_grasps(run, problem)
+    with blaming(seen.doubts):
+        check_grasps(run, problem)
     more = object_doubts(problem)
     if more:
         stop_at(run, more)

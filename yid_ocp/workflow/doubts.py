@@ -5,7 +5,8 @@ Recordings given twice count once, gaps are cut out; everything else is said and
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -30,6 +31,9 @@ from yid_ocp.model.cable import Cable
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem, SensorOptions
 from yid_ocp.problem.prediction import EpisodeResult
+
+MOST_BLAMED = 3
+"""Doubts that an error quotes."""
 
 
 @dataclass(frozen=True)
@@ -165,7 +169,24 @@ def stop_at(run: Run, doubts: Sequence[Doubt]) -> None:
     )
 
 
+@contextlib.contextmanager
+def blaming(doubts: Sequence[Doubt]) -> Iterator[None]:
+    """Say in errors of the block what is in doubt about the recordings, which may be why."""
+    try:
+        yield
+    except DataError as error:
+        if not doubts:
+            raise
+        said = "; ".join(f"{doubt.where}: {doubt.what}" for doubt in ordered(doubts)[:MOST_BLAMED])
+        hint = f"first look at what is in doubt: {said}"
+        raise DataError(error.what, where=error.where, allowed=error.allowed, hint=hint) from error
+
+
+def ordered(doubts: Sequence[Doubt]) -> list[Doubt]:
+    """Those that weigh most first."""
+    return sorted(doubts, key=lambda doubt: (doubt.weight == "warning", -doubt.evidence))
+
+
 def doubts_result(doubts: Sequence[Doubt]) -> list[dict[str, Any]]:
-    """`doubts` of a result, those that weigh most first."""
-    order = sorted(doubts, key=lambda doubt: (doubt.weight == "warning", -doubt.evidence))
-    return [{**asdict(doubt), "sure": doubt.sure, "where": doubt.where} for doubt in order]
+    """`doubts` of a result."""
+    return [{**asdict(doubt), "sure": doubt.sure, "where": doubt.where} for doubt in ordered(doubts)]

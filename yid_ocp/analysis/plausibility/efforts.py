@@ -49,7 +49,11 @@ ABOVE_LIMIT = 1.3
 
 @dataclass(frozen=True)
 class _Fit:
-    """`inverse` 1/g and its `std`, `offset` [N m], what is `left` in sizes of the model's error, each (k,); `cost`."""
+    """`inverse` 1/g and its `std`, `offset` [N m], what is `left` in sizes of the model's error, each (k,); `cost`.
+
+    `direct` is the gain by which an effort's variation follows what is needed, `shift` by how much it is off in the
+    mean [N m]: without the prior, and not made smaller by noise of what was measured.
+    """
 
     inverse: Array
     std: Array
@@ -57,6 +61,7 @@ class _Fit:
     offset_std: Array
     left: Array
     direct: Array
+    shift: Array
     cost: float
 
 
@@ -131,14 +136,15 @@ def _by_joint(arm: Arm, motion: Motion, needed: Array, size: Array) -> Iterator[
     fit = _fitted(arm, motion, motion.effort, needed, size)
     told = fit.std < np.maximum(0.6 * np.abs(fit.inverse), 0.35)
     common = 1.0
-    if told.sum() >= 2 and not 1 / GAIN < abs(np.median(fit.inverse[told])) < GAIN:
+    typical = float(np.median(np.abs(fit.inverse[told]))) if told.any() else 1.0
+    if told.sum() >= 2 and not 1 / GAIN < typical < GAIN:
         # a prior about one holds a gain that is a power of ten away, so efforts are scaled first
-        common = 10.0 ** round(math.log10(abs(float(np.median(fit.inverse[told])))))
+        common = 10.0 ** round(math.log10(typical))
         fit = _fitted(arm, motion, common * motion.effort, needed, size)
         told = fit.std < np.maximum(0.6 * np.abs(fit.inverse), 0.35)
     sound = told & (fit.left < EXPLAINED) & (np.abs(fit.offset) < 3 * OFFSET * size)
     if common != 1.0 and sound.sum() >= 2:
-        scale = 1 / (common * abs(float(np.median(fit.inverse[sound]))))
+        scale = 1 / (common * float(np.median(np.abs(fit.inverse[sound]))))
         yield Doubt(
             "effort_gain",
             f"efforts are about {scale:.2g} times what gravity and motion need",
@@ -173,17 +179,20 @@ def _by_joint(arm: Arm, motion: Motion, needed: Array, size: Array) -> Iterator[
                 setting=f"model.effects: [{{kind: effort_gain, location: {arm.names[j]}}}]",
             )
     modelled = {effect.location for effect in arm.system.effects if effect.kind == "effort_offset"}
-    calm = told & (fit.left < EXPLAINED / 1.5) & (fit.inverse > 1 / GAIN) & (fit.inverse < GAIN)
-    for j in np.flatnonzero(calm & (np.abs(fit.offset) > 3 * OFFSET * size)):
+    # a large zero error looks like a large gain; but then the variation follows as it should
+    off_zero = (fit.inverse > 0) & (fit.inverse < 1 / GAIN) & (fit.direct > 1 / GAIN) & (fit.direct < GAIN)
+    offset = np.where(off_zero, fit.shift, fit.offset)
+    calm = told & (fit.left < EXPLAINED / 1.5) & (off_zero | ((fit.inverse > 1 / GAIN) & (fit.inverse < GAIN)))
+    for j in np.flatnonzero(calm & (np.abs(offset) > 3 * OFFSET * size)):
         # springs that carry part of the weight are no wrong zero
-        balanced = fit.offset[j] * np.mean(needed[:, j]) < 0 and abs(fit.offset[j]) < np.max(np.abs(needed[:, j]))
-        sure = abs(fit.offset[j]) > SURE * fit.offset_std[j]
+        balanced = offset[j] * np.mean(needed[:, j]) < 0 and abs(offset[j]) < np.max(np.abs(needed[:, j]))
+        sure = abs(offset[j]) > SURE * fit.offset_std[j]
         if sure and not balanced and arm.names[j] not in modelled:
             yield Doubt(
                 "effort_offset",
-                f"the zero of the effort of {arm.names[j]} is off by {fit.offset[j]:+.3g} N m",
+                f"the zero of the effort of {arm.names[j]} is off by {offset[j]:+.3g} N m",
                 "not_trusted",
-                abs(float(fit.offset[j])) / (3 * OFFSET * float(size[j])),
+                abs(float(offset[j])) / (3 * OFFSET * float(size[j])),
                 "let it be estimated, or set the sensor's zero",
                 "",
                 "joints",
@@ -266,14 +275,18 @@ def _fitted(arm: Arm, motion: Motion, effort: Array, needed: Array, size: Array)
     found = np.linalg.solve(normal, rows.T @ target + pull)
     std = np.sqrt(np.diag(np.linalg.inv(normal)))
     remains = (rows @ found - target).reshape(count, width) / weight
-    # measured on explained, which noise in the measured one does not make larger
-    explained = needed - np.einsum("njc,c->nj", matrix[:, :, width:] * error[:, None], found[width:])
-    direct = np.sum(effort * explained, axis=0) / np.maximum(np.sum(explained**2, axis=0), 1e-12)
+    others = np.concatenate([np.zeros(2 * width), found[2 * width :]])
+    explained = needed - np.einsum("njc,c->nj", matrix * error[:, None], others)
+    shift = effort.mean(axis=0) - explained.mean(axis=0)
+    moved, about = explained - explained.mean(axis=0), effort - effort.mean(axis=0)
+    direct = np.sum(about * moved, axis=0) / np.maximum(np.sum(moved**2, axis=0), 1e-12)
     cost = float(
         np.sum((rows @ found - target) ** 2) + np.sum(((found - (np.arange(len(prior)) < width)) / prior) ** 2)
     )
     own = slice(width, 2 * width)
-    return _Fit(found[:width], std[:width], found[own], std[own], np.sqrt(np.mean(remains**2, axis=0)), direct, cost)
+    return _Fit(
+        found[:width], std[:width], found[own], std[own], np.sqrt(np.mean(remains**2, axis=0)), direct, shift, cost
+    )
 
 
 def _by_itself(arm: Arm, motion: Motion, effort: Array, size: Array) -> tuple[Array, Array]:
