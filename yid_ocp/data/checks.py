@@ -193,10 +193,12 @@ def check_recording(recording: Recording, choice: Choices, driving: bool = True)
     -------
     list of Doubt
     """
+    units = [replace(doubt, recording=recording.name) for doubt in _units_of_time(recording)]
+    if units:
+        return units  # nothing else can be said in times that are not seconds
     return [
         replace(doubt, recording=recording.name)
         for found in (
-            _units_of_time(recording),
             _common_clock(recording),
             _dropped(recording, driving),
             _velocities(recording),
@@ -639,11 +641,8 @@ def _saturated(recording: Recording) -> Iterator[Doubt]:
 
 def shared_samples(one: Recording, other: Recording) -> int:
     """How many samples of motion two recordings have in common, to the last digit."""
-    found = 0
     if one.joints is not None and other.joints is not None:
-        found = _common(_rows(one.joints), _rows(other.joints))
-    if found:
-        return found
+        return _common(_rows(one.joints), _rows(other.joints))
     others = {group.name: group for group in other.points}
     return max((_common(_rows(g), _rows(others[g.name])) for g in one.points if g.name in others), default=0)
 

@@ -22,8 +22,8 @@ SHORTEST = 0.5
 """A shorter part is not worth a start of its own [s]."""
 RESTING = 0.01
 """A part whose joints turn by less in its first fifth of a second starts at rest [rad]."""
-JUMP = 0.2
-"""Part of the way that joints go at their speed across a gap; less means that the clock jumped, not the joints."""
+JUMP = 5
+"""Periods in which joints at their speed go as far as across a gap, where the clock jumped and not the joints."""
 FAST = 0.05
 """What joints would have to go across a gap at their speed for that to be told [rad]."""
 
@@ -106,8 +106,8 @@ def _doubt(recording: Recording, t: Array, gap: int, allowed: float, said: str) 
         after = (joints.position[gap + 6] - joints.position[gap + 1]) / (t[gap + 6] - t[gap + 1])
         speed = 0.5 * (np.abs(before) + np.abs(after)) * (np.sign(before) == np.sign(after))
         way = np.abs(joints.position[gap + 1] - joints.position[gap])
-        j = int(np.argmax(speed))
-        jumped = bool(speed[j] * length > FAST and way[j] < JUMP * speed[j] * min(length, 5.0))
+        fastest = float(np.max(speed))
+        jumped = bool(fastest * length > FAST and np.max(way) < JUMP * period(t) * fastest)
     what = f"nothing was recorded of what drives the model for {length:.3g} s"
     if jumped:
         what = f"the clock jumps by {length - period(t):.3g} s while the joints go on as if it had not"

@@ -266,7 +266,7 @@ def diagnose_summary(result: Mapping[str, Any]) -> list[str]:
         rows.append((label, values, closed, f"{entry['score']:.3g}", p))
     lines += [*table(rows), ""] if len(rows) > 1 else []
     lines += _offset_lines(result)
-    lines += ["what is in doubt about the recordings may be what the verdict is about"] if result["doubts"] else []
+    lines += ["what is in doubt about the recordings may be what the verdict is about"] if result.get("doubts") else []
     return [*lines, f"verdict: {result['verdict']} ({sum(result['seconds'].values()):.1f} s)"]
 
 
@@ -307,7 +307,7 @@ def check_summary(result: Mapping[str, Any]) -> list[str]:
     moved = _moved_lines(result)
     lines += ["", "if the initial values were the estimates:", *moved] if moved else []
     lines += ["", *_doubt_lines(result), *(f"warning: {text}" for text in result["warnings"])]
-    if result["doubts"]:
+    if result.get("doubts"):
         lines.append("a run is possible; see what is in doubt")
     else:
         lines.append(

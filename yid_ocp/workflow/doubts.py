@@ -91,6 +91,15 @@ def examined(
     return Examined(tuple(kept[0]), tuple(kept[1]), tuple(doubts))
 
 
+def of_one(run: Run, system: System, recording: Recording) -> list[Doubt]:
+    """All doubts about one recording that is used as it is; errors as `examined`."""
+    found = check_recording(recording, lambda name: run.sensors.get(name, SensorOptions()))
+    stop_at(run, found)
+    found += _beside_the_model(run, system, Arm.of(system, system.parameters.vector()), None, recording)
+    stop_at(run, found)
+    return found
+
+
 def _once(
     run: Run, estimate: Sequence[Recording], held_out: Sequence[Recording], doubts: list[Doubt]
 ) -> tuple[list[Recording], list[Recording]]:
