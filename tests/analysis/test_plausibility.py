@@ -19,7 +19,7 @@ from yid_ocp.data import read_recording
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.model.cable import Cable
 from yid_ocp.model.system import System
-from yid_ocp.model.urdf import read_urdf
+from yid_ocp.model.urdf import read_urdf, robot_description_file
 from yid_ocp.problem.options import SensorOptions
 from yid_ocp.virtual.experiment import paper_system
 
@@ -58,9 +58,9 @@ def test_inverse_dynamics_are_pinocchios():
     robot = read_urdf("package:baxter", joints=[f"left_{j}" for j in ("s0", "s1", "e0", "e1", "w0", "w1", "w2")])
     system = System.build(robot, prescribed=robot.joint_names)
     arm = Arm.of(system, system.parameters.vector())
-    from yid_ocp.analysis.cross_check import _assembled
-
-    model = _assembled(robot, np.array([0.0, 0.0, -9.81]), True)
+    whole = pin.buildModelFromUrdf(str(robot_description_file("baxter")))
+    others = [whole.getJointId(name) for name in whole.names[1:] if name not in robot.joint_names]
+    model = pin.buildReducedModel(whole, others, pin.neutral(whole))
     data = model.createData()
     q, v, a = np.random.default_rng(1).uniform(-1, 1, (3, 5, 7))
     expected = np.array([pin.rnea(model, data, *row) for row in zip(q, v, a, strict=True)])

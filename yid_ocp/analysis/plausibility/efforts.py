@@ -4,10 +4,10 @@ With measured effort e_j of joint j and the effort w_j that bodies and gravity n
 
     e_j / g_j = w_j + c_j + d_j v_j + s_j sign(v_j) + k_j q_j + (J' f)_j,
 
-linear in 1/g_j, offset, friction, springs and in the force f = f_0 + K (x - mean x) + D dx/dt with which each grasp
-loads the arm, whatever it holds. All have priors of the size that robots have, so that a joint about which the
-recording says nothing keeps g = 1. Nothing is said of a joint whose effort is not explained: a counterbalance that the
-URDF does not have is no wrong sign.
+linear in 1/g_j, offset, friction, springs and in the force f = f_0 + K (x - mean x) + D dx/dt + (quadratic in x) with
+which each grasp loads the arm, whatever it holds. All have priors of the size that robots have, so that a joint about
+which the recording says nothing keeps g = 1. Nothing is said of a joint whose effort is not explained: a counterbalance
+that the URDF does not have is no wrong sign.
 """
 
 from __future__ import annotations
@@ -29,12 +29,14 @@ ERROR, ERROR_OF_MOTION = 0.02, 0.1
 """What a robot's model is off by: part of the joint's largest effort, part of the spread of what it needs."""
 OFFSET, VISCOUS, COULOMB, SPRING = 0.05, 0.04, 0.02, 0.02
 """Usual sizes beside a joint's largest effort: of a zero's error, of friction [per rad/s, 1], of a spring [per rad]."""
-FORCE, STIFFNESS, DAMPER = 30.0, 150.0, 30.0
-"""Usual sizes of the force on a grasp [N], and by which it changes [N/m, N s/m]."""
+FORCE, STIFFNESS, BENDING, DAMPER = 30.0, 150.0, 1500.0, 30.0
+"""Usual sizes of the force on a grasp [N], and by which it changes [N/m, N/m^2, N s/m]."""
 GAIN = 3.0
 """Usual size of 1/g, and the factor from which a gain counts as wrong."""
 EXPLAINED = 1.5
 """Root mean square of what is left, in sizes of the model's error, up to which a joint's effort is explained."""
+WELL = 0.5
+"""The same up to which nothing is left to be explained by a lag."""
 UNLIKE = 3.0
 """The same from which on it is not this robot's."""
 SURE = 5.0
@@ -85,9 +87,8 @@ def check_efforts(arm: Arm, recording: Recording) -> list[Doubt]:
     if dead.any():
         found.append(_zero(arm, dead))
     else:
-        found += _by_joint(arm, motion, needed, size)
-    if not found:
-        found += _late(arm, motion, needed, size)
+        # motion to and fro that is late looks turned round, so that comes first
+        found += list(_late(arm, motion, needed, size)) or list(_by_joint(arm, motion, needed, size))
     return [replace(doubt, recording=recording.name, group="joints") for doubt in found]
 
 
@@ -135,9 +136,12 @@ def _by_joint(arm: Arm, motion: Motion, needed: Array, size: Array) -> Iterator[
     assert motion.effort is not None
     fit = _fitted(arm, motion, motion.effort, needed, size)
     told = fit.std < np.maximum(0.6 * np.abs(fit.inverse), 0.35)
+    loaded = _loaded(arm, motion, size)
     common = 1.0
     typical = float(np.median(np.abs(fit.inverse[told]))) if told.any() else 1.0
-    if told.sum() >= 2 and not 1 / GAIN < typical < GAIN:
+    # what is held can add to efforts, so that they look too large, but not beyond what the arm itself weighs
+    large = np.linalg.norm(motion.effort) > GAIN * np.linalg.norm(needed)
+    if told.sum() >= 2 and (typical > GAIN or (typical < 1 / GAIN and large)):
         # a prior about one holds a gain that is a power of ten away, so efforts are scaled first
         common = 10.0 ** round(math.log10(typical))
         fit = _fitted(arm, motion, common * motion.effort, needed, size)
@@ -165,7 +169,7 @@ def _by_joint(arm: Arm, motion: Motion, needed: Array, size: Array) -> Iterator[
             yield _sign(f"the effort of {arm.names[j]} has", depth, arm.names[j], f"effort.{arm.names[j]}")
     for j in np.flatnonzero(sound & ~turned):
         inverse, off = float(fit.inverse[j]), abs(float(fit.inverse[j]) - 1) / float(fit.std[j])
-        weak, strong = inverse > GAIN, 0 < inverse < 1 / GAIN and fit.direct[j] > GAIN
+        weak, strong = inverse > GAIN, 0 < inverse < 1 / GAIN and fit.direct[j] > GAIN and not loaded[j]
         if off > SURE and (weak or strong):
             yield Doubt(
                 "effort_gain",
@@ -183,7 +187,7 @@ def _by_joint(arm: Arm, motion: Motion, needed: Array, size: Array) -> Iterator[
     off_zero = (fit.inverse > 0) & (fit.inverse < 1 / GAIN) & (fit.direct > 1 / GAIN) & (fit.direct < GAIN)
     offset = np.where(off_zero, fit.shift, fit.offset)
     calm = told & (fit.left < EXPLAINED / 1.5) & (off_zero | ((fit.inverse > 1 / GAIN) & (fit.inverse < GAIN)))
-    for j in np.flatnonzero(calm & (np.abs(offset) > 3 * OFFSET * size)):
+    for j in np.flatnonzero(calm & ~loaded & (np.abs(offset) > 3 * OFFSET * size)):
         # springs that carry part of the weight are no wrong zero
         balanced = offset[j] * np.mean(needed[:, j]) < 0 and abs(offset[j]) < np.max(np.abs(needed[:, j]))
         sure = abs(offset[j]) > SURE * fit.offset_std[j]
@@ -235,6 +239,8 @@ def _late(arm: Arm, motion: Motion, needed: Array, size: Array) -> Iterator[Doub
     assert motion.effort is not None
     trials = LAG * np.arange(-5, 6)
     if motion.t[-1] - motion.t[0] < 4 * trials[-1]:
+        return
+    if np.max(_fitted(arm, motion, motion.effort, needed, size).left) < WELL:
         return
     inside = (motion.t >= motion.t[0] + trials[-1]) & (motion.t <= motion.t[-1] - trials[-1])
     kept = replace(motion, t=motion.t[inside], q=motion.q[inside], v=motion.v[inside], a=motion.a[inside])
@@ -312,8 +318,18 @@ def _springs(arm: Arm, size: Array) -> Array:
     return np.where([name in sprung for name in arm.names], 10 * size, SPRING * size)
 
 
+def _loaded(arm: Arm, motion: Motion, size: Array) -> NDArray[np.bool_]:
+    """Joints on which what is held can act like a wrong zero."""
+    holders = tuple(grasp.holder for grasp in arm.system.grasps if arm.carries(grasp.holder))
+    if not holders:
+        return np.zeros(len(arm.names), bool)
+    _, by_angle = arm.places(holders, motion.q[:: max(1, len(motion.q) // 20)])
+    lever = np.max(np.linalg.norm(by_angle, axis=2), axis=(0, 1))
+    return np.asarray(FORCE * lever > 3 * OFFSET * size)
+
+
 def _loads(arm: Arm, motion: Motion) -> tuple[Array, Array]:
-    """Columns of the force at every grasp, shape (N, k, 15 per grasp), and their usual sizes."""
+    """Columns of the force at every grasp, shape (N, k, 33 per grasp), and their usual sizes."""
     holders = tuple(grasp.holder for grasp in arm.system.grasps if arm.carries(grasp.holder))
     count, width = motion.q.shape
     if not holders:
@@ -325,6 +341,7 @@ def _loads(arm: Arm, motion: Motion) -> tuple[Array, Array]:
         speed = np.einsum("nik,nk->ni", by_angle[:, g], motion.v)
         for axis in range(3):
             lever = by_angle[:, g, axis, :]
-            columns += [lever, *(lever * moved[:, [b]] for b in range(3)), lever * speed[:, [axis]]]
-            sizes += [FORCE, *[STIFFNESS] * 3, DAMPER]
+            squares = [lever * (moved[:, [b]] * moved[:, [c]]) for b in range(3) for c in range(b, 3)]
+            columns += [lever, *(lever * moved[:, [b]] for b in range(3)), *squares, lever * speed[:, [axis]]]
+            sizes += [FORCE, *[STIFFNESS] * 3, *[BENDING] * 6, DAMPER]
     return np.stack(columns, axis=2), np.array(sizes)

@@ -155,14 +155,15 @@ def _changed_times(
     def error(late: float) -> float:
         at = t - late
         inside = (at >= knots[0]) & (at <= knots[-1])
-        return _rms(seen[inside] - path(at[inside])) if inside.sum() > max(3, len(t) // 5) else math.inf
+        return _rms(seen[inside] - path(at[inside])) if inside.sum() > max(3, len(t) // 2) else math.inf
 
-    width = 0.8 * (knots[-1] - knots[0])
+    width = 0.5 * (knots[-1] - knots[0])
     best = 0.0
     for step in (width / 100, width / 1000, width / 10000):
         trials = best + step * np.arange(-100 if step == width / 100 else -12, 101 if step == width / 100 else 13)
         best = float(min(trials, key=error))
-    if abs(best) >= LATE:
+    # of a search over so many times some always fits better
+    if abs(best) >= LATE and error(best) < 0.5 * BETTER * error(0.0):
         words, advice = f"taken {best:+.3g} s from the joints", f"subtract {best:.3g} s from their times"
         yield _Change("clock_offset", words, advice, error(best))
 
