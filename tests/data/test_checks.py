@@ -115,7 +115,7 @@ FAULTS = {
         {"stuck"},
     ),
     "all repeat one sample": (
-        changed(RECORDING, position=0 * POSITION + 0.1, velocity=None, effort=0 * EFFORT + 2.0),
+        changed(RECORDING, position=0 * POSITION + 0.1, velocity=None, effort=None),
         {"stuck"},
     ),
     "coarse angles": (changed(RECORDING, position=0.01 * np.rint(POSITION / 0.01)), {"quantised"}),

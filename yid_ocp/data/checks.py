@@ -481,8 +481,8 @@ def _stuck(recording: Recording) -> Iterator[Doubt]:
         if not len(rest) and stated:
             evidence = count / LIMITS.stuck_samples
         evidence = max(evidence, turned / LIMITS.turned if turned > LIMITS.turned else 0.0)
-        if quantity == "effort" and not np.any(values[begin : end + 1]) and count == len(t) - 1:
-            continue  # zero throughout: no effort was recorded, which is another cause
+        if quantity == "effort" and values[begin] in (0.0, np.max(values), np.min(values)):
+            continue  # no effort was recorded, or it is cut off: other causes
         if evidence >= 1:
             also = f", while its velocity turns it by {turned:.2g} rad" if turned > LIMITS.turned else ""
             found.append((group, channel, float(t[begin]), float(t[end]), evidence, also))

@@ -134,21 +134,18 @@ def _zero(arm: Arm, dead: NDArray[np.bool_]) -> Doubt:
 
 def _by_joint(arm: Arm, motion: Motion, needed: Array, size: Array) -> Iterator[Doubt]:
     assert motion.effort is not None
-    fit = _fitted(arm, motion, motion.effort, needed, size)
-    told = fit.std < np.maximum(0.6 * np.abs(fit.inverse), 0.35)
     loaded = _loaded(arm, motion, size)
-    common = 1.0
-    typical = float(np.median(np.abs(fit.inverse[told]))) if told.any() else 1.0
-    # what is held can add to efforts, so that they look too large, but not beyond what the arm itself weighs
-    large = np.linalg.norm(motion.effort) > GAIN * np.linalg.norm(needed)
-    if told.sum() >= 2 and (typical > GAIN or (typical < 1 / GAIN and large)):
-        # a prior about one holds a gain that is a power of ten away, so efforts are scaled first
-        common = 10.0 ** round(math.log10(typical))
-        fit = _fitted(arm, motion, common * motion.effort, needed, size)
-        told = fit.std < np.maximum(0.6 * np.abs(fit.inverse), 0.35)
+    # What is held can add to efforts, but not several times what the arm itself weighs, nor carry nearly all of that.
+    # A prior about one holds a gain that is a power of ten away, so efforts are scaled first.
+    ratio = float(np.linalg.norm(needed) / max(float(np.linalg.norm(motion.effort)), 1e-300))
+    common = 10.0 ** round(math.log10(ratio)) if not 1 / GAIN < ratio < GAIN else 1.0
+    fit = _fitted(arm, motion, common * motion.effort, needed, size)
+    told = fit.std < np.maximum(0.6 * np.abs(fit.inverse), 0.35)
     sound = told & (fit.left < EXPLAINED) & (np.abs(fit.offset) < 3 * OFFSET * size)
+    scale = 1.0
     if common != 1.0 and sound.sum() >= 2:
         scale = 1 / (common * float(np.median(np.abs(fit.inverse[sound]))))
+    if not 1 / GAIN < scale < GAIN:
         yield Doubt(
             "effort_gain",
             f"efforts are about {scale:.2g} times what gravity and motion need",
