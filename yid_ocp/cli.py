@@ -61,8 +61,15 @@ def _configured(parser: argparse.ArgumentParser, optional: bool = False) -> None
     parser.add_argument("--quiet", action="store_true", help="print nothing but the run folder's path")
 
 
-def _configured_or_embedded(parser: argparse.ArgumentParser) -> None:
-    _configured(parser, optional=True)
+def _doubting(parser: argparse.ArgumentParser, optional: bool = False) -> None:
+    _configured(parser, optional)
+    text = "stop, with exit code 2, where anything about a recording is in doubt"
+    strict = "recordings.strict=true"
+    parser.add_argument("--strict", action="append_const", const=strict, dest="overrides", help=text)
+
+
+def _doubting_or_embedded(parser: argparse.ArgumentParser) -> None:
+    _doubting(parser, optional=True)
 
 
 def _identifiability(parser: argparse.ArgumentParser) -> None:
@@ -116,8 +123,8 @@ def _schema(parser: argparse.ArgumentParser) -> None:
 
 
 COMMANDS: tuple[Command, ...] = (
-    Command("solve", "estimate the free parameters from recordings", "solve", _configured_or_embedded),
-    Command("compare", "run several methods on one problem and say whether they agree", "compare", _configured),
+    Command("solve", "estimate the free parameters from recordings", "solve", _doubting_or_embedded),
+    Command("compare", "run several methods on one problem and say whether they agree", "compare", _doubting),
     Command(
         "identifiability",
         "say which parameters the recordings determine, and which experiment would tell more",
@@ -128,7 +135,7 @@ COMMANDS: tuple[Command, ...] = (
         "diagnose",
         "find the gap between model and recordings, and what makes it",
         "diagnose",
-        _configured_or_embedded,
+        _doubting_or_embedded,
     ),
     Command(
         "blind",
@@ -138,9 +145,9 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command("plan", "plan a motion of the arms with the identified model", "plan", _configured),
     Command("simulate", "write what the model says would be recorded", "simulate", _simulate),
-    Command("check", "validate a configuration, its recordings and the model before a long run", "check", _configured),
+    Command("check", "validate a configuration, its recordings and the model before a long run", "check", _doubting),
     Command("inspect", "show the model's equations: names, patterns, single entries, numbers", "inspect", _inspect),
-    Command("track", "measure the object's points in the frames of a depth camera", "track", _configured),
+    Command("track", "measure the object's points in the frames of a depth camera", "track", _doubting),
     Command("import", "turn CSV, rosbag or MCAP into a recording", "import_recording", _import),
     Command("export", "turn a recording into CSV", "export_recording", _export),
     Command("schema", "print the JSON Schema of configuration files, for editors", "schema", _schema),

@@ -11,8 +11,8 @@ from yid_ocp.report.sections import SECTIONS, Findings
 from yid_ocp.solvers.judgement import verdict
 from yid_ocp.solvers.words import PREDICATES, VERDICT_WORDS
 
-GOOD = {"chi2_per_dof": 1.03, "p_value": 0.3, "explains": True, "worse_than_guess": []}
-BAD = {"chi2_per_dof": 41.7, "p_value": 0.0, "explains": False, "worse_than_guess": []}
+GOOD = {"chi2_per_dof": 1.03, "p_value": 0.3, "explains": True, "believed": True, "worse_than_guess": []}
+BAD = {"chi2_per_dof": 41.7, "p_value": 0.0, "explains": False, "believed": True, "worse_than_guess": []}
 
 
 def parameter(said: str, value: float = 2.0) -> dict:

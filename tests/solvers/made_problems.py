@@ -60,7 +60,9 @@ class MadeUp:
         self.shared, self.local = self.names, ()
         self.bounds = np.full(size, lower), np.full(size, upper)
         self.scales = np.abs(self.start) if scales is None else np.array(scales, float)
-        self.options = SimpleNamespace(weighting=weighting, priors=dict(priors or {}), path_cutoff=np.inf)
+        self.options = SimpleNamespace(
+            believed=True, weighting=weighting, priors=dict(priors or {}), path_cutoff=np.inf
+        )
         self.disturbed = False
         values = [*self.start, *fixed]
         entries = [Parameter(f"k{i}", v, "N m/rad", lower, upper, "made up") for i, v in enumerate(values)]

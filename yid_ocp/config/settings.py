@@ -187,6 +187,9 @@ class RecordingSettings:
 
     estimate: Annotated[tuple[RecordingPath, ...], About("to estimate on")] = ()
     held_out: Annotated[tuple[RecordingPath, ...], About("only predicted, never touched by the fit")] = ()
+    strict: Annotated[
+        bool, About("whether any doubt about a recording stops the run; --strict on the command line")
+    ] = False
 
 
 @dataclass(frozen=True, kw_only=True)

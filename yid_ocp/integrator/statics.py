@@ -172,9 +172,10 @@ class Statics:
         if not failed and np.max(np.abs(give), initial=0.0) > HOLD_LIMIT:
             joint = int(np.argmax(np.abs(give)))
             failed = True
+            # with a torque given, any of the three may be wrong
+            parts = "posture does not fit the grasp" if torque is None else "posture, torques and grasp do not balance"
             message = (
-                f"the measured posture does not fit the grasp: {system.driven[joint]} would have to move by "
-                f"{abs(give[joint]):.3g} rad"
+                f"the measured {parts} at rest: {system.driven[joint]} would have to move by {abs(give[joint]):.3g} rad"
             )
         count = len(self.unknown) + step.sizes["nz"]
         # torque and posture enter together, as the torque plus the holding spring's stiffness times the posture

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from annotated_types import Ge, Gt, Len
 from numpy.typing import ArrayLike
 
+from yid_ocp.data.checks import Doubt
 from yid_ocp.model.cable import ClampPath
 from yid_ocp.options import About
 from yid_ocp.problem.measurements import Weighting
@@ -64,6 +65,8 @@ class ProblemOptions:
     known_start : mapping of recording to array_like, shape (nx,)
         State (q, p, z) in which a recording starts, in place of rest or of the fit; an `estimated` start is offset from
         it.
+    doubts : tuple of Doubt
+        Why the recordings may be wrong; see `believed`.
     """
 
     initial_state: Annotated[
@@ -116,3 +119,9 @@ class ProblemOptions:
     ] = ()
     recording_values: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     known_start: Mapping[str, ArrayLike] = field(default_factory=dict)
+    doubts: tuple[Doubt, ...] = ()
+
+    @property
+    def believed(self) -> bool:
+        """Whether no doubt about a recording forbids to trust what is made of it."""
+        return all(doubt.weight == "warning" for doubt in self.doubts)

@@ -7,8 +7,45 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from yid_ocp.data.checks import CAUSES
+
+MOST_ALIKE = 3  # doubts of one kind
 MOST_OFFSETS = 4  # recordings side by side
 MOST_POINTS = 4  # a group of more points is shown as a whole; result.json has every point
+
+
+@dataclass(frozen=True)
+class DoubtRow:
+    """One doubt about a recording; `evidence` is how many times its limit was exceeded."""
+
+    cause: str
+    where: str
+    sure: str
+    evidence: float
+    what: str
+    advice: str
+    setting: str
+
+
+def doubt_rows(result: Mapping[str, Any]) -> list[DoubtRow]:
+    """The doubts of a result that people want to see: those of one kind up to `MOST_ALIKE`, then how many more."""
+    rows: list[DoubtRow] = []
+    for cause in dict.fromkeys(entry["cause"] for entry in result.get("doubts", ())):
+        alike = [entry for entry in result["doubts"] if entry["cause"] == cause]
+        for i, entry in enumerate(alike[:MOST_ALIKE]):
+            last, more = i == MOST_ALIKE - 1, len(alike) - MOST_ALIKE
+            where = entry["where"] + (f" and {more} more" if last and more > 0 else "")
+            told = (entry["sure"], entry["evidence"], entry["what"], entry["advice"], entry["setting"])
+            rows.append(DoubtRow(CAUSES[cause], where, *told))
+    return rows
+
+
+def doubt_sentences(result: Mapping[str, Any]) -> list[str]:
+    """What follows from the doubts of a result."""
+    grave = [entry for entry in result.get("doubts", ()) if entry["weight"] != "warning"]
+    if not grave:
+        return []
+    return ["no number is said to be found while a recording of the run is in doubt"]
 
 
 @dataclass(frozen=True)

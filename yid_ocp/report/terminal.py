@@ -9,6 +9,8 @@ from typing import Any
 from yid_ocp.data import Recording
 from yid_ocp.report.tables import (
     blind_table,
+    doubt_rows,
+    doubt_sentences,
     guess_sentences,
     held_out_rows,
     medians,
@@ -32,8 +34,7 @@ def solve_summary(result: Mapping[str, Any]) -> list[str]:
         interval = "" if failed or entry["interval"] is None else interval_words(*entry["interval"])
         verdict = "" if failed else VERDICT_WORDS[entry["verdict"]]
         rows.append((name, f"{entry['value']:.4g}", std, interval, entry["unit"], verdict, f"{entry['initial']:.4g}"))
-    lines = [] if failed else _misfit(result["fit"])
-    lines += [*table(rows), ""]
+    lines = [*_doubt_lines(result), *([] if failed else _misfit(result["fit"])), *table(rows), ""]
     rows = [("channel", "error (rms)", "unit", "samples")]
     rows += [(c, f"{e['rmse']:.3g}", e["unit"], str(e["n"])) for c, e in result["residuals"].items()]
     if len(rows) > 1:
@@ -60,6 +61,20 @@ def solve_summary(result: Mapping[str, Any]) -> list[str]:
         f"{result['status']}: {result['message']} ({result['iterations']} iterations, {result['seconds']:.1f} s)"
     )
     return lines
+
+
+def _doubt_lines(result: Mapping[str, Any]) -> list[str]:
+    """What is in doubt about the recordings, as one table, and what follows; nothing where nothing is."""
+    shown = doubt_rows(result)
+    if not shown:
+        return []
+    rows: Rows = [("in doubt", "where", "how sure", "times its limit")]
+    rows += [(row.cause, row.where, row.sure, f"{row.evidence:.3g}") for row in shown]
+    lines = [*table(rows), ""]
+    for row in shown:
+        lines += textwrap.wrap(f"{row.cause}: {row.what}; {row.advice}", 118, subsequent_indent="  ")
+        lines += [f"  {row.setting}"] if row.setting else []
+    return [*lines, *doubt_sentences(result), ""]
 
 
 def _misfit(fit: Mapping[str, Any]) -> list[str]:
@@ -120,7 +135,7 @@ def track_summary(result: Mapping[str, Any]) -> list[str]:
         cells = ["" if entry["std"] is None else f"{1e3 * entry['std']:.1f}"]
         cells += [f"{1e3 * truth[name][key]:.1f}" if name in truth else "" for key in ("median", "largest")]
         rows.append((name, str(entry["frames"]), *cells))
-    lines = [*table(rows), ""]
+    lines = [*_doubt_lines(result), *table(rows), ""]
     good = sum(not frame["reason"] for frame in result["frames"])
     spent = 1e3 * result["fit_seconds"]
     lines.append(f"{good} of {len(result['frames'])} frames are good, the fit took {spent:.0f} ms each")
@@ -145,7 +160,7 @@ def compare_summary(result: Mapping[str, Any]) -> list[str]:
         known = [f"{result[key][name]:.4g}" if name in result[key] else "" for key in beside]
         rows.append((name, *cells, *known, VERDICT_WORDS[judged["parameters"][name]["verdict"]]))
     fit = judged["fit"]
-    lines = [*_misfit(fit), *table(rows), "", *table(_efforts(methods)), ""]
+    lines = [*_doubt_lines(result), *_misfit(fit), *table(rows), "", *table(_efforts(methods)), ""]
     for name, entry in methods.items():
         if entry["status"] != "converged":
             lines.append(f"{name} did not converge: {entry['message']}")
@@ -159,6 +174,8 @@ def compare_summary(result: Mapping[str, Any]) -> list[str]:
     lines += result["published_explained"]
     if not fit["explains"]:
         lines.append("the model does not explain the recordings, so agreement of methods says nothing of the truth")
+    elif not fit["believed"]:
+        lines.append("the recordings are in doubt, so agreement of methods says nothing of the truth")
     elif not any(judged["parameters"][name]["verdict"] == "identifiable" for name in free):
         lines.append("no parameter can be found from these recordings, so there is nothing to agree on")
         lines.append("`yid-ocp identifiability CONFIG --what-if` says what would have to be measured")
@@ -233,7 +250,7 @@ def _percent(value: float | None) -> str:
 
 def diagnose_summary(result: Mapping[str, Any]) -> list[str]:
     """Lines that tell a person what a `yid-diagnosis/1` result says."""
-    lines = [*textwrap.wrap(result["summary"], 100), ""]
+    lines = [*_doubt_lines(result), *textwrap.wrap(result["summary"], 100), ""]
     before, after, units = (result["gap"][a][b] for a, b in (("before", "rmse"), ("after", "rmse"), ("before", "unit")))
     rows: Rows = [("held-out channel", "before", "after", "unit")]
     rows += [(c, f"{e:.3g}", f"{after[c]:.3g}" if c in after else "", units[c]) for c, e in before.items()]
@@ -249,6 +266,7 @@ def diagnose_summary(result: Mapping[str, Any]) -> list[str]:
         rows.append((label, values, closed, f"{entry['score']:.3g}", p))
     lines += [*table(rows), ""] if len(rows) > 1 else []
     lines += _offset_lines(result)
+    lines += ["what is in doubt about the recordings may be what the verdict is about"] if result.get("doubts") else []
     return [*lines, f"verdict: {result['verdict']} ({sum(result['seconds'].values()):.1f} s)"]
 
 
@@ -288,10 +306,13 @@ def check_summary(result: Mapping[str, Any]) -> list[str]:
     lines += _convergence_lines(result["convergence"])
     moved = _moved_lines(result)
     lines += ["", "if the initial values were the estimates:", *moved] if moved else []
-    lines += ["", *(f"warning: {text}" for text in result["warnings"])]
-    lines.append(
-        "nothing stands in the way of a run" if not result["warnings"] else "a run is possible; see the warnings"
-    )
+    lines += ["", *_doubt_lines(result), *(f"warning: {text}" for text in result["warnings"])]
+    if result.get("doubts"):
+        lines.append("a run is possible; see what is in doubt")
+    else:
+        lines.append(
+            "nothing stands in the way of a run" if not result["warnings"] else "a run is possible; see the warnings"
+        )
     return lines
 
 

@@ -91,7 +91,17 @@ def _points(around: Surroundings, group: PointData, choice: Choice) -> SensorDat
     where = around.recording.name
     wanted = choice.points if choice.points is not None else group.names
     frames = {p: choice.frames.get(p, p) for p in wanted}
-    known = tuple(p for p in wanted if around.system.mechanism.has_frame(frames[p]))
+    mechanism = around.system.mechanism
+    known = tuple(p for p in wanted if mechanism.has_frame(frames[p]))
+    for point in wanted:
+        # what is listed by name is meant
+        if point not in known and (choice.points is not None or point in choice.frames):
+            raise DataError(
+                f"point '{point}' of '{group.name}' marks the frame '{frames[point]}', which the model does not have",
+                where=where,
+                allowed=", ".join(around.system.points),
+                hint=f"{nearest(frames[point], mechanism.frames)} (see sensors.{group.name})",
+            )
     if not known:
         raise DataError(
             f"none of the points of group '{group.name}' is a frame of the model",

@@ -46,11 +46,14 @@ class Fit:
         Of a residual this large under noise alone.
     explains : bool
         By the null test of a diagnosis, at its level and relevance; see `null_test.more_than_noise`.
+    believed : bool
+        Whether there is no grave doubt about a recording; see `ProblemOptions.doubts`.
     """
 
     chi2_per_dof: float
     p_value: float
     explains: bool
+    believed: bool = True
 
 
 NO_FIT = Fit(math.nan, math.nan, False)
@@ -102,7 +105,7 @@ def judge_fit(problem: EstimationProblem, evaluation: Evaluation, limits: GapLim
         ]
         residual = np.concatenate(parts) if parts else np.zeros(0)
     found = null_test(residual_series(problem), residual / limits.noise_fraction, len(problem.names))
-    return Fit(found.chi2_per_dof, found.p_value, not more_than_noise((found,), limits))
+    return Fit(found.chi2_per_dof, found.p_value, not more_than_noise((found,), limits), problem.options.believed)
 
 
 # -- how sure ---------------------------------------------------------------------------------------------------------
@@ -275,7 +278,7 @@ def verdict(value: float, std: float, *, scale: float = 0.0, explains: bool = Tr
 
     ==================  ================================================================================================
     not_identifiable    the standard deviation is above 400 % of the value
-    not_trusted         the model does not explain the data
+    not_trusted         the model does not explain the data, or the data are in grave doubt
     at_bound            the value lies at one of its bounds
     identifiable        the standard deviation is up to 10 % of the value
     weak                anything else
@@ -412,7 +415,7 @@ def estimates(
         std = float(spread[at])
         std = std if std < UNINFORMED * max(abs(value), float(scales[at])) else math.inf
         side = bound_side(value, float(lower[at]), float(upper[at]), float(scales[at])) if known else 0
-        explains = fit is None or fit.explains
+        explains = problem.options.believed and (fit is None or fit.explains)
         said = verdict(value, std, scale=sizes[entry.name], explains=explains, at_bound=side != 0)
         interval = None
         if said == "not_identifiable":

@@ -31,6 +31,7 @@ from yid_ocp.model.y_object import Y_FOOT, y_segments
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.sensors.joints import POSITION, of_arm
+from yid_ocp.workflow.doubts import blaming, examined, object_doubts, stop_at
 
 GIVEN_FRAMES = 2  # of a cable's free points, from which every prediction starts
 LARGEST_GAP = 0.01  # what encoder noise and a slightly wrong length of the object can make of a grasp [m]
@@ -459,7 +460,8 @@ def build_problem(run: Run, step: Step | None = None) -> EstimationProblem:
     Raises
     ------
     ConfigError, DataError, ModelError
-        Settings, recordings or names that do not fit, a grasp that cannot be closed.
+        Settings, recordings or names that do not fit, a grasp that cannot be closed, a recording that nothing can be
+        done with; with `recordings.strict` any doubt about one.
     """
     system = build_system(run) if step is None else step.system
     free = [name for name, said in parameter_settings(run, system.parameters).items() if said.free]
@@ -480,10 +482,17 @@ def build_problem(run: Run, step: Step | None = None) -> EstimationProblem:
             "there is no recording to estimate on", "recordings", "estimate", hint="list at least one recording"
         )
     _check_sensors(run, [*estimate, *held_out])
-    options = problem_options(run, system.parameters, [*estimate, *held_out])
+    seen = examined(run, system, build_cable(run), estimate, held_out)
+    options = problem_options(run, system.parameters, [*seen.estimate, *seen.held_out])
     step = build_step(run, system) if step is None else step
-    problem = EstimationProblem(step, estimate, free, options, None, held_out)
-    check_grasps(run, problem)
+    said = replace(options, doubts=seen.doubts)
+    problem = EstimationProblem(step, seen.estimate, free, said, None, seen.held_out)
+    with blaming(seen.doubts):
+        check_grasps(run, problem)
+    more = object_doubts(problem)
+    if more:
+        stop_at(run, more)
+        problem = problem.with_options(replace(said, doubts=(*seen.doubts, *more)))
     return problem
 
 

@@ -23,7 +23,8 @@ from yid_ocp.report.terminal import check_summary
 from yid_ocp.sensors.joints import EFFORT, POSITION, angle_std, is_stated, torque_std
 from yid_ocp.solvers.base import estimates, uncertainty
 from yid_ocp.workflow.build import build_problem, build_step, first_gaps, input_files
-from yid_ocp.workflow.command import DONE, carry_out
+from yid_ocp.workflow.command import DONE, WRONG_INPUT, carry_out
+from yid_ocp.workflow.doubts import doubts_result
 from yid_ocp.workflow.folder import new_run_folder
 from yid_ocp.workflow.progress import SILENT, Progress
 from yid_ocp.workflow.refine import discretisation, refine
@@ -42,8 +43,8 @@ class CheckOutcome:
 def run(arguments: argparse.Namespace) -> int:
     """The command."""
     settings = load_config(arguments.config, arguments.overrides)
-    carry_out(lambda shown: run_check(settings, arguments.out, shown), check_summary, arguments.quiet)
-    return DONE
+    outcome = carry_out(lambda shown: run_check(settings, arguments.out, shown), check_summary, arguments.quiet)
+    return WRONG_INPUT if settings.recordings.strict and outcome.result["warnings"] else DONE
 
 
 def run_check(run: Run, out: str | Path | None = None, progress: Progress = SILENT) -> CheckOutcome:
@@ -92,6 +93,7 @@ def run_check(run: Run, out: str | Path | None = None, progress: Progress = SILE
             "recordings": recordings,
             "convergence": convergence,
             "discretisation": moved,
+            "doubts": [] if problem is None else doubts_result(problem.options.doubts),
             "warnings": warnings,
         }
         written = folder.finish(result)

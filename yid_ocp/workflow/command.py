@@ -9,8 +9,8 @@ from typing import Any, Protocol, TypeVar
 
 from yid_ocp.workflow.progress import Progress, shown
 
-DONE, FAILED = 0, 1
-"""Exit codes of commands that ran to their end."""
+DONE, FAILED, WRONG_INPUT = 0, 1, 2
+"""Exit codes of commands that ran to their end; the last where they were told to be strict and found something."""
 
 
 class Outcome(Protocol):

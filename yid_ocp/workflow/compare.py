@@ -18,6 +18,7 @@ from yid_ocp.solvers import SOLVERS, Iterate
 from yid_ocp.solvers.base import Solver
 from yid_ocp.workflow.build import build_problem
 from yid_ocp.workflow.command import DONE, FAILED, carry_out
+from yid_ocp.workflow.doubts import doubts_result
 from yid_ocp.workflow.folder import new_run_folder
 from yid_ocp.workflow.progress import SILENT, Progress
 from yid_ocp.workflow.solve import solve_result
@@ -97,7 +98,12 @@ def run_compare(run: Run, out: str | Path | None = None, progress: Progress = SI
         draw_convergence(folder.path / "convergence.png", comparison)
         experiment = run.compare.published
         said = published_sentences(experiment, comparison.judged.parameters, truth) if experiment else ()
-        about = {"published": published, "published_explained": list(said), "truth": truth}
+        about = {
+            "doubts": doubts_result(problem.options.doubts),
+            "published": published,
+            "published_explained": list(said),
+            "truth": truth,
+        }
         written = folder.finish(compare_result(problem, comparison) | about)
     return CompareOutcome(folder.path, written, comparison)
 

@@ -24,6 +24,7 @@ from yid_ocp.sensors.joints import EFFORT, POSITION
 from yid_ocp.solvers import Solution, solve
 from yid_ocp.workflow.build import build_problem
 from yid_ocp.workflow.command import DONE, carry_out
+from yid_ocp.workflow.doubts import doubts_result
 from yid_ocp.workflow.folder import new_run_folder, versions
 from yid_ocp.workflow.progress import SILENT, Progress
 from yid_ocp.workflow.refits import Refits
@@ -97,7 +98,11 @@ def run_diagnose(run: Run, out: str | Path | None = None, progress: Progress = S
         write_diagnosis_trajectories(folder.path / "trajectories.h5", finding, predicted)
         last = finding.last
         offsets = torque_offsets(last.problem, last.problem.vector(last.values))
-        own = {"torque_offsets": offsets, "command": reproducing(run, folder.target)}
+        own = {
+            "doubts": doubts_result(problem.options.doubts),
+            "torque_offsets": offsets,
+            "command": reproducing(run, folder.target),
+        }
         written = folder.finish(finding.to_dict() | own)
         if run.output.report:
             progress.stage("writing the report")

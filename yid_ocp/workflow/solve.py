@@ -23,6 +23,7 @@ from yid_ocp.report.terminal import solve_summary
 from yid_ocp.solvers import Iterate, Solution, Status, solve
 from yid_ocp.workflow.build import build_cable, build_problem
 from yid_ocp.workflow.command import DONE, FAILED, carry_out
+from yid_ocp.workflow.doubts import doubts_result
 from yid_ocp.workflow.folder import new_run_folder
 from yid_ocp.workflow.held_out import held_out_entry, worse_than_guess
 from yid_ocp.workflow.progress import SILENT, Progress
@@ -110,6 +111,7 @@ def run_solve(run: Run, out: str | Path | None = None, progress: Progress = SILE
         folder.log("end", status=solution.status.value, message=solution.message, seconds_solving=solution.seconds)
         write_trajectories(folder.path / "trajectories.h5", problem, solution, held_out)
         more = {
+            "doubts": doubts_result(problem.options.doubts),
             "safeguard": safe.message,
             "discretisation": finer.result(data_std),
             "discretisation_notes": list(finer.notes),

@@ -27,6 +27,7 @@ from yid_ocp.vision.pictures import draw_stages, draw_track
 from yid_ocp.vision.track import Track, track
 from yid_ocp.workflow.build import build_system, located, recording_file
 from yid_ocp.workflow.command import DONE, carry_out
+from yid_ocp.workflow.doubts import doubts_result, of_one
 from yid_ocp.workflow.folder import new_run_folder
 from yid_ocp.workflow.progress import SILENT, Progress
 
@@ -95,6 +96,7 @@ def run_track(run: Run, out: str | Path | None = None, progress: Progress = SILE
         else:
             recording, seen = _recorded(run, settings.frames)
             folder.inputs[settings.frames] = file_sha256(Path(settings.frames))
+        doubts = of_one(run, system, recording)
         progress.stage("tracking")
         drawn = sorted({int(i) for i in np.linspace(0, len(seen) - 1, settings.pictures + 2)[1:-1]})
         with located(run, "track"):
@@ -106,7 +108,12 @@ def run_track(run: Run, out: str | Path | None = None, progress: Progress = SILE
         draw_track(found, folder.path / "track.png")
         tracked = found.recording(recording)
         write_recording(tracked, folder.path / "recording.h5")
-        result = track_result(found) | {"truth_errors": {} if made is None else truth_errors(system, found, made)}
+        # what was tracked may be elsewhere than the object reaches
+        doubts += [doubt for doubt in of_one(run, system, tracked) if doubt.cause.startswith("point_")]
+        result = track_result(found) | {
+            "doubts": doubts_result(doubts),
+            "truth_errors": {} if made is None else truth_errors(system, found, made),
+        }
         written = folder.finish(result)
     return TrackOutcome(folder.path, written, found, tracked)
 

@@ -1,0 +1,251 @@
+"""What a model says against a recording: Baxter holding the foam Y in MuJoCo, and a cable made up here."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from yid_ocp.analysis.plausibility import (
+    Arm,
+    check_cable,
+    check_efforts,
+    check_held_points,
+    check_limits,
+    check_reach,
+)
+from yid_ocp.data import read_recording
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.model.cable import Cable
+from yid_ocp.model.system import System
+from yid_ocp.model.urdf import read_urdf, robot_description_file
+from yid_ocp.problem.options import SensorOptions
+from yid_ocp.virtual.experiment import paper_system
+
+
+def usual(_group: str) -> SensorOptions:
+    return SensorOptions()
+
+
+@pytest.fixture(scope="module")
+def arms() -> dict[int, Arm]:
+    systems = {count: paper_system(count) for count in (1, 2)}
+    return {count: Arm.of(system, system.parameters.vector()) for count, system in systems.items()}
+
+
+@pytest.fixture(scope="module")
+def runs(clean) -> dict[int, Recording]:
+    names = {1: "single_arm_vision", 2: "dual_arm_vision"}
+    return {count: read_recording(clean / f"{name}_estimate.h5") for count, name in names.items()}
+
+
+def with_joints(recording: Recording, **changes) -> Recording:
+    made = {name: change(recording.joints) for name, change in changes.items()}
+    return replace(recording, joints=replace(recording.joints, **made))
+
+
+def with_points(recording: Recording, name: str, change) -> Recording:
+    groups = [replace(g, position=change(g.position)) if g.name == name else g for g in recording.points]
+    return replace(recording, points=tuple(groups))
+
+
+# -- the arm ----------------------------------------------------------------------------------------------------------
+
+
+def test_inverse_dynamics_are_pinocchios():
+    pin = pytest.importorskip("pinocchio")
+    robot = read_urdf("package:baxter", joints=[f"left_{j}" for j in ("s0", "s1", "e0", "e1", "w0", "w1", "w2")])
+    system = System.build(robot, prescribed=robot.joint_names)
+    arm = Arm.of(system, system.parameters.vector())
+    whole = pin.buildModelFromUrdf(str(robot_description_file("baxter")))
+    others = [whole.getJointId(name) for name in whole.names[1:] if name not in robot.joint_names]
+    model = pin.buildReducedModel(whole, others, pin.neutral(whole))
+    data = model.createData()
+    q, v, a = np.random.default_rng(1).uniform(-1, 1, (3, 5, 7))
+    expected = np.array([pin.rnea(model, data, *row) for row in zip(q, v, a, strict=True)])
+    assert np.max(np.abs(arm.inverse_dynamics(q, v, a) - expected)) < 1e-9
+
+
+def test_slopes_of_places_are_their_derivatives(arms):
+    arm, frames = arms[2], ("left_gripper", "right_gripper")
+    q, step = np.random.default_rng(2).uniform(-1, 1, (3, 14)), 1e-6
+    _, slope = arm.places(frames, q)
+    for j in range(14):
+        up, down = q.copy(), q.copy()
+        up[:, j] += step
+        down[:, j] -= step
+        difference = (arm.places(frames, up)[0] - arm.places(frames, down)[0]) / (2 * step)
+        assert np.max(np.abs(difference - slope[..., j])) < 1e-8
+
+
+# -- efforts ----------------------------------------------------------------------------------------------------------
+
+
+def times(factor, *columns):
+    def change(joints):
+        effort = np.array(joints.effort)
+        effort[:, list(columns) or slice(None)] *= factor
+        return effort
+
+    return change
+
+
+def late(by):
+    def change(joints):
+        rows = round(by / 0.01)
+        return np.vstack([joints.effort[rows:0:-1], joints.effort[: len(joints.t) - rows]])
+
+    return change
+
+
+EFFORTS = {
+    "as recorded": (1, lambda j: j.effort, set()),
+    "as recorded by two": (2, lambda j: j.effort, set()),
+    "a tenth": (1, times(0.1), {"effort_gain"}),
+    "a thousand times": (2, times(1e3), {"effort_gain", "effort_limits"}),
+    "flipped": (2, times(-1.0), {"effort_sign"}),
+    "one flipped": (1, times(-1.0, 3), {"effort_sign"}),
+    "one arm flipped": (2, times(-1.0, *range(7, 14)), {"effort_sign"}),
+    "zero": (1, times(0.0), {"effort_zero"}),
+    "one zero": (1, times(0.0, 1), {"effort_zero"}),
+    "late": (2, late(0.3), {"effort_lag"}),
+    "wrist off": (1, lambda j: j.effort + 5.0 * (np.arange(7) == 6), {"effort_offset"}),
+}
+
+
+@pytest.mark.parametrize("case", EFFORTS)
+def test_efforts_beside_inverse_dynamics(arms, runs, case):
+    count, change, expected = EFFORTS[case]
+    found = check_efforts(arms[count], with_joints(runs[count], effort=change))
+    assert {doubt.cause for doubt in found} == expected
+    if case == "one flipped":
+        assert [doubt.channel for doubt in found] == ["effort.left_e1"]
+    if case == "flipped":
+        assert [doubt.channel for doubt in found] == ["effort"]
+    if case == "late":
+        assert "0.3 s earlier" in found[0].what
+
+
+def test_a_counterbalance_that_the_urdf_does_not_have_is_no_wrong_zero(arms, runs):
+    balanced = with_joints(runs[1], effort=lambda j: j.effort + 20.0 * (np.arange(7) == 1))
+    assert check_efforts(arms[1], balanced) == []
+
+
+def test_motion_that_belongs_to_other_efforts_is_not_this_robots(arms, runs):
+    quick = with_joints(runs[1], t=lambda j: j.t / 10)
+    robot = read_urdf("package:baxter", joints=arms[1].names)
+    system = System.build(robot, prescribed=robot.joint_names)
+    free = Arm.of(system, system.parameters.vector())
+    # nothing else can load an arm that holds nothing
+    assert "effort_unlike" in {doubt.cause for doubt in check_efforts(free, quick)}
+
+
+def test_limits_of_joints(arms, runs):
+    arm, run = arms[1], runs[1]
+    assert list(check_limits(arm, run)) == []
+    wide = with_joints(run, position=lambda j: j.position + 3.0 * (np.arange(7) == 3))
+    assert [(d.cause, d.channel) for d in check_limits(arm, wide)] == [("angle_limits", "position.left_e1")]
+    degrees = with_joints(run, position=lambda j: np.degrees(j.position))
+    assert [(d.cause, d.weight) for d in check_limits(arm, degrees)] == [("degrees", "refused")]
+    quick = with_joints(run, t=lambda j: j.t / 30)
+    assert "speed_limits" in {d.cause for d in check_limits(arm, quick)}
+
+
+# -- points -----------------------------------------------------------------------------------------------------------
+
+MIRROR = np.array([1.0, -1.0, 1.0])
+TURN = np.array([[0.9, -np.sqrt(0.19), 0.0], [np.sqrt(0.19), 0.9, 0.0], [0.0, 0.0, 1.0]])
+HELD = {
+    "as recorded": (1, lambda p: p, None, ""),
+    "as recorded by two": (2, lambda p: p, None, ""),
+    "mirrored": (1, lambda p: MIRROR * p, "point_mirrored", "(x, -y, z)"),
+    "axes exchanged": (2, lambda p: p[..., [1, 0, 2]], "point_mirrored", "(y, x, z)"),
+    "in millimetres": (1, lambda p: 1e3 * p, "point_scale", "divided by 1000"),
+    "shifted": (2, lambda p: p + np.array([0.1, 0.0, 0.2]), "point_frame", "shifted by (-0.1"),
+    "turned": (2, lambda p: p @ TURN.T, "point_frame", "turned by 25.8 degrees"),
+    "exchanged": (2, lambda p: p[:, ::-1], "point_swapped", "w_T2 and w_T3 exchanged"),
+}
+
+
+@pytest.mark.parametrize("case", HELD)
+def test_points_that_the_arm_holds(arms, runs, case):
+    count, change, cause, words = HELD[case]
+    found = list(check_held_points(arms[count], with_points(runs[count], "points_arm", change), usual))
+    assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
+    assert not found or words in found[0].what
+
+
+@pytest.mark.parametrize("joint", [1, 3, 5])
+@pytest.mark.parametrize("offset", [0.05, -0.03])
+def test_an_encoder_whose_zero_is_off_is_named_with_its_size(arms, runs, joint, offset):
+    moved = with_joints(runs[1], position=lambda j: j.position + offset * (np.arange(7) == joint))
+    (doubt,) = check_held_points(arms[1], moved, usual)
+    name = arms[1].names[joint]
+    assert (doubt.cause, name in doubt.setting) == ("encoder_offset", True)
+    assert f"with {-offset:+.3g}"[:9] in doubt.what.replace("+0.0499", "+0.05").replace("-0.0499", "-0.05")
+
+
+def test_points_on_a_late_clock(arms, runs):
+    groups = [replace(g, t=g.t + 0.4) if g.name == "points_arm" else g for g in runs[2].points]
+    (doubt,) = check_held_points(arms[2], replace(runs[2], points=tuple(groups)), usual)
+    assert doubt.cause == "clock_offset"
+    assert "taken +0.4 s" in doubt.what
+
+
+def test_what_no_change_explains_is_said_so(arms, runs):
+    rng = np.random.default_rng(0)
+    walk = np.cumsum(0.02 * rng.standard_normal((501, 1, 3)), axis=0)
+    (doubt,) = check_held_points(arms[1], with_points(runs[1], "points_arm", lambda p: p + walk), usual)
+    assert doubt.cause == "point_unlike"
+
+
+@pytest.mark.parametrize(
+    ("factor", "cause"), [(1.0, None), (10.0, "point_scale"), (1 / 0.3048, "point_reach"), (-1.0, "point_reach")]
+)
+def test_the_object_does_not_stretch(arms, runs, factor, cause):
+    recording = with_points(runs[1], "points_camera", lambda p: factor * p)
+    found = check_reach(arms[1], arms[1].system, arms[1].theta, recording, usual)
+    assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
+
+
+# -- a cable ----------------------------------------------------------------------------------------------------------
+
+REST = {f"p{i}": (0.1 * i, 0.0, 0.0) for i in range(9)} | {f"a{i}": (0.4, 0.07 * i, 0.0) for i in (1, 2, 3)}
+CABLE = Cable(tuple(f"p{i}" for i in range(9)), {"a": ("p4", "a1", "a2", "a3")}, REST)
+GRAVITY = np.array([0.0, 0.0, -9.81])
+
+
+def hanging(seed: int = 0) -> Recording:
+    """The parent as an arc below its ends, the child hanging from it, swinging a little."""
+    t = np.arange(200) / 100
+    at = np.linspace(-0.8, 0.8, 9)
+    arc = 0.5 * np.stack([np.sin(at), 0 * at, 1 - np.cos(at)], axis=1)
+    child = arc[4] + np.array([[0.0, 0.0, -0.07 * i] for i in (1, 2, 3)])
+    shape = np.concatenate([arc, child])
+    swing = 0.02 * np.sin(3 * t)[:, None, None] * np.ones((1, 12, 3))
+    noise = 2e-4 * np.random.default_rng(seed).standard_normal((200, 12, 3))
+    names = (*(f"p{i}" for i in range(9)), "a1", "a2", "a3")
+    return Recording(None, (PointGroup("points", names, t, shape + swing + noise, sensor="motion capture"),), name="c")
+
+
+@pytest.mark.parametrize(
+    ("change", "cause", "words"),
+    [
+        (lambda p: p, None, ""),
+        (lambda p: 10 * p, "point_scale", "9.98 times as long"),
+        (lambda p: p * [1, 1, -1], "point_mirrored", "above its clamps"),
+        (lambda p: p[:, [0, 1, 2, 10, 4, 5, 6, 7, 8, 9, 3, 11]], "point_swapped", "a2 and p3 exchanged"),
+    ],
+)
+def test_a_cable_keeps_its_lengths_and_hangs(change, cause, words):
+    found = list(check_cable(CABLE, with_points(hanging(), "points", change), GRAVITY))
+    assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
+    assert not found or words in found[0].what
+
+
+def test_joints_of_another_name_leave_nothing_to_compare(arms, runs):
+    joints = runs[1].joints
+    other = JointGroup(tuple(name.replace("left", "right") for name in joints.names), joints.t, joints.position)
+    assert not arms[1].is_in(replace(runs[1], joints=other))
+    assert arms[1].is_in(runs[1])

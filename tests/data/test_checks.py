@@ -1,0 +1,245 @@
+"""What a recording says against itself: every fault is told by its cause, and a recording without one by none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from yid_ocp.data.checks import CAUSES, Doubt, check_recording, quantum, same_data, shared_samples
+from yid_ocp.data.gaps import cut_at_gaps
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.problem.options import SensorOptions
+
+NAMES = ("a", "b", "c")
+STD = 1e-4
+
+
+def made(seed: int = 1, duration: float = 8.0, rate: float = 100.0, **more) -> Recording:
+    """Three joints in motion with noise, velocities and efforts, and a point that a slow camera sees."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(round(duration * rate) + 1) / rate
+    phase = rng.uniform(0, 6, 3)
+    wave = 2 * np.pi * np.array([0.3, 0.5, 0.7])
+    angle = 0.4 * np.sin(wave * t[:, None] + phase)
+    rate_of = 0.4 * wave * np.cos(wave * t[:, None] + phase)
+    effort = 5 * np.sin(0.7 * wave * t[:, None]) + 0.05 * rng.standard_normal(angle.shape)
+    joints = JointGroup(
+        NAMES,
+        t,
+        angle + STD * rng.standard_normal(angle.shape),
+        velocity=rate_of + 5e-3 * rng.standard_normal(angle.shape),
+        effort=effort,
+        position_std=STD,
+        effort_std=0.05,
+        **more,
+    )
+    at = np.arange(0.2, duration, 0.3)
+    seen = np.stack([np.sin(at), np.cos(at), 0 * at], axis=1)[:, None, :]
+    camera = PointGroup("points_camera", ("p",), at, seen, np.full(seen.shape, 5e-3), "camera")
+    return Recording(joints, (camera,), name="made")
+
+
+def changed(recording: Recording, **fields) -> Recording:
+    return replace(recording, joints=replace(recording.joints, **fields))
+
+
+def column(values, j, change):
+    values = np.array(values)
+    values[:, j] = change(values[:, j])
+    return values
+
+
+def causes(recording, driving=True, **sensors) -> set[str]:
+    found = check_recording(recording, lambda group: sensors.get(group.replace(".", "_"), SensorOptions()), driving)
+    assert all(doubt.recording == recording.name and doubt.advice and doubt.evidence >= 1 for doubt in found)
+    return {doubt.cause for doubt in found}
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_recording_without_a_fault_is_not_in_doubt(seed):
+    assert causes(made(seed, rate=[50.0, 100.0, 500.0][seed % 3])) == set()
+
+
+def test_angles_that_count_in_steps_of_their_stated_noise_are_not_in_doubt():
+    recording, step = made(), 12**0.5 * STD
+    counted = changed(recording, position=step * np.rint(recording.joints.position / step), velocity=None)
+    assert causes(counted) == set()
+
+
+def test_a_joint_that_rests_on_one_step_of_its_encoder_is_not_stuck():
+    recording = made()
+    rest = column(recording.joints.position, 1, lambda x: 0 * x + 0.3)
+    still = column(recording.joints.velocity, 1, lambda v: 0 * v)
+    assert causes(changed(recording, position=rest, velocity=still, position_std=None)) == set()
+
+
+def test_noise_from_a_clock_that_is_known_by_its_period_only_is_no_noise():
+    recording = made()
+    t, rng = recording.joints.t, np.random.default_rng(0)
+    angle = np.stack([np.interp(t + rng.uniform(-3e-3, 3e-3, len(t)), t, x) for x in recording.joints.position.T], 1)
+    assert "noise" in causes(changed(recording, position=angle))
+    assert causes(changed(recording, position=angle, clock="nominal")) == set()
+
+
+def shifted(recording, by, which=("joints", "points_camera")):
+    joints = replace(recording.joints, t=recording.joints.t + by) if "joints" in which else recording.joints
+    points = [replace(g, t=g.t + by) if g.name in which else g for g in recording.points]
+    return replace(recording, joints=joints, points=tuple(points))
+
+
+def timed(recording, factor):
+    points = [replace(g, t=g.t * factor) for g in recording.points]
+    return replace(recording, joints=replace(recording.joints, t=recording.joints.t * factor), points=tuple(points))
+
+
+RECORDING = made()
+POSITION, VELOCITY, EFFORT = RECORDING.joints.position, RECORDING.joints.velocity, RECORDING.joints.effort
+FAULTS = {
+    "milliseconds": (timed(RECORDING, 1e3), {"time_unit"}),
+    "nanoseconds": (timed(RECORDING, 1e9), {"time_unit"}),
+    "ten times as fast": (timed(RECORDING, 0.1), {"time_scale"}),
+    "since 1970": (shifted(RECORDING, 1.7e9, ("joints",)), {"clock_base"}),
+    "a late camera": (shifted(RECORDING, 3.0, ("points_camera",)), {"clock_offset"}),
+    "an early camera": (shifted(RECORDING, -3.0, ("points_camera",)), {"clock_offset"}),
+    "degrees": (changed(RECORDING, position=np.degrees(POSITION), position_std=np.degrees(STD)), {"degrees"}),
+    "one angle too large": (
+        changed(RECORDING, position=column(POSITION, 1, lambda x: 20 * x)),
+        {"angle_scale", "noise"},
+    ),
+    "one angle turned": (changed(RECORDING, position=column(POSITION, 1, lambda x: -x)), {"angle_sign"}),
+    "two angles exchanged": (changed(RECORDING, position=POSITION[:, [1, 0, 2]]), {"swapped_joints"}),
+    "a stuck encoder": (
+        changed(RECORDING, position=column(POSITION, 2, lambda x: np.where(np.arange(len(x)) > 300, x[300], x))),
+        {"stuck"},
+    ),
+    "all repeat one sample": (
+        changed(RECORDING, position=0 * POSITION + 0.1, velocity=None, effort=None),
+        {"stuck"},
+    ),
+    "coarse angles": (changed(RECORDING, position=0.01 * np.rint(POSITION / 0.01)), {"quantised"}),
+    "coarse efforts": (changed(RECORDING, effort=np.rint(EFFORT)), {"quantised"}),
+    "noisy efforts": (
+        changed(RECORDING, effort=EFFORT + 0.5 * np.random.default_rng(2).standard_normal(EFFORT.shape)),
+        {"noise"},
+    ),
+    "clipped efforts": (changed(RECORDING, effort=np.clip(EFFORT, -4, 3)), {"saturated"}),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_is_told_by_its_cause(fault):
+    recording, expected = FAULTS[fault]
+    assert causes(recording) == expected
+
+
+def test_noise_that_settings_state_counts_instead_of_the_recorded():
+    recording, _ = FAULTS["noisy efforts"]
+    assert causes(recording, joints_effort=SensorOptions(std=0.5)) == set()
+    assert causes(recording, joints_effort=SensorOptions(std=dict.fromkeys(NAMES, 0.1))) == {"noise"}
+    assert causes(made(), joints_effort=SensorOptions(std=0.005)) == {"noise"}
+
+
+def test_a_camera_that_runs_longer_than_the_joints_at_both_ends_is_not_late():
+    recording = made()
+    group = recording.points[0]
+    t = np.arange(-4.0, 12.0, 0.3)
+    longer = replace(group, t=t, position=np.ones((len(t), 1, 3)) * np.sin(t)[:, None, None], std=None)
+    assert causes(replace(recording, points=(longer,))) == set()
+
+
+def test_half_of_the_samples_missing_is_a_warning_where_joints_drive_the_model():
+    recording = made()
+    rows = np.random.default_rng(1).random(len(recording.joints.t)) > 0.5
+    thin = {name: values[rows] for name, values in recording.joints.channels.items()}
+    recording = changed(recording, t=recording.joints.t[rows], **thin)
+    assert causes(recording) == {"dropped_samples"}
+    assert causes(recording, driving=False) == set()
+
+
+def test_nothing_moves():
+    recording = made()
+    rng = np.random.default_rng(1)
+    rest = {
+        "position": STD * rng.standard_normal(POSITION.shape),
+        "velocity": 5e-3 * rng.standard_normal(POSITION.shape),
+    }
+    still = [
+        replace(g, position=1 + 0 * g.position + 5e-3 * rng.standard_normal(g.position.shape)) for g in recording.points
+    ]
+    assert causes(replace(changed(recording, **rest), points=tuple(still))) == {"standstill"}
+
+
+def test_steps_of_a_channel():
+    rng = np.random.default_rng(0)
+    assert quantum(0.25 * rng.integers(-50, 50, 2000)) == pytest.approx(0.25)
+    assert quantum(rng.standard_normal(2000)) == 0.0
+    assert quantum(np.ones(100)) == 0.0
+
+
+def test_one_measurement_listed_twice_is_told_also_in_part():
+    recording = made()
+    assert same_data(recording, replace(recording, name="again")).cause == "same_data"
+    assert same_data(recording, replace(recording.slice(2.0, 6.0), name="part")).what.startswith("401 samples of part")
+    assert same_data(recording, made(2)) is None
+    assert shared_samples(recording, made(2)) == 0
+
+
+def test_doubts_have_a_cause_that_is_listed_and_say_how_sure_they_are():
+    with pytest.raises(ValueError, match="no cause 'bad'"):
+        Doubt("bad", "", "warning", 1.0, "", "r")
+    words = [Doubt("gap", "", "warning", evidence, "", "r").sure for evidence in (0.5, 1.6, 4.0)]
+    assert words == ["perhaps", "likely", "certain"]
+    assert Doubt("gap", "", "warning", np.inf, "", "r", "joints", "t", 1.0, 2.0).where == "r/joints/t, 1 to 2 s"
+    assert len(set(CAUSES.values())) == len(CAUSES)
+
+
+# -- gaps -------------------------------------------------------------------------------------------------------------
+
+
+def without(recording, begin, end):
+    rows = (recording.joints.t < begin) | (recording.joints.t > end)
+    left = {name: values[rows] for name, values in recording.joints.channels.items()}
+    return changed(recording, t=recording.joints.t[rows], **left)
+
+
+def test_a_recording_is_cut_at_a_gap_and_every_part_is_kept_where_it_may_start_in_motion():
+    parts = cut_at_gaps(without(made(), 3.0, 5.0), (), True)
+    assert [(p.joints.t[0], p.joints.t[-1]) for p in parts.recordings] == [(0.0, 2.99), (5.01, 8.0)]
+    assert [p.name for p in parts.recordings] == ["made_part1", "made_part2"]
+    (doubt,) = parts.doubts
+    assert (doubt.cause, doubt.weight, doubt.begin, doubt.end) == ("gap", "warning", 2.99, 5.01)
+    assert "2 parts of it, 5.98 s, are used" in doubt.what
+
+
+def test_where_a_model_starts_from_rest_only_parts_that_do_are_kept():
+    recording = without(made(), 3.0, 5.0)
+    parts = cut_at_gaps(recording, (), False)
+    assert [(p.name, p.joints.t[-1]) for p in parts.recordings] == [("made", 2.99)]
+    assert "a part counts only where it starts at rest" in parts.doubts[0].what
+    resting = np.where(np.abs(recording.joints.t - 5.2) < 0.3, 0.0, 1.0)[:, None] * recording.joints.position
+    assert len(cut_at_gaps(changed(recording, position=resting), (), False).recordings) == 2
+
+
+def test_a_few_samples_missing_are_no_gap_and_short_parts_are_left_out():
+    assert cut_at_gaps(without(made(), 3.0, 3.05), (), True).doubts == ()
+    parts = cut_at_gaps(without(made(), 0.3, 1.0), (), True)
+    assert [p.joints.t[0] for p in parts.recordings] == [1.01]
+
+
+def test_a_clock_that_jumps_is_told_from_joints_that_went_on_unseen():
+    recording = made()
+    late = np.where(recording.joints.t > 4.0, 2.0, 0.0)
+    parts = cut_at_gaps(changed(recording, t=recording.joints.t + late), (), True)
+    assert [doubt.cause for doubt in parts.doubts] == ["clock_jump"]
+    assert len(parts.recordings) == 2
+
+
+def test_points_that_drive_a_model_may_be_hidden_for_a_while():
+    t = np.arange(500) / 100
+    seen = np.zeros((500, 2, 3)) + np.sin(t)[:, None, None]
+    seen[200:300, 0] = np.nan
+    recording = Recording(None, (PointGroup("points", ("p0", "p5"), t, seen),), name="cable")
+    assert [len(p.points[0].t) for p in cut_at_gaps(recording, ("p0",), True).recordings] == [200, 200]
+    assert cut_at_gaps(recording, ("p5",), True).doubts == ()

@@ -1,0 +1,81 @@
+"""A part of `benchmarks/nonsense.py`: wrong recordings are named with their cause, shipped ones are not in doubt."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from test_coverage_benchmark import loaded
+
+from yid_ocp.config.reader import load_config
+from yid_ocp.workflow.build import build_problem, recording_file
+
+QUICK = {
+    "single_arm_vision": ["effort x 0.1", "gap of 2 s", "camera mirrored", "wrist angles x 20", "a link renamed"],
+    "dual_arm_vision": ["grippers exchanged"],
+    "baxter_arm": ["effort flipped", "10 x fast", "stuck encoder", "clock in ms", "another robot held out"],
+    "panda_beam": ["effort x 0.1", "saturated effort"],
+    "deft_bdlo1": ["upside down"],
+}
+SLOW = pytest.mark.slow
+CONFIGS = [pytest.param(name, marks=SLOW if name == "deft_bdlo1" else ()) for name in sorted(QUICK)]
+
+
+@pytest.fixture(scope="module")
+def benchmark(repository: Path) -> ModuleType:
+    """The module benchmarks/nonsense.py."""
+    return loaded(repository / "benchmarks", "nonsense")
+
+
+def test_there_are_at_least_forty_cases_each_with_a_name_of_its_own(benchmark: ModuleType) -> None:
+    names = [(case.config, case.name) for case in benchmark.cases()]
+    assert len(set(names)) == len(names) >= 40
+    assert {config for config, _ in names} == set(QUICK)
+    assert {(config, name) for config, some in QUICK.items() for name in some} <= set(names)
+
+
+@pytest.mark.parametrize(
+    ("config", "name"),
+    [
+        pytest.param(config, name, marks=SLOW if config == "deft_bdlo1" else ())
+        for config, some in QUICK.items()
+        for name in some
+    ],
+)
+def test_a_wrong_recording_is_named(benchmark: ModuleType, tmp_path: Path, config: str, name: str) -> None:
+    case = next(case for case in benchmark.cases() if (case.config, case.name) == (config, name))
+    if benchmark.clean_recording(case) is None:
+        pytest.skip(f"its recording is not here: {benchmark.REAL[config]}")
+    entry = benchmark.tried(case, tmp_path, solving=False)
+    assert entry["named"], entry
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+def test_shipped_recordings_are_not_in_doubt(repository: Path, config: str) -> None:
+    run = load_config(repository / "configs" / f"{config}.yaml")
+    files = [recording_file(path) for path in (*run.recordings.estimate, *run.recordings.held_out)]
+    missing = [file for file in files if not file.is_file()]
+    if missing:
+        pytest.skip(f"its recordings are not here: {missing[0]}")
+    assert build_problem(run).options.doubts == ()
+
+
+@pytest.mark.parametrize(
+    "config", ["single_arm_no_vision", "single_arm_vision", "dual_arm_no_vision", "dual_arm_vision"]
+)
+def test_exact_torques_are_not_in_doubt(repository: Path, clean: Path, config: str) -> None:
+    files = [f"recordings.{role}=[{clean / config}_{role}.h5]" for role in ("estimate", "held_out")]
+    run = load_config(repository / "configs" / f"{config}.yaml", files)
+    assert build_problem(run).options.doubts == ()
+
+
+@SLOW
+def test_nine_of_ten_wrong_recordings_are_named_and_nothing_is_found_on_the_others(
+    benchmark: ModuleType, tmp_path: Path
+) -> None:
+    here = [case for case in benchmark.cases() if benchmark.clean_recording(case) is not None]
+    entries = [benchmark.tried(case, tmp_path / str(i)) for i, case in enumerate(here)]
+    assert sum(entry["named"] for entry in entries) >= 0.9 * len(entries)
+    assert not any(entry["found"] for entry in entries if not entry.get("harmless"))
+    assert not any(entry.get("wrong") for entry in entries)

@@ -1,0 +1,167 @@
+"""The doctor of recordings in a run: what it leaves out, what it stops, and what may still be said of parameters."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from yid_ocp.config.reader import load_config
+from yid_ocp.data import read_recording, write_recording
+from yid_ocp.data.checks import Doubt
+from yid_ocp.errors import DataError
+from yid_ocp.solvers import solve
+from yid_ocp.workflow.build import build_problem
+
+
+@pytest.fixture
+def damaged(pendulum_data, tmp_path):
+    """Write the pendulum's recording after a change, and its configuration; returns the configuration's file."""
+
+    def write(change=lambda recording: recording, **files):
+        recording = change(read_recording(pendulum_data.folder / "estimate.h5"))
+        write_recording(recording, tmp_path / "damaged.h5")
+        text = pendulum_data.text.replace(str(pendulum_data.folder / "estimate.h5"), "damaged.h5")
+        file = tmp_path / "run.yaml"
+        file.write_text(text)
+        return file
+
+    return write
+
+
+def joints(**changes):
+    def change(recording):
+        made = {name: make(recording.joints) for name, make in changes.items()}
+        return replace(recording, joints=replace(recording.joints, **made))
+
+    return change
+
+
+def noisy(recording):
+    rng = np.random.default_rng(1)
+    more = 10 * recording.joints.effort_std * rng.standard_normal(recording.joints.effort.shape)
+    return joints(effort=lambda group: group.effort + more)(recording)
+
+
+def without(begin, end):
+    def change(recording):
+        group = recording.joints
+        rows = (group.t < begin) | (group.t > end)
+        left = {name: values[rows] for name, values in group.channels.items()}
+        return replace(recording, joints=replace(group, t=group.t[rows], **left))
+
+    return change
+
+
+def test_a_run_on_good_recordings_says_nothing(cli, damaged, tmp_path):
+    file = damaged()
+    done = cli("solve", file, "--out", tmp_path / "run", "--strict", "--set", "output.report=false")
+    assert done.code == 0, done.err
+    assert "in doubt" not in done.out
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert result["doubts"] == []
+    assert result["fit"]["believed"]
+    assert result["parameters"]["shoulder.stiffness"]["verdict"] == "identifiable"
+
+
+def test_no_number_from_a_recording_in_grave_doubt_is_found(cli, damaged, tmp_path):
+    file = damaged(noisy)
+    done = cli("solve", file, "--out", tmp_path / "run")
+    assert done.code == 0, done.err
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert {doubt["cause"] for doubt in result["doubts"]} == {"noise"}
+    assert not result["fit"]["believed"]
+    free = [entry for entry in result["parameters"].values() if entry["free"]]
+    assert {entry["verdict"] for entry in free} <= {"not_trusted", "not_identifiable"}
+    lines = done.out.splitlines()
+    assert lines[0].split("  ")[0] == "in doubt"
+    assert "no number is said to be found while a recording of the run is in doubt" in done.out
+    assert "sensors.joints.effort.std: 0.1" in done.out
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert '<section id="doubts">' in page
+    assert "more noise than stated" in page
+
+
+def test_the_doubt_alone_forbids_to_trust_what_a_model_explains(damaged):
+    """With the noise stated ten times larger everything is explained; then a doubt is all that is left."""
+    run = load_config(damaged())
+    problem = build_problem(run)
+    doubt = Doubt("effort_sign", "made up", "not_trusted", 5.0, "", "damaged")
+    for weight, verdict in (("warning", "identifiable"), ("not_trusted", "not_trusted")):
+        said = problem.with_options(replace(problem.options, doubts=(replace(doubt, weight=weight),)))
+        solution = solve(said, run.solver)
+        assert solution.fit.explains
+        assert solution.fit.believed == (weight == "warning")
+        assert solution.parameters["shoulder.stiffness"].verdict == verdict
+
+
+@pytest.mark.parametrize("command", ["solve", "compare", "diagnose", "check"])
+def test_strict_stops_a_run_in_doubt(cli, damaged, tmp_path, left_nothing, command):
+    file = damaged(noisy)
+    done = cli(command, file, "--strict", "--out", tmp_path / "run")
+    assert done.code == 2
+    assert "error: more noise than stated: effort.shoulder has noise of" in done.err
+    assert "damaged/joints/effort.shoulder" in done.err
+    left_nothing(file)
+
+
+def test_check_lists_what_is_in_doubt(cli, damaged, tmp_path):
+    done = cli("check", damaged(noisy), "--out", tmp_path / "run")
+    assert done.code == 0
+    assert "more noise than stated" in done.out
+    assert done.out.splitlines()[-2] == "a run is possible; see what is in doubt"
+
+
+def test_times_that_are_not_seconds_stop_a_run_at_once(cli, damaged, tmp_path, left_nothing):
+    file = damaged(joints(t=lambda group: 1e3 * group.t))
+    done = cli("solve", file, "--out", tmp_path / "run")
+    assert done.code == 2
+    assert "times are not in seconds: joints/t has a sample every 10 s: in milliseconds it would be 100 Hz" in done.err
+    assert "divide by 1e+03" in done.err
+    left_nothing(file)
+
+
+def test_gaps_are_cut_out_and_said(cli, damaged, tmp_path):
+    done = cli("solve", damaged(without(0.55, 0.66)), "--out", tmp_path / "run", "--set", "output.report=false")
+    assert done.code == 0, done.err
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert [doubt["cause"] for doubt in result["doubts"]] == ["gap"]
+    assert "2 parts of it, 1.07 s, are used" in result["doubts"][0]["what"]
+    assert result["fit"]["believed"]
+
+
+def test_the_same_data_twice_count_once(damaged):
+    file = damaged()
+    once = build_problem(load_config(file))
+    write_recording(read_recording(file.parent / "damaged.h5"), file.parent / "again.h5")
+    twice = build_problem(load_config(file, ["recordings.estimate=[damaged.h5, again.h5]"]))
+    assert [episode.name for episode in twice.episodes] == [episode.name for episode in once.episodes]
+    assert [doubt.cause for doubt in twice.options.doubts] == ["same_data"]
+    with pytest.raises(DataError, match="both estimated on and held out"):
+        build_problem(load_config(file, ["recordings.held_out=[again.h5]"]))
+
+
+def test_times_since_1970_give_the_same_problem(damaged):
+    usual = build_problem(load_config(damaged()))
+    late = build_problem(load_config(damaged(joints(t=lambda group: group.t + 1.7e9))))
+    assert late.options.doubts == ()
+    assert np.allclose(late.episodes[0].path, usual.episodes[0].path, atol=1e-5)
+    assert late.episodes[0].samples[0].count == usual.episodes[0].samples[0].count
+
+
+NAMED = {
+    "of the group": ("points: [w_T1, w_T4]", "'w_T4'"),
+    "of the model": ("frames: {w_T1: w_Tl}", "'w_Tl'"),
+}
+
+
+@pytest.mark.parametrize("what", NAMED)
+def test_points_listed_by_name_that_are_not_there_are_an_error(repository, what):
+    setting, name = NAMED[what]
+    file = repository / "configs" / "single_arm_vision.yaml"
+    run = load_config(file, [f"sensors.points_camera={{{setting}}}", "problem.compiler=false", "model.object.links=1"])
+    with pytest.raises(DataError, match=name) as caught:
+        build_problem(run)
+    assert "did you mean 'w_T" in str(caught.value)

@@ -1,0 +1,233 @@
+"""The part of a system that recorded angles tell the place of, in numbers; and recorded angles beside its limits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+import scipy.interpolate
+from numpy.typing import NDArray
+
+from yid_ocp.data.checks import DEGREE, Doubt, period
+from yid_ocp.data.recording import JointGroup, Recording
+from yid_ocp.model.kinematics import forward_kinematics, rigid_body
+from yid_ocp.model.mechanism import Joint
+from yid_ocp.model.system import System
+from yid_ocp.problem.low_pass import LowPass
+
+Array = NDArray[np.float64]
+
+BEYOND = 0.1
+"""How far angles may be beyond a joint's limits, where a robot's own model differs from its URDF [rad or m]."""
+TOO_FAST = 1.5
+"""Factor by which joints may turn faster than the URDF says that they can."""
+APART = 5
+"""Samples over which a speed is taken, so that neither noise nor steps of encoders count."""
+MOTION_BAND = 5.0
+"""Where motion of a robot's arm ends; what is faster is left out [Hz]."""
+
+
+@dataclass(frozen=True)
+class Arm:
+    """The joints of a system whose angles are recorded: kinematics and inverse dynamics in numbers.
+
+    What hangs on them and is not known, such as a beam's bending, stands at zero.
+
+    Attributes
+    ----------
+    system : System
+    theta : ndarray, shape (ntheta,)
+    names : tuple of str, length k
+        Driven, then prescribed joints.
+    """
+
+    system: System
+    theta: Array
+    names: tuple[str, ...]
+
+    @staticmethod
+    def of(system: System, theta: Array) -> Arm | None:
+        """None where the model has no known coordinates."""
+        names = (*system.driven, *system.prescribed)
+        return Arm(system, theta, names) if names else None
+
+    def is_in(self, recording: Recording) -> bool:
+        """Whether all its joints are recorded, which those of clamps that follow points are not."""
+        return all(name in recording.joint_names for name in self.names)
+
+    @property
+    def joints(self) -> tuple[Joint, ...]:
+        """The joints, in the order of `names`."""
+        mechanism = self.system.mechanism
+        return tuple(mechanism.joints[mechanism.joint_index(name)] for name in self.names)
+
+    @property
+    def indices(self) -> tuple[int, ...]:
+        """Their places in the configuration."""
+        return tuple(self.system.mechanism.joint_index(name) for name in self.names)
+
+    def carries(self, frame: str) -> bool:
+        """Whether a frame's place follows from the known angles alone."""
+        mechanism = self.system.mechanism
+        known = set(self.indices)
+        return all(i in known for i in mechanism.ancestors(mechanism.frame(frame).joint))
+
+    @cached_property
+    def complete(self) -> bool:
+        """Whether nothing that is not known hangs on the joints."""
+        known = set(self.indices)
+        return not any(
+            i not in known and set(self.system.mechanism.ancestors(i)) & known for i in range(self.system.size)
+        )
+
+    def places(self, frames: tuple[str, ...], q: Array) -> tuple[Array, Array]:
+        """Positions of frames and their derivative by the angles.
+
+        Parameters
+        ----------
+        frames : tuple of str
+            Frames that it `carries`.
+        q : ndarray, shape (N, k)
+
+        Returns
+        -------
+        ndarray, shape (N, nf, 3)
+            [m]
+        ndarray, shape (N, nf, 3, k)
+        """
+        known = ca.SX.sym("q", len(self.names))
+        kinematics = forward_kinematics(self.system.mechanism, self._placed(known))
+        at = self._numbers(ca.vertcat(*(kinematics.position(frame) for frame in frames)))
+        function = ca.Function("places", [known], [ca.densify(at), ca.densify(ca.jacobian(at, known))])
+        place, slope = (np.array(ca.densify(x)) for x in function.map(len(q)).call([q.T]))
+        count, width = len(frames), len(self.names)
+        by_angle = slope.reshape(3 * count, len(q), width).transpose(1, 0, 2)
+        return place.T.reshape(len(q), count, 3), by_angle.reshape(len(q), count, 3, width)
+
+    def inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
+        """Efforts that the bodies alone need, without dampers, springs and grasps, shape (N, k) [N m]."""
+        return np.array(self._effort.map(len(q)).call([q.T, v.T, a.T])[0]).T
+
+    @cached_property
+    def _effort(self) -> ca.Function:
+        size = self.system.size
+        full = [ca.SX.sym(name, size) for name in ("q", "v", "a")]
+        known = [ca.SX.sym(name, len(self.names)) for name in ("q", "v", "a")]
+        rigid = rigid_body(forward_kinematics(self.system.mechanism, full[0]), full[1], self.system.gravity)
+        effort = ca.jtimes(rigid.by_v, full[0], full[1]) + ca.jtimes(rigid.by_v, full[1], full[2]) - rigid.by_q
+        effort = ca.substitute(
+            effort[list(self.indices)], ca.vertcat(*full), ca.vertcat(*(self._placed(x) for x in known))
+        )
+        return ca.Function("effort", known, [ca.densify(self._numbers(effort))])
+
+    def _placed(self, known: ca.SX) -> ca.SX:
+        full = ca.SX.zeros(self.system.size)
+        for row, i in enumerate(self.indices):
+            full[i] = known[row]
+        return full
+
+    def _numbers(self, expression: ca.SX) -> ca.SX:
+        internal = self.system.internal.values()
+        symbols = ca.vertcat(self.system.parameters.symbols, *internal)
+        return ca.substitute(expression, symbols, ca.SX(ca.DM([*self.theta, *([0.0] * len(internal))])))
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Recorded motion of an arm, smoothed and differentiated; both ends are left out.
+
+    Attributes
+    ----------
+    t : ndarray, shape (N,)
+    q, v, a : ndarray, shape (N, k)
+    effort : ndarray, shape (N, k), or None
+        Smoothed alike [N m].
+    """
+
+    t: Array
+    q: Array
+    v: Array
+    a: Array
+    effort: Array | None
+
+
+def recorded_motion(joints: JointGroup, names: tuple[str, ...], most: int = 300) -> Motion | None:
+    """Motion of the named joints at up to `most` times, None for too short a recording.
+
+    Parameters
+    ----------
+    joints : JointGroup
+    names : tuple of str
+    most : int
+    """
+    t, step = joints.t, period(joints.t)
+    if len(t) < 30 or step <= 0 or t[-1] - t[0] > 1e5 * step:
+        return None
+    columns = [joints.names.index(name) for name in names]
+    low_pass = LowPass(min(MOTION_BAND, 0.2 / step))
+    course = scipy.interpolate.CubicSpline(t, low_pass(t, joints.position[:, columns]), axis=0)
+    end = max(5, min(len(t) // 10, round(0.3 / step)))
+    kept = slice(end, len(t) - end, max(1, len(t) // most))
+    at = t[kept]
+    effort = None
+    if joints.effort is not None and not np.isnan(joints.effort[:, columns]).any():
+        smooth = low_pass(t, joints.effort[:, columns])
+        effort = np.stack([np.interp(at, t, column) for column in smooth.T], axis=1)
+    return Motion(at, course(at), course(at, 1), course(at, 2), effort)
+
+
+def check_limits(arm: Arm, recording: Recording) -> Iterator[Doubt]:
+    """Recorded angles and their rates beside what the joints can do."""
+    joints = recording.joints
+    if joints is None:
+        return
+    low, high = (np.array([getattr(joint, side) for joint in arm.joints]) for side in ("lower", "upper"))
+    position = joints.position[:, [joints.names.index(name) for name in arm.names]]
+    beyond = np.maximum(low - position, position - high).max(axis=0)
+    if np.any(beyond > BEYOND):
+        inside = np.all((position / DEGREE > low - BEYOND) & (position / DEGREE < high + BEYOND))
+        if inside and np.median(np.max(np.abs(position), axis=0)) > 2 * math.pi:
+            yield Doubt(
+                "degrees",
+                f"angles reach {np.max(np.abs(position)):.3g} rad; taken as degrees all are within their limits",
+                "refused",
+                float(np.max(beyond)) / BEYOND,
+                "convert angles to radians; a CSV is read with units: {position: deg}",
+                recording.name,
+                "joints",
+                "position",
+            )
+            return
+        for j in (int(j) for j in np.flatnonzero(beyond > BEYOND)):
+            yield Doubt(
+                "angle_limits",
+                f"{arm.names[j]} goes {beyond[j]:.3g} {arm.joints[j].unit} beyond its limits of {low[j]:.3g} to "
+                f"{high[j]:.3g}",
+                "not_trusted",
+                float(beyond[j]) / BEYOND,
+                "check the joint's zero, unit and column, and that the recording is this robot's",
+                recording.name,
+                "joints",
+                f"position.{arm.names[j]}",
+            )
+    if len(joints.t) < 2 * APART:
+        return
+    limits = np.array([joint.velocity_limit for joint in arm.joints])
+    speed = np.abs(position[APART:] - position[:-APART]) / (joints.t[APART:] - joints.t[:-APART])[:, None]
+    ratio = np.percentile(speed, 99, axis=0) / limits
+    if np.any(ratio > TOO_FAST):
+        j = int(np.argmax(ratio))
+        yield Doubt(
+            "speed_limits",
+            f"{arm.names[j]} turns {ratio[j]:.3g} times as fast as it can ({limits[j]:.3g} {arm.joints[j].unit}/s)",
+            "not_trusted",
+            float(ratio[j]) / TOO_FAST,
+            "check the unit of time and of angles",
+            recording.name,
+            "joints",
+            "t",
+        )

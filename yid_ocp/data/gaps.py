@@ -1,0 +1,125 @@
+"""Recordings cut where what drives the model was not recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.data.checks import Doubt, period
+from yid_ocp.data.recording import Recording
+
+Array = NDArray[np.float64]
+
+LONGEST = 0.1
+"""What lies between samples farther apart is not known: motion of an arm has a band of 5 Hz [s]."""
+PERIODS = 5
+"""So many periods may be missing in any case."""
+SHORTEST = 0.5
+"""A shorter part is not worth a start of its own [s]."""
+RESTING = 0.01
+"""A part whose joints turn by less in its first fifth of a second starts at rest [rad]."""
+JUMP = 5
+"""Periods in which joints at their speed go as far as across a gap, where the clock jumped and not the joints."""
+FAST = 0.05
+"""What joints would have to go across a gap at their speed for that to be told [rad]."""
+
+
+@dataclass(frozen=True)
+class Parts:
+    """A recording without its gaps: what is left of it, and what is said of that."""
+
+    recordings: tuple[Recording, ...]
+    doubts: tuple[Doubt, ...]
+
+
+def cut_at_gaps(recording: Recording, driving: Sequence[str], anywhere: bool) -> Parts:
+    """Cut a recording where nothing says what drove the model.
+
+    Parameters
+    ----------
+    recording : Recording
+    driving : sequence of str
+        Points that drive it besides the joints: those that clamps follow.
+    anywhere : bool
+        Whether a rollout may start in motion; else later parts are kept only where they start at rest.
+
+    Returns
+    -------
+    Parts
+        The recording itself where there is no gap.
+    """
+    t = _times(recording, driving)
+    steps = np.diff(t)
+    if len(steps) < 2:
+        return Parts((recording,), ())
+    allowed = max(LONGEST, PERIODS * float(np.median(steps)))
+    gaps = np.flatnonzero(steps > allowed)
+    if not len(gaps):
+        return Parts((recording,), ())
+    edges = [(0, gaps[0]), *((a + 1, b) for a, b in pairwise(gaps)), (gaps[-1] + 1, len(t) - 1)]
+    kept = []
+    for begin, end in edges:
+        part = None if t[end] - t[begin] < SHORTEST else recording.slice(float(t[begin]), float(t[end]))
+        if part is not None and (begin == 0 or anywhere or _rests(part)):
+            kept.append(part)
+    left = sum(part.duration for part in kept)
+    named = kept if len(kept) == 1 else [replace(p, name=f"{recording.name}_part{i + 1}") for i, p in enumerate(kept)]
+    said = (
+        f"{len(kept)} part{'' if len(kept) == 1 else 's'} of it, {left:.3g} s, {'is' if len(kept) == 1 else 'are'} used"
+    )
+    if not anywhere and len(kept) < len(edges):
+        said += "; a part counts only where it starts at rest"
+    doubts = [_doubt(recording, t, int(gap), allowed, said) for gap in gaps]
+    return Parts(
+        tuple(replace(part, name=recording.name) for part in named) if len(kept) == 1 else tuple(named), tuple(doubts)
+    )
+
+
+def _times(recording: Recording, driving: Sequence[str]) -> Array:
+    """Times at which all that drives the model was seen."""
+    if recording.joints is not None:
+        return recording.joints.t
+    for group in recording.points:
+        columns = [group.names.index(name) for name in driving if name in group.names]
+        if columns:
+            return group.t[np.isfinite(group.position[:, columns]).all(axis=(1, 2))]
+    return recording.points[0].t
+
+
+def _rests(part: Recording) -> bool:
+    joints = part.joints
+    if joints is None:
+        return False
+    first = joints.t <= joints.t[0] + 0.2
+    return float(np.max(np.ptp(joints.position[first], axis=0))) < RESTING
+
+
+def _doubt(recording: Recording, t: Array, gap: int, allowed: float, said: str) -> Doubt:
+    length = float(t[gap + 1] - t[gap])
+    joints, jumped = recording.joints, False
+    if joints is not None and gap >= 5 and gap + 6 < len(t):
+        before = (joints.position[gap] - joints.position[gap - 5]) / (t[gap] - t[gap - 5])
+        after = (joints.position[gap + 6] - joints.position[gap + 1]) / (t[gap + 6] - t[gap + 1])
+        speed = 0.5 * (np.abs(before) + np.abs(after)) * (np.sign(before) == np.sign(after))
+        way = np.abs(joints.position[gap + 1] - joints.position[gap])
+        fastest = float(np.max(speed))
+        jumped = bool(fastest * length > FAST and np.max(way) < JUMP * period(t) * fastest)
+    what = f"nothing was recorded of what drives the model for {length:.3g} s"
+    if jumped:
+        what = f"the clock jumps by {length - period(t):.3g} s while the joints go on as if it had not"
+    return Doubt(
+        "clock_jump" if jumped else "gap",
+        f"{what}; {said}",
+        "warning",
+        length / allowed,
+        "find what lost the samples, or list the part that is wanted as a recording of its own",
+        recording.name,
+        "joints" if joints is not None else "",
+        "t",
+        float(t[gap]),
+        float(t[gap + 1]),
+    )

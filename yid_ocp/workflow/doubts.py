@@ -1,0 +1,201 @@
+"""The doctor of recordings: all checks of a run's recordings, what is left out, and what stops a run.
+
+Recordings given twice count once, gaps are cut out; everything else is said and left as it is.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from yid_ocp.analysis.plausibility import (
+    Arm,
+    check_cable,
+    check_efforts,
+    check_held_points,
+    check_limits,
+    check_object,
+    check_reach,
+)
+from yid_ocp.config.settings import Run
+from yid_ocp.data.checks import CAUSES, Doubt, check_recording, same_data
+from yid_ocp.data.gaps import cut_at_gaps
+from yid_ocp.data.recording import Recording
+from yid_ocp.errors import DataError
+from yid_ocp.model.cable import Cable
+from yid_ocp.model.system import System
+from yid_ocp.problem import EstimationProblem, SensorOptions
+from yid_ocp.problem.prediction import EpisodeResult
+
+MOST_BLAMED = 3
+"""Doubts that an error quotes."""
+
+
+@dataclass(frozen=True)
+class Examined:
+    """Recordings of a run as they are used, and all doubts about them."""
+
+    estimate: tuple[Recording, ...]
+    held_out: tuple[Recording, ...]
+    doubts: tuple[Doubt, ...]
+
+
+def examined(
+    run: Run, system: System, cable: Cable | None, estimate: Sequence[Recording], held_out: Sequence[Recording]
+) -> Examined:
+    """Check recordings before a model is moved by them; leave out what was given twice, and gaps.
+
+    Parameters
+    ----------
+    run : Run
+    system : System
+    cable : Cable, optional
+        The run's object, where it is one.
+    estimate, held_out : sequence of Recording
+
+    Raises
+    ------
+    DataError
+        Nothing can be done with a recording, a measurement is both estimated on and held out, or, with
+        `recordings.strict`, any doubt.
+    """
+    doubts: list[Doubt] = []
+    used, others = _once(run, estimate, held_out, doubts)
+    kept: list[list[Recording]] = [[], []]
+    arm = None if cable is not None else Arm.of(system, system.parameters.vector())
+    anywhere = run.problem.initial_state != "equilibrium" or not system.free_indices
+    clamped = () if cable is None else cable.held
+    for role, recordings in enumerate((used, others)):
+        for recording in recordings:
+            found = check_recording(recording, lambda name: run.sensors.get(name, SensorOptions()))
+            doubts += found
+            if any(doubt.weight == "refused" for doubt in found):
+                continue
+            parts = cut_at_gaps(recording, clamped, anywhere)
+            doubts += parts.doubts
+            for part in parts.recordings:
+                doubts += _beside_the_model(run, system, arm, cable, part)
+            kept[role] += parts.recordings
+    stop_at(run, doubts)
+    if not kept[0]:
+        raise DataError(
+            "gaps leave nothing of the recordings to estimate on",
+            where=run.where("recordings", "estimate"),
+            hint="; ".join(doubt.what for doubt in doubts if doubt.cause in ("gap", "clock_jump")),
+        )
+    return Examined(tuple(kept[0]), tuple(kept[1]), tuple(doubts))
+
+
+def of_one(run: Run, system: System, recording: Recording) -> list[Doubt]:
+    """All doubts about one recording that is used as it is; errors as `examined`."""
+    found = check_recording(recording, lambda name: run.sensors.get(name, SensorOptions()))
+    stop_at(run, found)
+    found += _beside_the_model(run, system, Arm.of(system, system.parameters.vector()), None, recording)
+    stop_at(run, found)
+    return found
+
+
+def _once(
+    run: Run, estimate: Sequence[Recording], held_out: Sequence[Recording], doubts: list[Doubt]
+) -> tuple[list[Recording], list[Recording]]:
+    used: list[Recording] = []
+    others: list[Recording] = []
+    for recording in estimate:
+        same = next(filter(None, (same_data(other, recording) for other in used)), None)
+        if same is None:
+            used.append(recording)
+        else:
+            doubts.append(replace(same, what=f"{same.what}; it counts once"))
+    for recording in held_out:
+        for other in used:
+            same = same_data(other, recording)
+            if same is not None:
+                raise DataError(
+                    f"a measurement is both estimated on and held out: {same.what}",
+                    where=run.where("recordings", "held_out"),
+                    allowed="one of the two",
+                    hint=f"leave out {recording.name} or {other.name}",
+                )
+        if all(same_data(other, recording) is None for other in others):
+            others.append(recording)
+        else:
+            text = f"{recording.name} is held out twice; it counts once"
+            doubts.append(Doubt("same_data", text, "warning", 1e3, "list every measurement once", recording.name))
+    return used, others
+
+
+def _beside_the_model(
+    run: Run, system: System, arm: Arm | None, cable: Cable | None, recording: Recording
+) -> list[Doubt]:
+    def choice(name: str) -> SensorOptions:
+        return run.sensors.get(name, SensorOptions())
+
+    gravity = np.array(run.model.gravity, float)
+    if cable is not None:
+        return list(check_cable(cable, recording, gravity))
+    found: list[Doubt] = []
+    theta = system.parameters.vector()
+    if arm is not None and arm.is_in(recording):
+        found += check_limits(arm, recording)
+        if any(doubt.weight == "refused" for doubt in found):
+            return found
+        found += check_efforts(arm, recording)
+        found += check_held_points(arm, recording, choice)
+    return found + list(check_reach(arm, system, theta, recording, choice))
+
+
+def object_doubts(problem: EstimationProblem) -> list[Doubt]:
+    """Doubts about points of the object, from one rollout of every recording with the initial parameters."""
+    lengths = ca.vertcat(ca.SX(0), *(length for segment in problem.system.segments for length in segment.lengths))
+    size = float(ca.Function("size", [problem.system.parameters.symbols], [ca.sum1(lengths)])(problem.theta))
+    wanted = any(samples.sensor.points for episode in problem.episodes for samples in episode.samples)
+    if not size or not wanted or problem.options.clamps:
+        return []
+    found: list[Doubt] = []
+    for i, episode in enumerate(problem.episodes):
+        result = problem.predictor.run(episode, *problem.split(problem.start, i), False, None)
+        if isinstance(result, EpisodeResult):
+            found += check_object(episode, result, size)
+    return found
+
+
+def stop_at(run: Run, doubts: Sequence[Doubt]) -> None:
+    """Raise `DataError` for what no run may begin with: with `recordings.strict`, for any doubt."""
+    grave = [doubt for doubt in doubts if run.recordings.strict or doubt.weight == "refused"]
+    if not grave:
+        return
+    first, *others = grave
+    more = [f"{doubt.where}: {doubt.what}" for doubt in others]
+    raise DataError(
+        "; ".join([f"{CAUSES[first.cause]}: {first.what}", *more]),
+        where=first.where,
+        hint=first.advice + (f" ({first.setting})" if first.setting else ""),
+    )
+
+
+@contextlib.contextmanager
+def blaming(doubts: Sequence[Doubt]) -> Iterator[None]:
+    """Say in errors of the block what is in doubt about the recordings, which may be why."""
+    try:
+        yield
+    except DataError as error:
+        if not doubts:
+            raise
+        said = "; ".join(f"{doubt.where}: {doubt.what}" for doubt in ordered(doubts)[:MOST_BLAMED])
+        hint = f"first look at what is in doubt: {said}"
+        raise DataError(error.what, where=error.where, allowed=error.allowed, hint=hint) from error
+
+
+def ordered(doubts: Sequence[Doubt]) -> list[Doubt]:
+    """Those that weigh most first."""
+    return sorted(doubts, key=lambda doubt: (doubt.weight == "warning", -doubt.evidence))
+
+
+def doubts_result(doubts: Sequence[Doubt]) -> list[dict[str, Any]]:
+    """`doubts` of a result."""
+    return [{**asdict(doubt), "sure": doubt.sure, "where": doubt.where} for doubt in ordered(doubts)]
