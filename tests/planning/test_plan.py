@@ -10,6 +10,7 @@ import pytest
 from yid_ocp.errors import ConfigError, ModelError, YidError
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.statics import Statics
+from yid_ocp.integrator.step import compile_step
 from yid_ocp.planning.mover import Mover
 from yid_ocp.planning.options import PlanLimits, PlanOptions
 from yid_ocp.planning.path import SplinePath
@@ -73,17 +74,31 @@ def test_the_point_arrives_and_stays_without_swinging(moved, wanted, found):
     assert found.error < 1e-4
     assert found.swing < wanted.swing
     n = moved.system.size
-    again = simulate(moved, found.mover.theta, found.mover.start.state, len(found.t) - 1, path=found.position)
+    step = found.mover.step
+    again = simulate(step, found.mover.theta, found.mover.start.state, len(found.t) - 1, path=found.position)
     tip = Points(moved.system, ["tip"]).at(again.state[:, :n], found.mover.theta)[0]
     np.testing.assert_allclose(found.points["tip"], tip, atol=1e-12)
     end = found.t >= wanted.duration - 1e-9
     assert np.linalg.norm(tip[end] - wanted.place, axis=1).max() == pytest.approx(found.error)
-    speed = np.linalg.norm(np.diff(tip[end], axis=0), axis=1) / moved.time_step
+    speed = np.linalg.norm(np.diff(tip[end], axis=0), axis=1) / step.time_step
     assert speed.max() <= found.swing + 1e-12
     # moving the shoulder there smoothly, as if the elbow were stiff, leaves the tip swinging
     simple = found.mover.roll(found.mover.path.straight([GOAL - START]))
     left = Points(moved.system, ["tip"]).at(simple.state[end, :n], found.mover.theta)[0] - wanted.place
     assert np.linalg.norm(left, axis=1).max() > 20 * found.error
+
+
+def test_a_plan_holds_where_time_is_stepped_more_finely(moved, wanted):
+    coarse, fine = (compile_step(moved.system, h, use_compiler=False) for h in (0.05, 0.001))
+    done = plan(coarse, wanted)
+    assert done.reached, done.message
+    assert done.mover.step.time_step < coarse.time_step
+    start = Statics(fine).solve([START], done.mover.theta)
+    held = replace(done.mover, step=fine, start=start)
+    tip = Points(moved.system, ["tip"]).at(held.roll(done.unknowns).state[:, : moved.system.size], held.theta)[0]
+    end = held.times >= wanted.duration - 1e-9
+    assert np.linalg.norm(tip[end] - wanted.place, axis=1).max() < wanted.tolerance
+    assert np.linalg.norm(np.diff(tip[end], axis=0), axis=1).max() / fine.time_step < 2 * wanted.swing
 
 
 def test_a_plan_starts_and_ends_at_rest(found):

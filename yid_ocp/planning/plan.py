@@ -1,4 +1,4 @@
-"""Plan a motion: its ends by statics, its middle by IPOPT, and what is left of error, swing and uncertainty."""
+"""Plan a motion: its ends by statics, its middle by rollouts, and what is left of error, swing and uncertainty."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from yid_ocp.errors import ConfigError, nearest
 from yid_ocp.integrator.statics import Rest
-from yid_ocp.integrator.step import Step
+from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.model.system import System
 from yid_ocp.options import check
@@ -24,6 +24,9 @@ from yid_ocp.planning.shooting import Shooting, Shot, failed
 from yid_ocp.virtual.posture import initial_posture
 
 Array = NDArray[np.float64]
+
+HALVINGS = 3  # of the time step
+STEADY = 0.1  # change by halving it, in parts of what counts as reached and as rest, that counts as none
 
 
 @dataclass(frozen=True)
@@ -70,6 +73,7 @@ class Plan:
     unknowns : ndarray, shape (K, nc)
     evaluations : int
     mover : Mover
+        Its step may be a shorter one than that the plan began with.
     """
 
     reached: bool
@@ -138,10 +142,6 @@ def plan(
     ------
     ConfigError, ModelError
         A goal that cannot be reached, names that do not exist, an empty box, no rest to begin from.
-
-    References
-    ----------
-    Waechter and Biegler (2006), Math. Programming 106:25, doi:10.1007/s10107-004-0559-y.
     """
     check(options, "plan")
     system = step.system
@@ -254,17 +254,51 @@ def _attempt(
     points: tuple[Points, Points | None],
     place: Array,
 ) -> tuple[Plan, Rows]:
-    """The best motion of one duration."""
+    """The best motion of one duration: found with the step's time step, sharpened with shorter ones.
+
+    What swings in the end is a small difference of large motions: a step that is fine enough for them leaves out part
+    of it.
+    """
     start, end = ends
     path = SplinePath(options.duration, options.knots)
     mover = Mover(step, theta, start, path, options.settle)
-    straight = path.straight(end.posture - mover.first)
-    rows = Rows(mover, options, points[0], place, straight, points[1])
-    cases = [rows, *_scenarios(rows, known)] if options.spread else [rows]
+    guess = straight = path.straight(end.posture - mover.first)
     lower, upper = (np.tile(side - mover.first, (options.knots, 1)) for side in joint_range(step.system))
-    shooting = Shooting(cases, straight.shape)
-    shot = shooting.solve(straight, lower, upper, options.iterations)
-    return _outcome(rows, shot, known), rows
+    evaluations = 0
+    for halved in range(HALVINGS + 1):
+        rows = Rows(mover, options, points[0], place, straight, points[1])
+        cases = [rows, *_scenarios(rows, known)] if options.spread else [rows]
+        shot = Shooting(cases, straight.shape).solve(guess, lower, upper, options.iterations)
+        evaluations += shot.evaluations
+        if not shot.finished or halved == HALVINGS:
+            break
+        finer = _finer(mover)
+        if _steady(rows, finer, shot.w):
+            break
+        mover, guess = finer, shot.w
+    return _outcome(rows, replace(shot, evaluations=evaluations), known), rows
+
+
+def _finer(mover: Mover) -> Mover:
+    """The same with half the time step."""
+    step = mover.step
+    half = compile_step(
+        step.system, step.time_step / 2, step.force_split, step.constraint_force, use_compiler=step.compiled
+    )
+    return replace(mover, step=half, start=first_rest(half, mover.theta, mover.first))
+
+
+def _steady(rows: Rows, finer: Mover, w: Array) -> bool:
+    """Whether half the time step moves the point neither from where it arrives nor from rest."""
+    options, n, h = rows.options, rows.mover.step.system.size, rows.mover.step.time_step
+    own, other = (
+        rows.point.at(mover.roll(w).state[::every, :n], mover.theta)[0].reshape(len(rows.mover.times), -1, 3)
+        for mover, every in ((rows.mover, 1), (finer, 2))
+    )
+    change = (other - own)[rows.mover.standing]
+    place = np.linalg.norm(change[:, 0], axis=1).max()
+    speed = np.linalg.norm(np.diff(change, axis=0), axis=2).max() / h
+    return bool(place <= STEADY * options.tolerance and speed <= STEADY * options.swing)
 
 
 def _scenarios(rows: Rows, known: Known) -> list[Rows]:
