@@ -14,7 +14,7 @@ from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.model.system import System
 from yid_ocp.options import check
-from yid_ocp.planning.ends import REACHED, End, check_reached, end_at, first_rest, joint_range, start_posture
+from yid_ocp.planning.ends import REACHED, End, check_limits, check_reached, end_at, first_rest, joint_range, start_posture
 from yid_ocp.planning.mover import Mover
 from yid_ocp.planning.options import PlanOptions
 from yid_ocp.planning.path import SplinePath
@@ -162,8 +162,10 @@ def plan(
     begin = point.at(start.state[None, :n], values)[0][0, :3]
     place = _place(options, begin)
     _check_box(options, inside, start, n, values, place)
+    check_limits(step, values, start, options.limits, "where the motion begins")
     end = end_at(step, values, start, point, place, options.tolerance)
     check_reached(end, point.names[0], place, options.tolerance)
+    check_limits(step, values, end.rest, options.limits, "where it ends")
 
     def attempt(duration: float) -> tuple[Plan, Rows]:
         return _attempt(step, replace(options, duration=duration), values, known, (start, end), (point, inside), place)
@@ -204,12 +206,12 @@ def _points(step: Step, options: PlanOptions) -> tuple[Points, Points | None]:
 
 def _place(options: PlanOptions, begin: Array) -> Array:
     if (options.place is None) == (options.shift is None):
+        twice = options.place is not None
         raise ConfigError(
-            "where the point is to arrive is said twice"
-            if options.place
-            else "nothing says where the point is to arrive",
+            f"{'it is said twice' if twice else 'nothing says'} where the point is to arrive",
             where="plan.place",
             allowed="one of place and shift",
+            hint="set the other one to null" if twice else "set plan.place, or plan.shift from where it rests",
         )
     if options.goal == "path" and not options.via:
         raise ConfigError("the path has no places on the way", where="plan.via", allowed="one or more shifts [m]")
@@ -223,9 +225,10 @@ def _check_box(options: PlanOptions, inside: Points | None, start: Rest, n: int,
         raise ConfigError("there is no box", where="plan.box", allowed="two corners [m]", hint="goal: place needs none")
     low, high = np.array(options.box)
     if np.any(low >= high):
-        axis = "xyz"[int(np.argmin(high - low))]
+        worst = int(np.argmin(high - low))
+        axis = "xyz"[worst]
         raise ConfigError(
-            f"the box is empty along {axis}: its lowest corner is {float(np.max(low - high)):.3g} m above its highest",
+            f"the box is empty along {axis}: it goes from {low[worst]:.4g} up to {high[worst]:.4g} m",
             where="plan.box",
             allowed="lowest corner first",
         )
@@ -361,8 +364,9 @@ def _outcome(rows: Rows, shot: Shot, known: Known) -> Plan:
     doubt = float(np.linalg.norm(std)) if std is not None and rows.options.spread else 0.0
     far = not error <= REACHED * max(rows.options.tolerance, doubt)
     if shot.finished and far:
-        message += (
-            f"; the point comes no nearer than {1e3 * error:.3g} mm; take a longer plan.duration or a nearer place"
+        message = (
+            f"the best motion within the limits leaves the point {1e3 * error:.3g} mm from its place; take a longer "
+            "plan.duration or a nearer place"
         )
     reached = shot.finished and not broken and not far
     return Plan(
