@@ -1,6 +1,6 @@
 """Plans carried out in MuJoCo with the true stiffness and damping: ten goals, four models, and one withheld effect.
 
-    python benchmarks/planning.py [GOALS] [--only goals | effect]
+    python benchmarks/planning.py [GOALS] [--only goals | effect | hands]
 
 The free tip of the foam Y that one arm of Baxter holds is to be brought to ten places (`configs/plan_place.yaml`). The
 model is identified first, by `solve` on two noisy recordings made in MuJoCo. Compared are the plan with what was found,
@@ -8,7 +8,8 @@ the plan with the true stiffness, the plan with 3 N m/rad everywhere, and no mod
 straight line by as much as the tip is to move, with the smoothest timing. Reported are the largest distance of the tip
 from its place and its largest speed in the half second after the arm stands still.
 
-Then something that the model lacks hangs on the tip: a plan before `diagnose` has found it, and one after.
+Then something that the model lacks hangs on the tip: a plan before `diagnose` has found it, and one after. In the end
+two arms move what they hold.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ from yid_ocp.virtual.injected import InjectedEffect, injected_experiment
 from yid_ocp.virtual.motion import Excitation, multisine
 from yid_ocp.virtual.posture import initial_posture
 from yid_ocp.workflow.diagnose import run_diagnose
-from yid_ocp.workflow.plan import identified, planning_step
+from yid_ocp.workflow.plan import identified, planning_step, start_posture
 from yid_ocp.workflow.solve import run_solve
 
 Array = NDArray[np.float64]
@@ -152,14 +153,17 @@ class Servo:
         return np.array([np.interp(t, middle, one) for one in self._planned.effort[:-1].T])
 
 
-def carried_out(system: System, movement: PlannedMovement, planned: Plan | None, by: Plan) -> tuple[float, float]:
-    """Error [m] and swing [m/s] of the tip in the simulator, where a plan begins and as long as it takes."""
+def carried_out(
+    system: System, values: Mapping[str, float], movement: PlannedMovement, planned: Plan | None, by: Plan
+) -> tuple[float, float]:
+    """Error [m] and swing [m/s] of a plan's point in the simulator, where the plan begins and as long as it takes."""
     duration, settle = by.mover.path.duration, by.mover.settle
-    simulation = Simulation(duration + settle, controller_rate=500.0, effort_kind="mean")
-    posture = dict(zip(by.joints, map(float, by.position[0]), strict=True))
+    simulation = Simulation(duration + settle, time_step=5e-5, controller_rate=500.0, effort_kind="mean")
+    # all coordinates, so that what hangs between two hands is in their hold when it settles
+    posture = dict(zip(system.mechanism.joint_names, map(float, by.state[0, : system.size]), strict=True))
     terms = Servo(movement, planned)
-    run = simulate_in_mujoco(system, TRUTH, movement, simulation, posture=posture, injected=terms)
-    tip = run.points[run.t >= duration - 1e-9, system.points.index(TIP)]
+    run = simulate_in_mujoco(system, values, movement, simulation, posture=posture, injected=terms)
+    tip = run.points[run.t >= duration - 1e-9, system.points.index(by.point)]
     speed = np.linalg.norm(np.diff(tip, axis=0), axis=1) * simulation.rate
     return float(np.max(np.linalg.norm(tip - by.place, axis=1))), float(np.max(speed))
 
@@ -218,9 +222,9 @@ def ten_goals(folder: Path, count: int) -> None:
         # the same place in the world, whatever a model believes of where the tip rests
         there = replace(options, shift=None, place=tuple(best.place))
         plans = [plan(step, there, theta), best, plan(step, there, guess)]
-        cells = [carried_out(twin, movement(one), one, one) for one in plans]
+        cells = [carried_out(twin, TRUTH, movement(one), one, one) for one in plans]
         first = np.array([posture[name] for name in step.system.prescribed])
-        cells.append(carried_out(twin, straight(step, first, np.array(shift), best.mover.path), None, best))
+        cells.append(carried_out(twin, TRUTH, straight(step, first, np.array(shift), best.mover.path), None, best))
         text = [f"{1e3 * error:.2f}, {1e3 * swing:.1f}" for error, swing in cells]
         print(f"| {i + 1} | {', '.join(f'{1e3 * x:.0f}' for x in shift)} | {' | '.join(text)} |", flush=True)
         ratios.append([np.array(cell) / np.array(cells[0]) for cell in cells[2:]])
@@ -252,21 +256,44 @@ def withheld_effect(folder: Path) -> None:
     for name, chosen in (("before", run), ("after", with_effects(run, result["effects"]))):
         values, step = found(chosen, folder / name)
         made = plan(step, replace(run.plan, shift=None, place=(x, y, z), posture=posture), values)
-        error, swing = carried_out(twin, movement(made), made, made)
+        error, swing = carried_out(twin, TRUTH, movement(made), made, made)
         print(f"| {name} | {1e3 * error:.2f} | {1e3 * swing:.1f} |", flush=True)
+
+
+def two_hands() -> None:
+    """Print what becomes of plans for two arms, beside a smooth motion of every joint to the same posture."""
+    truth = ", ".join(f"{name}: {{initial: {value}}}" for name, value in TRUTH.items())
+    way = "plan={point: w_T1, shift: [0.03, 0.03, 0.0], duration: 0.8}"
+    print("| held by two arms | plan: error [mm], swing [mm/s] | same posture, smoothly |\n|---|---|---|")
+    for name, config, more in (
+        ("junction of the Y", "dual_arm_vision", [f"parameters={{{truth}}}", way]),
+        ("middle of a cable", "plan_cable", []),
+    ):
+        run = load_config(CONFIG.with_name(f"{config}.yaml"), more)
+        step = planning_step(run)
+        made = plan(step, replace(run.plan, posture=start_posture(run, step)))
+        points = tuple(dict.fromkeys((*step.system.points, made.point)))
+        twin = replace(step.system, driven=step.system.prescribed, prescribed=(), points=points)
+        smooth = replace(movement(made), unknowns=made.mover.path.straight(made.unknowns[-1]))
+        cells = [carried_out(twin, {}, one, made, made) for one in (movement(made), smooth)]
+        print(
+            f"| {name} | {' | '.join(f'{1e3 * error:.2f}, {1e3 * swing:.1f}' for error, swing in cells)} |", flush=True
+        )
 
 
 def main() -> None:
     """Make what is asked for in a folder that is thrown away."""
     parser = argparse.ArgumentParser(description="Carry plans out in MuJoCo.")
     parser.add_argument("goals", nargs="?", type=int, default=10)
-    parser.add_argument("--only", choices=("goals", "effect"))
+    parser.add_argument("--only", choices=("goals", "effect", "hands"))
     said = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        if said.only != "effect":
+        if said.only in (None, "goals"):
             ten_goals(Path(folder) / "goals", said.goals)
-        if said.only != "goals":
+        if said.only in (None, "effect"):
             withheld_effect(Path(folder) / "effect")
+        if said.only in (None, "hands"):
+            two_hands()
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -227,10 +228,10 @@ class Statics:
             residual, _ = self._residual(w, *arguments)
             _, _, energy, _ = self._outcome(w, *arguments)
             scale = 1.0 / max(float(ca.norm_inf(self._residual(0, *arguments)[0])), 1e-6)
-            quiet = {"print_time": False, "error_on_fail": False}
-            options = {"print_level": 0, "sb": "yes", "max_iter": MOST_ITERATIONS, "tol": 1e-8}
+            search = {"print_level": 0, "sb": "yes", "max_iter": MOST_ITERATIONS, "tol": 1e-8}
+            options: dict[str, Any] = {"print_time": False, "error_on_fail": False, "ipopt": search}
             program = {"x": x, "f": scale * energy, "g": residual[-m:]}
-            solver = ca.nlpsol("lowest", "ipopt", program, {**quiet, "ipopt": options})
+            solver = ca.nlpsol("lowest", "ipopt", program, options)
         for start in self._guesses(given, None):
             found = np.array(solver(x0=start[:size], lbg=0.0, ubg=0.0)["x"]).ravel()
             if solver.stats()["success"]:

@@ -84,21 +84,21 @@ def start_posture(system: System, posture: Mapping[str, float]) -> Array:
     return chosen
 
 
-def first_rest(step: Step, theta: Array, posture: Array) -> Rest:
-    """The equilibrium from which a motion begins.
+def first_rest(step: Step, theta: Array, posture: Array, guess: Array | None = None) -> Rest:
+    """The equilibrium from which a motion begins, of several the one near a configuration where that is given.
 
     Raises
     ------
     ModelError
         There is none, for example because a grasp cannot be closed.
     """
-    rest = Statics(step).solve(posture, theta)
+    rest = Statics(step).solve(posture, theta, guess=guess)
     if not rest.converged:
         raise ModelError(
             f"the motion cannot begin: {rest.message}",
             where="plan.posture",
             allowed="a posture at which every grasp holds the object at rest",
-            hint="give plan.posture (a recording's first angles), or correct model.grasp",
+            hint="give plan.posture or a recording, which begins where the object is held; or correct model.grasp",
         )
     return rest
 
@@ -117,7 +117,10 @@ def check_limits(step: Step, theta: Array, rest: Rest, limits: PlanLimits, when:
     springs = sorted({system.mechanism.joint_index(spring.joint) for spring in system.elastic})
     largest = np.inf if limits.spring_angle is None else limits.spring_angle
     rows = [
-        *((j.name, "effort", "N m or N", u, limits.effort * j.effort_limit) for j, u in zip(joints, effort, strict=True)),
+        *(
+            (j.name, "effort", "N m or N", u, limits.effort * j.effort_limit)
+            for j, u in zip(joints, effort, strict=True)
+        ),
         *((system.mechanism.joint_names[i], "spring_angle", "rad", rest.state[i], largest) for i in springs),
     ]
     for name, which, unit, value, limit in rows:

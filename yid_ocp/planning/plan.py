@@ -14,7 +14,16 @@ from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.model.system import System
 from yid_ocp.options import check
-from yid_ocp.planning.ends import REACHED, End, check_limits, check_reached, end_at, first_rest, joint_range, start_posture
+from yid_ocp.planning.ends import (
+    REACHED,
+    End,
+    check_limits,
+    check_reached,
+    end_at,
+    first_rest,
+    joint_range,
+    start_posture,
+)
 from yid_ocp.planning.mover import Mover
 from yid_ocp.planning.options import PlanOptions
 from yid_ocp.planning.path import SplinePath
@@ -61,13 +70,17 @@ class Plan:
         What they need, the last row as the one before [N m or N].
     state : ndarray, shape (N + 1, nx)
     points : mapping of str to ndarray, shape (N + 1, 3)
-        Where the system's points go [m].
+        Where the system's points and the one that is to arrive go [m].
+    point : str
+        What is to arrive.
     place : ndarray, shape (3,)
-        Where the point is to arrive [m].
+        Where [m].
     error : float
         Largest distance of the point from it while the arms stand still in the end [m].
     swing : float
         Largest speed of a point of the object in that time [m/s].
+    off_path : float or None
+        Largest distance of the point from where it is to be on its path at that time [m]; None without a path.
     std : ndarray, shape (3,), or None
         Of the point's place in the end, from the parameters' covariance [m]; None without one.
     unknowns : ndarray, shape (K, nc)
@@ -86,9 +99,11 @@ class Plan:
     effort: Array
     state: Array
     points: dict[str, Array]
+    point: str
     place: Array
     error: float
     swing: float
+    off_path: float | None
     std: Array | None
     unknowns: Array
     evaluations: int
@@ -288,7 +303,7 @@ def _finer(mover: Mover) -> Mover:
     half = compile_step(
         step.system, step.time_step / 2, step.force_split, step.constraint_force, use_compiler=step.compiled
     )
-    return replace(mover, step=half, start=first_rest(half, mover.theta, mover.first))
+    return replace(mover, step=half, start=first_rest(half, mover.theta, mover.first, mover.configuration))
 
 
 def _steady(rows: Rows, finer: Mover, w: Array) -> bool:
@@ -324,7 +339,7 @@ def _scenarios(rows: Rows, known: Known) -> list[Rows]:
                 entry = system.parameters[name]
                 floor = max(entry.lower, 0.2 * theta[i]) if theta[i] > 0 else entry.lower
                 theta[i] = np.clip(theta[i] + change, floor, entry.upper)
-            rest = first_rest(mover.step, theta, mover.first)
+            rest = first_rest(mover.step, theta, mover.first, mover.configuration)
             found.append(
                 Rows(replace(mover, theta=theta, start=rest), rows.options, rows.point, rows.target, rows.simple)
             )
@@ -346,12 +361,14 @@ def _outcome(rows: Rows, shot: Shot, known: Known) -> Plan:
     if len(known.names):
         slope = _point_slopes(rows, mover.roll(shot.w, names=known.names), len(known.names))[-1]
         std = np.sqrt(np.maximum(np.diag(slope @ known.covariance @ slope.T), 0.0))
-    names = step.system.points
+    names = tuple(dict.fromkeys((*step.system.points, rows.point.names[0])))
     at = Points(step.system, names).at(rollout.state[:, :n], mover.theta)[0].reshape(len(mover.times), -1, 3)
     own = rows.point.at(rollout.state[:, :n], mover.theta)[0].reshape(len(mover.times), -1, 3)
     end = mover.standing
     error = float(np.max(np.linalg.norm(own[end, 0] - rows.target, axis=1)))
     swing = float(np.max(np.linalg.norm(np.diff(own[end], axis=0), axis=2)) / step.time_step)
+    course = rows.course
+    off_path = None if course is None else float(np.max(np.linalg.norm(own[:, 0] - course, axis=1)))
     broken = rows.broken(rows.limits(rollout, shot.w).value)
     message = shot.message
     for what, (name, value, bound) in broken.items():
@@ -373,8 +390,8 @@ def _outcome(rows: Rows, shot: Shot, known: Known) -> Plan:
         reached, message, step.system.prescribed, mover.times, mover.positions(shot.w),
         mover.path.basis(mover.times, 1) @ shot.w, mover.path.basis(mover.times, 2) @ shot.w,
         np.vstack([rollout.effort, rollout.effort[-1:]]), rollout.state,
-        {name: at[:, i] for i, name in enumerate(names)}, rows.target, error, swing, std, shot.w, shot.evaluations,
-        mover,
+        {name: at[:, i] for i, name in enumerate(names)}, rows.point.names[0], rows.target, error, swing, off_path, std,
+        shot.w, shot.evaluations, mover,
     )  # fmt: skip
 
 

@@ -164,6 +164,8 @@ def plan_sentences(result: Mapping[str, Any]) -> list[str]:
         f"that it is at most {1e3 * result['error']:.3g} mm from there, and no point of the object is faster than "
         f"{1e3 * result['swing']:.3g} mm/s, as the model has it"
     ]
+    if result["off_path"] is not None:
+        said.append(f"on the way it is at most {1e3 * result['off_path']:.3g} mm from where its path is at that time")
     if result["std"] is not None:
         std = ", ".join(f"{1e3 * x:.2g}" for x in result["std"])
         said.append(f"what is not known of the parameters makes that uncertain by ({std}) mm, one standard deviation")

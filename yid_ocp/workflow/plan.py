@@ -217,6 +217,7 @@ def plan_result(run: Run, found: Plan, source: dict[str, Any]) -> dict[str, Any]
         "settle": run.plan.settle,
         "error": found.error,
         "swing": found.swing,
+        "off_path": found.off_path,
         "time_step": found.mover.step.time_step,
         "std": None if found.std is None else found.std.tolist(),
         "tolerance": run.plan.tolerance,
