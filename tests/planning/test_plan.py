@@ -126,6 +126,13 @@ def test_a_limit_that_cannot_be_kept_is_named(moved, wanted):
     assert "plan.duration" in hasty.message
 
 
+def test_a_motion_that_leaves_the_point_elsewhere_has_not_arrived(moved, wanted):
+    few = plan(moved, replace(wanted, knots=2, duration=0.4, limits=PlanLimits(acceleration=1e3)))
+    assert few.error > 2 * wanted.tolerance, "the motion must fail for this to be a test"
+    assert not few.reached
+    assert f"leaves the point {1e3 * few.error:.3g} mm from its place" in few.message
+
+
 def test_a_path_is_followed(moved, wanted):
     begin = tip_at(moved, START)
     via = tuple(tuple(float(x) for x in tip_at(moved, angle) - begin) for angle in (0.45, 0.8))
