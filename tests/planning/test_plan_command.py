@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 
 import h5py
@@ -99,6 +100,7 @@ def test_a_plan_that_fails_says_so(config, tmp_path, capsys):
     result = json.loads((tmp_path / "out" / "result.json").read_text())
     assert result["status"] == "failed"
     assert result["message"] in capsys.readouterr().out
+    assert result["message"] in html.unescape((tmp_path / "out" / "report.html").read_text())
 
 
 @pytest.mark.parametrize(

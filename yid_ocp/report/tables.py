@@ -146,9 +146,10 @@ def plan_rows(result: Mapping[str, Any]) -> Sequence[tuple[str, ...]]:
     def percent(share: float | None) -> str:
         return "" if share is None else f"{100 * share:.0f} %"
 
-    rows = [("joint", "travel", "largest velocity, of its limit", "largest effort, of its limit")]
+    rows = [("joint", "travel [rad or m]", "largest velocity, of its limit", "largest effort, of its limit")]
     for name, own in result["joints"].items():
-        rows.append((name, f"{own['travel']:.3g}", percent(own["velocity"]), percent(own["effort"])))
+        travel = own["travel"] if own["travel"] > 1e-9 else 0.0
+        rows.append((name, f"{travel:.3g}", percent(own["velocity"]), percent(own["effort"])))
     return rows
 
 
