@@ -88,6 +88,20 @@ def test_the_point_arrives_and_stays_without_swinging(moved, wanted, found):
     assert np.linalg.norm(left, axis=1).max() > 20 * found.error
 
 
+def test_what_hangs_below_the_point_comes_to_rest_as_well(moved, wanted):
+    lower = Points(moved.system, ["lower"])
+
+    def at(angle):
+        rest = Statics(moved).solve([angle], moved.system.parameters.vector())
+        return lower.at(rest.state[None, : moved.system.size], moved.system.parameters.vector())[0][0]
+
+    # the shoulder alone brings this one there, whatever the elbow does
+    done = plan(moved, replace(wanted, point="lower", place=tuple(map(float, at(GOAL)))))
+    assert done.reached, done.message
+    tip = np.diff(done.points["tip"][done.mover.standing], axis=0) / done.mover.step.time_step
+    assert np.linalg.norm(tip, axis=1).max() < wanted.swing
+
+
 def test_a_plan_holds_where_time_is_stepped_more_finely(moved, wanted):
     coarse, fine = (compile_step(moved.system, h, use_compiler=False) for h in (0.05, 0.001))
     done = plan(coarse, wanted)

@@ -139,7 +139,7 @@ def identified(run: Run, step: Step) -> tuple[Array, Known, dict[str, Any]]:
     Raises
     ------
     ConfigError, DataError
-        The folder is none of `solve`, or its solve failed.
+        The folder is none of `solve`, its solve failed, or it had effects that this model has not.
     """
     parameters = step.system.parameters
     theta = parameters.vector()
@@ -165,6 +165,15 @@ def identified(run: Run, step: Step) -> tuple[Array, Known, dict[str, Any]]:
         )
     if result["status"] == "failed":
         raise DataError(f"the solve in {folder} failed: {result['message']}", where=run.where("plan", "run"))
+    lacking = {name.rpartition(".")[0] for name in result["parameters"] if "@" in name and name not in parameters}
+    if lacking:
+        raise run.refuse(
+            f"{folder} was solved with {', '.join(sorted(lacking))}, which this model does not have",
+            "plan",
+            "run",
+            allowed="a run of `solve` on the same model",
+            hint="list the same effects under model.effects",
+        )
     found = {name: entry["value"] for name, entry in result["parameters"].items() if name in parameters}
     for name, value in found.items():
         theta[parameters.index(name)] = value
