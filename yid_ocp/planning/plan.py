@@ -182,13 +182,13 @@ def plan(
     check_reached(end, point.names[0], place, options.tolerance)
     check_limits(step, values, end.rest, options.limits, "where it ends")
 
-    def attempt(duration: float) -> tuple[Plan, Rows]:
+    def attempt(duration: float) -> Plan:
         return _attempt(step, replace(options, duration=duration), values, known, (start, end), (point, inside), place)
 
     told(f"searching the motion in {options.duration:g} s")
-    found, rows = attempt(options.duration)
+    found = attempt(options.duration)
     if options.shortest:
-        found, rows = _shortest(found, rows, options, attempt, told)
+        found = _shortest(found, options, step.time_step, attempt, told)
     return found
 
 
@@ -271,7 +271,7 @@ def _attempt(
     ends: tuple[Rest, End],
     points: tuple[Points, Points | None],
     place: Array,
-) -> tuple[Plan, Rows]:
+) -> Plan:
     """The best motion of one duration: found with the step's time step, sharpened with shorter ones.
 
     What swings in the end is a small difference of large motions: a step that is fine enough for them leaves out part
@@ -294,7 +294,7 @@ def _attempt(
         if _steady(rows, finer, shot.w):
             break
         mover, guess = finer, shot.w
-    return _outcome(rows, replace(shot, evaluations=evaluations), known), rows
+    return _outcome(rows, replace(shot, evaluations=evaluations), known)
 
 
 def _finer(mover: Mover) -> Mover:
@@ -395,24 +395,21 @@ def _outcome(rows: Rows, shot: Shot, known: Known) -> Plan:
     )  # fmt: skip
 
 
-def _shortest(
-    found: Plan, rows: Rows, options: PlanOptions, attempt: Callable[[float], tuple[Plan, Rows]], told: Told
-) -> tuple[Plan, Rows]:
-    """Halve the gap between a duration with which the goal is reached and one with which it is not."""
-    h = found.mover.step.time_step
+def _shortest(found: Plan, options: PlanOptions, h: float, attempt: Callable[[float], Plan], told: Told) -> Plan:
+    """Halve the gap between a duration with which the goal is reached and one with which it is not, in steps of h."""
 
     def good(one: Plan) -> bool:
         return one.reached and one.swing <= options.swing
 
     if not good(found):
-        return found, rows
+        return found
     low, high = 0, round(options.duration / h)
     while high - low > max(1, round(0.02 / h)):
         middle = (low + high) // 2
         told(f"searching the motion in {middle * h:g} s")
-        tried, its = attempt(middle * h)
+        tried = attempt(middle * h)
         if good(tried):
-            found, rows, high = tried, its, middle
+            found, high = tried, middle
         else:
             low = middle
-    return found, rows
+    return found
