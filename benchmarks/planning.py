@@ -1,43 +1,61 @@
-"""Plans carried out in MuJoCo with the true stiffness: ten goals, three models, one table.
+"""Plans carried out in MuJoCo with the true stiffness and damping: ten goals, four models, and one withheld effect.
 
-    python benchmarks/planning.py [GOALS]
+    python benchmarks/planning.py [GOALS] [--only goals | effect | hands]
 
-The free tip of the foam Y that one arm of Baxter holds is to be brought to ten places. Compared are the plan with the
-true stiffness (what an identification that succeeds gives), the plan with 3 N m/rad everywhere, and no model: the
-gripper is moved along a straight line by as much as the tip is to move, with the smoothest timing. Reported are the
-largest distance of the tip from its place and its largest speed in the half second after the arm stands still.
+The free tip of the foam Y that one arm of Baxter holds is to be brought to ten places (`configs/plan_place.yaml`). The
+model is identified first, by `solve` on two noisy recordings made in MuJoCo. Compared are the plan with what was found,
+the plan with the true stiffness, the plan with 3 N m/rad everywhere, and no model: the gripper is moved along a
+straight line by as much as the tip is to move, with the smoothest timing. Reported are the largest distance of the tip
+from its place and its largest speed in the half second after the arm stands still.
+
+Then something that the model lacks hangs on the tip: a plan before `diagnose` has found it, and one after. In the end
+two arms move what they hold.
 """
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Mapping
+import argparse
+import tempfile
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from make_recordings import ROUGH, TRUTH
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from yid_ocp.config.reader import load_config
+from yid_ocp.config.settings import EffectSettings, ParameterSettings, Run
+from yid_ocp.data.hdf5 import write_recording
+from yid_ocp.effects import make_effect
 from yid_ocp.integrator.step import Step, compile_step
+from yid_ocp.model.system import System
 from yid_ocp.planning.ends import end_at, first_rest
-from yid_ocp.planning.options import PlanOptions
 from yid_ocp.planning.path import SplinePath
-from yid_ocp.planning.plan import PlannedMovement, plan
+from yid_ocp.planning.plan import Plan, PlannedMovement, plan
 from yid_ocp.planning.points import Points
 from yid_ocp.virtual.engine import Simulation, simulate_in_mujoco
-from yid_ocp.virtual.experiment import paper_system
+from yid_ocp.virtual.experiment import PointCamera, VirtualExperiment, paper_system
+from yid_ocp.virtual.injected import InjectedEffect, injected_experiment
+from yid_ocp.virtual.motion import Excitation, multisine
 from yid_ocp.virtual.posture import initial_posture
+from yid_ocp.workflow.diagnose import run_diagnose
+from yid_ocp.workflow.plan import identified, planning_step, start_posture
+from yid_ocp.workflow.solve import run_solve
 
 Array = NDArray[np.float64]
 
-TRUE: Mapping[str, float] = {
-    "T1.bend": 22.0, "T1.twist": 14.0, "T2.bend": 11.0, "T2.twist": 8.0, "T3.bend": 11.5, "T3.twist": 9.7,
-}  # fmt: skip
-"""Of the order of the source paper's answer for one arm with vision [N m/rad]."""
-GUESS: Mapping[str, float] = dict.fromkeys(TRUE, 3.0)
+CONFIG = Path(__file__).resolve().parents[1] / "configs" / "plan_place.yaml"
+GUESS: Mapping[str, float] = dict.fromkeys(TRUTH, 3.0)
 TIP, GRIPPER = "w_T3", "left_gripper"
-DURATION, SETTLE, TRAVEL = 0.8, 0.5, 0.6  # [s], [s], [rad]
+TRAVEL = 0.6  # of a joint [rad]
+CAMERA = PointCamera(rate=30.0, gaps=False)  # 5 mm of noise, one frame in ten without the point
+MOTIONS = ((7, 501), (2, 502))  # seeds of the motion and of the noise
+RECORDED = 10.0  # [s]
+HANGING_SHIFT = (-0.044, 0.0, 0.026)  # of the tip on which something hangs [m]
+HANGING = InjectedEffect("point_mass", TIP, {"mass": 0.01})
 
 
 def goals(step: Step, count: int = 10) -> list[tuple[float, float, float]]:
@@ -47,8 +65,8 @@ def goals(step: Step, count: int = 10) -> list[tuple[float, float, float]]:
     turned by more than `TRAVEL`.
     """
     system, rng = step.system, np.random.default_rng(11)
-    theta, tip = system.parameters.vector(TRUE), Points(system, [TIP])
-    posture = initial_posture(system, TRUE)
+    theta, tip = system.parameters.vector(TRUTH), Points(system, [TIP])
+    posture = initial_posture(system, TRUTH)
     start = first_rest(step, theta, np.array([posture[name] for name in system.prescribed]))
     begin = tip.at(start.state[None, : system.size], theta)[0][0]
     found: list[tuple[float, float, float]] = []
@@ -59,12 +77,6 @@ def goals(step: Step, count: int = 10) -> list[tuple[float, float, float]]:
         if end.distance < 1e-4 and np.abs(end.posture - start.state[list(system.prescribed_indices)]).max() < TRAVEL:
             found.append((float(x), float(y), float(z)))
     return found
-
-
-def planning_step() -> Step:
-    """One arm, prescribed, that holds the Y."""
-    system = paper_system(1)
-    return compile_step(replace(system, driven=(), prescribed=system.driven), 0.01)
 
 
 def straight(step: Step, posture: Array, shift: Array, path: SplinePath) -> PlannedMovement:
@@ -96,26 +108,28 @@ def straight(step: Step, posture: Array, shift: Array, path: SplinePath) -> Plan
 
 
 class Servo:
-    """Position control beside the virtual robot's own torques, as stiff as that of an industrial arm.
+    """The robot's own position control: planned torques fed forward, and a servo as stiff as an industrial arm's.
 
     The torque-controlled arm of the virtual experiments gives way under the object's load by some milliradians, which
-    says nothing of a plan.
+    says nothing of a plan. Without planned torques it is the virtual robot's own that are fed forward: of the arm
+    alone, the object's load as it was at the start.
     """
 
-    STIFFNESS, DAMPING = 5e3, 60.0  # [N m/rad], [N m s/rad]
+    STIFFNESS, DAMPING = 5e3, 300.0  # [N m/rad], [N m s/rad]
 
-    def __init__(self, movement: PlannedMovement) -> None:
-        self._movement = movement
+    def __init__(self, movement: PlannedMovement, planned: Plan | None) -> None:
+        self._movement, self._planned = movement, planned
         self._joints, self._first = np.zeros(0, int), np.zeros(0)
-        self._kept: tuple[float, Array] | None = None
+        self._kept: tuple[float, Array, Array | None] | None = None
 
     def prepare(self, model: Any) -> None:
-        """Find the joints' addresses."""
+        """Find the joints' addresses; damping is the model's own, which the simulator integrates implicitly."""
         self._joints = np.array([model.joint(name).id for name in self._movement.joints])
+        model.dof_damping[self._joints] += self.DAMPING
 
     def begin(self, data: Any) -> None:
         """Take the posture at rest as where the motion begins."""
-        self._first, self._kept = data.qpos[self._joints].copy(), (-1.0, np.zeros((3, 7)))
+        self._first, self._kept = data.qpos[self._joints].copy(), (-1.0, np.zeros((3, len(self._joints))), None)
 
     def force(self, _: Any, data: Any) -> None:
         """Pull towards the planned angles."""
@@ -124,56 +138,163 @@ class Servo:
         if self._kept is None or t == 0.0:
             return
         if t - self._kept[0] >= 1e-3 - 1e-9 or t < self._kept[0]:
-            self._kept = (t, np.array(self._movement.at(t)))
-        offset, rate, _bend = self._kept[1]
-        q, v = data.qpos[self._joints] - self._first, data.qvel[self._joints]
-        data.qfrc_passive[self._joints] += self.STIFFNESS * (offset - q) + self.DAMPING * (rate - v)
+            self._kept = (t, np.array(self._movement.at(t)), self._fed_forward(t))
+        (offset, rate, _bend), torque = self._kept[1:]
+        push = self.STIFFNESS * (offset - data.qpos[self._joints] + self._first) + self.DAMPING * rate
+        if torque is not None:
+            push += torque - data.qfrc_applied[self._joints]
+        data.qfrc_passive[self._joints] += push
+
+    def _fed_forward(self, t: float) -> Array | None:
+        if self._planned is None:
+            return None
+        # an effort is the mean over its step
+        middle = self._planned.t[:-1] + self._planned.mover.step.time_step / 2
+        return np.array([np.interp(t, middle, one) for one in self._planned.effort[:-1].T])
 
 
-def carried_out(movement: PlannedMovement, posture: Mapping[str, float], place: Array) -> tuple[float, float]:
-    """Error [m] and swing [m/s] of the tip in the simulator."""
+def carried_out(
+    system: System, values: Mapping[str, float], movement: PlannedMovement, planned: Plan | None, by: Plan
+) -> tuple[float, float]:
+    """Error [m] and swing [m/s] of a plan's point in the simulator, where the plan begins and as long as it takes."""
+    duration, settle = by.mover.path.duration, by.mover.settle
+    simulation = Simulation(duration + settle, time_step=5e-5, controller_rate=500.0, effort_kind="mean")
+    # all coordinates, so that what hangs between two hands is in their hold when it settles
+    posture = dict(zip(system.mechanism.joint_names, map(float, by.state[0, : system.size]), strict=True))
+    terms = Servo(movement, planned)
+    run = simulate_in_mujoco(system, values, movement, simulation, posture=posture, injected=terms)
+    tip = run.points[run.t >= duration - 1e-9, system.points.index(by.point)]
+    speed = np.linalg.norm(np.diff(tip, axis=0), axis=1) * simulation.rate
+    return float(np.max(np.linalg.norm(tip - by.place, axis=1))), float(np.max(speed))
+
+
+def movement(planned: Plan) -> PlannedMovement:
+    return PlannedMovement(planned.joints, planned.mover.path, planned.unknowns)
+
+
+def settings(**recordings: Sequence[Path]) -> Run:
+    """The configuration with recordings by purpose."""
+    files = [f"recordings.{purpose}=[{', '.join(map(str, paths))}]" for purpose, paths in recordings.items()]
+    return load_config(CONFIG, [*files, "output.report=false", "output.discretisation=none"])
+
+
+def record(folder: Path, effects: Sequence[InjectedEffect] = ()) -> list[Path]:
+    """Two recordings of what the arm with its noisy torques and a camera see of the Y."""
+    folder.mkdir(parents=True)
     system = paper_system(1)
-    simulation = Simulation(DURATION + SETTLE, controller_rate=500.0, effort_kind="mean")
-    run = simulate_in_mujoco(system, TRUE, movement, simulation, posture=posture, injected=Servo(movement))
-    tip = run.points[run.t >= DURATION - 1e-9, system.points.index(TIP)]
-    speed = np.linalg.norm(np.diff(tip, axis=0), axis=1) * 100.0
-    return float(np.max(np.linalg.norm(tip - place, axis=1))), float(np.max(speed))
+    posture = initial_posture(system, TRUTH)
+    simulation = replace(ROUGH.simulation, duration=RECORDED)
+    files = []
+    for motion_seed, seed in MOTIONS:
+        excitation = Excitation(travel=ROUGH.travel[1], shake=ROUGH.shake, duration=RECORDED)
+        motion = multisine(system, TRUTH, seed=motion_seed, posture=posture, excitation=excitation)
+        experiment = VirtualExperiment(motion, posture, simulation, ROUGH.noise(1), CAMERA, seed=seed)
+        files.append(folder / f"motion_{motion_seed}.h5")
+        write_recording(injected_experiment(system, TRUTH, effects, experiment), files[-1])
+    return files
 
 
-def compared(shift: tuple[float, float, float], step: Step) -> dict[str, tuple[float, float]]:
-    """Error and swing of the three ways to one goal."""
-    system = step.system
-    posture = initial_posture(system)
-    true, guess = (system.parameters.vector(values) for values in (TRUE, GUESS))
-    options = PlanOptions(point=TIP, shift=shift, duration=DURATION, settle=SETTLE)
-    best = plan(step, options, true)
-    # the same place in the world, whatever the model believes of where the tip rests
-    rough = plan(step, replace(options, shift=None, place=tuple(best.place)), guess)
-    first = np.array([posture[name] for name in system.prescribed])
-    ways = {
-        "identified": PlannedMovement(best.joints, best.mover.path, best.unknowns),
-        "3 N m/rad": PlannedMovement(rough.joints, rough.mover.path, rough.unknowns),
-        "straight": straight(step, first, np.array(shift), best.mover.path),
-    }
-    return {name: carried_out(way, posture, best.place) for name, way in ways.items()}
+def found(run: Run, folder: Path) -> tuple[Array, Step]:
+    """Parameters that `solve` finds, as a plan takes them, and the step that plans."""
+    solved = run_solve(run, folder)
+    for name, entry in solved.result["parameters"].items():
+        if entry["free"]:
+            std = "unknown" if entry["std"] is None else f"{entry['std']:.2g}"
+            print(f"  {name}: {entry['value']:.4g} +- {std} {entry['unit']} (true {TRUTH.get(name, HANGING.values)})")
+    step = planning_step(run)
+    return identified(replace(run, plan=replace(run.plan, run=str(folder))), step)[0], step
 
 
-def main(count: int) -> None:
-    """Print the table."""
-    step = planning_step()
-    print("| goal | shift [mm] | identified: error [mm], swing [mm/s] | 3 N m/rad | straight |")
-    print("|---|---|---|---|---|")
+def ten_goals(folder: Path, count: int) -> None:
+    """Print the table of goals."""
+    run = settings(estimate=record(folder / "data"))
+    print("found by solve:")
+    theta, step = found(run, folder / "solved")
+    true, guess = (step.system.parameters.vector(values) for values in (TRUTH, GUESS))
+    twin, posture = paper_system(1), initial_posture(step.system)
+    names = ("identified", "true stiffness", "3 N m/rad", "straight")
+    print(f"| goal | shift [mm] | {names[0]}: error [mm], swing [mm/s] | {' | '.join(names[1:])} |")
+    print("|" + "---|" * (2 + len(names)))
     ratios = []
     for i, shift in enumerate(goals(step, count)):
-        found = compared(shift, step)
-        cells = [f"{1e3 * error:.2f}, {1e3 * swing:.1f}" for error, swing in found.values()]
-        print(f"| {i + 1} | {', '.join(f'{1e3 * x:.0f}' for x in shift)} | {' | '.join(cells)} |", flush=True)
-        own = np.array(found["identified"])
-        ratios.append([np.array(found[name]) / own for name in ("3 N m/rad", "straight")])
-    for name, own in zip(("3 N m/rad", "straight"), np.array(ratios).transpose(1, 0, 2), strict=True):
+        options = replace(run.plan, shift=shift, posture=posture)
+        best = plan(step, options, true)
+        # the same place in the world, whatever a model believes of where the tip rests
+        there = replace(options, shift=None, place=tuple(best.place))
+        plans = [plan(step, there, theta), best, plan(step, there, guess)]
+        cells = [carried_out(twin, TRUTH, movement(one), one, one) for one in plans]
+        first = np.array([posture[name] for name in step.system.prescribed])
+        cells.append(carried_out(twin, TRUTH, straight(step, first, np.array(shift), best.mover.path), None, best))
+        text = [f"{1e3 * error:.2f}, {1e3 * swing:.1f}" for error, swing in cells]
+        print(f"| {i + 1} | {', '.join(f'{1e3 * x:.0f}' for x in shift)} | {' | '.join(text)} |", flush=True)
+        ratios.append([np.array(cell) / np.array(cells[0]) for cell in cells[2:]])
+    for name, own in zip(names[2:], np.array(ratios).transpose(1, 0, 2), strict=True):
         (error, swing), (most_error, most_swing) = own.min(0), own.max(0)
         print(f"{name}: error {error:.1f} to {most_error:.1f} times, swing {swing:.1f} to {most_swing:.1f}")
 
 
+def with_effects(run: Run, effects: Sequence[Mapping[str, Any]]) -> Run:
+    """The run whose model has effects, their parameters free."""
+    said = tuple(EffectSettings(kind=one["kind"], location=one["location"]) for one in effects)
+    own = {f"{one.kind}@{one.location}.*": ParameterSettings(free=True) for one in said}
+    return replace(run, model=replace(run.model, effects=said), parameters={**run.parameters, **own})
+
+
+def withheld_effect(folder: Path) -> None:
+    """Print what becomes of one goal before and after the diagnosis."""
+    estimate, held_out = record(folder / "data", [HANGING])
+    run = settings(estimate=[estimate], held_out=[held_out])
+    result = run_diagnose(run, folder / "diagnosed").result
+    print(f"diagnosis: {result['verdict']}, {result['effects']}, confusable {result['confusable']}")
+    twin = paper_system(1).with_effects([make_effect(HANGING.kind, HANGING.location, paper_system(1), HANGING.values)])
+    posture = initial_posture(twin, TRUTH)
+    tip, theta = Points(twin, [TIP]), twin.parameters.vector(TRUTH)
+    true = compile_step(replace(twin, driven=(), prescribed=twin.driven), 0.01)
+    rest = first_rest(true, theta, np.array(list(posture.values()))).state[None, : twin.size]
+    x, y, z = map(float, tip.at(rest, theta)[0][0] + HANGING_SHIFT)
+    print("| model | error [mm] | swing [mm/s] |\n|---|---|---|")
+    for name, chosen in (("before", run), ("after", with_effects(run, result["effects"]))):
+        values, step = found(chosen, folder / name)
+        made = plan(step, replace(run.plan, shift=None, place=(x, y, z), posture=posture), values)
+        error, swing = carried_out(twin, TRUTH, movement(made), made, made)
+        print(f"| {name} | {1e3 * error:.2f} | {1e3 * swing:.1f} |", flush=True)
+
+
+def two_hands() -> None:
+    """Print what becomes of plans for two arms, beside a smooth motion of every joint to the same posture."""
+    truth = ", ".join(f"{name}: {{initial: {value}}}" for name, value in TRUTH.items())
+    way = "plan={point: w_T1, shift: [0.03, 0.03, 0.0], duration: 0.8}"
+    print("| held by two arms | plan: error [mm], swing [mm/s] | same posture, smoothly |\n|---|---|---|")
+    for name, config, more in (
+        ("junction of the Y", "dual_arm_vision", [f"parameters={{{truth}}}", way]),
+        ("middle of a cable", "plan_cable", []),
+    ):
+        run = load_config(CONFIG.with_name(f"{config}.yaml"), more)
+        step = planning_step(run)
+        made = plan(step, replace(run.plan, posture=start_posture(run, step)))
+        points = tuple(dict.fromkeys((*step.system.points, made.point)))
+        twin = replace(step.system, driven=step.system.prescribed, prescribed=(), points=points)
+        smooth = replace(movement(made), unknowns=made.mover.path.straight(made.unknowns[-1]))
+        cells = [carried_out(twin, {}, one, made, made) for one in (movement(made), smooth)]
+        print(
+            f"| {name} | {' | '.join(f'{1e3 * error:.2f}, {1e3 * swing:.1f}' for error, swing in cells)} |", flush=True
+        )
+
+
+def main() -> None:
+    """Make what is asked for in a folder that is thrown away."""
+    parser = argparse.ArgumentParser(description="Carry plans out in MuJoCo.")
+    parser.add_argument("goals", nargs="?", type=int, default=10)
+    parser.add_argument("--only", choices=("goals", "effect", "hands"))
+    said = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        if said.only in (None, "goals"):
+            ten_goals(Path(folder) / "goals", said.goals)
+        if said.only in (None, "effect"):
+            withheld_effect(Path(folder) / "effect")
+        if said.only in (None, "hands"):
+            two_hands()
+
+
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 10)
+    main()

@@ -42,7 +42,8 @@ QUICK = {
 
 def configurations(repository):
     files = (repository / "configs").glob("*.yaml")
-    return {path.stem: path for path in files if not path.stem.startswith("track_")}  # tests/vision runs those
+    # tests/vision and tests/planning run the others
+    return {path.stem: path for path in files if not path.stem.startswith(("track_", "plan_"))}
 
 
 def test_every_configuration_has_its_row(repository):

@@ -44,6 +44,17 @@ def test_of_several_equilibria_the_one_of_least_energy():
     assert height(system, "C_1_tip", rest.state[: system.size]) < -0.05
 
 
+def test_a_cable_held_far_from_its_undeformed_shape_hangs_at_rest():
+    statics, _ = hung_cable(0.95)
+    system, theta = statics.step.system, statics.step.system.parameters.vector()
+    # on the other side of where it begins, where Newton's iteration from the undeformed shape leads nowhere
+    rest = statics.solve([-0.3, 0.2, 0.2, 0.0, 0.0, 0.0], theta)
+    assert rest.converged, rest.message
+    held = simulate(statics.step, theta, rest.state, 50).state[-1]
+    np.testing.assert_allclose(held, rest.state, atol=1e-8)
+    assert height(system, "w_C", rest.state[: system.size]) == pytest.approx(0.2)
+
+
 @pytest.fixture(scope="module")
 def arm(urdf_folder):
     """The double pendulum, its elbow driven, with a spring on each joint."""

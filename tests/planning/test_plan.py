@@ -10,6 +10,7 @@ import pytest
 from yid_ocp.errors import ConfigError, ModelError, YidError
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.statics import Statics
+from yid_ocp.integrator.step import compile_step
 from yid_ocp.planning.mover import Mover
 from yid_ocp.planning.options import PlanLimits, PlanOptions
 from yid_ocp.planning.path import SplinePath
@@ -73,17 +74,45 @@ def test_the_point_arrives_and_stays_without_swinging(moved, wanted, found):
     assert found.error < 1e-4
     assert found.swing < wanted.swing
     n = moved.system.size
-    again = simulate(moved, found.mover.theta, found.mover.start.state, len(found.t) - 1, path=found.position)
+    step = found.mover.step
+    again = simulate(step, found.mover.theta, found.mover.start.state, len(found.t) - 1, path=found.position)
     tip = Points(moved.system, ["tip"]).at(again.state[:, :n], found.mover.theta)[0]
     np.testing.assert_allclose(found.points["tip"], tip, atol=1e-12)
     end = found.t >= wanted.duration - 1e-9
     assert np.linalg.norm(tip[end] - wanted.place, axis=1).max() == pytest.approx(found.error)
-    speed = np.linalg.norm(np.diff(tip[end], axis=0), axis=1) / moved.time_step
+    speed = np.linalg.norm(np.diff(tip[end], axis=0), axis=1) / step.time_step
     assert speed.max() <= found.swing + 1e-12
     # moving the shoulder there smoothly, as if the elbow were stiff, leaves the tip swinging
     simple = found.mover.roll(found.mover.path.straight([GOAL - START]))
     left = Points(moved.system, ["tip"]).at(simple.state[end, :n], found.mover.theta)[0] - wanted.place
     assert np.linalg.norm(left, axis=1).max() > 20 * found.error
+
+
+def test_what_hangs_below_the_point_comes_to_rest_as_well(moved, wanted):
+    lower = Points(moved.system, ["lower"])
+
+    def at(angle):
+        rest = Statics(moved).solve([angle], moved.system.parameters.vector())
+        return lower.at(rest.state[None, : moved.system.size], moved.system.parameters.vector())[0][0]
+
+    # the shoulder alone brings this one there, whatever the elbow does
+    done = plan(moved, replace(wanted, point="lower", place=tuple(map(float, at(GOAL)))))
+    assert done.reached, done.message
+    tip = np.diff(done.points["tip"][done.mover.standing], axis=0) / done.mover.step.time_step
+    assert np.linalg.norm(tip, axis=1).max() < wanted.swing
+
+
+def test_a_plan_holds_where_time_is_stepped_more_finely(moved, wanted):
+    coarse, fine = (compile_step(moved.system, h, use_compiler=False) for h in (0.05, 0.001))
+    done = plan(coarse, wanted)
+    assert done.reached, done.message
+    assert done.mover.step.time_step < coarse.time_step
+    start = Statics(fine).solve([START], done.mover.theta)
+    held = replace(done.mover, step=fine, start=start)
+    tip = Points(moved.system, ["tip"]).at(held.roll(done.unknowns).state[:, : moved.system.size], held.theta)[0]
+    end = held.times >= wanted.duration - 1e-9
+    assert np.linalg.norm(tip[end] - wanted.place, axis=1).max() < wanted.tolerance
+    assert np.linalg.norm(np.diff(tip[end], axis=0), axis=1).max() / fine.time_step < 2 * wanted.swing
 
 
 def test_a_plan_starts_and_ends_at_rest(found):
@@ -107,8 +136,15 @@ def test_limits_are_kept_at_the_price_of_the_goal_or_of_calm(moved, wanted, foun
 def test_a_limit_that_cannot_be_kept_is_named(moved, wanted):
     hasty = plan(moved, replace(wanted, duration=0.15))
     assert not hasty.reached
-    assert "shoulder passes its limit" in hasty.message or "comes no nearer" in hasty.message
+    assert "shoulder passes its limit" in hasty.message or "leaves the point" in hasty.message
     assert "plan.duration" in hasty.message
+
+
+def test_a_motion_that_leaves_the_point_elsewhere_has_not_arrived(moved, wanted):
+    few = plan(moved, replace(wanted, knots=2, duration=0.4, limits=PlanLimits(acceleration=1e3)))
+    assert few.error > 2 * wanted.tolerance, "the motion must fail for this to be a test"
+    assert not few.reached
+    assert f"leaves the point {1e3 * few.error:.3g} mm from its place" in few.message
 
 
 def test_a_path_is_followed(moved, wanted):
@@ -190,7 +226,7 @@ def test_a_motion_planned_for_uncertainty_errs_less_where_the_stiffness_is_anoth
         ({"posture": None}, ("nothing says where the motion begins",)),
         ({"goal": "path"}, ("no places on the way",)),
         ({"goal": "box"}, ("there is no box",)),
-        ({"goal": "box", "box": ((0, 0, 1), (1, 1, 0))}, ("empty along z", "1 m above")),
+        ({"goal": "box", "box": ((0, 0, 1), (1, 1, 0))}, ("empty along z", "from 1 up to 0 m")),
         ({"goal": "box", "box": ((-1, -1, -1), (1, 1, 0.3))}, ("mm outside the box along z", "plan.inside")),
         ({"spread": True}, ("uncertainty is not known", "plan.run")),
         ({"knots": 1}, ("knots = 1", "from 2")),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 
 import h5py
@@ -36,11 +37,11 @@ def config(limited_urdf, tmp_path):
     return file
 
 
-def solved(folder, stiffness, std, status="converged"):
+def solved(folder, stiffness, std, status="converged", **more):
     """What `solve` leaves, as far as a plan reads it."""
     folder.mkdir()
-    entry = {"value": stiffness, "free": True}
-    result = {"format": "yid-solve/1", "status": status, "message": "made up", "parameters": {"elbow.stiffness": entry}}
+    parameters = {"elbow.stiffness": {"value": stiffness, "free": True}} | more
+    result = {"format": "yid-solve/1", "status": status, "message": "made up", "parameters": parameters}
     (folder / "result.json").write_text(json.dumps(result))
     with h5py.File(folder / "trajectories.h5", "w") as file:
         unknowns = file.create_group("unknowns")
@@ -99,6 +100,7 @@ def test_a_plan_that_fails_says_so(config, tmp_path, capsys):
     result = json.loads((tmp_path / "out" / "result.json").read_text())
     assert result["status"] == "failed"
     assert result["message"] in capsys.readouterr().out
+    assert result["message"] in html.unescape((tmp_path / "out" / "report.html").read_text())
 
 
 @pytest.mark.parametrize(
@@ -124,3 +126,18 @@ def test_a_folder_of_another_kind_is_refused(config, tmp_path, capsys):
     failed = solved(tmp_path / "failed", 4.0, 0.1, status="failed")
     assert main(["plan", str(config), "--out", str(tmp_path / "out"), "--set", f"plan.run={failed}"]) == 2
     assert "failed: made up" in capsys.readouterr().err
+
+
+def test_a_run_with_effects_that_the_model_lacks_is_refused(config, tmp_path, capsys):
+    more = {"point_mass@tip.mass": {"value": 0.1, "free": True}}
+    folder = solved(tmp_path / "solved", 4.0, 0.1, **more)
+    chosen = ("plan", str(config), "--out", str(tmp_path / "out"), "--set", f"plan.run={folder}")
+    assert main(list(chosen)) == 2
+    told = capsys.readouterr().err
+    assert "was solved with point_mass@tip, which this model does not have" in told
+    assert "model.effects" in told
+    with_it = "model.effects=[{kind: point_mass, location: tip}]"
+    assert main([*chosen, "--set", with_it]) == 0
+    assert (
+        json.loads((tmp_path / "out" / "result.json").read_text())["from"]["parameters"]["point_mass@tip.mass"] == 0.1
+    )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -58,6 +59,8 @@ class Rest:
 # ratio of torque error to encoder error; without one it is stiff enough to give less than an encoder's noise.
 HOLD_STIFFNESS = 1e5
 HOLD_STIFFNESS_WITH_TORQUE = 1e3
+
+MOST_ITERATIONS = 300  # of the search for the lowest energy
 
 # A holding spring that gives by more than this means that the posture does not fit the grasp [rad].
 HOLD_LIMIT = 0.02
@@ -166,6 +169,10 @@ class Statics:
                 break
         assert best is not None
         failed, _, error, w = best
+        if failed and guess is None:
+            lowest = self._lowest_energy(given, arguments)
+            if lowest is not None:
+                return self.solve(posture, theta, torque, lowest, names, tolerance)
         state, holding, _, give = (np.array(x).ravel() for x in self._outcome(w, *arguments))
         by_theta, by_posture = self._differentiate(w, arguments, tuple(names))
         message = self._explain(state, theta, error) if failed else "at rest"
@@ -203,6 +210,36 @@ class Statics:
             bent[bendable] += np.random.default_rng(seed).normal(scale=0.05, size=len(bendable))
             starts.append(bent)
         return starts
+
+    def _lowest_energy(self, given: Array, arguments: list[Array | float]) -> Array | None:
+        """A configuration of lowest potential energy within the constraints, shape (n,); None where there is none.
+
+        Newton's iteration leaves an object that is held far from its undeformed shape, as a cable between two clamps.
+
+        References
+        ----------
+        Waechter and Biegler (2006), Math. Programming 106:25, doi:10.1007/s10107-004-0559-y.
+        """
+        size, m = len(self.unknown), self.step.sizes["m"]
+        if not size or not m:
+            return None
+        with SYMBOLIC:
+            x = ca.SX.sym("x", size)
+            w = ca.vertcat(x, ca.SX(self.step.sizes["nz"] + m, 1))
+            residual, _ = self._residual(w, *arguments)
+            _, _, energy, _ = self._outcome(w, *arguments)
+            scale = 1.0 / max(float(ca.norm_inf(self._residual(0, *arguments)[0])), 1e-6)
+            search = {"print_level": 0, "sb": "yes", "max_iter": MOST_ITERATIONS, "tol": 1e-8}
+            options: dict[str, Any] = {"print_time": False, "error_on_fail": False, "ipopt": search}
+            program = {"x": x, "f": scale * energy, "g": residual[-m:]}
+            solver = ca.nlpsol("lowest", "ipopt", program, options)
+        for start in self._guesses(given, None):
+            found = np.array(solver(x0=start[:size], lbg=0.0, ubg=0.0)["x"]).ravel()
+            if solver.stats()["success"]:
+                q = np.zeros(self.step.system.size)
+                q[list(self.known)], q[list(self.unknown)] = given, found
+                return q
+        return None
 
     def _differentiate(self, w: Array, arguments: list, names: tuple[str, ...]) -> tuple[Array, Array]:
         r_w, r_o, s_w, s_o = (np.array(ca.densify(x)) for x in self._derivatives(names)(w, *arguments))

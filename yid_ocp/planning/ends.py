@@ -10,14 +10,17 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from yid_ocp.errors import ConfigError, ModelError, nearest
+from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.statics import Rest, Statics
 from yid_ocp.integrator.step import Step
 from yid_ocp.model.system import System
+from yid_ocp.planning.options import PlanLimits
 from yid_ocp.planning.points import Points
 
 Array = NDArray[np.float64]
 
 NEAR = 1e-2  # weight of a joint's travel [rad] beside the distance to the place in units of what counts as reached
+STIFF = 1e-9  # motion of the point by a joint's, in metres per radian or metre, that counts as none
 REACHED = 1.5  # of that unit: beyond it a place is out of reach
 
 
@@ -81,27 +84,63 @@ def start_posture(system: System, posture: Mapping[str, float]) -> Array:
     return chosen
 
 
-def first_rest(step: Step, theta: Array, posture: Array) -> Rest:
-    """The equilibrium from which a motion begins.
+def first_rest(step: Step, theta: Array, posture: Array, guess: Array | None = None) -> Rest:
+    """The equilibrium from which a motion begins, of several the one near a configuration where that is given.
 
     Raises
     ------
     ModelError
         There is none, for example because a grasp cannot be closed.
     """
-    rest = Statics(step).solve(posture, theta)
+    rest = Statics(step).solve(posture, theta, guess=guess)
     if not rest.converged:
         raise ModelError(
             f"the motion cannot begin: {rest.message}",
             where="plan.posture",
             allowed="a posture at which every grasp holds the object at rest",
-            hint="give plan.posture (a recording's first angles), or correct model.grasp",
+            hint="give plan.posture or a recording, which begins where the object is held; or correct model.grasp",
         )
     return rest
 
 
+def check_limits(step: Step, theta: Array, rest: Rest, limits: PlanLimits, when: str) -> None:
+    """Refuse limits that are passed where the arms stand still, since no motion can keep within them.
+
+    Raises
+    ------
+    ConfigError
+        Naming the joint or spring, its value and what is allowed.
+    """
+    system = step.system
+    effort = simulate(step, theta, rest.state, 1).effort[0]
+    joints = [system.mechanism.joints[i] for i in system.prescribed_indices]
+    springs = sorted({system.mechanism.joint_index(spring.joint) for spring in system.elastic})
+    largest = np.inf if limits.spring_angle is None else limits.spring_angle
+    rows = [
+        *(
+            (j.name, "effort", "N m or N", u, limits.effort * j.effort_limit)
+            for j, u in zip(joints, effort, strict=True)
+        ),
+        *((system.mechanism.joint_names[i], "spring_angle", "rad", rest.state[i], largest) for i in springs),
+    ]
+    for name, which, unit, value, limit in rows:
+        if not abs(value) <= limit * (1 + 1e-9):
+            raise ConfigError(
+                f"{name} at rest {when} takes {value:.4g} {unit}, {abs(value) - limit:.3g} beyond its limit",
+                where=f"plan.limits.{which}",
+                allowed=f"up to {limit:.4g} {unit}",
+                hint=f"raise plan.limits.{which} where the machine allows it, or take another posture or place",
+            )
+
+
 def end_at(step: Step, theta: Array, start: Rest, point: Points, place: Array, tolerance: float) -> End:
-    """The posture within the joints' range, not far from the start, at which the point rests nearest to a place."""
+    """The posture within the joints' range, not far from the start, at which the point rests nearest to a place.
+
+    Raises
+    ------
+    ConfigError
+        No joint moves the point.
+    """
     statics, system = Statics(step), step.system
     joints, n = list(system.prescribed_indices), system.size
     first = start.state[joints]
@@ -126,6 +165,14 @@ def end_at(step: Step, theta: Array, start: Rest, point: Points, place: Array, t
             np.vstack([slope / tolerance, NEAR * np.eye(len(x))]),
         )
 
+    moved, reach = start.by_posture[:n], point.at(start.state[None, :n], theta)[1][0, :3]
+    if np.abs(reach @ moved).max(initial=0.0) < STIFF:
+        raise ConfigError(
+            f"no arm moves '{point.names[0]}'",
+            where="plan.point",
+            allowed="a point of what an arm holds or carries",
+            hint="set model.grasp, or name another point",
+        )
     lower, upper = joint_range(system)
     begin = np.clip(first, lower + 1e-6, upper - 1e-6)
     found = least_squares(

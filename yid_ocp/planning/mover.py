@@ -81,12 +81,13 @@ class Mover:
             if slopes:
                 by_path[:, :, len(names) :] = np.einsum("tk,ji->tjki", self._basis, np.eye(nc)).reshape(nodes, nc, size)
             if names:
-                rest = Statics(self.step).solve(self.first, self.theta, guess=self._configuration, names=names)
+                rest = Statics(self.step).solve(self.first, self.theta, guess=self.configuration, names=names)
                 start[:, : len(names)] = rest.by_theta
             directions = Directions(tuple(names), start, None, by_path)
         steps = len(self.times) - 1
         return simulate(self.step, self.theta, self.start.state, steps, path=self.positions(w), directions=directions)
 
     @property
-    def _configuration(self) -> Array:
-        return self.start.state[: self.step.system.size]
+    def configuration(self) -> Array:
+        """All coordinates at the start, shape (n,)."""
+        return np.asarray(self.start.state[: self.step.system.size])

@@ -40,7 +40,11 @@ class PlanOptions:
     inside: Annotated[tuple[str, ...] | None, About("frames kept inside the box; all points of the object")] = None
     posture: Annotated[
         Mapping[str, float] | None,
-        About("joints at the start, at rest; the arms' first grasp of the undeformed object when absent", "rad or m"),
+        About(
+            "joints at the start, at rest; when absent those with which the first recording begins, else those of the "
+            "arms' first grasp of the undeformed object",
+            "rad or m",
+        ),
     ] = None
     duration: Annotated[float, Gt(0), Le(60), About("of the arms' motion", "s")] = 1.5
     settle: Annotated[float, Gt(0), Le(60), About("after it, the arms at rest and the point in its place", "s")] = 0.5

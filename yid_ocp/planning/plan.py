@@ -1,4 +1,4 @@
-"""Plan a motion: its ends by statics, its middle by IPOPT, and what is left of error, swing and uncertainty."""
+"""Plan a motion: its ends by statics, its middle by rollouts, and what is left of error, swing and uncertainty."""
 
 from __future__ import annotations
 
@@ -10,11 +10,20 @@ from numpy.typing import NDArray
 
 from yid_ocp.errors import ConfigError, nearest
 from yid_ocp.integrator.statics import Rest
-from yid_ocp.integrator.step import Step
+from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.model.system import System
 from yid_ocp.options import check
-from yid_ocp.planning.ends import REACHED, End, check_reached, end_at, first_rest, joint_range, start_posture
+from yid_ocp.planning.ends import (
+    REACHED,
+    End,
+    check_limits,
+    check_reached,
+    end_at,
+    first_rest,
+    joint_range,
+    start_posture,
+)
 from yid_ocp.planning.mover import Mover
 from yid_ocp.planning.options import PlanOptions
 from yid_ocp.planning.path import SplinePath
@@ -24,6 +33,9 @@ from yid_ocp.planning.shooting import Shooting, Shot, failed
 from yid_ocp.virtual.posture import initial_posture
 
 Array = NDArray[np.float64]
+
+HALVINGS = 3  # of the time step
+STEADY = 0.1  # change by halving it, in parts of what counts as reached and as rest, that counts as none
 
 
 @dataclass(frozen=True)
@@ -58,18 +70,23 @@ class Plan:
         What they need, the last row as the one before [N m or N].
     state : ndarray, shape (N + 1, nx)
     points : mapping of str to ndarray, shape (N + 1, 3)
-        Where the system's points go [m].
+        Where the system's points and the one that is to arrive go [m].
+    point : str
+        What is to arrive.
     place : ndarray, shape (3,)
-        Where the point is to arrive [m].
+        Where [m].
     error : float
         Largest distance of the point from it while the arms stand still in the end [m].
     swing : float
         Largest speed of a point of the object in that time [m/s].
+    off_path : float or None
+        Largest distance of the point from where it is to be on its path at that time [m]; None without a path.
     std : ndarray, shape (3,), or None
         Of the point's place in the end, from the parameters' covariance [m]; None without one.
     unknowns : ndarray, shape (K, nc)
     evaluations : int
     mover : Mover
+        Its step may be a shorter one than that the plan began with.
     """
 
     reached: bool
@@ -82,9 +99,11 @@ class Plan:
     effort: Array
     state: Array
     points: dict[str, Array]
+    point: str
     place: Array
     error: float
     swing: float
+    off_path: float | None
     std: Array | None
     unknowns: Array
     evaluations: int
@@ -138,10 +157,6 @@ def plan(
     ------
     ConfigError, ModelError
         A goal that cannot be reached, names that do not exist, an empty box, no rest to begin from.
-
-    References
-    ----------
-    Waechter and Biegler (2006), Math. Programming 106:25, doi:10.1007/s10107-004-0559-y.
     """
     check(options, "plan")
     system = step.system
@@ -162,16 +177,18 @@ def plan(
     begin = point.at(start.state[None, :n], values)[0][0, :3]
     place = _place(options, begin)
     _check_box(options, inside, start, n, values, place)
+    check_limits(step, values, start, options.limits, "where the motion begins")
     end = end_at(step, values, start, point, place, options.tolerance)
     check_reached(end, point.names[0], place, options.tolerance)
+    check_limits(step, values, end.rest, options.limits, "where it ends")
 
-    def attempt(duration: float) -> tuple[Plan, Rows]:
+    def attempt(duration: float) -> Plan:
         return _attempt(step, replace(options, duration=duration), values, known, (start, end), (point, inside), place)
 
     told(f"searching the motion in {options.duration:g} s")
-    found, rows = attempt(options.duration)
+    found = attempt(options.duration)
     if options.shortest:
-        found, rows = _shortest(found, rows, options, attempt, told)
+        found = _shortest(found, options, step.time_step, attempt, told)
     return found
 
 
@@ -204,12 +221,12 @@ def _points(step: Step, options: PlanOptions) -> tuple[Points, Points | None]:
 
 def _place(options: PlanOptions, begin: Array) -> Array:
     if (options.place is None) == (options.shift is None):
+        twice = options.place is not None
         raise ConfigError(
-            "where the point is to arrive is said twice"
-            if options.place
-            else "nothing says where the point is to arrive",
+            f"{'it is said twice' if twice else 'nothing says'} where the point is to arrive",
             where="plan.place",
             allowed="one of place and shift",
+            hint="set the other one to null" if twice else "set plan.place, or plan.shift from where it rests",
         )
     if options.goal == "path" and not options.via:
         raise ConfigError("the path has no places on the way", where="plan.via", allowed="one or more shifts [m]")
@@ -223,9 +240,10 @@ def _check_box(options: PlanOptions, inside: Points | None, start: Rest, n: int,
         raise ConfigError("there is no box", where="plan.box", allowed="two corners [m]", hint="goal: place needs none")
     low, high = np.array(options.box)
     if np.any(low >= high):
-        axis = "xyz"[int(np.argmin(high - low))]
+        worst = int(np.argmin(high - low))
+        axis = "xyz"[worst]
         raise ConfigError(
-            f"the box is empty along {axis}: its lowest corner is {float(np.max(low - high)):.3g} m above its highest",
+            f"the box is empty along {axis}: it goes from {low[worst]:.4g} up to {high[worst]:.4g} m",
             where="plan.box",
             allowed="lowest corner first",
         )
@@ -253,18 +271,52 @@ def _attempt(
     ends: tuple[Rest, End],
     points: tuple[Points, Points | None],
     place: Array,
-) -> tuple[Plan, Rows]:
-    """The best motion of one duration."""
+) -> Plan:
+    """The best motion of one duration: found with the step's time step, sharpened with shorter ones.
+
+    What swings in the end is a small difference of large motions: a step that is fine enough for them leaves out part
+    of it.
+    """
     start, end = ends
     path = SplinePath(options.duration, options.knots)
     mover = Mover(step, theta, start, path, options.settle)
-    straight = path.straight(end.posture - mover.first)
-    rows = Rows(mover, options, points[0], place, straight, points[1])
-    cases = [rows, *_scenarios(rows, known)] if options.spread else [rows]
+    guess = straight = path.straight(end.posture - mover.first)
     lower, upper = (np.tile(side - mover.first, (options.knots, 1)) for side in joint_range(step.system))
-    shooting = Shooting(cases, straight.shape)
-    shot = shooting.solve(straight, lower, upper, options.iterations)
-    return _outcome(rows, shot, known), rows
+    evaluations = 0
+    for halved in range(HALVINGS + 1):
+        rows = Rows(mover, options, points[0], place, straight, points[1])
+        cases = [rows, *_scenarios(rows, known)] if options.spread else [rows]
+        shot = Shooting(cases, straight.shape).solve(guess, lower, upper, options.iterations)
+        evaluations += shot.evaluations
+        if not shot.finished or halved == HALVINGS:
+            break
+        finer = _finer(mover)
+        if _steady(rows, finer, shot.w):
+            break
+        mover, guess = finer, shot.w
+    return _outcome(rows, replace(shot, evaluations=evaluations), known)
+
+
+def _finer(mover: Mover) -> Mover:
+    """The same with half the time step."""
+    step = mover.step
+    half = compile_step(
+        step.system, step.time_step / 2, step.force_split, step.constraint_force, use_compiler=step.compiled
+    )
+    return replace(mover, step=half, start=first_rest(half, mover.theta, mover.first, mover.configuration))
+
+
+def _steady(rows: Rows, finer: Mover, w: Array) -> bool:
+    """Whether half the time step moves the point neither from where it arrives nor from rest."""
+    options, n, h = rows.options, rows.mover.step.system.size, rows.mover.step.time_step
+    own, other = (
+        rows.point.at(mover.roll(w).state[::every, :n], mover.theta)[0].reshape(len(rows.mover.times), -1, 3)
+        for mover, every in ((rows.mover, 1), (finer, 2))
+    )
+    change = (other - own)[rows.mover.standing]
+    place = np.linalg.norm(change[:, 0], axis=1).max()
+    speed = np.linalg.norm(np.diff(change, axis=0), axis=2).max() / h
+    return bool(place <= STEADY * options.tolerance and speed <= STEADY * options.swing)
 
 
 def _scenarios(rows: Rows, known: Known) -> list[Rows]:
@@ -287,7 +339,7 @@ def _scenarios(rows: Rows, known: Known) -> list[Rows]:
                 entry = system.parameters[name]
                 floor = max(entry.lower, 0.2 * theta[i]) if theta[i] > 0 else entry.lower
                 theta[i] = np.clip(theta[i] + change, floor, entry.upper)
-            rest = first_rest(mover.step, theta, mover.first)
+            rest = first_rest(mover.step, theta, mover.first, mover.configuration)
             found.append(
                 Rows(replace(mover, theta=theta, start=rest), rows.options, rows.point, rows.target, rows.simple)
             )
@@ -309,12 +361,14 @@ def _outcome(rows: Rows, shot: Shot, known: Known) -> Plan:
     if len(known.names):
         slope = _point_slopes(rows, mover.roll(shot.w, names=known.names), len(known.names))[-1]
         std = np.sqrt(np.maximum(np.diag(slope @ known.covariance @ slope.T), 0.0))
-    names = step.system.points
+    names = tuple(dict.fromkeys((*step.system.points, rows.point.names[0])))
     at = Points(step.system, names).at(rollout.state[:, :n], mover.theta)[0].reshape(len(mover.times), -1, 3)
     own = rows.point.at(rollout.state[:, :n], mover.theta)[0].reshape(len(mover.times), -1, 3)
     end = mover.standing
     error = float(np.max(np.linalg.norm(own[end, 0] - rows.target, axis=1)))
     swing = float(np.max(np.linalg.norm(np.diff(own[end], axis=0), axis=2)) / step.time_step)
+    course = rows.course
+    off_path = None if course is None else float(np.max(np.linalg.norm(own[:, 0] - course, axis=1)))
     broken = rows.broken(rows.limits(rollout, shot.w).value)
     message = shot.message
     for what, (name, value, bound) in broken.items():
@@ -327,37 +381,35 @@ def _outcome(rows: Rows, shot: Shot, known: Known) -> Plan:
     doubt = float(np.linalg.norm(std)) if std is not None and rows.options.spread else 0.0
     far = not error <= REACHED * max(rows.options.tolerance, doubt)
     if shot.finished and far:
-        message += (
-            f"; the point comes no nearer than {1e3 * error:.3g} mm; take a longer plan.duration or a nearer place"
+        message = (
+            f"the best motion within the limits leaves the point {1e3 * error:.3g} mm from its place; take a longer "
+            "plan.duration or a nearer place"
         )
     reached = shot.finished and not broken and not far
     return Plan(
         reached, message, step.system.prescribed, mover.times, mover.positions(shot.w),
         mover.path.basis(mover.times, 1) @ shot.w, mover.path.basis(mover.times, 2) @ shot.w,
         np.vstack([rollout.effort, rollout.effort[-1:]]), rollout.state,
-        {name: at[:, i] for i, name in enumerate(names)}, rows.target, error, swing, std, shot.w, shot.evaluations,
-        mover,
+        {name: at[:, i] for i, name in enumerate(names)}, rows.point.names[0], rows.target, error, swing, off_path, std,
+        shot.w, shot.evaluations, mover,
     )  # fmt: skip
 
 
-def _shortest(
-    found: Plan, rows: Rows, options: PlanOptions, attempt: Callable[[float], tuple[Plan, Rows]], told: Told
-) -> tuple[Plan, Rows]:
-    """Halve the gap between a duration with which the goal is reached and one with which it is not."""
-    h = found.mover.step.time_step
+def _shortest(found: Plan, options: PlanOptions, h: float, attempt: Callable[[float], Plan], told: Told) -> Plan:
+    """Halve the gap between a duration with which the goal is reached and one with which it is not, in steps of h."""
 
     def good(one: Plan) -> bool:
         return one.reached and one.swing <= options.swing
 
     if not good(found):
-        return found, rows
+        return found
     low, high = 0, round(options.duration / h)
     while high - low > max(1, round(0.02 / h)):
         middle = (low + high) // 2
         told(f"searching the motion in {middle * h:g} s")
-        tried, its = attempt(middle * h)
+        tried = attempt(middle * h)
         if good(tried):
-            found, rows, high = tried, its, middle
+            found, high = tried, middle
         else:
             low = middle
-    return found, rows
+    return found

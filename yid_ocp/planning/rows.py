@@ -17,8 +17,8 @@ from yid_ocp.planning.points import Points
 Array = NDArray[np.float64]
 
 EVERY = 2  # nodes between those at which limits on what moves freely are asked for
-NEAR = 0.3  # root mean square distance of the joints from the quasi-static motion that counts as one [rad or m]
-CALM = 1e-2  # weight of the accelerations' mean square, in parts of their limit: of equal motions the calmer one
+NEAR = 1.0  # root mean square distance of the joints from the quasi-static motion that counts as one [rad or m]
+CALM = 1e-3  # weight of the accelerations' mean square, in parts of their limit: of equal motions the calmer one
 
 
 @dataclass(frozen=True)

@@ -132,7 +132,8 @@ class Shooting:
         assert limits.slope is not None
         root = np.sqrt(penalty)
         sides = ((1.0, limits.value - self._upper, pull[0]), (-1.0, self._lower - limits.value, pull[1]))
-        values, slopes = [residual.value], [residual.slope]
+        # a one beside them: the search ends where the cost falls by little of what counts as reached
+        values, slopes = [np.ones(1), residual.value], [np.zeros((1, len(x))), residual.slope]
         for sign, over, raised in sides:
             shifted = np.maximum(over + raised / penalty, 0.0)
             values.append(root * shifted)

@@ -183,9 +183,10 @@ def plan_rows(result: Mapping[str, Any]) -> Sequence[tuple[str, ...]]:
     def percent(share: float | None) -> str:
         return "" if share is None else f"{100 * share:.0f} %"
 
-    rows = [("joint", "travel", "largest velocity, of its limit", "largest effort, of its limit")]
+    rows = [("joint", "travel [rad or m]", "largest velocity, of its limit", "largest effort, of its limit")]
     for name, own in result["joints"].items():
-        rows.append((name, f"{own['travel']:.3g}", percent(own["velocity"]), percent(own["effort"])))
+        travel = own["travel"] if own["travel"] > 1e-9 else 0.0
+        rows.append((name, f"{travel:.3g}", percent(own["velocity"]), percent(own["effort"])))
     return rows
 
 
@@ -201,6 +202,8 @@ def plan_sentences(result: Mapping[str, Any]) -> list[str]:
         f"that it is at most {1e3 * result['error']:.3g} mm from there, and no point of the object is faster than "
         f"{1e3 * result['swing']:.3g} mm/s, as the model has it"
     ]
+    if result["off_path"] is not None:
+        said.append(f"on the way it is at most {1e3 * result['off_path']:.3g} mm from where its path is at that time")
     if result["std"] is not None:
         std = ", ".join(f"{1e3 * x:.2g}" for x in result["std"])
         said.append(f"what is not known of the parameters makes that uncertain by ({std}) mm, one standard deviation")

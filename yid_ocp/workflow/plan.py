@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,10 +23,13 @@ from yid_ocp.export.csv import export_csv
 from yid_ocp.export.trajectory import joint_trajectory
 from yid_ocp.integrator.step import Step
 from yid_ocp.planning.plan import Known, Plan, plan
+from yid_ocp.problem.grid import make_grid
+from yid_ocp.problem.inputs import prescribed_path
+from yid_ocp.problem.low_pass import LowPass
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import Findings
 from yid_ocp.report.terminal import plan_summary
-from yid_ocp.workflow.build import build_step, located, parameter_settings
+from yid_ocp.workflow.build import build_cable, build_step, located, parameter_settings, read_recordings
 from yid_ocp.workflow.command import DONE, FAILED, carry_out
 from yid_ocp.workflow.folder import new_run_folder
 from yid_ocp.workflow.progress import SILENT, Progress
@@ -80,8 +84,9 @@ def run_plan(run: Run, out: str | Path | None = None, progress: Progress = SILEN
         progress.stage("building the model and its compiled step")
         step = planning_step(run)
         theta, known, source = identified(run, step)
+        options = replace(run.plan, posture=start_posture(run, step))
         with located(run, "plan"):
-            found = plan(step, run.plan, theta, known, progress.stage)
+            found = plan(step, options, theta, known, progress.stage)
         recording = as_recording(run, found, step)
         write_recording(recording, folder.path / "recording.h5")
         export_csv(recording, folder.path / "csv")
@@ -107,13 +112,34 @@ def planning_step(run: Run) -> Step:
     return build_step(replace(run, model=model, recordings=recordings))
 
 
+def start_posture(run: Run, step: Step) -> Mapping[str, float] | None:
+    """Moved joints where the motion begins: as the settings say, else as the first recording begins.
+
+    None where neither says it: then it begins where the arms first grasp the undeformed object. Two arms that hold a
+    straight object are at its full stretch, from which it snaps to either side; a recording rarely begins there.
+
+    Raises
+    ------
+    DataError
+        The recording does not hold a joint that moves.
+    """
+    if run.plan.posture is not None or not run.recordings.estimate:
+        return run.plan.posture
+    recording, cable, system = read_recordings(run, "estimate")[0], build_cable(run), step.system
+    clamps = () if cable is None else cable.clamps
+    grid = make_grid(recording, step.time_step, run.problem.duration)
+    with located(run, "recordings", "estimate", 0):
+        path = prescribed_path(recording, system, grid, LowPass(run.problem.path_cutoff), clamps)
+    return dict(zip(system.prescribed, map(float, path[0]), strict=True))
+
+
 def identified(run: Run, step: Step) -> tuple[Array, Known, dict[str, Any]]:
     """Parameters, their covariance, and where both come from: a run folder of `solve`, or the settings.
 
     Raises
     ------
     ConfigError, DataError
-        The folder is none of `solve`, or its solve failed.
+        The folder is none of `solve`, its solve failed, or it had effects that this model has not.
     """
     parameters = step.system.parameters
     theta = parameters.vector()
@@ -139,6 +165,15 @@ def identified(run: Run, step: Step) -> tuple[Array, Known, dict[str, Any]]:
         )
     if result["status"] == "failed":
         raise DataError(f"the solve in {folder} failed: {result['message']}", where=run.where("plan", "run"))
+    lacking = {name.rpartition(".")[0] for name in result["parameters"] if "@" in name and name not in parameters}
+    if lacking:
+        raise run.refuse(
+            f"{folder} was solved with {', '.join(sorted(lacking))}, which this model does not have",
+            "plan",
+            "run",
+            allowed="a run of `solve` on the same model",
+            hint="list the same effects under model.effects",
+        )
     found = {name: entry["value"] for name, entry in result["parameters"].items() if name in parameters}
     for name, value in found.items():
         theta[parameters.index(name)] = value
@@ -191,6 +226,8 @@ def plan_result(run: Run, found: Plan, source: dict[str, Any]) -> dict[str, Any]
         "settle": run.plan.settle,
         "error": found.error,
         "swing": found.swing,
+        "off_path": found.off_path,
+        "time_step": found.mover.step.time_step,
         "std": None if found.std is None else found.std.tolist(),
         "tolerance": run.plan.tolerance,
         "joints": shares,

@@ -32,7 +32,7 @@ def prepare(findings: Findings) -> Mapping[str, Any] | None:
     )
     head, *rows = plan_rows(findings.result)
     return {
-        "sentences": plan_sentences(findings.result),
+        "sentences": [f"{findings.result['status']}: {findings.result['message']}", *plan_sentences(findings.result)],
         "head": head,
         "rows": rows,
         "figures": [html(lines_over_time(curve)) for curve in curves],

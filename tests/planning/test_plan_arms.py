@@ -1,0 +1,127 @@
+"""Plans of the shipped configurations, coarsened: one arm and two that hold the Y, two that hold a cable, clamps."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from yid_ocp.config.reader import load_config
+from yid_ocp.data import read_recording
+from yid_ocp.errors import ConfigError
+from yid_ocp.integrator.rollout import simulate
+from yid_ocp.planning.points import Points
+from yid_ocp.workflow.build import recording_file
+from yid_ocp.workflow.plan import run_plan
+
+STIFF = "parameters={T*.bend: {initial: 15}, T*.twist: {initial: 10}}"
+COARSE = {
+    "plan_place": ("model.object.links=2", "plan.shift=[-0.01, 0.02, 0.015]"),
+    "plan_cable": ("model.object.segments.cable.links=4",),
+}
+
+
+def planned(repository, tmp_path, name, *overrides):
+    run = load_config(repository / "configs" / f"{name}.yaml", [*overrides, "output.report=false"])
+    return run, run_plan(run, tmp_path / "out")
+
+
+def test_every_plan_that_ships_is_tried(repository):
+    assert {path.stem for path in (repository / "configs").glob("plan_*.yaml")} == set(COARSE)
+
+
+@pytest.mark.parametrize("name", sorted(COARSE))
+def test_a_plan_that_ships_arrives_within_its_limits(repository, tmp_path, name):
+    run, outcome = planned(repository, tmp_path, name, *COARSE[name])
+    assert outcome.ok, outcome.result["message"]
+    assert outcome.result["error"] < run.plan.tolerance
+    assert outcome.result["swing"] < run.plan.swing
+    for joint, own in outcome.result["joints"].items():
+        assert own["velocity"] <= run.plan.limits.velocity + 1e-3, joint
+        assert own["effort"] <= run.plan.limits.effort + 1e-3, joint
+    written = read_recording(outcome.folder / "recording.h5")
+    assert set(written.joints.names) == set(run.model.arms.joints)
+    # what is to arrive is among the points that were written, whether or not the system names it
+    group = written.points[0]
+    last = group.position[-1, group.names.index(run.plan.point)]
+    np.testing.assert_allclose(last, outcome.result["place"], atol=run.plan.tolerance)
+    message = json.loads((outcome.folder / "trajectory.json").read_text())
+    assert message["joint_names"] == list(written.joints.names)
+
+
+def test_the_middle_of_a_cable_stays_below_a_lid(repository, tmp_path):
+    quick = (*COARSE["plan_cable"], "plan.duration=0.6")
+    _, free = planned(repository, tmp_path / "free", "plan_cable", *quick, "plan.goal=place")
+    height = free.plan.points["cable:50%"][:, 2]
+    lid = 0.5 * (height.max() + free.plan.place[2])
+    assert height.max() > lid + 1e-3, "the free motion must pass the lid for this to be a test"
+    box = f"plan.box=[[0.0, -1.0, -0.6], [1.5, 1.0, {lid}]]"
+    _, kept = planned(repository, tmp_path / "kept", "plan_cable", *quick, box, "plan.inside=['cable:50%']")
+    assert kept.ok, kept.result["message"]
+    assert kept.plan.points["cable:50%"][:, 2].max() < lid + 2e-4
+
+
+def test_a_path_of_the_free_tip_is_followed_as_far_as_it_says(repository, tmp_path):
+    path = ("plan.goal=path", "plan.via=[[-0.01, 0.01, 0.02]]", "plan.duration=1.6", "plan.knots=8")
+    run, outcome = planned(repository, tmp_path, "plan_place", *COARSE["plan_place"], *path, "plan.tolerance=0.004")
+    assert outcome.ok, outcome.result["message"]
+    tip, t = outcome.plan.points["w_T3"], outcome.plan.t
+    halfway = tip[int(np.argmin(np.abs(t - 0.8)))] - tip[0]
+    off = np.linalg.norm(halfway - run.plan.via[0])
+    assert off <= outcome.result["off_path"] + 1e-9
+    assert outcome.result["off_path"] < 0.01
+    direct = 0.5 * (outcome.plan.place - tip[0])
+    assert np.linalg.norm(np.array(run.plan.via[0]) - direct) > 0.01, "the way there must not lead there by itself"
+
+
+def test_two_arms_bring_the_junction_to_a_place_and_keep_hold_of_it(repository, tmp_path):
+    name = "dual_arm_vision"
+    way = "plan={point: w_T1, shift: [0.03, 0.03, 0.0], duration: 0.8, settle: 0.3}"
+    run, outcome = planned(repository, tmp_path, name, "model.object.links=2", STIFF, way)
+    assert outcome.ok, outcome.result["message"]
+    assert outcome.result["swing"] < run.plan.swing
+    found = outcome.plan
+    # it begins where the recording does, and both arms take part
+    recorded = read_recording(recording_file(run.recordings.estimate[0])).joints
+    first = recorded.position[0, [recorded.names.index(name) for name in found.joints]]
+    np.testing.assert_allclose(found.position[0], first, atol=5e-3)
+    travel = dict(zip(found.joints, np.ptp(found.position, axis=0), strict=True))
+    assert min(max(v for k, v in travel.items() if k.startswith(side)) for side in ("left", "right")) > 0.01
+    system, theta = found.mover.step.system, found.mover.theta
+    names = [end for grasp in system.grasps for end in (grasp.holder, grasp.held)]
+    at = Points(system, names).at(found.state[:, : system.size], theta)[0].reshape(len(found.t), -1, 2, 3)
+    assert np.abs(at[:, :, 0] - at[:, :, 1]).max() < 1e-8
+
+
+def test_an_arm_that_holds_nothing_cannot_move_the_object(repository, tmp_path):
+    with pytest.raises(ConfigError, match=r"(?s)no arm moves 'w_T3'.*model\.grasp"):
+        planned(repository, tmp_path, "plan_place", "model.object.links=1", "model.grasp={}")
+
+
+@pytest.mark.parametrize(
+    ("limit", "words"),
+    [
+        ("effort=0.4", ("left_s1 at rest where the motion begins", "beyond its limit", "plan.limits.effort")),
+        ("spring_angle=0.001", ("at rest", "rad", "plan.limits.spring_angle")),
+    ],
+)
+def test_limits_that_rest_itself_passes_are_refused(repository, tmp_path, limit, words):
+    with pytest.raises(ConfigError) as caught:
+        planned(repository, tmp_path, "plan_place", *COARSE["plan_place"], f"plan.limits.{limit}")
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_a_real_cable_in_two_clamps_is_at_rest_before_it_is_moved(repository, tmp_path):
+    file = repository / "configs" / "deft_bdlo1.yaml"
+    run = load_config(file)
+    if not recording_file(run.recordings.estimate[0]).is_file():
+        pytest.skip("its recordings are not here")
+    way = "plan={point: p6, shift: [0.02, 0.02, 0.0], duration: 1.0, knots: 4}"
+    run, outcome = planned(repository, tmp_path, "deft_bdlo1", way)
+    assert outcome.ok, outcome.result["message"]
+    first = outcome.plan.state[0]
+    held = simulate(outcome.plan.mover.step, outcome.plan.mover.theta, first, 20).state[-1]
+    np.testing.assert_allclose(held, first, atol=1e-7)
+    np.testing.assert_allclose(outcome.plan.points["p6"][-1], outcome.result["place"], atol=run.plan.tolerance)
