@@ -1,0 +1,262 @@
+"""An experiment that was not made yet: what the configured sensors would tell of a motion of the arms.
+
+Two forms of one experiment. In the first the motion is known and the torques that it needs are measured, with a
+constant error each: one rollout tells all, so that it serves to search. The second is the estimation problem as it is
+configured, driven by these torques, and judges what was found.
+
+A camera's frames come when they come. What is counted is the information of its mean rate over the recording, spread
+evenly over the motion, so that no plan relies on a frame at a certain moment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.analysis.identifiability import carried
+from yid_ocp.analysis.layouts import TORQUE_STD
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.errors import ConfigError, DataError
+from yid_ocp.integrator.step import compile_alike
+from yid_ocp.parallel import map_threads
+from yid_ocp.planning.ends import first_rest, start_posture
+from yid_ocp.planning.mover import Mover
+from yid_ocp.planning.options import PlanOptions
+from yid_ocp.planning.path import SplinePath
+from yid_ocp.planning.points import Points
+from yid_ocp.problem import EstimationProblem, ProblemOptions
+from yid_ocp.problem.measurements import Measurements
+from yid_ocp.sensors.joints import EFFORT
+
+Array = NDArray[np.float64]
+
+PLANNED = "planned"
+EVEN_RATE = 20.0  # at least so often a slow sensor's information is spread over the motion [Hz]
+DIFFERENCE = 1e-5  # of an unknown of the motion [rad or m]
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """A motion to come, by the unknowns of the arms' splines, and what it would tell of parameters.
+
+    Attributes
+    ----------
+    configured : EstimationProblem
+        As the settings have it; its first recording says how the sensors are.
+    values : mapping of str to float
+        Parameters at which the sensitivities are taken.
+    mover : Mover
+        Of the same system with its arms prescribed.
+    names : tuple of str
+        Parameters that are free in the form with a known motion.
+    """
+
+    configured: EstimationProblem
+    values: Mapping[str, float]
+    mover: Mover
+    names: tuple[str, ...]
+
+    @staticmethod
+    def of(
+        problem: EstimationProblem, values: Mapping[str, float], options: PlanOptions, names: Sequence[str] = ()
+    ) -> Experiment:
+        """The experiment that a plan's settings describe.
+
+        Parameters
+        ----------
+        problem : EstimationProblem
+        values : mapping of str to float
+            Of any parameters; the others as the problem has them.
+        options : PlanOptions
+            Duration, spline, posture at the start: the first of the recording when absent.
+        names : sequence of str
+            Parameters that are free; those of the problem when empty.
+
+        Raises
+        ------
+        ConfigError
+            No joint moves, or clamps follow measured points.
+        ModelError
+            There is no rest to begin from.
+        """
+        system, episode = problem.system, problem.episodes[0]
+        if problem.options.clamps or not (system.driven or system.prescribed):
+            raise ConfigError(
+                "no joint moves whose motion could be planned"
+                if not problem.options.clamps
+                else "the ends of a cable follow measured points: there is no joint whose motion could be planned",
+                where="plan",
+                allowed="a robot whose arms move",
+                hint="set model.robot and model.arms",
+            )
+        moved = replace(system, driven=(), prescribed=(*system.driven, *system.prescribed))
+        step = problem.step if not system.driven else compile_alike(problem.step, moved)
+        known = dict(zip(system.parameters.names, map(float, problem.theta), strict=True)) | dict(values)
+        theta = step.system.parameters.vector(known)
+        first = np.array(episode.posture) if options.posture is None else start_posture(step.system, options.posture)
+        path = SplinePath(options.duration, options.knots)
+        mover = Mover(step, theta, first_rest(step, theta, first), path, options.settle)
+        return Experiment(problem, known, mover, tuple(names) or problem.free)
+
+    # -- what the sensors would record --------------------------------------------------------------------------------
+
+    def recording(self, w: Array) -> Recording:
+        """What the sensors would record of a motion without their noise, (K, nc) its unknowns; they state the noise."""
+        mover, base = self.mover, self.configured.episodes[0]
+        rollout, system = mover.roll(w), mover.step.system
+        if not rollout.status.ok:
+            raise DataError(f"the motion cannot be carried out: {rollout.status.message}", where="plan")
+        joints, duration = base.recording.joints, float(mover.times[-1])
+        assert joints is not None
+        period = float(np.median(np.diff(joints.t)))
+        t = period * np.arange(int(np.floor(duration / period + 1e-9)) + 1)
+        middles = mover.times[:-1] + 0.5 * mover.step.time_step
+        effort = np.stack([np.interp(t, middles, column) for column in rollout.effort.T], axis=1)
+        columns = [joints.names.index(name) for name in system.prescribed]
+        errors = base.errors
+        known = (joints.position_std, joints.effort_std, joints.effort_bias_std)
+        stds = [None if std is None else np.broadcast_to(std, (len(joints.names),))[columns] for std in known]
+        if errors is not None:
+            per_sample = errors.torque_std / min(1.0, np.sqrt(period / mover.step.time_step))
+            stds = [errors.angle_std, per_sample, errors.bias_std]
+        group = JointGroup(
+            system.prescribed, t, mover.first + mover.path.basis(t) @ w,
+            effort=None if joints.effort is None else effort, effort_kind="sample",
+            position_std=stds[0], effort_std=stds[1], effort_bias_std=stds[2],
+        )  # fmt: skip
+        q = rollout.state[:, : system.size]
+        groups = [self._seen(samples, q) for samples in base.samples if samples.sensor.width == 3]
+        return Recording(group, tuple(groups), "a planned motion", "yid_ocp plan", PLANNED)
+
+    def _seen(self, samples: Measurements, q: Array) -> PointGroup:
+        """Points of one sensor along the motion, their information per second as in the recording."""
+        mover, base = self.mover, self.configured.episodes[0]
+        sensor, spent = samples.sensor, base.grid.steps * base.grid.time_step
+        inverse = np.sum(np.where(samples.seen, samples.weight**2, 0.0), axis=0)
+        rate = float(np.max(np.count_nonzero(samples.seen, axis=0))) / spent
+        stride = max(1, round(1.0 / (mover.step.time_step * max(rate, EVEN_RATE))))
+        at = np.arange(0, len(mover.times), stride)
+        dense = 1.0 / (stride * mover.step.time_step)
+        with np.errstate(divide="ignore"):
+            std = np.sqrt(dense * spent / inverse)
+        places = self._frames[sensor.frames].at(q[at], mover.theta)[0]
+        places = np.where(np.isfinite(std), places, np.nan).reshape(len(at), -1, 3)
+        std = np.broadcast_to(np.where(np.isfinite(std), std, 1.0).reshape(-1, 3), places.shape)
+        group = next(g for g in base.recording.points if g.name == sensor.group)
+        return PointGroup(sensor.group, sensor.points, mover.times[at], places, std.copy(), group.sensor, pose=group.pose)
+
+    @cached_property
+    def _frames(self) -> dict[tuple[str, ...], Points]:
+        found = {s.sensor.frames for s in self.configured.episodes[0].samples if s.sensor.width == 3}
+        return {frames: Points(self.mover.step.system, frames) for frames in found}
+
+    def _options(self, **changes: object) -> ProblemOptions:
+        """The problem's options for the planned recording alone, which states its points' noise itself."""
+        options, base = self.configured.options, self.configured.episodes[0]
+        own = dict(options.sensors)
+        for samples in base.samples:
+            if samples.sensor.width == 3 and samples.sensor.group in own:
+                own[samples.sensor.group] = replace(own[samples.sensor.group], std=None)
+        named = {PLANNED: dict(options.recording_values[base.name])} if base.name in options.recording_values else {}
+        same = {"sensors": own, "duration": None, "known_start": {}, "recording_values": named}
+        return replace(options, **{**same, **changes})  # type: ignore[arg-type]
+
+    def as_configured(self, w: Array) -> EstimationProblem:
+        """The estimation problem of the planned recording, the same in all else, at `values`."""
+        problem = self.configured
+        return EstimationProblem(problem.step, [self.recording(w)], problem.free, self._options(), self.values)
+
+    # -- sensitivities with a known motion ----------------------------------------------------------------------------
+
+    @cached_property
+    def _known(self) -> EstimationProblem:
+        """The problem in which the motion is known and torques are measured."""
+        recording = self.recording(np.zeros((self.mover.path.unknowns, len(self.mover.joints))))
+        joints = recording.joints
+        assert joints is not None
+        if joints.effort is not None:
+            std = np.zeros(len(joints.names)) if joints.effort_std is None else np.asarray(joints.effort_std)
+            joints = replace(joints, effort_std=np.where(std > 0, std, TORQUE_STD))
+        options = self._options(huber_threshold=np.inf, weak_prior_factor=0.0, weighting="whitened")
+        free = [name for name in self.names if name in self.configured.free]
+        extra = [name for name in self.names if name not in free]
+        step = self.mover.step
+        made = EstimationProblem(
+            step, [replace(recording, joints=joints)], free, options, self.values, (), extra
+        )
+        return made.freeing((*free, *extra))
+
+    @cached_property
+    def _point(self) -> Array:
+        return carried(np.array([self.values[n] for n in self.names]), self.names, self._known)
+
+    @cached_property
+    def scale(self) -> Array:
+        """Size of every column's unknown: its value, its typical size where that is zero; offsets are in their std."""
+        x, typical = self._point, self._known.scales
+        return np.where(x != 0, np.abs(x), typical)
+
+    @cached_property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the columns of `rows`: parameters, other unknowns, constant errors of torques."""
+        return (*self._known.names, *(f"offset of {name}" for name in self._offset_std))
+
+    @cached_property
+    def _offset_std(self) -> dict[str, float]:
+        errors = self.configured.episodes[0].errors
+        if errors is None:
+            return {}
+        known = zip(self.configured.system.driven, errors.bias_std, strict=True)
+        return {name: float(std) for name, std in known if std > 0}
+
+    @cached_property
+    def _offsets(self) -> Array:
+        """Columns of the constant errors, in units of their standard deviations, priors below, (nr + no, no)."""
+        problem, std = self._known, self._offset_std
+        found = np.zeros((problem.rows.informing.stop, len(std)))
+        for samples, rows in zip(problem.episodes[0].samples, problem.rows.measurements[0], strict=True):
+            if samples.sensor.group != EFFORT:
+                continue
+            joint = np.broadcast_to(np.arange(samples.value.shape[1]), samples.value.shape)[samples.seen]
+            for i, (name, size) in enumerate(std.items()):
+                own = joint == samples.sensor.efforts.index(name)
+                found[rows, i] = np.where(own, size * samples.weight[samples.seen], 0.0)
+        return np.vstack([found, np.eye(len(std))])
+
+    def rows(self, w: Array) -> Array | None:
+        """Whitened sensitivity of all that is measured to relative changes of the unknowns, (nr, columns).
+
+        With rows for what is stated of nuisances beforehand; None where the motion cannot be carried out.
+        """
+        problem = self._known
+        episode = replace(problem.episodes[0], path=np.asarray(self.mover.positions(w)))
+        moved = problem.on([episode], ())
+        evaluation = moved.evaluate(self._point, warm=(self.mover.start.state[: self.mover.step.system.size],))
+        if not evaluation.ok:
+            return None
+        _, jacobian = moved.informing(evaluation)
+        jacobian = jacobian * self.scale
+        # what is known beforehand of the parameters themselves is not something that a sensor sees
+        own = [i for i, name in enumerate(problem.names) if name.split("[")[0] in self.names]
+        jacobian[np.ix_(np.arange(*problem.rows.stated_priors.indices(len(jacobian))), own)] = 0.0
+        offsets = self._offsets
+        whole = np.zeros((len(offsets), jacobian.shape[1] + offsets.shape[1]))
+        whole[: len(jacobian), : jacobian.shape[1]] = jacobian
+        whole[:, jacobian.shape[1] :] = offsets
+        return whole
+
+    def slopes(self, w: Array, rows: Array) -> Array | None:
+        """Derivative of `rows` by the unknowns of the motion by forward differences, (w.size, nr, columns)."""
+
+        def one(i: int) -> Array | None:
+            moved = w.ravel().copy()
+            moved[i] += DIFFERENCE
+            there = self.rows(moved.reshape(w.shape))
+            return None if there is None else (there - rows) / DIFFERENCE
+
+        found = map_threads(one, range(w.size))
+        return None if any(part is None for part in found) else np.array(found)
