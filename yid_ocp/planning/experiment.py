@@ -1,8 +1,10 @@
 """An experiment that was not made yet: what the configured sensors would tell of a motion of the arms.
 
-Two forms of one experiment. In the first the motion is known and the torques that it needs are measured, with a
-constant error each: one rollout tells all, so that it serves to search. The second is the estimation problem as it is
-configured, driven by these torques, and judges what was found.
+Two forms of one experiment. In the first the arms are moved and the torques that this needs are measured, with a
+constant error each: one rollout tells all, so that it serves to search. Where arms are driven their motion is known as
+far as sensors tell of it only; what an error of the motion does to all readings is taken at rest, once, and eliminated
+(Golub and Pereyra 1973, doi:10.1137/0710036). The second form is the estimation problem as it is configured, driven by
+these torques; it judges what was found.
 
 A camera's frames come when they come. What is counted is the information of its mean rate over the recording, spread
 evenly over the motion, so that no plan relies on a frame at a certain moment.
@@ -15,7 +17,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
+from scipy.interpolate import BSpline
 
 from yid_ocp.analysis.identifiability import carried
 from yid_ocp.analysis.layouts import TORQUE_STD
@@ -30,12 +34,15 @@ from yid_ocp.planning.path import SplinePath
 from yid_ocp.planning.points import Points
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.measurements import Measurements
-from yid_ocp.sensors.joints import EFFORT
+from yid_ocp.sensors.joints import EFFORT, POSITION
 
 Array = NDArray[np.float64]
 
 PLANNED = "planned"
 EVEN_RATE = 20.0  # at least so often a slow sensor's information is spread over the motion [Hz]
+FASTEST = 40.0  # samples of a point while a motion is searched: twice the band in which the motion may be wrong [Hz]
+BAND = 12.0  # up to which the motion may be wrong: beyond it efforts are smoothed away [Hz]
+WRONG = 1e-6  # of the arms' motion, by which its errors' effect is differenced [rad or m]
 DIFFERENCE = 1e-5  # of an unknown of the motion [rad or m]
 
 
@@ -104,8 +111,16 @@ class Experiment:
 
     # -- what the sensors would record --------------------------------------------------------------------------------
 
-    def recording(self, w: Array) -> Recording:
-        """What the sensors would record of a motion without their noise, (K, nc) its unknowns; they state the noise."""
+    def recording(self, w: Array, fastest: float = np.inf) -> Recording:
+        """What the sensors would record of a motion without their noise, which the recording states.
+
+        Parameters
+        ----------
+        w : ndarray, shape (K, nc)
+            Unknowns of the motion.
+        fastest : float
+            Points that are seen more often are recorded so often, their information per second kept [Hz].
+        """
         mover, base = self.mover, self.configured.episodes[0]
         rollout, system = mover.roll(w), mover.step.system
         if not rollout.status.ok:
@@ -129,16 +144,16 @@ class Experiment:
             position_std=stds[0], effort_std=stds[1], effort_bias_std=stds[2],
         )  # fmt: skip
         q = rollout.state[:, : system.size]
-        groups = [self._seen(samples, q) for samples in base.samples if samples.sensor.width == 3]
+        groups = [self._seen(samples, q, fastest) for samples in base.samples if samples.sensor.width == 3]
         return Recording(group, tuple(groups), "a planned motion", "yid_ocp plan", PLANNED)
 
-    def _seen(self, samples: Measurements, q: Array) -> PointGroup:
+    def _seen(self, samples: Measurements, q: Array, fastest: float) -> PointGroup:
         """Points of one sensor along the motion, their information per second as in the recording."""
         mover, base = self.mover, self.configured.episodes[0]
         sensor, spent = samples.sensor, base.grid.steps * base.grid.time_step
         inverse = np.sum(np.where(samples.seen, samples.weight**2, 0.0), axis=0)
         rate = float(np.max(np.count_nonzero(samples.seen, axis=0))) / spent
-        stride = max(1, round(1.0 / (mover.step.time_step * max(rate, EVEN_RATE))))
+        stride = max(1, round(1.0 / (mover.step.time_step * min(max(rate, EVEN_RATE), fastest))))
         at = np.arange(0, len(mover.times), stride)
         dense = 1.0 / (stride * mover.step.time_step)
         with np.errstate(divide="ignore"):
@@ -147,7 +162,9 @@ class Experiment:
         places = np.where(np.isfinite(std), places, np.nan).reshape(len(at), -1, 3)
         std = np.broadcast_to(np.where(np.isfinite(std), std, 1.0).reshape(-1, 3), places.shape)
         group = next(g for g in base.recording.points if g.name == sensor.group)
-        return PointGroup(sensor.group, sensor.points, mover.times[at], places, std.copy(), group.sensor, pose=group.pose)
+        return PointGroup(
+            sensor.group, sensor.points, mover.times[at], places, std.copy(), group.sensor, pose=group.pose
+        )
 
     @cached_property
     def _frames(self) -> dict[tuple[str, ...], Points]:
@@ -175,19 +192,22 @@ class Experiment:
     @cached_property
     def _known(self) -> EstimationProblem:
         """The problem in which the motion is known and torques are measured."""
-        recording = self.recording(np.zeros((self.mover.path.unknowns, len(self.mover.joints))))
+        recording = self.recording(np.zeros((self.mover.path.unknowns, len(self.mover.joints))), FASTEST)
         joints = recording.joints
         assert joints is not None
+        sensors = dict(self._options().sensors)
         if joints.effort is not None:
             std = np.zeros(len(joints.names)) if joints.effort_std is None else np.asarray(joints.effort_std)
             joints = replace(joints, effort_std=np.where(std > 0, std, TORQUE_STD))
-        options = self._options(huber_threshold=np.inf, weak_prior_factor=0.0, weighting="whitened")
+        if self.configured.system.driven:
+            # how wrong the motion may be is said by `_blur`
+            joints = replace(joints, position_std=None)
+            sensors.pop(POSITION, None)
+        options = self._options(huber_threshold=np.inf, weak_prior_factor=0.0, weighting="whitened", sensors=sensors)
         free = [name for name in self.names if name in self.configured.free]
         extra = [name for name in self.names if name not in free]
         step = self.mover.step
-        made = EstimationProblem(
-            step, [replace(recording, joints=joints)], free, options, self.values, (), extra
-        )
+        made = EstimationProblem(step, [replace(recording, joints=joints)], free, options, self.values, (), extra)
         return made.freeing((*free, *extra))
 
     @cached_property
@@ -247,7 +267,46 @@ class Experiment:
         whole = np.zeros((len(offsets), jacobian.shape[1] + offsets.shape[1]))
         whole[: len(jacobian), : jacobian.shape[1]] = jacobian
         whole[:, jacobian.shape[1] :] = offsets
+        vectors, taken = self._blur
+        data = len(vectors)
+        whole[:data] -= vectors @ (taken[:, None] * (vectors.T @ whole[:data]))
         return whole
+
+    @cached_property
+    def _blur(self) -> tuple[Array, Array]:
+        """Directions of the data that errors of a driven arm's motion blur, and how much of each is lost, 0 to 1."""
+        problem, mover, errors = self._known, self.mover, self.configured.episodes[0].errors
+        data = problem.rows.data.stop
+        if not self.configured.system.driven:
+            return np.zeros((data, 0)), np.zeros(0)
+        h, nodes, nc = mover.step.time_step, len(mover.times), len(mover.joints)
+        waves = _splines(mover.times, BAND)
+        path = np.asarray(mover.positions(np.zeros((mover.path.unknowns, nc))))
+
+        def residual(i: int) -> Array:
+            moved = path.copy()
+            if i >= 0:
+                moved[:, i % nc] += WRONG * waves[:, i // nc]
+            found = problem.on([replace(problem.episodes[0], path=moved)], ())
+            evaluation = found.evaluate(self._point, False, (mover.start.state[: mover.step.system.size],))
+            if not evaluation.ok:
+                raise DataError(f"the motion cannot be carried out: {evaluation.message}", where="plan")
+            return evaluation.residual[problem.rows.data]
+
+        still = residual(-1)
+        blur = np.stack(
+            [(found - still) / WRONG for found in map_threads(residual, range(nc * waves.shape[1]))], axis=1
+        )
+        known = blur.T @ blur
+        if errors is not None and errors.encoders:
+            told = (waves.T @ waves)[:, None, :, None] * np.diag(errors.angle_std**-2 * errors.spread**-1)[
+                None, :, None, :
+            ]
+            known += told.reshape(known.shape)
+        values, vectors = scipy.linalg.eigh(known)
+        kept = values > 1e-10 * values[-1]
+        u, s, _ = np.linalg.svd(blur @ (vectors[:, kept] / np.sqrt(values[kept])), full_matrices=False)
+        return u, 1.0 - np.sqrt(np.clip(1.0 - s**2, 0.0, 1.0))
 
     def slopes(self, w: Array, rows: Array) -> Array | None:
         """Derivative of `rows` by the unknowns of the motion by forward differences, (w.size, nr, columns)."""
@@ -260,3 +319,11 @@ class Experiment:
 
         found = map_threads(one, range(w.size))
         return None if any(part is None for part in found) else np.array(found)
+
+
+def _splines(times: Array, band: float) -> Array:
+    """Cubic splines from rest up to a frequency, shape (N + 1, count)."""
+    inner = np.linspace(times[0], times[-1], max(2, round((times[-1] - times[0]) * 2 * band)))
+    knots = np.concatenate([np.full(3, inner[0]), inner, np.full(3, inner[-1])])
+    # the first posture is known
+    return np.asarray(BSpline.design_matrix(np.clip(times, inner[0], inner[-1]), knots, 3).toarray()[:, 1:])
