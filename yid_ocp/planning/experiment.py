@@ -21,11 +21,10 @@ import scipy.linalg
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
-from yid_ocp.analysis.identifiability import carried
 from yid_ocp.analysis.layouts import TORQUE_STD
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
-from yid_ocp.errors import ConfigError, DataError
-from yid_ocp.integrator.step import compile_alike
+from yid_ocp.errors import ConfigError, DataError, SolverError
+from yid_ocp.integrator.step import Step, compile_alike
 from yid_ocp.parallel import map_threads
 from yid_ocp.planning.ends import first_rest, start_posture
 from yid_ocp.planning.mover import Mover
@@ -33,6 +32,7 @@ from yid_ocp.planning.options import PlanOptions
 from yid_ocp.planning.path import SplinePath
 from yid_ocp.planning.points import Points
 from yid_ocp.problem import EstimationProblem, ProblemOptions
+from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.sensors.joints import EFFORT, POSITION
 
@@ -128,7 +128,7 @@ class Experiment:
         joints, duration = base.recording.joints, float(mover.times[-1])
         assert joints is not None
         period = float(np.median(np.diff(joints.t)))
-        t = period * np.arange(int(np.floor(duration / period + 1e-9)) + 1)
+        t = np.asarray(period * np.arange(int(np.floor(duration / period + 1e-9)) + 1), float)
         middles = mover.times[:-1] + 0.5 * mover.step.time_step
         effort = np.stack([np.interp(t, middles, column) for column in rollout.effort.T], axis=1)
         columns = [joints.names.index(name) for name in system.prescribed]
@@ -182,17 +182,58 @@ class Experiment:
         same = {"sensors": own, "duration": None, "known_start": {}, "recording_values": named}
         return replace(options, **{**same, **changes})  # type: ignore[arg-type]
 
+    @property
+    def still(self) -> Array:
+        """Unknowns with which nothing moves, shape (K, nc)."""
+        return np.zeros((self.mover.path.unknowns, len(self.mover.joints)))
+
     def as_configured(self, w: Array) -> EstimationProblem:
         """The estimation problem of the planned recording, the same in all else, at `values`."""
-        problem = self.configured
-        return EstimationProblem(problem.step, [self.recording(w)], problem.free, self._options(), self.values)
+        return self._problem(self.configured.step, self.recording(w), self._options())
+
+    def _problem(self, step: Step, recording: Recording, options: ProblemOptions) -> EstimationProblem:
+        free = [name for name in self.names if name in self.configured.free]
+        extra = [name for name in self.names if name not in free]
+        return EstimationProblem(step, [recording], free, options, self.values, (), extra).freeing(self.names)
+
+    def judged(self, w: Array) -> Array:
+        """Like `rows`, of the configured problem: of `columns` but the offsets, which its innovations know.
+
+        Raises
+        ------
+        SolverError
+            The motion cannot be followed by its torques.
+        """
+        return self._weighted(self.as_configured(w))
+
+    @property
+    def recorded(self) -> Array:
+        """The same of the recordings that there are."""
+        return self._weighted(self.configured.at(self.values).freeing(self.names))
+
+    def _weighted(self, problem: EstimationProblem) -> Array:
+        problem = problem.weighted_at(problem.start)
+        evaluation = problem.evaluate(problem.start)
+        if not evaluation.ok:
+            raise SolverError(f"the motion cannot be followed by its torques: {evaluation.message}")
+        return self._relative(problem, evaluation)
+
+    def _relative(self, problem: EstimationProblem, evaluation: Evaluation) -> Array:
+        """Sensitivities to relative changes, without what is known beforehand of the parameters themselves.
+
+        That is not something that a sensor sees.
+        """
+        jacobian = problem.informing(evaluation)[1] * _sizes(problem)
+        own = np.array([name.split("[")[0] in self.names for name in problem.names])
+        jacobian[problem.rows.stated_priors] = np.where(own, 0.0, jacobian[problem.rows.stated_priors])
+        return jacobian
 
     # -- sensitivities with a known motion ----------------------------------------------------------------------------
 
     @cached_property
     def _known(self) -> EstimationProblem:
         """The problem in which the motion is known and torques are measured."""
-        recording = self.recording(np.zeros((self.mover.path.unknowns, len(self.mover.joints))), FASTEST)
+        recording = self.recording(self.still, FASTEST)
         joints = recording.joints
         assert joints is not None
         sensors = dict(self._options().sensors)
@@ -204,21 +245,12 @@ class Experiment:
             joints = replace(joints, position_std=None)
             sensors.pop(POSITION, None)
         options = self._options(huber_threshold=np.inf, weak_prior_factor=0.0, weighting="whitened", sensors=sensors)
-        free = [name for name in self.names if name in self.configured.free]
-        extra = [name for name in self.names if name not in free]
-        step = self.mover.step
-        made = EstimationProblem(step, [replace(recording, joints=joints)], free, options, self.values, (), extra)
-        return made.freeing((*free, *extra))
-
-    @cached_property
-    def _point(self) -> Array:
-        return carried(np.array([self.values[n] for n in self.names]), self.names, self._known)
+        return self._problem(self.mover.step, replace(recording, joints=joints), options)
 
     @cached_property
     def scale(self) -> Array:
-        """Size of every column's unknown: its value, its typical size where that is zero; offsets are in their std."""
-        x, typical = self._point, self._known.scales
-        return np.where(x != 0, np.abs(x), typical)
+        """What a relative change of each of the problem's unknowns refers to, in the order of `columns`."""
+        return _sizes(self._known)
 
     @cached_property
     def columns(self) -> tuple[str, ...]:
@@ -255,14 +287,10 @@ class Experiment:
         problem = self._known
         episode = replace(problem.episodes[0], path=np.asarray(self.mover.positions(w)))
         moved = problem.on([episode], ())
-        evaluation = moved.evaluate(self._point, warm=(self.mover.start.state[: self.mover.step.system.size],))
+        evaluation = moved.evaluate(moved.start, warm=(self.mover.start.state[: self.mover.step.system.size],))
         if not evaluation.ok:
             return None
-        _, jacobian = moved.informing(evaluation)
-        jacobian = jacobian * self.scale
-        # what is known beforehand of the parameters themselves is not something that a sensor sees
-        own = [i for i, name in enumerate(problem.names) if name.split("[")[0] in self.names]
-        jacobian[np.ix_(np.arange(*problem.rows.stated_priors.indices(len(jacobian))), own)] = 0.0
+        jacobian = self._relative(moved, evaluation)
         offsets = self._offsets
         whole = np.zeros((len(offsets), jacobian.shape[1] + offsets.shape[1]))
         whole[: len(jacobian), : jacobian.shape[1]] = jacobian
@@ -279,16 +307,16 @@ class Experiment:
         data = problem.rows.data.stop
         if not self.configured.system.driven:
             return np.zeros((data, 0)), np.zeros(0)
-        h, nodes, nc = mover.step.time_step, len(mover.times), len(mover.joints)
+        nc = len(mover.joints)
         waves = _splines(mover.times, BAND)
-        path = np.asarray(mover.positions(np.zeros((mover.path.unknowns, nc))))
+        path = np.asarray(mover.positions(self.still))
 
         def residual(i: int) -> Array:
             moved = path.copy()
             if i >= 0:
                 moved[:, i % nc] += WRONG * waves[:, i // nc]
             found = problem.on([replace(problem.episodes[0], path=moved)], ())
-            evaluation = found.evaluate(self._point, False, (mover.start.state[: mover.step.system.size],))
+            evaluation = found.evaluate(found.start, False, (mover.start.state[: mover.step.system.size],))
             if not evaluation.ok:
                 raise DataError(f"the motion cannot be carried out: {evaluation.message}", where="plan")
             return evaluation.residual[problem.rows.data]
@@ -319,6 +347,11 @@ class Experiment:
 
         found = map_threads(one, range(w.size))
         return None if any(part is None for part in found) else np.array(found)
+
+
+def _sizes(problem: EstimationProblem) -> Array:
+    """Value of every unknown, its typical size where that is zero."""
+    return np.where(problem.start != 0, np.abs(problem.start), problem.scales)
 
 
 def _splines(times: Array, band: float) -> Array:
