@@ -129,8 +129,11 @@ class Experiment:
         assert joints is not None
         period = float(np.median(np.diff(joints.t)))
         t = np.asarray(period * np.arange(int(np.floor(duration / period + 1e-9)) + 1), float)
-        middles = mover.times[:-1] + 0.5 * mover.step.time_step
-        effort = np.stack([np.interp(t, middles, column) for column in rollout.effort.T], axis=1)
+        sums = np.vstack([np.zeros((1, len(mover.joints))), np.cumsum(rollout.effort, axis=0)]) * mover.step.time_step
+        edges = [np.stack([np.interp(at, mover.times, total) for total in sums.T], axis=1) for at in (t, t + period)]
+        effort = (edges[1] - edges[0]) / period
+        # nothing is known of what comes after
+        effort[t + period > duration + 1e-9] = rollout.effort[-1]
         columns = [joints.names.index(name) for name in system.prescribed]
         errors = base.errors
         known = (joints.position_std, joints.effort_std, joints.effort_bias_std)
@@ -140,7 +143,7 @@ class Experiment:
             stds = [errors.angle_std, per_sample, errors.bias_std]
         group = JointGroup(
             system.prescribed, t, mover.first + mover.path.basis(t) @ w,
-            effort=None if joints.effort is None else effort, effort_kind="sample",
+            effort=None if joints.effort is None else effort, effort_kind="mean",
             position_std=stds[0], effort_std=stds[1], effort_bias_std=stds[2],
         )  # fmt: skip
         q = rollout.state[:, : system.size]

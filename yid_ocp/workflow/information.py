@@ -68,7 +68,7 @@ def informed(run: Run, progress: Progress) -> tuple[InformationPlan, dict[str, A
     source: dict[str, Any] = {"run": None, "parameters": free}
     if run.plan.run is not None:
         result, folder = run_result(run, ("solve", "diagnose"))
-        found, sizes = _found(result)
+        found, sizes = found_values(result)
         known = {name: value for name, value in found.items() if name in problem.system.parameters}
         source = {"run": str(folder), "parameters": free | known}
     with located(run, "plan"):
@@ -76,8 +76,8 @@ def informed(run: Run, progress: Progress) -> tuple[InformationPlan, dict[str, A
     return plan, source
 
 
-def _found(result: Mapping[str, Any]) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
-    """Parameters of a result, and sizes of effects where it is a diagnosis."""
+def found_values(result: Mapping[str, Any]) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
+    """Parameters of a `yid-solve/1` or `yid-diagnosis/1`, and in the latter sizes of effects, as people read them."""
     if "parameters" in result:
         return {name: entry["value"] for name, entry in result["parameters"].items()}, {}
     sizes = {
