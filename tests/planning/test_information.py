@@ -163,10 +163,14 @@ def made_up(rows, limits, size, low, high):
 
     mover = SimpleNamespace(path=SimpleNamespace(unknowns=size), roll=lambda w, slopes=False: w)
     experiment = SimpleNamespace(mover=mover, rows=rows, slopes=slopes, still=np.zeros((size, 1)))
-    matrix, upper = limits
+    values, upper = limits
     bounded = [SimpleNamespace(unit=np.ones(len(upper)), lower=-np.inf * np.ones(len(upper)), upper=np.array(upper))]
-    kept = SimpleNamespace(bounded=bounded, limits=lambda rolled, w: Values(matrix @ w.ravel(), matrix))
+    kept = SimpleNamespace(bounded=bounded, limits=lambda rolled, w: Values(*values(w.ravel())))
     return Search(experiment, kept, Precision((0, 1), (0, 1)), np.array([low]), np.array([high]))
+
+
+def straight(matrix):
+    return lambda w: (np.array(matrix) @ w, np.array(matrix))
 
 
 def line(w):
@@ -175,7 +179,7 @@ def line(w):
 
 
 def test_a_straight_line_is_read_at_the_ends_of_its_range():
-    search = made_up(line, (np.zeros((1, 2)), [1.0]), 2, -1.0, 1.5)
+    search = made_up(line, (straight([[0.0, 0.0]]), [1.0]), 2, -1.0, 1.5)
     found = search.improve(np.array([[0.1], [-0.05]]), 50, lambda _: None)
     assert found.finished
     np.testing.assert_allclose(np.sort(found.w.ravel()), [-1.0, 1.5], atol=1e-6)
@@ -184,10 +188,19 @@ def test_a_straight_line_is_read_at_the_ends_of_its_range():
 
 def test_a_limit_is_kept_and_used_up():
     # the places are no more than 0.8 apart
-    search = made_up(line, (np.array([[1.0, -1.0], [-1.0, 1.0]]), [0.8, 0.8]), 2, -1.0, 1.5)
+    search = made_up(line, (straight([[1.0, -1.0], [-1.0, 1.0]]), [0.8, 0.8]), 2, -1.0, 1.5)
     found = search.improve(np.array([[0.1], [-0.05]]), 50, lambda _: None)
     assert abs(float(np.diff(found.w.ravel())[0])) == pytest.approx(0.8, abs=5e-3)
     assert search.passed(found.w) <= 0.0
+
+
+def test_a_curved_limit_is_kept_on_the_way_and_in_the_end():
+    # the places lie in a circle of radius 0.6
+    search = made_up(line, (lambda w: (np.array([w @ w]), 2 * w[None, :]), [0.36]), 2, -1.0, 1.5)
+    for rounds in (1, 2, 50):
+        found = search.improve(np.array([[0.1], [-0.05]]), rounds, lambda _: None)
+        assert search.passed(found.w) <= 0.0
+    np.testing.assert_allclose(np.sort(found.w.ravel()), [-0.6 / 2**0.5, 0.6 / 2**0.5], atol=5e-3)
 
 
 # -- plans ------------------------------------------------------------------------------------------------------------

@@ -29,7 +29,7 @@ class Criterion(Protocol):
 
 def _prior(columns: int, bounded: Sequence[int]) -> Array:
     """Information beforehand: of parameters that of `WEAK`, of all else next to none (theirs stands in the rows)."""
-    prior = np.full(columns, 1e-12)
+    prior = np.full(columns, 1e-6)
     prior[list(bounded)] = WEAK**-2
     return prior
 
