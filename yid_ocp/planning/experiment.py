@@ -33,6 +33,7 @@ from yid_ocp.planning.path import SplinePath
 from yid_ocp.planning.points import Points
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.evaluation import Evaluation
+from yid_ocp.problem.low_pass import LowPass
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.sensors.joints import EFFORT, POSITION
 
@@ -107,6 +108,7 @@ class Experiment:
         first = np.array(episode.posture) if options.posture is None else start_posture(step.system, options.posture)
         path = SplinePath(options.duration, options.knots)
         mover = Mover(step, theta, first_rest(step, theta, first), path, options.settle)
+        _check_long_enough(problem, float(mover.times[-1]))
         return Experiment(problem, known, mover, tuple(names) or problem.free)
 
     # -- what the sensors would record --------------------------------------------------------------------------------
@@ -350,6 +352,19 @@ class Experiment:
 
         found = map_threads(one, range(w.size))
         return None if any(part is None for part in found) else np.array(found)
+
+
+def _check_long_enough(problem: EstimationProblem, duration: float) -> None:
+    """Refuse a motion of whose efforts the low-pass filter leaves nothing."""
+    joints, low_pass = problem.episodes[0].recording.joints, LowPass(problem.options.path_cutoff)
+    least = 2.0 * low_pass.settling + low_pass.stride(problem.step.time_step) * problem.step.time_step
+    if joints is not None and joints.effort is not None and duration <= least:
+        raise ConfigError(
+            f"{duration:g} s are too short to measure efforts that are smoothed at {low_pass.cutoff:g} Hz",
+            where="plan.duration",
+            allowed=f"more than {least:.2g} s together with plan.settle",
+            hint="take a longer plan.duration, or raise problem.path_cutoff",
+        )
 
 
 def _sizes(problem: EstimationProblem) -> Array:
