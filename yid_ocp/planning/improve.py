@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 FIRST_RADIUS, WIDEST = 0.05, 0.4  # of the trust region, for every unknown of the motion [rad or m]
 LEAST_RADIUS = 1e-3
-INNER = 40  # iterations of the inner search
+INNER = 100  # iterations of the inner search
 SLACK = 1e-3  # by which the linear limits are tighter, in parts of the limits
 GAINED = 1e-2  # of the criterion [nat]: less in a round is the end
 CORRECTIONS = 2  # of the linear limits where a step passes the true ones
@@ -122,7 +122,10 @@ class Search:
                     break
                 radius = max(0.3 * radius, 0.5 * LEAST_RADIUS)
             told(f"round {done}: {value - first:.3g} nat beyond the start")
-            finished = gained < GAINED
+            # a motion from which no step gains anything at all is too rough to be improved, as where the object snaps
+            finished = gained < GAINED and (done > 1 or gained > 0.0)
+            if gained == 0.0:
+                break
         return Improved(w, first, value, finished, done)
 
     def _step(self, rows: Array, slopes: Array, w: Array, bounded: tuple[Array, Array], radius: float) -> Array:
@@ -151,20 +154,19 @@ class Search:
 
     def _inner(self, rows: Array, slopes: Array, w: Array, normal: Array, room: Array, radius: float) -> Array:
         """Maximise the criterion of linear sensitivities over steps with normal @ step + room >= 0."""
-        flat = slopes.reshape(len(slopes), -1)
+        # in parts of the radius, so that the first step of the inner search is neither tiny nor far
+        flat, normal = radius * slopes.reshape(len(slopes), -1), radius * normal
 
         def cost(x: Array) -> tuple[float, Array]:
             found, by_rows = self.criterion.value(rows + (x @ flat).reshape(rows.shape))
             return -found, -(flat @ by_rows.ravel())
 
-        low = np.maximum(-radius, np.minimum(self.lower - w.ravel(), 0.0))
-        high = np.minimum(radius, np.maximum(self.upper - w.ravel(), 0.0))
-        # a point where all slopes vanish by symmetry is left to one side
-        begin = np.clip(np.zeros(w.size), low, high)
+        low = np.maximum(-1.0, np.minimum(self.lower - w.ravel(), 0.0) / radius)
+        high = np.minimum(1.0, np.maximum(self.upper - w.ravel(), 0.0) / radius)
         constraints = [{"type": "ineq", "fun": lambda x: normal @ x + room, "jac": lambda x: normal}]
         found = minimize(
-            cost, begin, jac=True, method="SLSQP", bounds=list(zip(low, high, strict=True)),
+            cost, np.zeros(w.size), jac=True, method="SLSQP", bounds=list(zip(low, high, strict=True)),
             constraints=constraints if len(room) else (), options={"maxiter": INNER, "ftol": 1e-4},
         )  # fmt: skip
-        step = np.clip(found.x, low, high)
+        step = radius * np.clip(found.x, low, high)
         return step if np.all(np.isfinite(step)) else np.zeros_like(step)

@@ -32,14 +32,14 @@ Array = NDArray[np.float64]
 
 UNSEEN = 1e-2
 """Standard deviations by which no reading moves when a parameter changes by its whole value: nothing sees it."""
-LARGE = 0.3
+FIRST = 0.05
 """Size of the random motions from which a search begins, before limits make them smaller [rad or m]."""
 AT_LIMIT = 0.98
 """Part of a limit from which it counts as reached."""
 SMALL = 0.05
 """Largest unknown of a motion in which it is asked what else could see a parameter [rad or m]."""
-ROUNDING = 1e-6
-"""Motion of a point that counts as none, for a change of a parameter by its whole value [m]."""
+VISIBLE = 1e-4
+"""Motion of a point that a camera may see, for a change of a parameter by its whole value [m]."""
 
 
 @dataclass(frozen=True)
@@ -359,7 +359,7 @@ def _check_room(search: Search, limits: Rows) -> None:
 
 
 def _random(experiment: Experiment, seed: int) -> Array:
-    return LARGE * np.random.default_rng(seed).normal(size=experiment.still.shape)
+    return FIRST * np.random.default_rng(seed).normal(size=experiment.still.shape)
 
 
 # -- what nothing sees ------------------------------------------------------------------------------------------------
@@ -412,14 +412,14 @@ def _would_see(experiment: Experiment, name: str, w: Array) -> str:
     moved = size * np.einsum("tiq,tq->ti", by_q, rolled.by_state[:, :n, 0]).reshape(len(by_q), -1, 3)
     farthest = np.linalg.norm(moved, axis=2).max(0)
     best = int(np.argmax(farthest))
-    if not farthest[best] > ROUNDING:
-        return (
-            f"{name} moves no point of the object in a random motion of {SMALL:g} rad, as nothing loads it: take "
-            "another grasp (`identifiability --what-if` tries them), or fix it"
-        )
+    moved_by = (
+        f"{1e3 * farthest[best]:.2g} mm in a random motion of {SMALL:g} rad, with {name} changed by its whole value"
+    )
+    if farthest[best] > VISIBLE:
+        return f"let a camera see {seen[best].words}: it moves by {moved_by}"
     return (
-        f"let a camera see {seen[best].words}: with {name} changed by its whole value it moves by "
-        f"{1e3 * farthest[best]:.2g} mm, in a random motion of {SMALL:g} rad"
+        f"no point of the object moves by more than {moved_by}: take another grasp, which loads it "
+        "(`identifiability --what-if` tries some), or fix it"
     )
 
 
@@ -449,11 +449,11 @@ def _plan(
     )
     parameters, open_words = _parameters(experiment, w)
     distances = {} if not isinstance(criterion, Separation) else _distances(experiment, criterion, rivals, w)
-    message = (
-        "the motion was found"
-        if found[best].finished
-        else (f"the search was stopped after {found[best].rounds} rounds; raise plan.iterations")
-    )
+    message = "the motion was found"
+    if found[best].value == found[best].first:
+        message = "the motions are too rough to be improved; lower plan.limits, or give another plan.posture"
+    elif not found[best].finished:
+        message = f"the search was stopped after {found[best].rounds} rounds; raise plan.iterations"
     lost = {name: _would_see(experiment, name, w) for name in unseen if name in experiment.configured.free}
     return InformationPlan(
         experiment.mover, w, experiment.mover.roll(w), found[best].finished, message, parameters, distances,

@@ -208,7 +208,9 @@ def information_sentences(result: Mapping[str, Any]) -> list[str]:
     ]
     reached = [f"{what} of {', '.join(names)}" for what, names in result["limits_reached"].items()]
     said.append(f"what limits it: {'; '.join(reached)}" if reached else "it reaches no limit")
-    said += [f"{name}: no motion: no sensor sees it to first order; {what}" for name, what in result["unseen"].items()]
+    said += [f"{name}: no motion, no sensor sees it to first order; {what}" for name, what in result["unseen"].items()]
+    left = [words for words in result["open"] if not words.startswith(tuple(f"{name} is" for name in result["unseen"]))]
+    said += [f"left open by this motion: {words}" for words in left]
     if result["from"]["run"] is None:
         said.append("the parameters are those of the configuration; where the true ones differ, so does what is told")
     return said

@@ -149,11 +149,14 @@ def as_recording(run: Run, found: Plan | InformationPlan) -> Recording:
         effort_std=EFFORT_STD, clock="nominal",
     )  # fmt: skip
     names = tuple(found.points)
-    position = np.stack([found.points[name] for name in names], axis=1)
-    points = PointGroup("points_planned", names, found.t, position, np.full(position.shape, POINT_STD), sensor="plan")
+    points: tuple[PointGroup, ...] = ()
+    if names:
+        position = np.stack([found.points[name] for name in names], axis=1)
+        std = np.full(position.shape, POINT_STD)
+        points = (PointGroup("points_planned", names, found.t, position, std, sensor="plan"),)
     truth = dict(zip(found.mover.step.system.parameters.names, map(float, found.mover.theta), strict=True))
     text = f"{run.description} Planned motion, goal {run.plan.goal}.".strip()
-    return validate(Recording(joints, (points,), text, "yid_ocp plan", "recording", truth=truth))
+    return validate(Recording(joints, points, text, "yid_ocp plan", "recording", truth=truth))
 
 
 def motion_result(run: Run, found: Plan | InformationPlan, source: dict[str, Any]) -> dict[str, Any]:
