@@ -212,7 +212,8 @@ def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():
     units = {"rmse": {}, "unit": {}}
     result = {
         "summary": "The gap is real.", "gap": {"before": units, "after": units}, "verdict": "unknown",
-        "seconds": {"fit": 1.0}, "which": [entry | {"p_value": 0.0}, entry | {"location": "T2", "p_value": 0.034}],
+        "next_plan": None, "seconds": {"fit": 1.0},
+        "which": [entry | {"p_value": 0.0}, entry | {"location": "T2", "p_value": 0.034}],
     }  # fmt: skip
     lines = terminal.diagnose_summary(result)
     assert line_of(lines, "kelvin_voigt@T1").endswith(" < 1e-12")

@@ -29,6 +29,7 @@ Array = NDArray[np.float64]
 
 FIRST_RADIUS, WIDEST = 0.05, 0.4  # of the trust region, for every unknown of the motion [rad or m]
 LEAST_RADIUS = 1e-3
+STATIONARY = 1e-9  # step in the linear picture that counts as none [rad or m]
 INNER = 100  # iterations of the inner search
 SLACK = 1e-3  # by which the linear limits are tighter, in parts of the limits
 GAINED = 1e-2  # of the criterion [nat]: less in a round is the end
@@ -111,9 +112,12 @@ class Search:
             if slopes is None or limits.slope is None:
                 break
             bounded = limits.value / self._unit, limits.slope / self._unit[:, None]
-            gained, small = 0.0, False
+            gained, small, still = 0.0, False, False
             while not small:
                 step = self._step(rows, slopes, w, bounded, radius)
+                still = not np.any(np.abs(step) > STATIONARY)
+                if still:
+                    break
                 there, its = self.value(w + step)
                 small = radius <= LEAST_RADIUS
                 if its is not None and there > value:
@@ -123,7 +127,7 @@ class Search:
                 radius = max(0.3 * radius, 0.5 * LEAST_RADIUS)
             told(f"round {done}: {value - first:.3g} nat beyond the start")
             # a motion from which no step gains anything at all is too rough to be improved, as where the object snaps
-            finished = gained < GAINED and (done > 1 or gained > 0.0)
+            finished = gained < GAINED and (done > 1 or gained > 0.0 or still)
             if gained == 0.0:
                 break
         return Improved(w, first, value, finished, done)

@@ -32,8 +32,10 @@ Array = NDArray[np.float64]
 
 UNSEEN = 1e-2
 """Standard deviations by which no reading moves when a parameter changes by its whole value: nothing sees it."""
-FIRST = 0.05
+FIRST = 0.3
 """Size of the random motions from which a search begins, before limits make them smaller [rad or m]."""
+ROUGH = 0.05
+"""Part of itself by which a sensitivity may change with a ten-thousandth of the motion, or the object snaps."""
 AT_LIMIT = 0.98
 """Part of a limit from which it counts as reached."""
 SMALL = 0.05
@@ -222,7 +224,7 @@ def informative(
     lower, upper = (side - experiment.mover.first for side in joint_range(experiment.mover.step.system))
     search = Search(experiment, limits, criterion, lower, upper)
     _check_room(search, limits)
-    begins = [search.within(_random(experiment, options.seed + i)) for i in range(options.starts)]
+    begins = [_smooth(experiment, search.within(_random(experiment, options.seed + i))) for i in range(options.starts)]
     if not any(np.any(begin) for begin in begins):
         raise ConfigError("the limits leave no motion", where="plan.limits", hint="widen plan.limits")
     unseen = _unseen(experiment, begins)
@@ -362,6 +364,16 @@ def _random(experiment: Experiment, seed: int) -> Array:
     return FIRST * np.random.default_rng(seed).normal(size=experiment.still.shape)
 
 
+def _smooth(experiment: Experiment, w: Array) -> Array:
+    """The motion, made smaller until what it tells changes smoothly with it."""
+    for _ in range(10):
+        rows, there = experiment.rows(w), experiment.rows((1.0 + 1e-4) * w)
+        if rows is not None and there is not None and np.linalg.norm(there - rows) <= ROUGH * np.linalg.norm(rows):
+            return w
+        w = 0.5 * w
+    return w
+
+
 # -- what nothing sees ------------------------------------------------------------------------------------------------
 
 
@@ -450,7 +462,7 @@ def _plan(
     parameters, open_words = _parameters(experiment, w)
     distances = {} if not isinstance(criterion, Separation) else _distances(experiment, criterion, rivals, w)
     message = "the motion was found"
-    if found[best].value == found[best].first:
+    if found[best].value == found[best].first and not found[best].finished:
         message = "the motions are too rough to be improved; lower plan.limits, or give another plan.posture"
     elif not found[best].finished:
         message = f"the search was stopped after {found[best].rounds} rounds; raise plan.iterations"
