@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -23,6 +23,7 @@ from yid_ocp.planning.experiment import Experiment
 from yid_ocp.planning.improve import Improved, Search
 from yid_ocp.planning.mover import Mover
 from yid_ocp.planning.options import PlanOptions
+from yid_ocp.planning.plan import Told
 from yid_ocp.planning.points import Points
 from yid_ocp.planning.rows import Rows
 from yid_ocp.problem import EstimationProblem
@@ -67,7 +68,7 @@ class Start:
 
 
 @dataclass(frozen=True)
-class Known:
+class Knowledge:
     """What is known of a parameter, as relative standard deviations: infinite where nothing tells of it.
 
     Attributes
@@ -101,7 +102,7 @@ class InformationPlan:
     reached : bool
         Whether the search ended where no round would gain more.
     message : str
-    parameters : mapping of str to Known
+    parameters : mapping of str to Knowledge
     distances : mapping of (str, str) to (float, float)
         By pairs of effects: standard deviations of the data between the change by the first and what the second and all
         that is free can make of it; in the recordings, and in the planned motion. Empty where no effects are separated.
@@ -122,7 +123,7 @@ class InformationPlan:
     rollout: Rollout
     reached: bool
     message: str
-    parameters: Mapping[str, Known]
+    parameters: Mapping[str, Knowledge]
     distances: Mapping[tuple[str, str], tuple[float, float]]
     starts: tuple[Start, ...]
     best: int
@@ -168,19 +169,12 @@ class InformationPlan:
         return {name: at[:, 3 * i : 3 * i + 3] for i, name in enumerate(system.points)}
 
 
-Told = Callable[[str], None]
-
-
-def _untold(_: str) -> None:
-    """For whoever does not want to know."""
-
-
 def informative(
     problem: EstimationProblem,
     options: PlanOptions,
     values: Mapping[str, float] | None = None,
     effects: Mapping[str, Mapping[str, float]] | None = None,
-    told: Told = _untold,
+    told: Told = lambda _: None,
 ) -> InformationPlan:
     """Find the motion of the arms that tells most of parameters, or that tells effects apart, within limits.
 
@@ -480,7 +474,7 @@ def _judged(experiment: Experiment, criterion: Criterion, found: Improved) -> fl
         return -math.inf
 
 
-def _parameters(experiment: Experiment, w: Array) -> tuple[dict[str, Known], tuple[str, ...]]:
+def _parameters(experiment: Experiment, w: Array) -> tuple[dict[str, Knowledge], tuple[str, ...]]:
     """Parameters of the nominal problem before, after and with both, and what the planned recording leaves open."""
     problem = experiment.configured
     before = identifiability(problem.at(experiment.values))
@@ -494,7 +488,7 @@ def _parameters(experiment: Experiment, w: Array) -> tuple[dict[str, Known], tup
     for name, std in zip(shared, together, strict=True):
         first, last = before.parameters[name].std_relative, after.parameters[name].std_relative
         least = min(first, last, float(std) if std < WEAK else math.inf)
-        found[name] = Known(first, last, least, after.parameters[name].verdict)
+        found[name] = Knowledge(first, last, least, after.parameters[name].verdict)
     return found, tuple(entry.words for entry in after.unseen)
 
 
