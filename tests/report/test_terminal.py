@@ -212,8 +212,16 @@ def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():
     units = {"rmse": {}, "unit": {}}
     result = {
         "summary": "The gap is real.", "gap": {"before": units, "after": units}, "verdict": "unknown",
-        "seconds": {"fit": 1.0}, "which": [entry | {"p_value": 0.0}, entry | {"location": "T2", "p_value": 0.034}],
+        "next_plan": None, "seconds": {"fit": 1.0},
+        "which": [entry | {"p_value": 0.0}, entry | {"location": "T2", "p_value": 0.034}],
     }  # fmt: skip
     lines = terminal.diagnose_summary(result)
     assert line_of(lines, "kelvin_voigt@T1").endswith(" < 1e-12")
     assert line_of(lines, "kelvin_voigt@T2").endswith(" 0.034")
+    assert not any("yid-ocp plan" in line for line in lines)
+    section = {"goal": "information", "separate": ["density@T3", "point_mass@w_T3"], "run": "runs/mine"}
+    said = terminal.diagnose_summary(result | {"next_plan": section})
+    assert line_of(said, "yid-ocp plan").split() == [
+        "yid-ocp", "plan", "runs/mine/config.yaml", "--set", "plan.goal=information", "--set",
+        "'plan.separate=[density@T3,", "point_mass@w_T3]'", "--set", "plan.run=runs/mine",
+    ]  # fmt: skip

@@ -303,7 +303,11 @@ class PlanSettings(PlanOptions):
     """What `plan` plans, and where the parameters come from."""
 
     run: Annotated[
-        FilePath | None, About("run folder of `solve` with parameters and covariance; the initial values when absent")
+        FilePath | None,
+        About(
+            "run folder of `solve` with parameters and covariance, for information of `diagnose` as well; the initial "
+            "values when absent"
+        ),
     ] = None
 
 

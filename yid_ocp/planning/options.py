@@ -11,7 +11,7 @@ from annotated_types import Ge, Gt, Le
 from yid_ocp.options import About
 
 Triple = tuple[float, float, float]
-Goal = Literal["place", "path", "box"]
+Goal = Literal["place", "path", "box", "information"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +30,10 @@ class PlanOptions:
 
     goal: Annotated[
         Goal,
-        About("bring a point to a place, there along a path, or there with points kept inside a box"),
+        About(
+            "bring a point to a place, there along a path, or there with points kept inside a box; or move so that the "
+            "recordings tell most"
+        ),
     ] = "place"
     point: Annotated[str | None, About("frame that is to arrive: a tip of the object, T3:50%, a gripper")] = None
     place: Annotated[Triple | None, About("where to, in the world; or give a shift", "m")] = None
@@ -58,7 +61,20 @@ class PlanOptions:
     spread: Annotated[bool, About("whether the error that comes of the parameters' uncertainty is minimised along")] = (
         False
     )
+    inform: Annotated[
+        tuple[str, ...] | None,
+        About("of information: parameters that are to be told most precisely together; all free ones when absent"),
+    ] = None
+    separate: Annotated[
+        tuple[str, ...] | None, About("of information: effects, kind@location, that are to be told apart")
+    ] = None
+    starts: Annotated[
+        int, Ge(1), Le(1000), About("of information: random motions from which the search begins; the best is kept")
+    ] = 5
+    seed: Annotated[int, Ge(0), About("of these motions")] = 0
     limits: Annotated[PlanLimits, About("of joints and springs")] = field(default_factory=PlanLimits)
-    iterations: Annotated[int, Ge(1), About("limit on evaluations of a search, each time the limits are sharpened")] = (
-        100
-    )
+    iterations: Annotated[
+        int,
+        Ge(1),
+        About("limit on evaluations of a search, each time the limits are sharpened; of information, on its rounds"),
+    ] = 100

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from yid_ocp.data.checks import CAUSES
+from yid_ocp.solvers.words import VERDICT_WORDS
 
 MOST_ALIKE = 3  # doubts of one kind
 MOST_OFFSETS = 4  # recordings side by side
@@ -211,4 +212,44 @@ def plan_sentences(result: Mapping[str, Any]) -> list[str]:
         said += [f"not counted, as their uncertainty is not known: {', '.join(lost)}"] if lost else []
     elif result["from"]["run"] is None:
         said.append("the parameters are those of the configuration, so nothing is said of how uncertain that is")
+    return said
+
+
+def information_rows(result: Mapping[str, Any]) -> Sequence[tuple[str, ...]]:
+    """What a `yid-plan/1` of goal information expects of every parameter, with a head."""
+
+    def percent(std: float | None) -> str:
+        return "unknown" if std is None else f"± {100 * std:.2g} %"
+
+    rows = [("parameter", "from the recordings", "from this motion", "from both", "verdict of this motion")]
+    for name, own in result["parameters"].items():
+        stds = (percent(own[f"std_relative_{when}"]) for when in ("before", "after", "together"))
+        rows.append((name, *stds, VERDICT_WORDS[own["verdict"]]))
+    return rows
+
+
+def distance_rows(result: Mapping[str, Any]) -> Sequence[tuple[str, ...]]:
+    """How far effects lie apart in a `yid-plan/1` of goal information, with a head."""
+    rows = [("effect", "beside what could be", "apart in the recordings", "apart in this motion")]
+    for own in result["distances"]:
+        rows.append((own["effect"], own["explained_by"], *(f"{own[when]:.3g} std" for when in ("before", "after"))))
+    return rows
+
+
+def information_sentences(result: Mapping[str, Any]) -> list[str]:
+    """What a `yid-plan/1` of goal information says of its search and of what limits it."""
+    starts, best = result["starts"], result["starts"][result["best"]]
+    gains = sorted((s["judged"] for s in starts if s["judged"] is not None), reverse=True)
+    others = f"; {len(starts)} starts ended at {gains[0]:.3g} to {gains[-1]:.3g} nat" if len(gains) > 1 else ""
+    said = [
+        f"start {result['best'] + 1} of {len(starts)} tells most: {best['value'] - best['first']:.3g} nat more than "
+        f"the random motion from which it came{others}"
+    ]
+    reached = [f"{what} of {', '.join(names)}" for what, names in result["limits_reached"].items()]
+    said.append(f"what limits it: {'; '.join(reached)}" if reached else "it reaches no limit")
+    said += [f"{name}: no motion, no sensor sees it to first order; {what}" for name, what in result["unseen"].items()]
+    left = [words for words in result["open"] if not words.startswith(tuple(f"{name} is" for name in result["unseen"]))]
+    said += [f"left open by this motion: {words}" for words in left]
+    if result["from"]["run"] is None:
+        said.append("the parameters are those of the configuration; where the true ones differ, so does what is told")
     return said

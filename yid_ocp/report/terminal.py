@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import shlex
 import textwrap
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from yid_ocp.data import Recording
 from yid_ocp.report.tables import (
     blind_table,
+    distance_rows,
     doubt_rows,
     doubt_sentences,
     guess_sentences,
     held_out_rows,
+    information_rows,
+    information_sentences,
     medians,
     offset_rows,
     plan_rows,
@@ -123,7 +128,13 @@ def _offset_lines(result: Mapping[str, Any]) -> list[str]:
 def plan_summary(result: Mapping[str, Any]) -> list[str]:
     """Lines that tell a person what a `yid-plan/1` result says."""
     lines = [*table(list(plan_rows(result))), ""]
-    return [*lines, *plan_sentences(result), f"{result['status']}: {result['message']}"]
+    if result["goal"] == "information":
+        for rows in (information_rows(result), distance_rows(result)):
+            lines += [*table(list(rows)), ""] if len(rows) > 1 else []
+        said = information_sentences(result)
+    else:
+        said = plan_sentences(result)
+    return [*lines, *said, f"{result['status']}: {result['message']}"]
 
 
 def track_summary(result: Mapping[str, Any]) -> list[str]:
@@ -267,7 +278,18 @@ def diagnose_summary(result: Mapping[str, Any]) -> list[str]:
     lines += [*table(rows), ""] if len(rows) > 1 else []
     lines += _offset_lines(result)
     lines += ["what is in doubt about the recordings may be what the verdict is about"] if result.get("doubts") else []
+    if result["next_plan"] is not None:
+        lines += ["to separate what looks alike, plan a motion:", planning_command(result["next_plan"]), ""]
     return [*lines, f"verdict: {result['verdict']} ({sum(result['seconds'].values()):.1f} s)"]
+
+
+def planning_command(section: Mapping[str, Any]) -> str:
+    """The command that plans what a section `plan` says, with the configuration in the run folder that it names."""
+    words = ["yid-ocp", "plan", str(Path(section["run"]) / "config.yaml")]
+    for key, value in section.items():
+        text = f"[{', '.join(value)}]" if isinstance(value, list) else str(value)
+        words += ["--set", f"plan.{key}={text}"]
+    return shlex.join(words)
 
 
 def check_summary(result: Mapping[str, Any]) -> list[str]:

@@ -26,6 +26,7 @@ from yid_ocp.workflow.build import build_problem
 from yid_ocp.workflow.command import DONE, carry_out
 from yid_ocp.workflow.doubts import doubts_result
 from yid_ocp.workflow.folder import new_run_folder, versions
+from yid_ocp.workflow.information import next_plan
 from yid_ocp.workflow.progress import SILENT, Progress
 from yid_ocp.workflow.refits import Refits
 from yid_ocp.workflow.torque_offsets import torque_offsets
@@ -98,12 +99,15 @@ def run_diagnose(run: Run, out: str | Path | None = None, progress: Progress = S
         write_diagnosis_trajectories(folder.path / "trajectories.h5", finding, predicted)
         last = finding.last
         offsets = torque_offsets(last.problem, last.problem.vector(last.values))
+        told = finding.to_dict()
+        moving = not last.problem.options.clamps and bool(last.problem.system.driven or last.problem.system.prescribed)
         own = {
             "doubts": doubts_result(problem.options.doubts),
             "torque_offsets": offsets,
             "command": reproducing(run, folder.target),
+            "next_plan": next_plan(told["confusable"] if moving else (), folder.target),
         }
-        written = folder.finish(finding.to_dict() | own)
+        written = folder.finish(told | own)
         if run.output.report:
             progress.stage("writing the report")
             more = {"finding": finding, "predictions": predicted}

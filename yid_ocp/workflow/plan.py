@@ -18,10 +18,10 @@ from yid_ocp.config.settings import Run
 from yid_ocp.data.hdf5 import write_recording
 from yid_ocp.data.hdf5_file import open_hdf5
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate
-from yid_ocp.errors import DataError
 from yid_ocp.export.csv import export_csv
 from yid_ocp.export.trajectory import joint_trajectory
 from yid_ocp.integrator.step import Step
+from yid_ocp.planning.information import InformationPlan
 from yid_ocp.planning.plan import Known, Plan, plan
 from yid_ocp.problem.grid import make_grid
 from yid_ocp.problem.inputs import prescribed_path
@@ -32,6 +32,7 @@ from yid_ocp.report.terminal import plan_summary
 from yid_ocp.workflow.build import build_cable, build_step, located, parameter_settings, read_recordings
 from yid_ocp.workflow.command import DONE, FAILED, carry_out
 from yid_ocp.workflow.folder import new_run_folder
+from yid_ocp.workflow.information import information_result, informed, run_result
 from yid_ocp.workflow.progress import SILENT, Progress
 
 FORMAT = "yid-plan/1"
@@ -45,7 +46,7 @@ class PlanOutcome:
 
     folder: Path
     result: dict[str, Any]
-    plan: Plan
+    plan: Plan | InformationPlan
 
     @property
     def ok(self) -> bool:
@@ -82,12 +83,16 @@ def run_plan(run: Run, out: str | Path | None = None, progress: Progress = SILEN
     with new_run_folder(run, out, "plan") as folder:
         folder.begin(run, "plan")
         progress.stage("building the model and its compiled step")
-        step = planning_step(run)
-        theta, known, source = identified(run, step)
-        options = replace(run.plan, posture=start_posture(run, step))
-        with located(run, "plan"):
-            found = plan(step, options, theta, known, progress.stage)
-        recording = as_recording(run, found, step)
+        found: Plan | InformationPlan
+        if run.plan.goal == "information":
+            found, source = informed(run, progress)
+        else:
+            step = planning_step(run)
+            theta, known, source = identified(run, step)
+            options = replace(run.plan, posture=start_posture(run, step))
+            with located(run, "plan"):
+                found = plan(step, options, theta, known, progress.stage)
+        recording = as_recording(run, found)
         write_recording(recording, folder.path / "recording.h5")
         export_csv(recording, folder.path / "csv")
         trajectory = joint_trajectory(
@@ -95,12 +100,12 @@ def run_plan(run: Run, out: str | Path | None = None, progress: Progress = SILEN
         )
         folder.write("trajectory.json", json.dumps(trajectory, indent=1) + "\n")
         folder.log("end", reached=found.reached, message=found.message)
-        written = folder.finish(plan_result(run, found, source))
+        told = plan_result(run, found) if isinstance(found, Plan) else information_result(run, found)
+        written = folder.finish(motion_result(run, found, source) | told)
         if run.output.report:
             progress.stage("writing the report")
-            write_report(
-                folder.path / "report.html", Findings(run.name, run.description, written, more={"plan": found})
-            )
+            more = {"plan" if isinstance(found, Plan) else "information": found}
+            write_report(folder.path / "report.html", Findings(run.name, run.description, written, more=more))
     return PlanOutcome(folder.path, written, found)
 
 
@@ -146,25 +151,8 @@ def identified(run: Run, step: Step) -> tuple[Array, Known, dict[str, Any]]:
     if run.plan.run is None:
         free = [name for name, said in parameter_settings(run, parameters).items() if said.free]
         return theta, Known(), {"run": None, "parameters": {name: parameters[name].value for name in free}}
-    folder = Path(run.plan.run)
-    file, solved = folder / "result.json", folder / "trajectories.h5"
-    if not file.is_file() or not solved.is_file():
-        raise run.refuse(
-            f"there is no finished run of `solve` in {folder}",
-            "plan",
-            "run",
-            hint="give the run folder that it printed",
-        )
-    result = json.loads(file.read_text(encoding="utf-8"))
-    if not str(result.get("format", "")).startswith("yid-solve/"):
-        raise run.refuse(
-            f"{folder} is a run folder of another command ({result.get('format')})",
-            "plan",
-            "run",
-            allowed="yid-solve/1",
-        )
-    if result["status"] == "failed":
-        raise DataError(f"the solve in {folder} failed: {result['message']}", where=run.where("plan", "run"))
+    result, folder = run_result(run, ("solve",))
+    solved = folder / "trajectories.h5"
     lacking = {name.rpartition(".")[0] for name in result["parameters"] if "@" in name and name not in parameters}
     if lacking:
         raise run.refuse(
@@ -188,7 +176,7 @@ def identified(run: Run, step: Step) -> tuple[Array, Known, dict[str, Any]]:
     return theta, Known(tuple(names[i] for i in usable), chosen), source
 
 
-def as_recording(run: Run, found: Plan, step: Step) -> Recording:
+def as_recording(run: Run, found: Plan | InformationPlan) -> Recording:
     """The plan as if it had been recorded: joints, and the points of the object as the model predicts them."""
     joints = JointGroup(
         found.joints, found.t, found.position, found.velocity, found.effort,
@@ -196,15 +184,18 @@ def as_recording(run: Run, found: Plan, step: Step) -> Recording:
         effort_std=EFFORT_STD, clock="nominal",
     )  # fmt: skip
     names = tuple(found.points)
-    position = np.stack([found.points[name] for name in names], axis=1)
-    points = PointGroup("points_planned", names, found.t, position, np.full(position.shape, POINT_STD), sensor="plan")
-    truth = dict(zip(step.system.parameters.names, map(float, found.mover.theta), strict=True))
+    points: tuple[PointGroup, ...] = ()
+    if names:
+        position = np.stack([found.points[name] for name in names], axis=1)
+        std = np.full(position.shape, POINT_STD)
+        points = (PointGroup("points_planned", names, found.t, position, std, sensor="plan"),)
+    truth = dict(zip(found.mover.step.system.parameters.names, map(float, found.mover.theta), strict=True))
     text = f"{run.description} Planned motion, goal {run.plan.goal}.".strip()
-    return validate(Recording(joints, (points,), text, "yid_ocp plan", "recording", truth=truth))
+    return validate(Recording(joints, points, text, "yid_ocp plan", "recording", truth=truth))
 
 
-def plan_result(run: Run, found: Plan, source: dict[str, Any]) -> dict[str, Any]:
-    """`yid-plan/1` without inputs and versions."""
+def motion_result(run: Run, found: Plan | InformationPlan, source: dict[str, Any]) -> dict[str, Any]:
+    """What `yid-plan/1` says of any goal's motion, without inputs and versions."""
     joints = found.mover.step.system.mechanism.joints
     limits = [joints[i] for i in found.mover.joints]
     shares = {
@@ -220,18 +211,24 @@ def plan_result(run: Run, found: Plan, source: dict[str, Any]) -> dict[str, Any]
         "status": "done" if found.reached else "failed",
         "message": found.message,
         "goal": run.plan.goal,
-        "point": run.plan.point,
-        "place": found.place.tolist(),
         "duration": found.mover.path.duration,
         "settle": run.plan.settle,
+        "joints": shares,
+        "from": source,
+    }
+
+
+def plan_result(run: Run, found: Plan) -> dict[str, Any]:
+    """What `yid-plan/1` says of a point that is to arrive."""
+    return {
+        "point": run.plan.point,
+        "place": found.place.tolist(),
         "error": found.error,
         "swing": found.swing,
         "off_path": found.off_path,
         "time_step": found.mover.step.time_step,
         "std": None if found.std is None else found.std.tolist(),
         "tolerance": run.plan.tolerance,
-        "joints": shares,
-        "from": source,
         "evaluations": found.evaluations,
     }
 

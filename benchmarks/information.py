@@ -1,0 +1,153 @@
+"""Planned motions that tell more, recorded in MuJoCo with the configuration's noise.
+
+    python benchmarks/information.py parameter [--starts 20] [--recordings 5]
+    python benchmarks/information.py pair [--starts 3] [--case heavy_free_branch]
+
+`parameter`: one arm with a camera (`configs/single_arm_vision.yaml`), whose recording tells T3.bend to some 20 %. Its
+solution is where the motion is planned that tells T3.bend best; that motion is recorded in MuJoCo with the true
+stiffness and the noise of the shipped recordings, several draws of it, and each recording is solved by itself from
+3 N m/rad.
+
+`pair`: an effect of `diagnosis_cases.py` is withheld in MuJoCo, and the diagnosis finds another one as likely. Two
+motions that tell them apart are planned, recorded with the same effect at work, and diagnosed beside the first two
+recordings: one to estimate on, one held out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+from diagnosis_cases import CASES, record
+from make_recordings import ROUGH, TRUTH
+
+from yid_ocp.config.reader import DIAGNOSIS_DEFAULT, load_config
+from yid_ocp.data.recording import Recording
+from yid_ocp.diagnosis import Finding, Thresholds, diagnose
+from yid_ocp.planning.information import InformationPlan, informative
+from yid_ocp.planning.options import PlanLimits, PlanOptions
+from yid_ocp.planning.plan import PlannedMovement
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.report.terminal import table
+from yid_ocp.solvers import GaussNewton, Solution, solve
+from yid_ocp.virtual.engine import Simulation
+from yid_ocp.virtual.experiment import PointCamera, VirtualExperiment, paper_system, virtual_experiment
+from yid_ocp.virtual.injected import injected_experiment
+from yid_ocp.workflow.build import build_problem
+from yid_ocp.workflow.information import found_values
+
+CONFIG = Path(__file__).resolve().parents[1] / "configs" / "single_arm_vision.yaml"
+SOUGHT = "T3.bend"
+OPTIONS = PlanOptions(
+    goal="information", inform=(SOUGHT,), duration=3.5, settle=0.5, knots=28, limits=PlanLimits(spring_angle=0.5)
+)
+NOISE_SEED = 500
+
+
+def told(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def recorded(plan: InformationPlan, seed: int) -> Recording:
+    """The planned motion as the virtual robot carries it out and its sensors see it."""
+    movement = PlannedMovement(plan.joints, plan.mover.path, plan.unknowns)
+    posture = dict(zip(plan.joints, map(float, plan.mover.first), strict=True))
+    simulation = replace(ROUGH.simulation, duration=float(plan.t[-1]))
+    experiment = VirtualExperiment(
+        motion=movement, posture=posture, simulation=simulation, noise=ROUGH.noise(1), camera=PointCamera(), seed=seed,
+        name=f"planned_{seed}",
+    )  # fmt: skip
+    return virtual_experiment(paper_system(1), TRUTH, experiment)
+
+
+def parameter(starts: int, recordings: int) -> None:
+    problem = build_problem(load_config(CONFIG))
+    solution = solve(problem, GaussNewton(cost_tolerance=1e-5))
+    values = {name: entry.value for name, entry in solution.parameters.items() if name in problem.free}
+    plan = informative(problem, replace(OPTIONS, starts=starts), values, None, told)
+    rows: list[tuple[str, ...]] = [("", SOUGHT, "± std", "of it", "true value off by")]
+    rows.append(_row("the configuration's recording, 5 s", solution))
+    for i in range(recordings):
+        recording = recorded(plan, NOISE_SEED + i)
+        alone = EstimationProblem(problem.step, [recording], problem.free, problem.options)
+        rows.append(
+            _row(
+                f"the planned motion, {recording.duration:g} s, noise {i + 1}",
+                solve(alone, GaussNewton(cost_tolerance=1e-5)),
+            )
+        )
+    print("\n".join(table(rows)))
+    known = plan.parameters[SOUGHT]
+    print(f"expected: {100 * known.before:.3g} % before, {100 * known.after:.3g} % after, verdict {known.verdict}")
+    print(f"starts, nat as judged: {', '.join(f'{start.judged:.3g}' for start in plan.starts)}")
+    print(f"limits reached: {dict(plan.active)}; unseen: {', '.join(plan.unseen)}")
+
+
+def _row(words: str, solution: Solution) -> tuple[str, ...]:
+    entry = solution.parameters[SOUGHT]
+    error = (entry.value - TRUTH[SOUGHT]) / entry.std
+    return (
+        words,
+        f"{entry.value:.3g}",
+        f"{entry.std:.2g}",
+        f"{100 * entry.std / entry.value:.3g} %",
+        f"{error:+.2g} std",
+    )
+
+
+def pair(name: str, starts: int) -> None:
+    case = CASES[name]
+    run = load_config(None, (), DIAGNOSIS_DEFAULT)
+    nominal = build_problem(run)
+    made = [record(case, 1, 401), record(case, 7, 402)]
+    before = _diagnosed(nominal, made[:1], made[1:])
+    labels = tuple(rival.label for rival in before.added[0].rivals) if before.effects else ()
+    print(f"withheld: {', '.join(effect.label for effect in case.withheld)}")
+    print(f"before: {before.verdict}, {', '.join(labels)}")
+    problem = EstimationProblem(nominal.step, made[:1], nominal.free, nominal.options)
+    values, sizes = found_values(before.to_dict())
+    planned = []
+    for seed in (0, 100):
+        options = replace(OPTIONS, inform=None, separate=labels, starts=starts, seed=seed)
+        plan = informative(problem, options, values, sizes, told)
+        for (first, second), (then, now) in plan.distances.items():
+            print(f"seed {seed}: {first} beside {second}: {then:.3g} std in the recording, {now:.3g} in the plan")
+        movement = PlannedMovement(plan.joints, plan.mover.path, plan.unknowns)
+        posture = dict(zip(plan.joints, map(float, plan.mover.first), strict=True))
+        experiment = VirtualExperiment(
+            motion=movement, posture=posture, simulation=Simulation(float(plan.t[-1])), seed=NOISE_SEED + seed,
+            name=f"planned_{seed}",
+        )  # fmt: skip
+        planned.append(injected_experiment(paper_system(1), TRUTH, case.withheld, experiment))
+    after = _diagnosed(nominal, [made[0], planned[0]], [made[1], planned[1]])
+    rivals = [rival.label for rival in after.added[0].rivals] if after.effects else []
+    print(f"after: {after.verdict}, {', '.join(rivals)}")
+    print(
+        "\n".join(
+            table([("effect", "held-out chi2/n"), *((f.effects[-1].label, f"{f.loss.mean:.4f}") for f in after.fits)])
+        )
+    )
+
+
+def _diagnosed(nominal: EstimationProblem, estimate: list[Recording], held_out: list[Recording]) -> Finding:
+    problem = EstimationProblem(nominal.step, estimate, nominal.free, nominal.options)
+    return diagnose(problem, "all", held_out, thresholds=Thresholds(), progress=told)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Planned motions that tell more, in MuJoCo.")
+    parser.add_argument("what", choices=("parameter", "pair"))
+    parser.add_argument("--starts", type=int, default=5)
+    parser.add_argument("--recordings", type=int, default=5)
+    parser.add_argument("--case", default="heavy_free_branch", help="of diagnosis_cases.py")
+    arguments = parser.parse_args()
+    if arguments.what == "parameter":
+        parameter(arguments.starts, arguments.recordings)
+    else:
+        pair(arguments.case, arguments.starts)
+
+
+if __name__ == "__main__":
+    main()

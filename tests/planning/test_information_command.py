@@ -1,0 +1,132 @@
+"""The goal `information` from the command line: run folder, words, parameters and effects of a diagnosis."""
+
+from __future__ import annotations
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+from small_problems import pendulum_step, taken
+
+from yid_ocp.cli import main
+from yid_ocp.config.reader import load_config
+from yid_ocp.data import read_recording
+from yid_ocp.data.hdf5 import write_recording
+from yid_ocp.report.terminal import plan_summary, planning_command
+from yid_ocp.workflow.information import next_plan
+from yid_ocp.workflow.plan import run_plan
+
+CONFIG = """\
+model:
+  robot: {urdf}
+  springs:
+    elbow: {{stiffness: 3.0, rest: 0.1}}
+  arms: {{mode: prescribed, passive: [elbow]}}
+  damping: 0.2
+  points: [tip, lower]
+recordings: {{estimate: [{recording}]}}
+parameters:
+  elbow.stiffness: {{free: true}}
+  elbow.damping: {{free: true}}
+problem: {{compiler: false, path_cutoff: 15.0, feedback: none}}
+plan:
+  {{goal: information, duration: 0.8, settle: 0.4, knots: 3, starts: 2, limits: {{acceleration: 15.0}}}}
+"""
+PAIR = ("joint_coulomb@shoulder", "joint_viscous@shoulder")
+
+
+@pytest.fixture
+def config(limited_urdf, tmp_path):
+    recording = tmp_path / "recording.h5"
+    write_recording(taken(pendulum_step(limited_urdf.parent, prescribed=("shoulder",)), 3, steps=140), recording)
+    file = tmp_path / "pendulum.yaml"
+    file.write_text(CONFIG.format(urdf=limited_urdf, recording=recording))
+    return file
+
+
+def diagnosed(folder, stiffness, verdict="confusable"):
+    """What `diagnose` leaves, as far as a plan reads it."""
+    folder.mkdir()
+    sizes = {PAIR[0]: {"tau_c": 0.4}, PAIR[1]: {"b": None}}
+    which = [
+        {
+            "kind": label.partition("@")[0],
+            "location": label.partition("@")[2],
+            "parameters": {name: {"value": value, "std": None, "unit": ""} for name, value in sizes[label].items()},
+        }
+        for label in PAIR
+    ]
+    absorption = {"elbow.stiffness": {"before": stiffness, "after": 9.0, "std": 0.1, "unit": "N m/rad"}}
+    result = {"format": "yid-diagnosis/1", "verdict": verdict, "which": which, "absorption": absorption}
+    (folder / "result.json").write_text(json.dumps(result))
+    h5py.File(folder / "trajectories.h5", "w").close()
+    return folder
+
+
+def test_the_run_folder_says_what_is_told_and_what_limits_it(config, tmp_path):
+    outcome = run_plan(load_config(config), tmp_path / "out")
+    assert outcome.ok, outcome.result["message"]
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert result["format"] == "yid-plan/1"
+    assert result["goal"] == "information"
+    assert {"recording.h5", "csv", "trajectory.json", "report.html"} <= {p.name for p in (tmp_path / "out").iterdir()}
+    planned = read_recording(tmp_path / "out" / "recording.h5")
+    np.testing.assert_allclose(planned.joints.position, outcome.plan.position)
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert '<section id="information">' in page
+    words = "\n".join(plan_summary(result))
+    for name, known in outcome.plan.parameters.items():
+        assert result["parameters"][name]["std_relative_after"] == pytest.approx(known.after)
+        assert f"± {100 * known.after:.2g} %" in words
+    assert "tells most" in words
+    assert all(name in words for names in result["limits_reached"].values() for name in names)
+    assert "the parameters are those of the configuration" in words
+
+
+def test_a_diagnosis_hands_over_its_parameters_and_effects(config, tmp_path):
+    folder = diagnosed(tmp_path / "diagnosed", 4.0)
+    alike = [[{"kind": label.partition("@")[0], "location": label.partition("@")[2]} for label in PAIR]]
+    section = next_plan(alike, folder)
+    assert section == {"goal": "information", "separate": list(PAIR), "run": str(folder)}
+    assert next_plan([], folder) is None
+    command = planning_command(section)
+    assert command.startswith(f"yid-ocp plan {folder / 'config.yaml'} --set plan.goal=information")
+    overrides = [f"plan.separate=[{', '.join(PAIR)}]", f"plan.run={folder}", "plan.iterations=3"]
+    assert all(f"'{text}'" in command or text in command for text in overrides[:2])
+    outcome = run_plan(load_config(config, overrides), tmp_path / "out")
+    assert outcome.result["from"]["parameters"] == {"elbow.stiffness": 4.0, "elbow.damping": 0.2}
+    pairs = {(entry["effect"], entry["explained_by"]) for entry in outcome.result["distances"]}
+    assert pairs == {PAIR, PAIR[::-1]}
+    assert all(entry["after"] > entry["before"] for entry in outcome.result["distances"])
+    assert f"{PAIR[0]}" in "\n".join(plan_summary(outcome.result))
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (["plan.inform=[elbow.stifness]"], ("no parameter 'elbow.stifness'", "did you mean", "pendulum.yaml")),
+        (["plan.separate=[joint_viscous@shoulder]"], ("two effects or more",)),
+        (["parameters.elbow.stiffness.free=false", "parameters.elbow.damping.free=false"],
+         ("no parameter is free",)),
+        (["recordings.estimate=[]"], ("no recording to estimate on",)),
+        (["plan.run=nowhere"], ("no finished run of `solve` or `diagnose`", "plan.run")),
+        (["plan.limits.effort=0.0001"], ("pass their limits before they move", "plan.limits")),
+        (["plan.duration=0.1", "plan.settle=0.1"], ("too short", "plan.duration")),
+    ],
+)  # fmt: skip
+def test_wrong_input_leaves_nothing(config, tmp_path, capsys, settings, words):
+    arguments = [part for setting in settings for part in ("--set", setting)]
+    assert main(["plan", str(config), "--out", str(tmp_path / "out"), *arguments]) == 2
+    told = capsys.readouterr().err
+    for word in words:
+        assert word in told, told
+    assert not (tmp_path / "out").exists()
+
+
+def test_other_goals_do_not_take_a_diagnosis(config, tmp_path, capsys):
+    folder = diagnosed(tmp_path / "diagnosed", 4.0)
+    settings = ["plan.goal=place", "plan.point=tip", "plan.shift=[0,0.1,0]", f"plan.run={folder}"]
+    arguments = [part for setting in settings for part in ("--set", setting)]
+    assert main(["plan", str(config), "--out", str(tmp_path / "out"), *arguments]) == 2
+    assert "run folder of another command (yid-diagnosis/1)" in capsys.readouterr().err

@@ -1,0 +1,380 @@
+"""An experiment that was not made yet: what the configured sensors would tell of a motion of the arms.
+
+Two forms of one experiment. In the first the arms are moved and the torques that this needs are measured, with a
+constant error each: one rollout tells all, so that it serves to search. Where arms are driven their motion is known as
+far as sensors tell of it only; what an error of the motion does to all readings is taken at rest, once, and eliminated
+(Golub and Pereyra 1973, doi:10.1137/0710036). The second form is the estimation problem as it is configured, driven by
+these torques; it judges what was found.
+
+A camera's frames come when they come. What is counted is the information of its mean rate over the recording, spread
+evenly over the motion, so that no plan relies on a frame at a certain moment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline
+
+from yid_ocp.analysis.layouts import TORQUE_STD
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.errors import ConfigError, DataError, SolverError
+from yid_ocp.integrator.step import Step, compile_alike
+from yid_ocp.parallel import map_threads
+from yid_ocp.planning.ends import first_rest, start_posture
+from yid_ocp.planning.mover import Mover
+from yid_ocp.planning.options import PlanOptions
+from yid_ocp.planning.path import SplinePath
+from yid_ocp.planning.points import Points
+from yid_ocp.problem import EstimationProblem, ProblemOptions
+from yid_ocp.problem.evaluation import Evaluation
+from yid_ocp.problem.low_pass import LowPass
+from yid_ocp.problem.measurements import Measurements
+from yid_ocp.sensors.joints import EFFORT, POSITION
+
+Array = NDArray[np.float64]
+
+PLANNED = "planned"
+EVEN_RATE = 20.0  # at least so often a slow sensor's information is spread over the motion [Hz]
+FASTEST = 40.0  # samples of a point while a motion is searched: twice the band in which the motion may be wrong [Hz]
+BAND = 12.0  # up to which the motion may be wrong: beyond it efforts are smoothed away [Hz]
+WRONG = 1e-6  # of the arms' motion, by which its errors' effect is differenced [rad or m]
+DIFFERENCE = 1e-5  # of an unknown of the motion [rad or m]
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """A motion to come, by the unknowns of the arms' splines, and what it would tell of parameters.
+
+    Attributes
+    ----------
+    configured : EstimationProblem
+        As the settings have it; its first recording says how the sensors are.
+    values : mapping of str to float
+        Parameters at which the sensitivities are taken.
+    mover : Mover
+        Of the same system with its arms prescribed.
+    names : tuple of str
+        Parameters that are free in the form with a known motion.
+    """
+
+    configured: EstimationProblem
+    values: Mapping[str, float]
+    mover: Mover
+    names: tuple[str, ...]
+
+    @staticmethod
+    def of(
+        problem: EstimationProblem, values: Mapping[str, float], options: PlanOptions, names: Sequence[str] = ()
+    ) -> Experiment:
+        """The experiment that a plan's settings describe.
+
+        Parameters
+        ----------
+        problem : EstimationProblem
+        values : mapping of str to float
+            Of any parameters; the others as the problem has them.
+        options : PlanOptions
+            Duration, spline, posture at the start: the first of the recording when absent.
+        names : sequence of str
+            Parameters that are free; those of the problem when empty.
+
+        Raises
+        ------
+        ConfigError
+            No joint moves, or clamps follow measured points.
+        ModelError
+            There is no rest to begin from.
+        """
+        system, episode = problem.system, problem.episodes[0]
+        if problem.options.clamps or not (system.driven or system.prescribed):
+            raise ConfigError(
+                "no joint moves whose motion could be planned"
+                if not problem.options.clamps
+                else "the ends of a cable follow measured points: there is no joint whose motion could be planned",
+                where="plan",
+                allowed="a robot whose arms move",
+                hint="set model.robot and model.arms",
+            )
+        moved = replace(system, driven=(), prescribed=(*system.driven, *system.prescribed))
+        step = problem.step if not system.driven else compile_alike(problem.step, moved)
+        known = dict(zip(system.parameters.names, map(float, problem.theta), strict=True)) | dict(values)
+        theta = step.system.parameters.vector(known)
+        first = np.array(episode.posture) if options.posture is None else start_posture(step.system, options.posture)
+        path = SplinePath(options.duration, options.knots)
+        mover = Mover(step, theta, first_rest(step, theta, first), path, options.settle)
+        _check_long_enough(problem, float(mover.times[-1]))
+        return Experiment(problem, known, mover, tuple(names) or problem.free)
+
+    # -- what the sensors would record --------------------------------------------------------------------------------
+
+    def recording(self, w: Array, fastest: float = np.inf) -> Recording:
+        """What the sensors would record of a motion without their noise, which the recording states.
+
+        Parameters
+        ----------
+        w : ndarray, shape (K, nc)
+            Unknowns of the motion.
+        fastest : float
+            Points that are seen more often are recorded so often, their information per second kept [Hz].
+        """
+        mover, base = self.mover, self.configured.episodes[0]
+        rollout, system = mover.roll(w), mover.step.system
+        if not rollout.status.ok:
+            raise DataError(f"the motion cannot be carried out: {rollout.status.message}", where="plan")
+        joints, duration = base.recording.joints, float(mover.times[-1])
+        assert joints is not None
+        period = float(np.median(np.diff(joints.t)))
+        t = np.asarray(period * np.arange(int(np.floor(duration / period + 1e-9)) + 1), float)
+        sums = np.vstack([np.zeros((1, len(mover.joints))), np.cumsum(rollout.effort, axis=0)]) * mover.step.time_step
+        edges = [np.stack([np.interp(at, mover.times, total) for total in sums.T], axis=1) for at in (t, t + period)]
+        effort = (edges[1] - edges[0]) / period
+        # nothing is known of what comes after
+        effort[t + period > duration + 1e-9] = rollout.effort[-1]
+        columns = [joints.names.index(name) for name in system.prescribed]
+        errors = base.errors
+        known = (joints.position_std, joints.effort_std, joints.effort_bias_std)
+        stds = [None if std is None else np.broadcast_to(std, (len(joints.names),))[columns] for std in known]
+        if errors is not None:
+            per_sample = errors.torque_std / min(1.0, np.sqrt(period / mover.step.time_step))
+            stds = [errors.angle_std, per_sample, errors.bias_std]
+        group = JointGroup(
+            system.prescribed, t, mover.first + mover.path.basis(t) @ w,
+            effort=None if joints.effort is None else effort, effort_kind="mean",
+            position_std=stds[0], effort_std=stds[1], effort_bias_std=stds[2],
+        )  # fmt: skip
+        q = rollout.state[:, : system.size]
+        groups = [self._seen(samples, q, fastest) for samples in base.samples if samples.sensor.width == 3]
+        return Recording(group, tuple(groups), "a planned motion", "yid_ocp plan", PLANNED)
+
+    def _seen(self, samples: Measurements, q: Array, fastest: float) -> PointGroup:
+        """Points of one sensor along the motion, their information per second as in the recording."""
+        mover, base = self.mover, self.configured.episodes[0]
+        sensor, spent = samples.sensor, base.grid.steps * base.grid.time_step
+        inverse = np.sum(np.where(samples.seen, samples.weight**2, 0.0), axis=0)
+        rate = float(np.max(np.count_nonzero(samples.seen, axis=0))) / spent
+        stride = max(1, round(1.0 / (mover.step.time_step * min(max(rate, EVEN_RATE), fastest))))
+        at = np.arange(0, len(mover.times), stride)
+        dense = 1.0 / (stride * mover.step.time_step)
+        with np.errstate(divide="ignore"):
+            std = np.sqrt(dense * spent / inverse)
+        places = self._frames[sensor.frames].at(q[at], mover.theta)[0]
+        places = np.where(np.isfinite(std), places, np.nan).reshape(len(at), -1, 3)
+        std = np.broadcast_to(np.where(np.isfinite(std), std, 1.0).reshape(-1, 3), places.shape)
+        group = next(g for g in base.recording.points if g.name == sensor.group)
+        return PointGroup(
+            sensor.group, sensor.points, mover.times[at], places, std.copy(), group.sensor, pose=group.pose
+        )
+
+    @cached_property
+    def _frames(self) -> dict[tuple[str, ...], Points]:
+        found = {s.sensor.frames for s in self.configured.episodes[0].samples if s.sensor.width == 3}
+        return {frames: Points(self.mover.step.system, frames) for frames in found}
+
+    def _options(self, **changes: object) -> ProblemOptions:
+        """The problem's options for the planned recording alone, which states its points' noise itself."""
+        options, base = self.configured.options, self.configured.episodes[0]
+        own = dict(options.sensors)
+        for samples in base.samples:
+            if samples.sensor.width == 3 and samples.sensor.group in own:
+                own[samples.sensor.group] = replace(own[samples.sensor.group], std=None)
+        named = {PLANNED: dict(options.recording_values[base.name])} if base.name in options.recording_values else {}
+        same = {"sensors": own, "duration": None, "known_start": {}, "recording_values": named}
+        return replace(options, **{**same, **changes})  # type: ignore[arg-type]
+
+    @property
+    def still(self) -> Array:
+        """Unknowns with which nothing moves, shape (K, nc)."""
+        return np.zeros((self.mover.path.unknowns, len(self.mover.joints)))
+
+    def as_configured(self, w: Array) -> EstimationProblem:
+        """The estimation problem of the planned recording, the same in all else, at `values`."""
+        return self._problem(self.configured.step, self.recording(w), self._options())
+
+    def _problem(self, step: Step, recording: Recording, options: ProblemOptions) -> EstimationProblem:
+        free = [name for name in self.names if name in self.configured.free]
+        extra = [name for name in self.names if name not in free]
+        return EstimationProblem(step, [recording], free, options, self.values, (), extra).freeing(self.names)
+
+    def judged(self, w: Array) -> Array:
+        """Like `rows`, of the configured problem: of `columns` but the offsets, which its innovations know.
+
+        Raises
+        ------
+        SolverError
+            The motion cannot be followed by its torques.
+        """
+        return self._weighted(self.as_configured(w))
+
+    @property
+    def recorded(self) -> Array:
+        """The same of the recordings that there are."""
+        return self._weighted(self.configured.at(self.values).freeing(self.names))
+
+    def _weighted(self, problem: EstimationProblem) -> Array:
+        problem = problem.weighted_at(problem.start)
+        evaluation = problem.evaluate(problem.start)
+        if not evaluation.ok:
+            raise SolverError(f"the motion cannot be followed by its torques: {evaluation.message}")
+        return self._relative(problem, evaluation)
+
+    def _relative(self, problem: EstimationProblem, evaluation: Evaluation) -> Array:
+        """Sensitivities to relative changes, without what is known beforehand of the parameters themselves.
+
+        That is not something that a sensor sees.
+        """
+        jacobian = problem.informing(evaluation)[1] * _sizes(problem)
+        own = np.array([name.split("[")[0] in self.names for name in problem.names])
+        jacobian[problem.rows.stated_priors] = np.where(own, 0.0, jacobian[problem.rows.stated_priors])
+        return jacobian
+
+    # -- sensitivities with a known motion ----------------------------------------------------------------------------
+
+    @cached_property
+    def _known(self) -> EstimationProblem:
+        """The problem in which the motion is known and torques are measured."""
+        recording = self.recording(self.still, FASTEST)
+        joints = recording.joints
+        assert joints is not None
+        sensors = dict(self._options().sensors)
+        if joints.effort is not None:
+            std = np.zeros(len(joints.names)) if joints.effort_std is None else np.asarray(joints.effort_std)
+            joints = replace(joints, effort_std=np.where(std > 0, std, TORQUE_STD))
+        if self.configured.system.driven:
+            # how wrong the motion may be is said by `_blur`
+            joints = replace(joints, position_std=None)
+            sensors.pop(POSITION, None)
+        options = self._options(huber_threshold=np.inf, weak_prior_factor=0.0, weighting="whitened", sensors=sensors)
+        return self._problem(self.mover.step, replace(recording, joints=joints), options)
+
+    @cached_property
+    def scale(self) -> Array:
+        """What a relative change of each of the problem's unknowns refers to, in the order of `columns`."""
+        return _sizes(self._known)
+
+    @cached_property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the columns of `rows`: parameters, other unknowns, constant errors of torques."""
+        return (*self._known.names, *(f"offset of {name}" for name in self._offset_std))
+
+    @cached_property
+    def _offset_std(self) -> dict[str, float]:
+        errors = self.configured.episodes[0].errors
+        if errors is None:
+            return {}
+        known = zip(self.configured.system.driven, errors.bias_std, strict=True)
+        return {name: float(std) for name, std in known if std > 0}
+
+    @cached_property
+    def _offsets(self) -> Array:
+        """Columns of the constant errors, in units of their standard deviations, priors below, (nr + no, no)."""
+        problem, std = self._known, self._offset_std
+        found = np.zeros((problem.rows.informing.stop, len(std)))
+        for samples, rows in zip(problem.episodes[0].samples, problem.rows.measurements[0], strict=True):
+            if samples.sensor.group != EFFORT:
+                continue
+            joint = np.broadcast_to(np.arange(samples.value.shape[1]), samples.value.shape)[samples.seen]
+            for i, (name, size) in enumerate(std.items()):
+                own = joint == samples.sensor.efforts.index(name)
+                found[rows, i] = np.where(own, size * samples.weight[samples.seen], 0.0)
+        return np.vstack([found, np.eye(len(std))])
+
+    def rows(self, w: Array) -> Array | None:
+        """Whitened sensitivity of all that is measured to relative changes of the unknowns, (nr, columns).
+
+        With rows for what is stated of nuisances beforehand; None where the motion cannot be carried out.
+        """
+        problem = self._known
+        episode = replace(problem.episodes[0], path=np.asarray(self.mover.positions(w)))
+        moved = problem.on([episode], ())
+        evaluation = moved.evaluate(moved.start, warm=(self.mover.start.state[: self.mover.step.system.size],))
+        if not evaluation.ok:
+            return None
+        jacobian = self._relative(moved, evaluation)
+        offsets = self._offsets
+        whole = np.zeros((len(offsets), jacobian.shape[1] + offsets.shape[1]))
+        whole[: len(jacobian), : jacobian.shape[1]] = jacobian
+        whole[:, jacobian.shape[1] :] = offsets
+        vectors, taken = self._blur
+        data = len(vectors)
+        whole[:data] -= vectors @ (taken[:, None] * (vectors.T @ whole[:data]))
+        return whole
+
+    @cached_property
+    def _blur(self) -> tuple[Array, Array]:
+        """Directions of the data that errors of a driven arm's motion blur, and how much of each is lost, 0 to 1."""
+        problem, mover, errors = self._known, self.mover, self.configured.episodes[0].errors
+        data = problem.rows.data.stop
+        if not self.configured.system.driven:
+            return np.zeros((data, 0)), np.zeros(0)
+        nc = len(mover.joints)
+        waves = _splines(mover.times, BAND)
+        path = np.asarray(mover.positions(self.still))
+
+        def residual(i: int) -> Array:
+            moved = path.copy()
+            if i >= 0:
+                moved[:, i % nc] += WRONG * waves[:, i // nc]
+            found = problem.on([replace(problem.episodes[0], path=moved)], ())
+            evaluation = found.evaluate(found.start, False, (mover.start.state[: mover.step.system.size],))
+            if not evaluation.ok:
+                raise DataError(f"the motion cannot be carried out: {evaluation.message}", where="plan")
+            return evaluation.residual[problem.rows.data]
+
+        still = residual(-1)
+        blur = np.stack(
+            [(found - still) / WRONG for found in map_threads(residual, range(nc * waves.shape[1]))], axis=1
+        )
+        known = blur.T @ blur
+        if errors is not None and errors.encoders:
+            told = (waves.T @ waves)[:, None, :, None] * np.diag(errors.angle_std**-2 * errors.spread**-1)[
+                None, :, None, :
+            ]
+            known += told.reshape(known.shape)
+        values, vectors = scipy.linalg.eigh(known)
+        kept = values > 1e-10 * values[-1]
+        u, s, _ = np.linalg.svd(blur @ (vectors[:, kept] / np.sqrt(values[kept])), full_matrices=False)
+        return u, 1.0 - np.sqrt(np.clip(1.0 - s**2, 0.0, 1.0))
+
+    def slopes(self, w: Array, rows: Array) -> Array | None:
+        """Derivative of `rows` by the unknowns of the motion by forward differences, (w.size, nr, columns)."""
+
+        def one(i: int) -> Array | None:
+            moved = w.ravel().copy()
+            moved[i] += DIFFERENCE
+            there = self.rows(moved.reshape(w.shape))
+            return None if there is None else (there - rows) / DIFFERENCE
+
+        found = map_threads(one, range(w.size))
+        return None if any(part is None for part in found) else np.array(found)
+
+
+def _check_long_enough(problem: EstimationProblem, duration: float) -> None:
+    """Refuse a motion of whose efforts the low-pass filter leaves nothing."""
+    joints, low_pass = problem.episodes[0].recording.joints, LowPass(problem.options.path_cutoff)
+    least = 2.0 * low_pass.settling + low_pass.stride(problem.step.time_step) * problem.step.time_step
+    if joints is not None and joints.effort is not None and duration <= least:
+        raise ConfigError(
+            f"{duration:g} s are too short to measure efforts that are smoothed at {low_pass.cutoff:g} Hz",
+            where="plan.duration",
+            allowed=f"more than {least:.2g} s together with plan.settle",
+            hint="take a longer plan.duration, or raise problem.path_cutoff",
+        )
+
+
+def _sizes(problem: EstimationProblem) -> Array:
+    """Value of every unknown, its typical size where that is zero."""
+    return np.where(problem.start != 0, np.abs(problem.start), problem.scales)
+
+
+def _splines(times: Array, band: float) -> Array:
+    """Cubic splines from rest up to a frequency, shape (N + 1, count)."""
+    inner = np.linspace(times[0], times[-1], max(2, round((times[-1] - times[0]) * 2 * band)))
+    knots = np.concatenate([np.full(3, inner[0]), inner, np.full(3, inner[-1])])
+    # the first posture is known
+    return np.asarray(BSpline.design_matrix(np.clip(times, inner[0], inner[-1]), knots, 3).toarray()[:, 1:])

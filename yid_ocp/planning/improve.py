@@ -1,0 +1,176 @@
+"""The motion that tells most: sequential linearisation of the sensitivities within limits, from several starts.
+
+Sensitivities J(w) of a motion w are nearly linear in it, since springs and small motions are; the criterion of J is
+not. In every round J and the limits are linearised and the criterion of the linear J is maximised within a trust
+region. All iterates keep the limits.
+
+References
+----------
+Burke and Ferris (1995), Math. Programming 71:179, doi:10.1007/BF01585997 (composite functions).
+Kraft (1988), DFVLR-FB 88-28 (the inner problem's SLSQP).
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from yid_ocp.planning.criteria import Criterion
+from yid_ocp.planning.experiment import Experiment
+from yid_ocp.planning.rows import Rows
+
+log = logging.getLogger(__name__)
+Array = NDArray[np.float64]
+
+FIRST_RADIUS, WIDEST = 0.05, 0.4  # of the trust region, for every unknown of the motion [rad or m]
+LEAST_RADIUS = 1e-3
+STATIONARY = 1e-9  # step in the linear picture that counts as none [rad or m]
+INNER = 100  # iterations of the inner search
+SLACK = 1e-3  # by which the linear limits are tighter, in parts of the limits
+GAINED = 1e-2  # of the criterion [nat]: less in a round is the end
+CORRECTIONS = 2  # of the linear limits where a step passes the true ones
+
+
+@dataclass(frozen=True)
+class Improved:
+    """Where the search from one start ended.
+
+    Attributes
+    ----------
+    w : ndarray, shape (K, nc)
+    first, value : float
+        Criterion at the start and in the end [nat].
+    finished : bool
+        Whether no round would gain more.
+    rounds : int
+    """
+
+    w: Array
+    first: float
+    value: float
+    finished: bool
+    rounds: int
+
+
+class Search:
+    """Motions of one experiment within limits, by a criterion.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    limits : Rows
+        Its bounded rows are the limits.
+    criterion : Criterion
+    lower, upper : ndarray, shape (nc,)
+        Of every joint's unknowns, which bound the joint.
+    """
+
+    def __init__(self, experiment: Experiment, limits: Rows, criterion: Criterion, lower: Array, upper: Array) -> None:
+        self.experiment, self.limits, self.criterion = experiment, limits, criterion
+        shape = (experiment.mover.path.unknowns, 1)
+        self.lower, self.upper = np.tile(lower, shape).ravel(), np.tile(upper, shape).ravel()
+        parts = [np.concatenate([getattr(b, k) for b in limits.bounded]) for k in ("unit", "lower", "upper")]
+        self._unit, self._low, self._high = parts[0], parts[1] / parts[0], parts[2] / parts[0]
+
+    def passed(self, w: Array) -> float:
+        """By how much a motion passes its limits at most, in parts of them; infinite where it cannot be carried out."""
+        value = self.limits.limits(self.experiment.mover.roll(w), w).value / self._unit
+        if not np.all(np.isfinite(value)):
+            return np.inf
+        flat = w.ravel()
+        joints = max(float(np.max(flat - self.upper)), float(np.max(self.lower - flat)))
+        return max(float(np.max(value - self._high)), float(np.max(self._low - value)), joints)
+
+    def within(self, w: Array) -> Array:
+        """The motion, made smaller until it keeps the limits."""
+        for _ in range(60):
+            if self.passed(w) <= 0.0:
+                return w
+            w = 0.8 * w
+        return np.zeros_like(w)
+
+    def value(self, w: Array) -> tuple[float, Array | None]:
+        """Criterion and sensitivities; minus infinity where the motion cannot be carried out."""
+        rows = self.experiment.rows(w)
+        return (-np.inf, None) if rows is None else (self.criterion.value(rows, False)[0], rows)
+
+    def improve(self, start: Array, rounds: int, told: Callable[[str], None]) -> Improved:
+        """The best motion from a start that keeps the limits."""
+        w, radius = start, FIRST_RADIUS
+        value, rows = self.value(w)
+        first, finished, done = value, False, 0
+        while rows is not None and done < rounds and not finished:
+            done += 1
+            slopes = self.experiment.slopes(w, rows)
+            rolled = self.experiment.mover.roll(w, True)
+            limits = self.limits.limits(rolled, w)
+            if slopes is None or limits.slope is None:
+                break
+            bounded = limits.value / self._unit, limits.slope / self._unit[:, None]
+            gained, small, still = 0.0, False, False
+            while not small:
+                step = self._step(rows, slopes, w, bounded, radius)
+                still = not np.any(np.abs(step) > STATIONARY)
+                if still:
+                    break
+                there, its = self.value(w + step)
+                small = radius <= LEAST_RADIUS
+                if its is not None and there > value:
+                    gained, w, value, rows = there - value, w + step, there, its
+                    radius = min(2.0 * radius, WIDEST) if np.abs(step).max() > 0.9 * radius else radius
+                    break
+                radius = max(0.3 * radius, 0.5 * LEAST_RADIUS)
+            told(f"round {done}: {value - first:.3g} nat beyond the start")
+            # a motion from which no step gains anything at all is too rough to be improved, as where the object snaps
+            finished = gained < GAINED and (done > 1 or gained > 0.0 or still)
+            if gained == 0.0:
+                break
+        return Improved(w, first, value, finished, done)
+
+    def _step(self, rows: Array, slopes: Array, w: Array, bounded: tuple[Array, Array], radius: float) -> Array:
+        """The best step in the linear picture within a trust region, made such that the true limits are kept."""
+        value, slope = bounded
+        reach = np.abs(slope).sum(1) * radius
+        shift = np.zeros_like(value)
+        for _ in range(1 + CORRECTIONS):
+            high, low = self._high - SLACK - value - shift, value + shift - self._low - SLACK
+            near_high, near_low = np.flatnonzero(reach > high), np.flatnonzero(reach > low)
+            normal = np.vstack([-slope[near_high], slope[near_low]])
+            room = np.maximum(np.concatenate([high[near_high], low[near_low]]), 0.0)
+            step = self._inner(rows, slopes, w, normal, room, radius)
+            there = w + step.reshape(w.shape)
+            if self.passed(there) <= 0.0:
+                return there - w
+            true = self.limits.limits(self.experiment.mover.roll(there), there).value / self._unit
+            if not np.all(np.isfinite(true)):
+                break
+            shift = true - value - slope @ step
+        for share in (0.9, 0.7, 0.4, 0.2, 0.1):
+            part = share * step.reshape(w.shape)
+            if self.passed(w + part) <= 0.0:
+                return part
+        return np.zeros_like(w)
+
+    def _inner(self, rows: Array, slopes: Array, w: Array, normal: Array, room: Array, radius: float) -> Array:
+        """Maximise the criterion of linear sensitivities over steps with normal @ step + room >= 0."""
+        # in parts of the radius, so that the first step of the inner search is neither tiny nor far
+        flat, normal = radius * slopes.reshape(len(slopes), -1), radius * normal
+
+        def cost(x: Array) -> tuple[float, Array]:
+            found, by_rows = self.criterion.value(rows + (x @ flat).reshape(rows.shape))
+            return -found, -(flat @ by_rows.ravel())
+
+        low = np.maximum(-1.0, np.minimum(self.lower - w.ravel(), 0.0) / radius)
+        high = np.minimum(1.0, np.maximum(self.upper - w.ravel(), 0.0) / radius)
+        constraints = [{"type": "ineq", "fun": lambda x: normal @ x + room, "jac": lambda x: normal}]
+        found = minimize(
+            cost, np.zeros(w.size), jac=True, method="SLSQP", bounds=list(zip(low, high, strict=True)),
+            constraints=constraints if len(room) else (), options={"maxiter": INNER, "ftol": 1e-4},
+        )  # fmt: skip
+        step = radius * np.clip(found.x, low, high)
+        return step if np.all(np.isfinite(step)) else np.zeros_like(step)

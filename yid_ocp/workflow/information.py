@@ -1,0 +1,137 @@
+"""The goal `information` of the command `plan`: from settings and run folders to the motion that tells most."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from yid_ocp.config.settings import Run
+from yid_ocp.errors import DataError
+from yid_ocp.planning.information import InformationPlan, informative
+from yid_ocp.workflow.build import build_problem, located
+from yid_ocp.workflow.progress import Progress
+
+MOST = 3
+"""Effects that one motion is asked to separate, the likeliest ones."""
+
+
+def run_result(run: Run, commands: Sequence[str]) -> tuple[dict[str, Any], Path]:
+    """Contents of result.json in the folder of `plan.run`, and the folder.
+
+    Parameters
+    ----------
+    run : Run
+    commands : sequence of str
+        Whose folders may be given.
+
+    Raises
+    ------
+    ConfigError, DataError
+        There is no finished run, it is one of another command, or it failed.
+    """
+    folder = Path(str(run.plan.run))
+    file = folder / "result.json"
+    if not file.is_file() or not (folder / "trajectories.h5").is_file():
+        raise run.refuse(
+            f"there is no finished run of {' or '.join(f'`{command}`' for command in commands)} in {folder}",
+            "plan",
+            "run",
+            hint="give the run folder that it printed",
+        )
+    result: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    formats = {"solve": "yid-solve/", "diagnose": "yid-diagnosis/"}
+    if not str(result.get("format", "")).startswith(tuple(formats[command] for command in commands)):
+        raise run.refuse(
+            f"{folder} is a run folder of another command ({result.get('format')})",
+            "plan",
+            "run",
+            allowed=" or ".join(f"{formats[command]}1" for command in commands),
+        )
+    if result.get("status") == "failed":
+        raise DataError(f"the solve in {folder} failed: {result['message']}", where=run.where("plan", "run"))
+    return result, folder
+
+
+def informed(run: Run, progress: Progress) -> tuple[InformationPlan, dict[str, Any]]:
+    """The motion that tells most, and where the parameters come from: the settings, or a folder of solve or diagnose.
+
+    Raises
+    ------
+    ConfigError, DataError, ModelError, SolverError
+    """
+    problem = build_problem(run)
+    free = {name: float(problem.theta[problem.system.parameters.index(name)]) for name in problem.free}
+    sizes: dict[str, dict[str, float]] = {}
+    source: dict[str, Any] = {"run": None, "parameters": free}
+    if run.plan.run is not None:
+        result, folder = run_result(run, ("solve", "diagnose"))
+        found, sizes = found_values(result)
+        known = {name: value for name, value in found.items() if name in problem.system.parameters}
+        source = {"run": str(folder), "parameters": free | known}
+    with located(run, "plan"):
+        plan = informative(problem, run.plan, source["parameters"], sizes, progress.stage)
+    return plan, source
+
+
+def found_values(result: Mapping[str, Any]) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
+    """Parameters of a `yid-solve/1` or `yid-diagnosis/1`, and in the latter sizes of effects, as people read them."""
+    if "parameters" in result:
+        return {name: entry["value"] for name, entry in result["parameters"].items()}, {}
+    sizes = {
+        f"{entry['kind']}@{entry['location']}": {
+            name: quantity["value"] for name, quantity in entry["parameters"].items() if quantity["value"] is not None
+        }
+        for entry in result["which"]
+    }
+    return {name: entry["before"] for name, entry in result["absorption"].items()}, sizes
+
+
+def information_result(run: Run, found: InformationPlan) -> dict[str, Any]:
+    """What `yid-plan/1` says of a motion that tells much."""
+    pairs = [
+        {"effect": first, "explained_by": second, "before": before, "after": after}
+        for (first, second), (before, after) in found.distances.items()
+    ]
+    return {
+        "inform": None if run.plan.inform is None else list(run.plan.inform),
+        "separate": None if run.plan.separate is None else list(run.plan.separate),
+        "parameters": {
+            name: {
+                "std_relative_before": _number(known.before),
+                "std_relative_after": _number(known.after),
+                "std_relative_together": _number(known.together),
+                "verdict": known.verdict,
+            }
+            for name, known in found.parameters.items()
+        },
+        "distances": pairs,
+        "starts": [
+            {
+                "first": start.first,
+                "value": start.value,
+                "judged": _number(start.judged),
+                "finished": start.finished,
+                "rounds": start.rounds,
+            }
+            for start in found.starts
+        ],
+        "best": found.best,
+        "limits_reached": {what: list(names) for what, names in found.active.items()},
+        "unseen": dict(found.unseen),
+        "open": list(found.open),
+    }
+
+
+def next_plan(confusable: Sequence[Sequence[Mapping[str, str]]], folder: Path) -> dict[str, Any] | None:
+    """The section `plan` that would separate the first effects of a diagnosis which look alike; None without any."""
+    if not confusable:
+        return None
+    labels = [f"{entry['kind']}@{entry['location']}" for entry in confusable[0]]
+    return {"goal": "information", "separate": labels[:MOST], "run": str(folder)}
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
