@@ -418,7 +418,8 @@ def _standstill(recording: Recording) -> Iterator[Doubt]:
     for group in recording.points:
         seen = group.position[:, np.isfinite(group.position).any(axis=(0, 2))]
         size = float(np.max(np.nanmax(seen, axis=0) - np.nanmin(seen, axis=0), initial=0.0))
-        noise = 0.0 if group.std is None else 6 * float(np.nanmedian(group.std))
+        known = np.zeros(0) if group.std is None else group.std[np.isfinite(group.std)]
+        noise = 6 * float(np.median(known)) if len(known) else 0.0
         moved.append(size / max(LIMITS.travel, noise))
     if max(moved, default=2.0) < 1.0:
         yield Doubt(

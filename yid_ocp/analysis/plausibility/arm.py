@@ -231,3 +231,8 @@ def check_limits(arm: Arm, recording: Recording) -> Iterator[Doubt]:
             "joints",
             "t",
         )
+
+
+def effect_line(kind: str, location: str, quantity: str, value: float) -> str:
+    """The line of configuration that describes an error as a known effect."""
+    return f"model.effects: [{{kind: {kind}, location: {location}, values: {{{quantity}: {value:.3g}}}}}]"
