@@ -10,7 +10,7 @@ import pytest
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording, write_recording
-from yid_ocp.data.checks import Doubt
+from yid_ocp.data.doubt import Doubt
 from yid_ocp.errors import DataError
 from yid_ocp.solvers import solve
 from yid_ocp.workflow.build import build_problem, build_system

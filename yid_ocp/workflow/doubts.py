@@ -23,7 +23,8 @@ from yid_ocp.analysis.plausibility import (
     check_reach,
 )
 from yid_ocp.config.settings import Run
-from yid_ocp.data.checks import CAUSES, Doubt, check_recording, same_data
+from yid_ocp.data.checks import check_recording, same_data
+from yid_ocp.data.doubt import CAUSES, Doubt
 from yid_ocp.data.gaps import cut_at_gaps
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError

@@ -12,7 +12,7 @@ import numpy as np
 import scipy.interpolate
 from numpy.typing import NDArray
 
-from yid_ocp.data.checks import DEGREE, Doubt, period
+from yid_ocp.data.doubt import DEGREE, Doubt, period
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.model.kinematics import forward_kinematics, rigid_body
 from yid_ocp.model.mechanism import Joint

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.analysis.plausibility.arm import Arm, Motion, effect_line, recorded_motion
-from yid_ocp.data.checks import Doubt
+from yid_ocp.data.doubt import Doubt
 from yid_ocp.data.recording import Recording
 from yid_ocp.effects.base import arms
 

@@ -13,7 +13,7 @@ import scipy.interpolate
 from numpy.typing import NDArray
 
 from yid_ocp.analysis.plausibility.arm import Arm, effect_line
-from yid_ocp.data.checks import Doubt, Weight, period
+from yid_ocp.data.doubt import Doubt, Weight, period
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.model.cable import Cable
 from yid_ocp.model.system import System
