@@ -6,7 +6,7 @@ Every case damages a recording that ships with the package (Baxter and the foam 
 RECORDINGS (Baxter's arm in free motion, a Panda with a beam, a branched cable), and hands it to the same steps as
 `yid-ocp solve`. Finished cases are kept in FOLDER/cases.jsonl and not repeated. A case passes where the cause that was
 made is named, or the recording is refused; a solve follows where no doubt forbids to trust it, and must find nothing.
-The undamaged recordings of every shipped configuration stand at the end: none of them may be in doubt.
+That the undamaged recordings of shipped configurations are not in doubt is for `tests/test_nonsense_benchmark.py`.
 """
 
 from __future__ import annotations

@@ -73,7 +73,7 @@ def _doubting_or_embedded(parser: argparse.ArgumentParser) -> None:
 
 
 def _identifiability(parser: argparse.ArgumentParser) -> None:
-    _configured(parser)
+    _doubting(parser)
     parser.add_argument("--what-if", action="store_true", help="rank changes of the experiment; takes a few minutes")
     text = "95 %% intervals by profile likelihood of: all, none, or NAME,NAME; by default all if they are few"
     parser.add_argument("--intervals", metavar="NAMES", default="auto", help=text)

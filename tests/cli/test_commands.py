@@ -20,7 +20,7 @@ from yid_ocp.data import read_recording
 SOLVE_KEYS = {
     "format", "status", "message", "parameters", "cost", "iterations", "evaluations", "seconds", "residuals", "fit",
     "held_out", "inputs", "versions", "notes", "safeguard", "discretisation", "discretisation_notes", "stability",
-    "torque_offsets",
+    "doubts", "torque_offsets",
 }  # fmt: skip
 PARAMETER_KEYS = {"value", "std", "unit", "initial", "lower", "upper", "free", "verdict", "interval"}
 

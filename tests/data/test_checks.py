@@ -7,7 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.data.checks import CAUSES, Doubt, check_recording, quantum, same_data, shared_samples
+from yid_ocp.data.channels import quantum
+from yid_ocp.data.checks import check_recording, same_data, shared_samples
+from yid_ocp.data.doubt import CAUSES, Doubt
 from yid_ocp.data.gaps import cut_at_gaps
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.problem.options import SensorOptions
@@ -132,6 +134,13 @@ FAULTS = {
 def test_a_fault_is_told_by_its_cause(fault):
     recording, expected = FAULTS[fault]
     assert causes(recording) == expected
+
+
+def test_commands_that_end_at_a_bound_are_a_warning():
+    recording, _ = FAULTS["clipped efforts"]
+    for kind, weight in (("command", "warning"), ("sample", "not_trusted")):
+        found = check_recording(changed(recording, effort_kind=kind), lambda _: SensorOptions())
+        assert {(doubt.cause, doubt.weight) for doubt in found} == {("saturated", weight)}
 
 
 def test_noise_that_settings_state_counts_instead_of_the_recorded():

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.data.checks import Doubt, period
+from yid_ocp.data.doubt import Doubt, period
 from yid_ocp.data.recording import Recording
 
 Array = NDArray[np.float64]

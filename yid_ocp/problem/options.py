@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from annotated_types import Ge, Gt, Len
 from numpy.typing import ArrayLike
 
-from yid_ocp.data.checks import Doubt
+from yid_ocp.data.doubt import Doubt
 from yid_ocp.model.cable import ClampPath
 from yid_ocp.options import About
 from yid_ocp.problem.measurements import Weighting

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from yid_ocp.data.checks import CAUSES
+from yid_ocp.data.doubt import CAUSES
 from yid_ocp.solvers.words import VERDICT_WORDS
 
 MOST_ALIKE = 3  # doubts of one kind

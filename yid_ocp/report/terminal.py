@@ -39,7 +39,7 @@ def solve_summary(result: Mapping[str, Any]) -> list[str]:
         interval = "" if failed or entry["interval"] is None else interval_words(*entry["interval"])
         verdict = "" if failed else VERDICT_WORDS[entry["verdict"]]
         rows.append((name, f"{entry['value']:.4g}", std, interval, entry["unit"], verdict, f"{entry['initial']:.4g}"))
-    lines = [*_doubt_lines(result), *([] if failed else _misfit(result["fit"])), *table(rows), ""]
+    lines = [*([] if failed else _misfit(result["fit"])), *_doubt_lines(result), *table(rows), ""]
     rows = [("channel", "error (rms)", "unit", "samples")]
     rows += [(c, f"{e['rmse']:.3g}", e["unit"], str(e["n"])) for c, e in result["residuals"].items()]
     if len(rows) > 1:
@@ -171,7 +171,7 @@ def compare_summary(result: Mapping[str, Any]) -> list[str]:
         known = [f"{result[key][name]:.4g}" if name in result[key] else "" for key in beside]
         rows.append((name, *cells, *known, VERDICT_WORDS[judged["parameters"][name]["verdict"]]))
     fit = judged["fit"]
-    lines = [*_doubt_lines(result), *_misfit(fit), *table(rows), "", *table(_efforts(methods)), ""]
+    lines = [*_misfit(fit), *_doubt_lines(result), *table(rows), "", *table(_efforts(methods)), ""]
     for name, entry in methods.items():
         if entry["status"] != "converged":
             lines.append(f"{name} did not converge: {entry['message']}")
@@ -228,7 +228,7 @@ def identifiability_summary(result: Mapping[str, Any]) -> list[str]:
         interval = "" if entry["interval"] is None else interval_words(*entry["interval"])
         rows.append((name, f"{entry['value']:.4g}", *spread, interval, entry["unit"], VERDICT_WORDS[entry["verdict"]]))
     lines = [] if result["fit"] is None else _misfit(result["fit"])
-    lines += [*table(rows), ""]
+    lines += [*_doubt_lines(result), *table(rows), ""]
     hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"]
     if len(hidden) > 8:
         hidden = [*hidden[:8], f"and {len(hidden) - 8} more directions, in result.json"]

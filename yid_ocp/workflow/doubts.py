@@ -23,7 +23,8 @@ from yid_ocp.analysis.plausibility import (
     check_reach,
 )
 from yid_ocp.config.settings import Run
-from yid_ocp.data.checks import CAUSES, Doubt, check_recording, same_data
+from yid_ocp.data.checks import check_recording, same_data
+from yid_ocp.data.doubt import CAUSES, Doubt
 from yid_ocp.data.gaps import cut_at_gaps
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError
@@ -32,6 +33,14 @@ from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem, SensorOptions
 from yid_ocp.problem.prediction import EpisodeResult
 
+MODELLED = {
+    "encoder_offset": "encoder_offset",
+    "effort_gain": "effort_gain",
+    "effort_sign": "effort_gain",
+    "effort_offset": "effort_offset",
+    "effort_lag": "effort_delay",
+}
+"""Effects by which a model takes such an error into account."""
 MOST_BLAMED = 3
 """Doubts that an error quotes."""
 
@@ -144,9 +153,17 @@ def _beside_the_model(
         found += check_limits(arm, recording)
         if any(doubt.weight == "refused" for doubt in found):
             return found
-        found += check_efforts(arm, recording)
-        found += check_held_points(arm, recording, choice)
+        told = [*check_efforts(arm, recording), *check_held_points(arm, recording, choice)]
+        found += [doubt for doubt in told if not _modelled(system, doubt)]
     return found + list(check_reach(arm, system, theta, recording, choice))
+
+
+def _modelled(system: System, doubt: Doubt) -> bool:
+    """Whether the model has as an effect what the doubt is about."""
+    kind = MODELLED.get(doubt.cause, "")
+    places = {effect.location for effect in system.effects if effect.kind == kind}
+    joint = doubt.channel.partition(".")[2]
+    return bool(places) and (not joint or joint in places)
 
 
 def object_doubts(problem: EstimationProblem) -> list[Doubt]:

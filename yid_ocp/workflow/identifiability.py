@@ -31,6 +31,7 @@ from yid_ocp.report.terminal import identifiability_summary
 from yid_ocp.solvers import Iterate, Solution, Status, solve
 from yid_ocp.workflow.build import build_problem, build_step, build_system
 from yid_ocp.workflow.command import DONE, FAILED, carry_out
+from yid_ocp.workflow.doubts import doubts_result
 from yid_ocp.workflow.folder import RunFolder, new_run_folder
 from yid_ocp.workflow.progress import SILENT, Progress
 
@@ -244,6 +245,7 @@ def identifiability_result(
         "directions": [],
         "nuisances": 0,
         "fit": None if solution is None else asdict(solution.fit),
+        "doubts": doubts_result(problem.options.doubts),
         "profiles": {},
         "what_if": None,
     }

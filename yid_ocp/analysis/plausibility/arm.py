@@ -12,7 +12,7 @@ import numpy as np
 import scipy.interpolate
 from numpy.typing import NDArray
 
-from yid_ocp.data.checks import DEGREE, Doubt, period
+from yid_ocp.data.doubt import DEGREE, Doubt, period
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.model.kinematics import forward_kinematics, rigid_body
 from yid_ocp.model.mechanism import Joint
@@ -231,3 +231,8 @@ def check_limits(arm: Arm, recording: Recording) -> Iterator[Doubt]:
             "joints",
             "t",
         )
+
+
+def effect_line(kind: str, location: str, quantity: str, value: float) -> str:
+    """The line of configuration that describes an error as a known effect."""
+    return f"model.effects: [{{kind: {kind}, location: {location}, values: {{{quantity}: {value:.3g}}}}}]"

@@ -19,9 +19,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.analysis.plausibility.arm import Arm, Motion, recorded_motion
-from yid_ocp.data.checks import Doubt
+from yid_ocp.analysis.plausibility.arm import Arm, Motion, effect_line, recorded_motion
+from yid_ocp.data.doubt import Doubt
 from yid_ocp.data.recording import Recording
+from yid_ocp.effects.base import arms
 
 Array = NDArray[np.float64]
 
@@ -43,6 +44,8 @@ SURE = 5.0
 """Standard deviations from which on a number counts."""
 SLOW = 1.0
 """Samples further apart than half of its inverse count as independent [Hz]."""
+NOTHING = 1e-3
+"""Efforts below this tell nothing [N m]."""
 LAG = 0.1
 """Steps in which a lag of efforts behind the motion is looked for; a shorter one is no gross error [s]."""
 ABOVE_LIMIT = 1.3
@@ -83,6 +86,8 @@ def check_efforts(arm: Arm, recording: Recording) -> list[Doubt]:
     largest = np.array([joint.effort_limit for joint in arm.joints])
     size = np.where(np.isfinite(largest), largest, np.maximum(np.max(np.abs(needed), axis=0), 1e-9))
     found = list(_limits(arm, motion, largest))
+    if not np.max(np.abs(needed)) > NOTHING or not np.all(np.isfinite(motion.effort)):
+        return [replace(doubt, recording=recording.name, group="joints") for doubt in found]
     dead = _dead(motion.effort, needed, size)
     if dead.any():
         found.append(_zero(arm, dead))
@@ -137,8 +142,9 @@ def _by_joint(arm: Arm, motion: Motion, needed: Array, size: Array) -> Iterator[
     loaded = _loaded(arm, motion, size)
     # What is held can add to efforts, but not several times what the arm itself weighs, nor carry nearly all of that.
     # A prior about one holds a gain that is a power of ten away, so efforts are scaled first.
-    ratio = float(np.linalg.norm(needed) / max(float(np.linalg.norm(motion.effort)), 1e-300))
-    common = 10.0 ** round(math.log10(ratio)) if not 1 / GAIN < ratio < GAIN else 1.0
+    ratio = float(np.linalg.norm(needed)) / max(float(np.linalg.norm(motion.effort)), 1e-300)
+    known = 0.0 < ratio < math.inf  # nothing is needed without gravity, and nothing is measured of an arm let go
+    common = 10.0 ** round(math.log10(ratio)) if known and not 1 / GAIN < ratio < GAIN else 1.0
     fit = _fitted(arm, motion, common * motion.effort, needed, size)
     told = fit.std < np.maximum(0.6 * np.abs(fit.inverse), 0.35)
     sound = told & (fit.left < EXPLAINED) & (np.abs(fit.offset) < 3 * OFFSET * size)
@@ -159,11 +165,11 @@ def _by_joint(arm: Arm, motion: Motion, needed: Array, size: Array) -> Iterator[
     upright = told & (fit.inverse > SURE * fit.std / 2) & (fit.inverse > 0.3)
     if turned.sum() >= 2 and not upright.any():
         depth = float(np.max(-fit.inverse[turned] / fit.std[turned])) / (SURE / 2)
-        yield _sign("all efforts have", depth, arm.names[int(np.argmax(turned))], "effort")
+        yield _sign("all efforts have", depth, "effort")
     else:
         for j in np.flatnonzero(turned):
             depth = float(-fit.inverse[j] / fit.std[j]) / (SURE / 2)
-            yield _sign(f"the effort of {arm.names[j]} has", depth, arm.names[j], f"effort.{arm.names[j]}")
+            yield _sign(f"the effort of {arm.names[j]} has", depth, f"effort.{arm.names[j]}")
     for j in np.flatnonzero(sound & ~turned):
         inverse, off = float(fit.inverse[j]), abs(float(fit.inverse[j]) - 1) / float(fit.std[j])
         weak, strong = inverse > GAIN, 0 < inverse < 1 / GAIN and fit.direct[j] > GAIN and not loaded[j]
@@ -177,9 +183,7 @@ def _by_joint(arm: Arm, motion: Motion, needed: Array, size: Array) -> Iterator[
                 "",
                 "joints",
                 f"effort.{arm.names[j]}",
-                setting=f"model.effects: [{{kind: effort_gain, location: {arm.names[j]}}}]",
             )
-    modelled = {effect.location for effect in arm.system.effects if effect.kind == "effort_offset"}
     # a large zero error looks like a large gain; but then the variation follows as it should
     off_zero = (fit.inverse > 0) & (fit.inverse < 1 / GAIN) & (fit.direct > 1 / GAIN) & (fit.direct < GAIN)
     offset = np.where(off_zero, fit.shift, fit.offset)
@@ -188,7 +192,7 @@ def _by_joint(arm: Arm, motion: Motion, needed: Array, size: Array) -> Iterator[
         # springs that carry part of the weight are no wrong zero
         balanced = offset[j] * np.mean(needed[:, j]) < 0 and abs(offset[j]) < np.max(np.abs(needed[:, j]))
         sure = abs(offset[j]) > SURE * fit.offset_std[j]
-        if sure and not balanced and arm.names[j] not in modelled:
+        if sure and not balanced:
             yield Doubt(
                 "effort_offset",
                 f"the zero of the effort of {arm.names[j]} is off by {offset[j]:+.3g} N m",
@@ -198,7 +202,7 @@ def _by_joint(arm: Arm, motion: Motion, needed: Array, size: Array) -> Iterator[
                 "",
                 "joints",
                 f"effort.{arm.names[j]}",
-                setting=f"model.effects: [{{kind: effort_offset, location: {arm.names[j]}}}]",
+                setting=effect_line("effort_offset", arm.names[j], "offset", float(offset[j])),
             )
     lost = fit.left > UNLIKE
     if arm.complete and lost.sum() > len(arm.names) / 2:
@@ -215,7 +219,7 @@ def _by_joint(arm: Arm, motion: Motion, needed: Array, size: Array) -> Iterator[
         )
 
 
-def _sign(who: str, depth: float, joint: str, channel: str) -> Doubt:
+def _sign(who: str, depth: float, channel: str) -> Doubt:
     return Doubt(
         "effort_sign",
         f"{who} the opposite sign of what gravity and motion need",
@@ -225,9 +229,6 @@ def _sign(who: str, depth: float, joint: str, channel: str) -> Doubt:
         "",
         "joints",
         channel,
-        setting=f"model.effects: [{{kind: effort_gain, location: {joint}, values: {{scale: -1}}}}]"
-        if "." in channel
-        else "",
     )
 
 
@@ -258,7 +259,11 @@ def _late(arm: Arm, motion: Motion, needed: Array, size: Array) -> Iterator[Doub
             "",
             "joints",
             "effort",
-            setting="model.effects: [{kind: effort_delay, location: arm}]",
+            setting="; ".join(
+                effect_line("effort_delay", name, "delay", float(trials[at])) for name in arms(arm.system)
+            )
+            if abs(trials[at]) <= LAG
+            else "",
         )
 
 

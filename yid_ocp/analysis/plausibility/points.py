@@ -12,8 +12,8 @@ import numpy as np
 import scipy.interpolate
 from numpy.typing import NDArray
 
-from yid_ocp.analysis.plausibility.arm import Arm
-from yid_ocp.data.checks import Doubt, Weight, period
+from yid_ocp.analysis.plausibility.arm import Arm, effect_line
+from yid_ocp.data.doubt import Doubt, Weight, period
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.model.cable import Cable
 from yid_ocp.model.system import System
@@ -47,6 +47,7 @@ class _Change:
     advice: str
     error: float
     setting: str = ""
+    channel: str = ""
 
 
 # -- points that the arm holds ----------------------------------------------------------------------------------------
@@ -83,7 +84,7 @@ def check_held_points(arm: Arm, recording: Recording, choice: Choices) -> Iterat
         )
         place, by_angle = arm.places(tuple(frames.values()), course(t))
         error = _rms(seen - place)
-        noise = 0.0 if group.std is None else float(np.nanmedian(group.std))
+        noise = _noise(group)
         if not error > max(CLOSE, 5 * noise):
             continue
         changes = [
@@ -108,7 +109,23 @@ def _explained(
         advice = "check the frame of the points, their names and the robot's description"
         return Doubt(otherwise, what, weight, error / allowed, advice, recording, group)
     what = f"points are {error:.3g} m (rms) from where the model has them; {chosen.words} it is {chosen.error:.2g} m"
-    return Doubt(chosen.cause, what, weight, error / allowed, chosen.advice, recording, group, setting=chosen.setting)
+    return Doubt(
+        chosen.cause,
+        what,
+        weight,
+        error / allowed,
+        chosen.advice,
+        recording,
+        "joints" if chosen.channel else group,
+        chosen.channel,
+        setting=chosen.setting,
+    )
+
+
+def _noise(group: PointGroup) -> float:
+    """Typical standard deviation that the recording gives to its points [m]."""
+    known = np.zeros(0) if group.std is None else group.std[np.isfinite(group.std)]
+    return float(np.median(known)) if len(known) else 0.0
 
 
 def _rms(difference: Array) -> float:
@@ -141,7 +158,8 @@ def _changed_names(seen: Array, place: Array, names: Sequence[str]) -> Iterator[
         order = list(range(len(names)))
         order[i], order[j] = j, i
         words = f"with {names[i]} and {names[j]} exchanged"
-        yield _Change("point_swapped", words, words.replace("with ", "take "), _rms(seen[:, order] - place))
+        advice = f"exchange the names of {names[i]} and {names[j]}"
+        yield _Change("point_swapped", words, advice, _rms(seen[:, order] - place))
 
 
 def _changed_times(
@@ -186,9 +204,9 @@ def _changed_zeros(
             moved[:, j] += offset
             place, by_angle = arm.places(frames, moved)
         else:
-            setting = f"model.effects: [{{kind: encoder_offset, location: {name}}}]"
+            setting = effect_line("encoder_offset", name, "offset", -offset)
             words, advice = f"with {offset:+.3g} rad more at {name}", f"set the zero of {name}, or let it be estimated"
-            found.append(_Change("encoder_offset", words, advice, _rms(seen - place), setting))
+            found.append(_Change("encoder_offset", words, advice, _rms(seen - place), setting, f"position.{name}"))
     yield from sorted(found, key=lambda change: change.error)[:1]
 
 
@@ -252,7 +270,7 @@ def check_reach(
         said = choice(group.name)
         frames = {n: said.frames.get(n, n) for n in (said.points or group.names) if n in group.names}
         ways = {n: _way(arm, system, theta, f) for n, f in frames.items() if mechanism.has_frame(f)}
-        noise = 0.0 if group.std is None else float(np.nanmedian(group.std))
+        noise = _noise(group)
         worst, words, ratio = 0.0, "", 1.0
         places = {n: group.position[:, group.names.index(n)] for n in ways}
         pairs: list[tuple[str, Array, float]] = []

@@ -1,0 +1,209 @@
+"""What single channels of a recording say against it: values that repeat, steps, noise, extremes that are cut off."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+import scipy.special
+from numpy.typing import NDArray
+
+from yid_ocp.data.doubt import FEWEST, LIMITS, Array, Choices, Doubt, group_name, period
+from yid_ocp.data.recording import Recording
+from yid_ocp.sensors.joints import DIFFERENCES, EFFORT, POSITION
+
+
+def _channels(recording: Recording, *wanted: str) -> Iterator[tuple[str, str, Array, Array]]:
+    """Group, channel, times and values (N,) or (N, 3) of what was measured."""
+    joints = recording.joints
+    if joints is not None:
+        for quantity, values in joints.channels.items():
+            for j, name in enumerate(joints.names):
+                if quantity in wanted:
+                    yield "joints", f"{quantity}.{name}", joints.t, values[:, j]
+    for group in recording.points:
+        for i, name in enumerate(group.names):
+            seen = np.isfinite(group.position[:, i]).all(axis=1)
+            if "points" in wanted:
+                yield group.name, name, group.t[seen], group.position[seen, i]
+
+
+def stuck(recording: Recording) -> Iterator[Doubt]:
+    """A channel that is noisy elsewhere repeats one value, or stays where its velocity says that it turns."""
+    joints, found = recording.joints, []
+    for group, channel, t, values in _channels(recording, "position", "effort", "points"):
+        if len(t) <= LIMITS.stuck_samples:
+            continue
+        same = np.all(np.diff(values.reshape(len(t), -1), axis=0) == 0, axis=1)
+        begin, end = _longest_run(same)
+        count, length = end - begin, float(t[end] - t[begin])
+        if count < LIMITS.stuck_samples or length < LIMITS.stuck_time:
+            continue
+        rest = np.delete(same, slice(begin, end))
+        usual = float(np.mean(rest)) if len(rest) >= count // 4 else 1.0
+        quantity, _, name = channel.partition(".")
+        turned = 0.0
+        if joints is not None and quantity == "position" and joints.velocity is not None:
+            speed = joints.velocity[begin : end + 1, joints.names.index(name)]
+            area = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(t[begin : end + 1]))])
+            turned = float(np.ptp(area))
+        # of a channel that changes from sample to sample in nine of ten, so long a run is no chance
+        evidence = (count / LIMITS.stuck_samples) if usual < 0.1 else 0.0
+        stated = joints is not None and quantity == "position" and bool(np.all(joints.position_std or 0))
+        if not len(rest) and stated:
+            evidence = count / LIMITS.stuck_samples
+        evidence = max(evidence, turned / LIMITS.turned if turned > LIMITS.turned else 0.0)
+        if quantity == "effort" and values[begin] in (0.0, np.max(values), np.min(values)):
+            continue  # no effort was recorded, or it is cut off: other causes
+        if evidence >= 1:
+            also = f", while its velocity turns it by {turned:.2g} rad" if turned > LIMITS.turned else ""
+            found.append((group, channel, float(t[begin]), float(t[end]), evidence, also))
+    for group, channel, start, stop, evidence, also in found:
+        yield Doubt(
+            "stuck",
+            f"{channel} repeats one value for {stop - start:.3g} s{also}",
+            "not_trusted",
+            evidence,
+            "leave that stretch or that channel out, and look at the sensor",
+            "",
+            group,
+            channel,
+            start,
+            stop,
+        )
+
+
+def _longest_run(same: NDArray[np.bool_]) -> tuple[int, int]:
+    """First and last index of the longest stretch of samples that are all the same."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(int)))
+    if not len(edges):
+        return 0, 0
+    begins, ends = edges[::2], edges[1::2]
+    longest = int(np.argmax(ends - begins))
+    return int(begins[longest]), int(ends[longest])
+
+
+def white(t: Array, values: Array) -> float:
+    """Noise that is white from sample to sample, robustly; zero for a channel with long rests or an uneven clock."""
+    even = np.abs(np.diff(t) / max(period(t), 1e-12) - 1) < 0.2
+    if len(t) < DIFFERENCES + FEWEST:
+        return 0.0
+    together = np.lib.stride_tricks.sliding_window_view(even, DIFFERENCES).all(axis=1)
+    if together.sum() < FEWEST:
+        return 0.0
+    size = math.sqrt(float(scipy.special.comb(2 * DIFFERENCES, DIFFERENCES)))
+    return float(1.4826 * np.median(np.abs(np.diff(values, DIFFERENCES)[together])) / size)
+
+
+def quantum(values: Array) -> float:
+    """Step of which all differences of a channel are multiples, zero where there is none."""
+    levels = np.unique(values)
+    if not 1 < len(levels) < 0.7 * values.size:
+        return 0.0
+    apart = np.diff(levels)
+    step = float(np.min(apart[apart > 1e-9 * np.ptp(levels)], initial=np.inf))
+    if not math.isfinite(step):
+        return 0.0
+    count = apart / step
+    return step if np.mean(np.abs(count - np.rint(count)) < 0.05 * np.maximum(count, 1)) > 0.95 else 0.0
+
+
+def _stated(recording: Recording, choice: Choices, group: str, channel: str) -> float:
+    """Standard deviation that settings or recording give to a channel, zero where nobody says."""
+    joints = recording.joints
+    quantity, _, name = channel.partition(".")
+    if group == "joints" and joints is not None:
+        said = choice({"position": POSITION, "effort": EFFORT}[quantity]).std
+        if isinstance(said, Mapping):
+            return float(said.get(name, 0.0))
+        own = joints.position_std if quantity == "position" else joints.effort_std
+        given = said if said is not None else own
+        if given is None:
+            return 0.0
+        return float(np.broadcast_to(given, (len(joints.names),))[joints.names.index(name)])
+    said = choice(group).std
+    if isinstance(said, (int, float)):
+        return float(said)
+    own_group = next(entry for entry in recording.points if entry.name == group)
+    if own_group.std is None:
+        return 0.0
+    spread = own_group.std[:, own_group.names.index(channel)]
+    return float(np.nanmedian(spread)) if np.any(np.isfinite(spread)) else 0.0
+
+
+def steps_and_noise(recording: Recording, choice: Choices) -> Iterator[Doubt]:
+    """Steps and noise beside the noise that is stated; where frames are as slow as the motion nothing can be said."""
+    for group, channel, t, values in _channels(recording, "position", "effort", "points"):
+        if len(t) < 100 or period(t) > 0.05:
+            continue
+        stated = _stated(recording, choice, group, channel)
+        columns = values.reshape(len(t), -1).T
+        step = max(quantum(column) for column in columns)
+        size, wide = step / math.sqrt(12), float(np.ptp(values))
+        # an angle that hardly moves has few levels by nature
+        few = step > wide / 16 and wide > (5 * LIMITS.motion if channel.startswith("position") else 0.0)
+        setting = f"sensors.{'joints.' + channel.partition('.')[0] if group == 'joints' else group}.std"
+        if step > 0 and (size > LIMITS.noise * stated > 0 or (few and stated == 0)):
+            yield Doubt(
+                "quantised",
+                f"{channel} moves in steps of {step:.3g}, which is noise of {size:.2g}"
+                + (f"; {stated:.2g} is stated" if stated else ""),
+                "not_trusted",
+                size / (LIMITS.noise * stated) if stated else 16 * step / wide,
+                "state the noise that the steps make, or record with more digits",
+                "",
+                group,
+                channel,
+                setting=f"{setting}: {size:.2g}",
+            )
+            continue
+        seen = max(white(t, column) for column in columns)
+        if _clock(recording, group) == "nominal":
+            # when a sample was taken is known to half a period, which looks like noise wherever something moves
+            seen -= min(seen, 0.5 * max(float(np.mean(np.abs(np.diff(column)))) for column in columns))
+        if seen > LIMITS.noise * stated > 0:
+            yield Doubt(
+                "noise",
+                f"{channel} has noise of {seen:.2g} from sample to sample; {stated:.2g} is stated",
+                "not_trusted",
+                seen / (LIMITS.noise * stated),
+                "state the noise that is there",
+                "",
+                group,
+                channel,
+                setting=f"{setting}: {seen:.2g}",
+            )
+
+
+def _clock(recording: Recording, name: str) -> str:
+    return next(group.clock for group in recording.groups if group_name(group) == name)
+
+
+def saturated(recording: Recording) -> Iterator[Doubt]:
+    """Efforts that meet their extreme again and again, to the last digit."""
+    commanded = recording.joints is not None and recording.joints.effort_taken_as == "command"
+    for group, channel, t, values in _channels(recording, "effort"):
+        for sign in (1.0, -1.0):
+            levels, counts = np.unique(sign * values, return_counts=True)
+            near = (levels > levels[-1] - 0.05 * np.ptp(levels)) & (levels < levels[-1])
+            at = sign * values == levels[-1]
+            # a value that many samples share while none of its neighbours has a fifth as many, held again and again
+            held = int(np.sum(np.diff(np.flatnonzero(at)) == 1))
+            apart = int(np.sum(np.diff(np.flatnonzero(at)) > 1)) + 1
+            alone = at.sum() >= LIMITS.clipped and at.sum() > 5 * np.max(counts[near], initial=0)
+            if alone and len(levels) > FEWEST and held >= LIMITS.clipped / 2 and apart >= 2:
+                first, last = np.flatnonzero(at)[[0, -1]]
+                yield Doubt(
+                    "saturated",
+                    f"{channel} is exactly {sign * levels[-1]:.4g} N m in {at.sum()} samples and never beyond",
+                    # what a controller asked for may end at its own bound
+                    "warning" if commanded else "not_trusted",
+                    at.sum() / LIMITS.clipped,
+                    "leave what is cut off out, or record within the sensor's range",
+                    "",
+                    group,
+                    channel,
+                    float(t[first]),
+                    float(t[last]),
+                )

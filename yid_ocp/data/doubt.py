@@ -1,0 +1,180 @@
+"""A reason not to believe a recording: its cause, place and weight, and the limits from which on anything counts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.data.recording import JointGroup, PointGroup
+from yid_ocp.sensors.base import Choice
+
+Array = NDArray[np.float64]
+Group = JointGroup | PointGroup
+Weight = Literal["warning", "not_trusted", "refused"]
+
+MOST = 1e3
+"""Evidence beyond which nothing more is to be said."""
+CLOCK_UNITS: Mapping[str, float] = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
+EPOCH = 1e8
+"""A clock that counts from 1970 is beyond this, one that counts from when a robot was switched on is not [s]."""
+DEGREE = math.degrees(1.0)
+FEWEST = 30
+"""Differences from which noise can be told."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """From where on something counts against a recording.
+
+    Attributes
+    ----------
+    slowest_joints, slowest_points : float
+        Longest period of a robot's joints and of frames [s].
+    dropped : float
+        Part of a clock's samples that may be missing.
+    clock_off : float
+        Part of the joints' time by which points may start late and end late.
+    rate : float
+        Factor by which angles may turn faster or more slowly than the recorded velocity says.
+    noise : float
+        Factor by which noise may exceed what is stated.
+    stuck_time : float
+        How long a channel that is noisy elsewhere may repeat one value [s].
+    stuck_samples : int
+        How often it may.
+    turned : float
+        By how much the recorded velocity may turn a joint whose angle stays the same [rad].
+    clipped : int
+        How often a noisy effort may hit its extreme exactly.
+    motion, travel : float
+        Less is no motion, of any joint [rad], of any point [m].
+    shared : int
+        Samples that two recordings may share.
+    """
+
+    slowest_joints: float = 0.5
+    slowest_points: float = 30.0
+    dropped: float = 0.2
+    clock_off: float = 0.2
+    rate: float = 1.3
+    noise: float = 3.0
+    stuck_time: float = 0.3
+    stuck_samples: int = 12
+    turned: float = 0.03
+    clipped: int = 8
+    motion: float = 0.01
+    travel: float = 0.002
+    shared: int = 50
+
+
+LIMITS = Limits()
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """One reason not to believe a recording as it is.
+
+    Attributes
+    ----------
+    cause : str
+        What is wrong, in one word of `CAUSES`.
+    what : str
+        The same in one sentence, with numbers.
+    weight : {'warning', 'not_trusted', 'refused'}
+        Whether a run goes on as it would (and says so), goes on but says of no number that it is found, or stops.
+    evidence : float
+        How many times what was seen exceeds the limit from which on it counts, 1 to `MOST`.
+    advice : str
+        What to do.
+    recording, group, channel : str
+        Where; empty for all of them.
+    begin, end : float, optional
+        Stretch of time on the group's clock [s]; all of it when absent.
+    setting : str
+        Line of configuration that repairs or describes it, where there is one.
+    """
+
+    cause: str
+    what: str
+    weight: Weight
+    evidence: float
+    advice: str
+    recording: str
+    group: str = ""
+    channel: str = ""
+    begin: float | None = None
+    end: float | None = None
+    setting: str = ""
+
+    def __post_init__(self) -> None:
+        if self.cause not in CAUSES:
+            raise ValueError(f"there is no cause '{self.cause}'")
+        object.__setattr__(self, "evidence", float(min(max(self.evidence, 1.0), MOST)))
+
+    @property
+    def sure(self) -> str:
+        """How sure it is, in words."""
+        return "perhaps" if self.evidence < 1.5 else "likely" if self.evidence < 3 else "certain"
+
+    @property
+    def where(self) -> str:
+        """Recording, group, channel and time in one text."""
+        place = "/".join(part for part in (self.recording, self.group, self.channel) if part)
+        span = "" if self.begin is None or self.end is None else f", {self.begin:.4g} to {self.end:.4g} s"
+        return place + span
+
+
+CAUSES: Mapping[str, str] = {
+    "time_unit": "times are not in seconds",
+    "time_scale": "the clock runs too fast or too slowly",
+    "clock_base": "clocks of two groups have nothing in common",
+    "clock_offset": "the clock of one group is late or early",
+    "clock_drift": "the clocks of two groups run apart",
+    "clock_jump": "the clock jumps",
+    "gap": "a gap in what drives the model",
+    "dropped_samples": "many samples are missing",
+    "standstill": "nothing moves",
+    "stuck": "a channel repeats one value",
+    "quantised": "a channel has steps larger than its noise",
+    "saturated": "a channel is cut off at its extreme",
+    "noise": "more noise than stated",
+    "same_data": "the same data twice",
+    "degrees": "angles are in degrees",
+    "angle_scale": "an angle is multiplied by something",
+    "angle_sign": "an angle has the wrong sign",
+    "swapped_joints": "two joints are exchanged",
+    "angle_limits": "angles are beyond the joint's limits",
+    "speed_limits": "joints turn faster than they can",
+    "effort_zero": "efforts are zero",
+    "effort_sign": "an effort has the wrong sign",
+    "effort_gain": "an effort is multiplied by something",
+    "effort_offset": "an effort's zero is off",
+    "effort_lag": "efforts are late",
+    "effort_limits": "efforts are larger than the joint can bear",
+    "effort_unlike": "efforts are not those of this robot",
+    "point_scale": "lengths are not in metres",
+    "point_mirrored": "points are mirrored or their axes exchanged",
+    "point_frame": "points are in another frame",
+    "point_swapped": "two points are exchanged",
+    "point_reach": "points are where the object cannot be",
+    "encoder_offset": "an encoder's zero is off",
+    "point_unlike": "points are not where the robot holds them",
+}
+"""What may be wrong with a recording, in the words of tables."""
+
+Choices = Callable[[str], Choice]
+
+
+def period(t: Array) -> float:
+    """Median time between samples [s]; zero for fewer than two."""
+    return float(np.median(np.diff(t))) if len(t) > 1 else 0.0
+
+
+def group_name(group: Group) -> str:
+    """Name of a group; `joints` for the joints."""
+    return group.name if isinstance(group, PointGroup) else "joints"
