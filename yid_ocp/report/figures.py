@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 
 INK, PALE = "#22303c", "#d9dee3"
 COLORS = ("#0b6e99", "#c2571a", "#5b8c2a", "#8a4f9e")
+DASHES = ("solid", "dash", "dot", "dashdot")
 BEFORE, AFTER, MEASURED = COLORS[1], COLORS[0], "#8d99a4"
 DIVERGING = ((0.0, "#2166ac"), (0.25, "#92c5de"), (0.5, "#ffffff"), (0.75, "#f4a582"), (1.0, "#b2182b"))
 WORST = -50.0  # lower end of an axis of closures [%]
@@ -131,12 +132,16 @@ def lines_over_time(curve: Curve) -> plotly.graph_objects.Figure:
     figure = go.Figure()
     for i, (name, (t, value)) in enumerate(curve.lines.items()):
         keep, style = _thinned(len(t)), {"color": COLORS[i % len(COLORS)], "width": 1.5}
-        style |= {"dash": "dash"} if i >= len(COLORS) else {}
+        style |= {"dash": DASHES[i // len(COLORS) % len(DASHES)]}
         figure.add_scatter(x=t[keep].tolist(), y=_listed(value[keep]), mode="lines", name=name, line=style)
     if curve.band is not None:
         shade = {"fillcolor": PALE, "opacity": 0.7, "line_width": 0, "layer": "below"}
         figure.add_hrect(y0=-curve.band, y1=curve.band, **shade)
-    return _styled(figure, 300, "time [s]", curve.title)
+    _styled(figure, 300, "time [s]", curve.title)
+    if len(curve.lines) > 2 * len(COLORS):  # more than a row above the figure holds
+        beside = {"orientation": "v", "x": 1.01, "xanchor": "left", "y": 1.0, "yanchor": "top", "font": {"size": 10}}
+        figure.update_layout(height=80 + 21 * len(curve.lines), legend=beside)
+    return figure
 
 
 def residual_histogram(residuals: Mapping[str, Array]) -> plotly.graph_objects.Figure:

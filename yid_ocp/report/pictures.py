@@ -31,7 +31,8 @@ def draw_convergence(path: Path, comparison: Comparison) -> None:
         by_iteration.plot(range(len(history)), relative, marker=".", label=run.method)
         by_time.plot([entry.seconds for entry in history], relative, marker=".", label=run.method)
     for axes, label in ((by_iteration, "iteration"), (by_time, "wall time [s]")):
-        axes.set_xscale("symlog", linthresh=1.0)
+        if axes.get_xlim()[1] > 2.0:  # below that it is linear all over, and has no ticks of its own
+            axes.set_xscale("symlog", linthresh=1.0)
         axes.set_yscale("log")
         axes.set_xlim(left=0.0)
         axes.set_xlabel(label)
