@@ -250,8 +250,16 @@ def test_two_effects_are_moved_apart(driven_problem):
     assert set(found.distances) == {pair, pair[::-1]}
     for before, after in found.distances.values():
         assert after > 1.5 * before
-    twice = informative(driven_problem, options, None, {pair[0]: {"tau_c": 2.0}, pair[1]: {"b": 0.5}})
-    assert min(after for _, after in twice.distances.values()) > 0
+
+
+def test_effects_of_twice_the_size_lie_twice_as_far_apart(driven_problem):
+    pair, quick = ("joint_coulomb@shoulder", "joint_viscous@shoulder"), replace(OPTIONS, starts=1, iterations=1)
+    told = []
+    for factor in (1.0, 2.0):
+        sizes = {pair[0]: {"tau_c": 0.2 * factor}, pair[1]: {"b": 0.05 * factor}}
+        told.append(informative(driven_problem, replace(quick, separate=pair), None, sizes).distances)
+    for key in told[0]:
+        assert told[1][key][0] == pytest.approx(2 * told[0][key][0], rel=1e-3)
 
 
 def test_a_parameter_that_nothing_sees_is_named_and_the_others_are_told(limited_urdf):

@@ -60,7 +60,7 @@ class Experiment:
     mover : Mover
         Of the same system with its arms prescribed.
     names : tuple of str
-        Parameters that are free in the form with a known motion.
+        Parameters that are free: those of the problem, and amplitudes of effects that are to be separated.
     """
 
     configured: EstimationProblem
