@@ -40,6 +40,7 @@ WELL = 0.5
 """The same up to which nothing is left to be explained by a lag."""
 UNLIKE = 3.0
 """The same from which on it is not this robot's."""
+TINY, ABSURD = 1e-12, 1e12  # where numbers end that a fit can be made of
 SURE = 5.0
 """Standard deviations from which on a number counts."""
 SLOW = 1.0
@@ -86,7 +87,8 @@ def check_efforts(arm: Arm, recording: Recording) -> list[Doubt]:
     largest = np.array([joint.effort_limit for joint in arm.joints])
     size = np.where(np.isfinite(largest), largest, np.maximum(np.max(np.abs(needed), axis=0), 1e-9))
     found = list(_limits(arm, motion, largest))
-    if not np.max(np.abs(needed)) > NOTHING or not np.all(np.isfinite(motion.effort)):
+    most = [float(np.max(np.abs(values), initial=0.0)) for values in (needed, motion.effort)]
+    if not most[0] > NOTHING or not max(most) < ABSURD:
         return [replace(doubt, recording=recording.name, group="joints") for doubt in found]
     dead = _dead(motion.effort, needed, size)
     if dead.any():
@@ -143,14 +145,13 @@ def _by_joint(arm: Arm, motion: Motion, needed: Array, size: Array) -> Iterator[
     # What is held can add to efforts, but not several times what the arm itself weighs, nor carry nearly all of that.
     # A prior about one holds a gain that is a power of ten away, so efforts are scaled first.
     ratio = float(np.linalg.norm(needed)) / max(float(np.linalg.norm(motion.effort)), 1e-300)
-    known = 0.0 < ratio < math.inf  # nothing is needed without gravity, and nothing is measured of an arm let go
-    common = 10.0 ** round(math.log10(ratio)) if known and not 1 / GAIN < ratio < GAIN else 1.0
+    common = 10.0 ** round(math.log10(ratio)) if not 1 / GAIN < ratio < GAIN else 1.0
     fit = _fitted(arm, motion, common * motion.effort, needed, size)
     told = fit.std < np.maximum(0.6 * np.abs(fit.inverse), 0.35)
     sound = told & (fit.left < EXPLAINED) & (np.abs(fit.offset) < 3 * OFFSET * size)
     scale = 1.0
     if common != 1.0 and sound.sum() >= 2:
-        scale = 1 / (common * float(np.median(np.abs(fit.inverse[sound]))))
+        scale = 1 / (common * max(float(np.median(np.abs(fit.inverse[sound]))), TINY))
     if not 1 / GAIN < scale < GAIN:
         yield Doubt(
             "effort_gain",
@@ -281,7 +282,7 @@ def _fitted(arm: Arm, motion: Motion, effort: Array, needed: Array, size: Array)
     pull = np.zeros(len(prior))
     pull[:width] = 1 / prior[:width] ** 2
     found = np.linalg.solve(normal, rows.T @ target + pull)
-    std = np.sqrt(np.diag(np.linalg.inv(normal)))
+    std = np.maximum(np.sqrt(np.diag(np.linalg.inv(normal))), TINY)
     remains = (rows @ found - target).reshape(count, width) / weight
     others = np.concatenate([np.zeros(2 * width), found[2 * width :]])
     explained = needed - np.einsum("njc,c->nj", matrix * error[:, None], others)
