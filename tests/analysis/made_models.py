@@ -59,6 +59,7 @@ class Formula:
         self.noise, self._fails = noise, fails or (lambda values: False)
         self.innovations, self.disturbed = (None,), False
         self.options = SimpleNamespace(
+            believed=True,
             weighting="paper" if noise != 1 else "whitened",
             initial_state="equilibrium",
             known_start={},

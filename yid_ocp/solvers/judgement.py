@@ -415,7 +415,7 @@ def estimates(
         std = float(spread[at])
         std = std if std < UNINFORMED * max(abs(value), float(scales[at])) else math.inf
         side = bound_side(value, float(lower[at]), float(upper[at]), float(scales[at])) if known else 0
-        explains = problem.options.believed and (fit is None or fit.explains)
+        explains = fit is None or (fit.explains and fit.believed)
         said = verdict(value, std, scale=sizes[entry.name], explains=explains, at_bound=side != 0)
         interval = None
         if said == "not_identifiable":
