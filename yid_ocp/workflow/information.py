@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -69,11 +69,25 @@ def informed(run: Run, progress: Progress) -> tuple[InformationPlan, dict[str, A
     if run.plan.run is not None:
         result, folder = run_result(run, ("solve", "diagnose"))
         found, sizes = found_values(result)
+        refuse_other_effects(run, found, problem.system.parameters.names)
         known = {name: value for name, value in found.items() if name in problem.system.parameters}
         source = {"run": str(folder), "parameters": free | known}
     with located(run, "plan"):
         plan = informative(problem, run.plan, source["parameters"], sizes, progress.stage)
     return plan, source
+
+
+def refuse_other_effects(run: Run, found: Iterable[str], own: Collection[str]) -> None:
+    """Refuse a run whose parameters belong to effects that the plan's model lacks: the others made up for nothing."""
+    lacking = sorted({name.rpartition(".")[0] for name in found if "@" in name and name not in own})
+    if lacking:
+        raise run.refuse(
+            f"{run.plan.run} was solved with {', '.join(lacking)}, which this model does not have",
+            "plan",
+            "run",
+            allowed="a run of `solve` on the same model",
+            hint="list the same effects under model.effects",
+        )
 
 
 def found_values(result: Mapping[str, Any]) -> tuple[dict[str, float], dict[str, dict[str, float]]]:

@@ -32,7 +32,7 @@ from yid_ocp.report.terminal import plan_summary
 from yid_ocp.workflow.build import build_cable, build_step, located, parameter_settings, read_recordings
 from yid_ocp.workflow.command import DONE, FAILED, carry_out
 from yid_ocp.workflow.folder import new_run_folder
-from yid_ocp.workflow.information import information_result, informed, run_result
+from yid_ocp.workflow.information import information_result, informed, refuse_other_effects, run_result
 from yid_ocp.workflow.progress import SILENT, Progress
 
 FORMAT = "yid-plan/1"
@@ -153,15 +153,7 @@ def identified(run: Run, step: Step) -> tuple[Array, Known, dict[str, Any]]:
         return theta, Known(), {"run": None, "parameters": {name: parameters[name].value for name in free}}
     result, folder = run_result(run, ("solve",))
     solved = folder / "trajectories.h5"
-    lacking = {name.rpartition(".")[0] for name in result["parameters"] if "@" in name and name not in parameters}
-    if lacking:
-        raise run.refuse(
-            f"{folder} was solved with {', '.join(sorted(lacking))}, which this model does not have",
-            "plan",
-            "run",
-            allowed="a run of `solve` on the same model",
-            hint="list the same effects under model.effects",
-        )
+    refuse_other_effects(run, result["parameters"], parameters.names)
     found = {name: entry["value"] for name, entry in result["parameters"].items() if name in parameters}
     for name, value in found.items():
         theta[parameters.index(name)] = value
