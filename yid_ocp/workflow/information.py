@@ -41,7 +41,10 @@ def run_result(run: Run, commands: Sequence[str]) -> tuple[dict[str, Any], Path]
             "run",
             hint="give the run folder that it printed",
         )
-    result: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    try:
+        result: dict[str, Any] = dict(json.loads(file.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError, RecursionError) as error:
+        raise DataError(f"the result cannot be read ({error})", where=str(file), hint="run it again") from error
     formats = {"solve": "yid-solve/", "diagnose": "yid-diagnosis/"}
     if not str(result.get("format", "")).startswith(tuple(formats[command] for command in commands)):
         raise run.refuse(
