@@ -17,6 +17,7 @@ from yid_ocp.analysis.identifiability import carried, identifiability, unknown_v
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ConfigError, SolverError
 from yid_ocp.model import Grasp
+from yid_ocp.solvers.words import percent_words
 
 
 def judged(problem, at=None, **more):
@@ -204,6 +205,23 @@ def test_directions_are_sorted_and_say_how_well_they_are_seen():
     assert judged(Formula(two(30.0, 10.0), START)).directions[0].words == "b is seen (± 10 %)"
 
 
+def test_what_is_said_of_one_parameter_is_what_stands_beside_it():
+    """Directions know the size of a misfit, standard deviations also whom it concerns."""
+
+    def rows(x):
+        slow = [(-1) ** (k // 10) for k in range(60)]
+        return [
+            *(30 * (x["a"] / 2 - 1) + (-1) ** k for k in range(60)),
+            *(30 * (x["b"] / 50 - 1) + 9 * sign for sign in slow),
+        ]
+
+    info = judged(Formula(rows, START), [2.0, 50.0])
+    assert len(info.directions) == 2
+    for direction in info.directions:
+        [name] = [name for name, part in direction.components.items() if abs(part) > 0.5]
+        assert f"(± {percent_words(info.parameters[name].std_relative)} %)" in direction.words
+
+
 def test_a_joint_change_names_the_largest_part_first_and_leaves_small_ones_out():
     def rows(x):
         a, b, c = (x[name] / 2 - 1 for name in "abc")
@@ -222,7 +240,7 @@ def test_the_largest_component_of_a_direction_is_positive():
 
 def test_what_is_hardly_seen_is_said_not_to_be_seen():
     """Fewer standard deviations than a quarter for a change by the whole value."""
-    for size, words in ((0.24, "b is not seen by any sensor"), (0.26, "b is seen only weakly (± 3.8e+02 %)")):
+    for size, words in ((0.24, "b is not seen by any sensor"), (0.26, "b is seen only weakly (± 385 %)")):
         directions = judged(Formula(two(30.0, size), START)).directions
         assert directions[0].words == words
         assert directions[0].singular_value == pytest.approx(size)

@@ -34,6 +34,7 @@ from yid_ocp.solvers.judgement import (
     uncertainty,
     verdict,
 )
+from yid_ocp.solvers.words import percent_words
 
 Array = NDArray[np.float64]
 StartKnowledge = Literal["assumed", "known", "unknown"]
@@ -241,7 +242,7 @@ def _information(
         names,
         _correlations(covariance[np.ix_(chosen, chosen)], informed),
         view.relative.T @ view.relative,
-        _directions(view),
+        _directions(view, std / scale),
         tuple(name for name in wide.names if name not in names),
         chi2,
         profiles,
@@ -468,8 +469,11 @@ class _Sensitivities:
         return self.problem.system.parameters[name.split("[")[0]].unit
 
 
-def _directions(view: _Sensitivities) -> tuple[Direction, ...]:
-    """Unseen parameters, plain unseen combinations, and what is seen; least seen first."""
+def _directions(view: _Sensitivities, std: Array) -> tuple[Direction, ...]:
+    """Unseen parameters, plain unseen combinations, and what is seen; least seen first.
+
+    `std`: relative standard deviations of the parameters, which count a misfit in time where directions count its size.
+    """
     relative, alone, count = view.relative, view.alone, len(view.names)
     found: list[Direction] = []
     hidden = [i for i in range(count) if alone[i] * WEAK < 1.0]
@@ -489,7 +493,7 @@ def _directions(view: _Sensitivities) -> tuple[Direction, ...]:
                 size = float(np.linalg.norm(relative @ vector))
                 found.append(_direction(view, size, vector, _unseen_words(view, vector)))
         found += [
-            _direction(view, float(size), vector, _seen_words(view, float(size), vector))
+            _direction(view, float(size), vector, _seen_words(view, float(size), vector, std))
             for size, vector in zip(sizes[~blind], wide[~blind], strict=True)
         ]
     return tuple(sorted(found, key=lambda entry: entry.singular_value))
@@ -547,12 +551,14 @@ def _moved(view: _Sensitivities, changes: Mapping[str, float]) -> float:
     return float(np.linalg.norm(without(change, view.split.nuisance))) / view.inflation
 
 
-def _seen_words(view: _Sensitivities, size: float, vector: Array) -> str:
-    """How well a direction is seen."""
+def _seen_words(view: _Sensitivities, size: float, vector: Array, std: Array) -> str:
+    """How well a direction is seen; of one parameter alone as its own standard deviation says."""
     parts = sorted(_components(view, vector), key=lambda part: -abs(part.part))
-    how = "is seen" if size * IDENTIFIABLE >= 1.0 else "is seen only weakly"
+    own = float(std[view.names.index(parts[0].name)])
+    spread = own if len(parts) == 1 and math.isfinite(own) else 1.0 / size
+    how = "is seen" if spread <= IDENTIFIABLE else "is seen only weakly"
     joint = "a joint change of " if len(parts) > 1 else ""
-    return f"{joint}{listed_names([part.name for part in parts])} {how} (± {100 / size:.2g} %)"
+    return f"{joint}{listed_names([part.name for part in parts])} {how} (± {percent_words(spread)} %)"
 
 
 def _completed(wide: Array, rest: Sequence[int], blind: NDArray[np.bool_]) -> Array:

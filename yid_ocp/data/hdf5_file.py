@@ -20,7 +20,7 @@ import h5py
 from yid_ocp.errors import DataError
 from yid_ocp.files import new_file, reason
 
-TRIAL_TIME = 20.0
+TRIAL_TIME = 10.0
 """How long reading a whole file may take [s]."""
 
 DEPTH = 10

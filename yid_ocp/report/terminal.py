@@ -23,7 +23,7 @@ from yid_ocp.report.tables import (
     plan_rows,
     plan_sentences,
 )
-from yid_ocp.solvers.words import VERDICT_WORDS, fit_words, interval_words, parameter_words
+from yid_ocp.solvers.words import VERDICT_WORDS, fit_words, interval_words, parameter_words, percent_words
 
 Rows = list[Sequence[str]]
 
@@ -256,7 +256,7 @@ def _what_if_lines(asked: Mapping[str, Any], total: int) -> list[str]:
 
 
 def _percent(value: float | None) -> str:
-    return "unknown" if value is None else f"{100 * value:.2g} %" if value < 10 else f"{value:.2g} times"
+    return "unknown" if value is None else f"{percent_words(value)} %" if value < 10 else f"{value:.2g} times"
 
 
 def diagnose_summary(result: Mapping[str, Any]) -> list[str]:

@@ -46,6 +46,11 @@ def parameter_words(value: float, std: float | None, interval: tuple[float | Non
     return f"{value:.4g}" if std is None else f"{value:.4g} ± {std:.2g}"
 
 
+def percent_words(part: float) -> str:
+    """A part in per cent, to two digits, without a power of ten as far as people read numbers."""
+    return f"{100 * part:.2g}" if 100 * part < 99.5 else f"{100 * part:.0f}" if part < 100 else f"{100 * part:.2g}"
+
+
 def interval_words(lower: float | None, upper: float | None) -> str:
     """A 95 % interval, of which ends may be open."""
     if lower is None and upper is None:
