@@ -23,7 +23,8 @@ LOCKED = {"nod": 0.7, "slide": -0.15}
 # name: (file, joints kept, values of locked joints)
 ROBOTS = {
     "baxter": ("package:baxter", ARMS, {"head_pan": 0.4}),
-    "panda": ("package:panda", None, {}),
+    # its second finger follows the first, which Pinocchio does not know of: both locked, and one kept
+    "panda": ("package:panda", [*(f"panda_joint{i}" for i in range(1, 8)), "panda_finger_joint1"], {}),
     "ur5": ("package:ur5", None, {}),
     "y_object": ("y_object.urdf", None, {}),
     "y_generated": (None, None, {}),
