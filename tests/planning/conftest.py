@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from yid_ocp.cli import main
+
 LIMITS = '<limit lower="-1.2" upper="1.2" effort="40" velocity="6"/>'
 
 
@@ -22,3 +24,18 @@ def moved(limited_urdf):
     from small_problems import pendulum_step
 
     return pendulum_step(limited_urdf.parent, prescribed=("shoulder",))
+
+
+@pytest.fixture
+def refused(tmp_path, capsys):
+    """Check that `plan` refuses some settings with some words and leaves nothing."""
+
+    def check(config, settings, words):
+        arguments = [part for setting in settings for part in ("--set", setting)]
+        assert main(["plan", str(config), "--out", str(tmp_path / "out"), *arguments]) == 2
+        told = capsys.readouterr().err
+        for word in words:
+            assert word in told, told
+        assert not (tmp_path / "out").exists()
+
+    return check
