@@ -171,11 +171,6 @@ def parser() -> argparse.ArgumentParser:
     return top
 
 
-def _refused(what: str, hint: str, error: OSError | None = None) -> int:
-    where = str(error.filename) if error is not None and error.filename is not None else ""
-    return _wrong(OutputError(what, where=where, hint=hint))
-
-
 def _wrong(error: YidError) -> int:
     print(f"error: {error}", file=sys.stderr)
     return WRONG_INPUT
@@ -224,9 +219,8 @@ def _carried_out(arguments: argparse.Namespace) -> int:
     try:
         os.getcwd()
     except OSError as error:
-        return _wrong(
-            OutputError(f"the working directory is not there: {error.strerror or error}", hint="cd to one that is")
-        )
+        what = f"the working directory is not there: {error.strerror or error}"
+        return _wrong(OutputError(what, hint="cd to one that is"))
     try:
         code = int(import_module(f"yid_ocp.workflow.{arguments.module}").run(arguments))
         sys.stdout.flush()
@@ -235,16 +229,13 @@ def _carried_out(arguments: argparse.Namespace) -> int:
         return _wrong(error)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python fails again when it ends
-        return _refused("standard output was closed before all was printed", "read it to its end")
+        return _wrong(OutputError("standard output was closed before all was printed", hint="read it to its end"))
     except OSError as error:
-        where = str(error.filename or "")
-        return _wrong(
-            OutputError(f"the system refused: {error.strerror or error}", where=where, hint="see what it says")
-        )
+        what = f"the system refused: {error.strerror or error}"
+        return _wrong(OutputError(what, where=str(error.filename or ""), hint="see whether disk and rights allow it"))
     except MemoryError as error:
-        return _wrong(
-            ResourceError(f"there is not enough memory: {error}", hint="shorten the run, or take fewer links")
-        )
+        what = f"there is not enough memory: {error}"
+        return _wrong(ResourceError(what, hint="shorten the run, or take fewer links"))
     except Exception as error:  # whatever else comes up here is a mistake of ours
         number = interruption.asked()
         if number is not None:  # or the words of a library that was interrupted

@@ -18,7 +18,8 @@ PATIENCE = 2.0
 LAST_RESORT = 10.0
 """Time after which a process that does not end, as in a long call of a library, is ended [s]."""
 
-_NAMES = ("SIGINT", "SIGTERM", "SIGHUP")
+SIGNALS = tuple(signal.Signals[name] for name in ("SIGINT", "SIGTERM", "SIGHUP") if name in signal.Signals.__members__)
+"""Those that end a command, as far as the system has them."""
 
 
 class Interrupted(KeyboardInterrupt):
@@ -87,8 +88,7 @@ def signals_raised() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    numbers = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
-    before = {number: signal.getsignal(number) for number in numbers}
+    before = {number: signal.getsignal(number) for number in SIGNALS}
     taken = {number: handler for number, handler in before.items() if handler not in (signal.SIG_IGN, None)}
     told, tell = socket.socketpair()
     tell.setblocking(False)
@@ -119,11 +119,12 @@ def _raise(number: int, frame: FrameType | None) -> None:
 
 def _watch(told: socket.socket, ended: threading.Event, main: int) -> None:
     """Wait for a signal of ours; see that it is obeyed."""
-    numbers = {int(getattr(signal, name)) for name in _NAMES if hasattr(signal, name)}
-    while not (numbers & set(received := told.recv(64))):
+    number = None
+    while number is None:
+        received = told.recv(64)
         if not received:
             return
-    number = next(iter(numbers & set(received)))
+        number = next((int(entry) for entry in SIGNALS if entry in received), None)
     waited = 0.0
     while not ended.wait(PATIENCE):
         waited += PATIENCE

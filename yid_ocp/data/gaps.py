@@ -67,16 +67,14 @@ def cut_at_gaps(recording: Recording, driving: Sequence[str], anywhere: bool) ->
         if part is not None and (begin == 0 or anywhere or _rests(part)):
             kept.append(part)
     left = sum(part.duration for part in kept)
-    named = kept if len(kept) == 1 else [replace(p, name=f"{recording.name}_part{i + 1}") for i, p in enumerate(kept)]
+    parts = [f"_part{i + 1}" for i in range(len(kept))] if len(kept) > 1 else [""]
+    named = tuple(replace(one, name=f"{recording.name}{part}") for one, part in zip(kept, parts, strict=False))
     said = (
         f"{len(kept)} part{'' if len(kept) == 1 else 's'} of it, {left:.3g} s, {'is' if len(kept) == 1 else 'are'} used"
     )
     if not anywhere and len(kept) < len(edges):
         said += "; a part counts only where it starts at rest"
-    doubts = [_doubt(recording, t, int(gap), allowed, said) for gap in gaps]
-    return Parts(
-        tuple(replace(part, name=recording.name) for part in named) if len(kept) == 1 else tuple(named), tuple(doubts)
-    )
+    return Parts(named, tuple(_doubt(recording, t, int(gap), allowed, said) for gap in gaps))
 
 
 def _times(recording: Recording, driving: Sequence[str]) -> Array:

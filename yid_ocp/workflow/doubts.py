@@ -6,7 +6,7 @@ Recordings given twice count once, gaps are cut out; everything else is said and
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -81,7 +81,7 @@ def examined(
     clamped = () if cable is None else cable.held
     for role, recordings in enumerate((used, others)):
         for recording in recordings:
-            found = check_recording(recording, lambda name: run.sensors.get(name, SensorOptions()))
+            found = check_recording(recording, _choice(run))
             doubts += found
             if any(doubt.weight == "refused" for doubt in found):
                 continue
@@ -102,11 +102,16 @@ def examined(
 
 def of_one(run: Run, system: System, recording: Recording) -> list[Doubt]:
     """All doubts about one recording that is used as it is; errors as `examined`."""
-    found = check_recording(recording, lambda name: run.sensors.get(name, SensorOptions()))
+    found = check_recording(recording, _choice(run))
     stop_at(run, found)
     found += _beside_the_model(run, system, Arm.of(system, system.parameters.vector()), None, recording)
     stop_at(run, found)
     return found
+
+
+def _choice(run: Run) -> Callable[[str], SensorOptions]:
+    """What is chosen of a group of sensors, by its name."""
+    return lambda name: run.sensors.get(name, SensorOptions())
 
 
 def _once(
@@ -141,9 +146,6 @@ def _once(
 def _beside_the_model(
     run: Run, system: System, arm: Arm | None, cable: Cable | None, recording: Recording
 ) -> list[Doubt]:
-    def choice(name: str) -> SensorOptions:
-        return run.sensors.get(name, SensorOptions())
-
     gravity = np.array(run.model.gravity, float)
     if cable is not None:
         return list(check_cable(cable, recording, gravity))
@@ -153,9 +155,9 @@ def _beside_the_model(
         found += check_limits(arm, recording)
         if any(doubt.weight == "refused" for doubt in found):
             return found
-        told = [*check_efforts(arm, recording), *check_held_points(arm, recording, choice)]
+        told = [*check_efforts(arm, recording), *check_held_points(arm, recording, _choice(run))]
         found += [doubt for doubt in told if not _modelled(system, doubt)]
-    return found + list(check_reach(arm, system, theta, recording, choice))
+    return found + list(check_reach(arm, system, theta, recording, _choice(run)))
 
 
 def _modelled(system: System, doubt: Doubt) -> bool:
