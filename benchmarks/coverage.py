@@ -1,6 +1,6 @@
 """Whether the standard deviations of `solve` are true: cells of MuJoCo twins whose truth is known.
 
-    python benchmarks/coverage.py --out FOLDER [CELL ...] [--twins 40] [--jobs 2] [--record-only]
+    python benchmarks/coverage.py --out FOLDER [CELL ...] [--twins 40] [--first 0] [--jobs 2] [--record-only]
 
 A cell is a kind of experiment: arms, noise of the torques, controller, start, sensors, time step. Each of its twins
 has a motion, noise and stiffnesses of its own, drawn around those of the embedded recordings, and is solved as a user
@@ -379,8 +379,10 @@ def _median(values: Sequence[float]) -> str:
 # -- the run ----------------------------------------------------------------------------------------------------------
 
 
-def record(names: Sequence[str], number: int, pool: Executor, out: Path) -> dict[str, list[TaskResult]]:
-    """Record so many twins of some cells; what stands in the folder is not done again."""
+def record(
+    names: Sequence[str], numbers: Sequence[int], pool: Executor, out: Path
+) -> dict[str, list[TaskResult]]:
+    """Record twins of some cells by their numbers; what stands in the folder is not done again."""
     recordings = out.resolve() / "recordings"
     recordings.mkdir(parents=True, exist_ok=True)
     code = code_hash(PACKAGE / "virtual")
@@ -390,10 +392,10 @@ def record(names: Sequence[str], number: int, pool: Executor, out: Path) -> dict
             {"cell": name, "recipe": CELLS[name].recipe, "number": k, "folder": str(recordings), "code": code},
         )
         for name in names
-        for k in range(number)
+        for k in numbers
     ]
     made = run_tasks(make_twin, tasks, out / "made", pool, print_progress)
-    return {name: made[i * number : (i + 1) * number] for i, name in enumerate(names)}
+    return {name: made[i * len(numbers) : (i + 1) * len(numbers)] for i, name in enumerate(names)}
 
 
 def solve(made: Mapping[str, Sequence[TaskResult]], pool: Executor, out: Path) -> dict[str, list[Twin]]:
@@ -451,10 +453,11 @@ def asked_for(parser: argparse.ArgumentParser, asked: Sequence[str], known: Mapp
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = command("Whether the standard deviations of `solve` are true.", "cell", CELLS, 40)
+    parser.add_argument("--first", type=int, default=0, help="number of the first twin, to add to those of another run")
     chosen = parser.parse_args(arguments)
     names = asked_for(parser, chosen.names, CELLS, "cell")
     with process_pool(chosen.jobs) as pool:
-        made = record(names, chosen.twins, pool, chosen.out)
+        made = record(names, range(chosen.first, chosen.first + chosen.twins), pool, chosen.out)
         if chosen.record_only:
             return 1 if any(entry.error for entries in made.values() for entry in entries) else 0
         twins = solve(made, pool, chosen.out)
