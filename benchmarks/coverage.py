@@ -379,9 +379,7 @@ def _median(values: Sequence[float]) -> str:
 # -- the run ----------------------------------------------------------------------------------------------------------
 
 
-def record(
-    names: Sequence[str], numbers: Sequence[int], pool: Executor, out: Path
-) -> dict[str, list[TaskResult]]:
+def record(names: Sequence[str], numbers: Sequence[int], pool: Executor, out: Path) -> dict[str, list[TaskResult]]:
     """Record twins of some cells by their numbers; what stands in the folder is not done again."""
     recordings = out.resolve() / "recordings"
     recordings.mkdir(parents=True, exist_ok=True)
