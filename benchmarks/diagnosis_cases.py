@@ -50,8 +50,20 @@ class Case:
     links: int = 1
 
 
+def injected(kind: str, location: str, **values: float) -> InjectedEffect:
+    return InjectedEffect(kind, location, values)
+
+
 def one(kind: str, location: str, **values: float) -> Case:
-    return Case((InjectedEffect(kind, location, values),))
+    return Case((injected(kind, location, **values),))
+
+
+def both(*effects: InjectedEffect) -> Case:
+    return Case(effects)
+
+
+def outside(kind: str, location: str, size: float) -> Case:
+    return Case((injected(kind, location, size=size),), "unknown")
 
 
 CASES: Mapping[str, Case] = {
@@ -81,16 +93,52 @@ CASES: Mapping[str, Case] = {
     "moved_camera": one("camera_translation", "camera", x=0.02, y=0.0, z=0.0),
     "late_camera": one("camera_latency", "camera", delay=0.08),
     "near_surface": one("surface_offset", "camera", fraction=0.8),
-    "pair": Case(
-        (
-            InjectedEffect("kelvin_voigt", "T1", {"tau": 0.05}),
-            InjectedEffect("camera_translation", "camera", {"x": 0.02, "y": 0.0, "z": 0.0}),
-        )
-    ),
     "robbed_trunk": Case((InjectedEffect("kelvin_voigt", "T1", {"tau": 0.05}),), "unknown", ("kelvin_voigt",)),
-    "ripple": Case((InjectedEffect("torque_ripple", "left_e1", {"size": 1.0}),), "unknown"),
-    "crossed_springs": Case((InjectedEffect("cross_stiffness", "T1", {"size": 8.0}),), "unknown"),
-    "gusts": Case((InjectedEffect("gusts", "T3", {"size": 0.1}),), "unknown"),
+    "ripple": outside("torque_ripple", "left_e1", 1.0),
+    "crossed_springs": outside("cross_stiffness", "T1", 8.0),
+    "gusts": outside("gusts", "T3", 0.1),
+    "crease": outside("crease", "T1", 12.0),
+    "tether": outside("tether", "T3", 15.0),
+    "dress_pack": outside("tether", "left_w0", 200.0),
+    "magnet": outside("magnet", "T3", 0.3),
+    "wall": outside("wall", "T3", 30.0),
+    "softening_trunk": outside("stiffness_drift", "T1", 0.3),
+    "one_way_trunk": outside("one_way_damping", "T1", 0.6),
+    "saturating_elbow": outside("saturating_drive", "left_e1", 3.5),
+    "warming_shoulder": outside("warming_gear", "left_s1", 3.0),
+    "loose_load": outside("shifting_load", "left_w1", 0.8),
+    "slipping_grasp": outside("slipping_grasp", "left", 0.008),
+    "damped_and_moved_camera": both(
+        injected("kelvin_voigt", "T1", tau=0.05), injected("camera_translation", "camera", x=0.02, y=0.0, z=0.0)
+    ),
+    "damped_and_dry": both(injected("kelvin_voigt", "T1", tau=0.05), injected("joint_coulomb", "left_e1", tau_c=0.6)),
+    "bent_and_heavy_link": both(
+        injected("rest_curvature", "T1", qx=0.03, qy=0.0), injected("link_mass", "left_w1", scale=1.1)
+    ),
+    "bent_and_shifted": both(
+        injected("rest_curvature", "T2", qx=0.05, qy=-0.03), injected("grasp_offset", "left", dx=0.008, dy=0.0, dz=0.0)
+    ),
+    "long_and_damped": both(injected("length_scale", "T2", scale=1.015), injected("kelvin_voigt", "T1", tau=0.06)),
+    "spring_and_weight": both(
+        injected("joint_spring", "left_s1", stiffness=10.0, rest_angle=-0.5), injected("point_mass", "w_T3", mass=0.02)
+    ),
+    "gain_and_friction": both(
+        injected("effort_gain", "left_s1", scale=1.05), injected("joint_viscous", "left_e1", b=1.0)
+    ),
+    "offset_and_solid": both(
+        injected("effort_offset", "left_e1", offset=0.6),
+        injected("standard_linear_solid", "T1", ratio=0.5, relaxation_time=0.3),
+    ),
+    "tilt_and_rotor": both(
+        injected("gravity_tilt", "world", rx=0.03, ry=0.0), injected("rotor_inertia", "left_e1", armature=0.4)
+    ),
+    "late_camera_and_encoder": both(
+        injected("camera_latency", "camera", delay=0.1), injected("encoder_offset", "left_s1", offset=0.01)
+    ),
+    "stiffening_and_dense": both(injected("cubic_stiffness", "T1", k3=400.0), injected("density", "T3", scale=1.8)),
+    "dahl_and_late_torque": both(
+        injected("hysteresis", "T1", stiffness=8.0, yield_angle=0.1), injected("effort_delay", "left", delay=0.03)
+    ),
     "finer_chain": Case((), "-", (), 2),
 }
 

@@ -19,7 +19,6 @@ from yid_ocp.virtual.injected import (
     FORCED,
     KINDS,
     MODELLED,
-    OUTSIDE,
     SENSOR_ERRORS,
     InjectedEffect,
     InjectedTerms,
@@ -28,6 +27,7 @@ from yid_ocp.virtual.injected import (
 )
 from yid_ocp.virtual.mjcf import mujoco_xml
 from yid_ocp.virtual.motion import multisine
+from yid_ocp.virtual.outside import OUTSIDE
 
 mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
 

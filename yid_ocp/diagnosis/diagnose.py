@@ -13,7 +13,7 @@ import threadpoolctl
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.finding import Finding, absorption
 from yid_ocp.diagnosis.hypotheses import CandidateProblem, Choice, chosen_effects
-from yid_ocp.diagnosis.localise import Place, attributed, localise, merged
+from yid_ocp.diagnosis.localise import Place, attributed, localise, main_places, merged
 from yid_ocp.diagnosis.refit import Fit, Progress, Search, Store, recalled, refit
 from yid_ocp.diagnosis.screening import Screened, screen
 from yid_ocp.diagnosis.select import Added, Closure, closure, compose
@@ -105,7 +105,8 @@ def _diagnosed(problem: EstimationProblem, search: Search, solution: Solution | 
     fits: tuple[Fit, ...] = ()
     added: tuple[Added, ...] = ()
     if gap and enough and screened.scores:
-        fits, added = compose(search, nominal, screened)
+        there = () if smoothed is None else main_places(localise(smoothed, limits.sure))
+        fits, added = compose(search, nominal, screened, [place.location for place in there])
     clock.lap("refits")
     total = closure(nominal.loss, added[-1].fit.loss, limits=limits) if added else Closure(np.nan, np.nan, np.nan)
     explained = explained_part(nominal, added, trusted)

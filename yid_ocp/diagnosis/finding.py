@@ -177,6 +177,7 @@ def _place(place: Place) -> dict[str, Any]:
         "share": place.share,
         "observable": place.observable,
         "windows": [list(window) for window in place.windows],
+        "also": list(place.also),
     }
 
 

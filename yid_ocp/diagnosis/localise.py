@@ -15,6 +15,11 @@ from yid_ocp.model.system import System
 
 Array = NDArray[np.float64]
 
+NAMED = 0.1
+"""Share of the gap from which a place is named."""
+MAIN = 3
+"""Places that are named at most."""
+
 
 @dataclass(frozen=True)
 class Place:
@@ -29,12 +34,20 @@ class Place:
         Whether the data would show a gap there.
     windows : tuple of (float, float)
         When it is there [s]; of all recordings together.
+    also : tuple of str
+        Places that the data cannot tell from this one.
     """
 
     location: str
     share: float
     observable: bool
     windows: tuple[tuple[float, float], ...]
+    also: tuple[str, ...] = ()
+
+
+def main_places(where: Sequence[Place]) -> tuple[Place, ...]:
+    """The places that are named: those with a share of the gap worth naming, three at most, one in any case."""
+    return tuple([place for place in where if place.share > NAMED] or where[:1])[:MAIN]
 
 
 def localise(smoothed: Smoothed, sure: float = DEFAULTS.sure) -> tuple[Place, ...]:
@@ -59,10 +72,17 @@ def localise(smoothed: Smoothed, sure: float = DEFAULTS.sure) -> tuple[Place, ..
             value / total if total > 0 else 0.0,
             observable[location],
             _windows(smoothed, [s for s in smoothed.weight if s.location == location and smoothed.variance[s]], sure),
+            _also(smoothed, location),
         )
         for location, value in weight.items()
     ]
     return tuple(sorted(found, key=lambda place: (-place.share, not place.observable)))
+
+
+def _also(smoothed: Smoothed, location: str) -> tuple[str, ...]:
+    """Places that would do in the place of every group at work at a location."""
+    own = [{entry.location for entry in others} for s, others in smoothed.instead.items() if s.location == location]
+    return tuple(sorted(set.intersection(*own) - {location})) if own else ()
 
 
 def _windows(smoothed: Smoothed, sources: Sequence[Source], limit: float) -> tuple[tuple[float, float], ...]:
@@ -116,7 +136,8 @@ def attributed(
         first = known.get(location)
         when = first.windows if first is not None and first.windows else windows if location in closed else ()
         part = share.get(location, 0.0) / total if total > 0 else 0.0
-        found.append(Place(location, part, location in closed or (first is not None and first.observable), when))
+        also = () if first is None or location in closed else first.also
+        found.append(Place(location, part, location in closed or (first is not None and first.observable), when, also))
     return tuple(sorted(found, key=lambda place: (-place.share, not place.observable)))
 
 

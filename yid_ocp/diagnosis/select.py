@@ -7,7 +7,7 @@ doi:10.1214/aos/1176347265).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -140,24 +140,57 @@ def oversized(effect: EffectBase, values: Mapping[str, float], limits: Threshold
     return False
 
 
+def stands_out(effect: EffectBase, fit: Fit, limits: Thresholds = DEFAULTS) -> bool:
+    """Whether any amplitude is `away` standard deviations or more from neutral; an effect that is not is not there."""
+    neutral = effect.neutral
+    return any(abs(fit.values[n] - neutral[n]) >= limits.away * fit.std.get(n, 0.0) for n in effect.amplitudes)
+
+
+def relevant(before: Loss, after: Loss, limits: Thresholds = DEFAULTS) -> bool:
+    """Whether the held-out error, of all channels together or of any one, falls by the part `relevance`.
+
+    Held-out recordings that are far likelier need not show it: what tells of a constant error shows in few samples.
+    """
+    if far_likelier(before, after, limits) or not np.isfinite(before.mean):
+        return True
+    least = 1.0 - limits.relevance
+    falls = [np.sqrt(after.mean) <= least * np.sqrt(before.mean)]
+    falls += [
+        after.channels[name][0] <= least * rmse for name, (rmse, _) in before.channels.items() if name in after.channels
+    ]
+    return any(falls)
+
+
 # -- several effects --------------------------------------------------------------------------------------------------
 
 
 def shortlist(
-    ranked: Sequence[Score], alike: Confusability, limits: Thresholds
+    ranked: Sequence[Score], alike: Confusability, limits: Thresholds, places: Sequence[str] = ()
 ) -> list[tuple[EffectBase, Mapping[str, float]]]:
-    """The best candidates of the first pass, and those that can stand in for them."""
+    """Which candidates of the first pass are refitted: none is left out because worse ones stand before it.
+
+    The best by what they promise; those that can stand in for them; the best by their statistic, which a promise made
+    far from its end says little about; and the best of every place where the gap lies.
+    """
     best = list(ranked[: limits.refits])
     extra: list[Score] = []
     for score in best:
         names = alike.like(score.effect.label, limits.alike)
         extra += [s for s in ranked if s.effect.label in names and s not in best and s not in extra]
     extra.sort(key=lambda s: -s.decrease)
-    return [(s.effect, s.step) for s in [*best, *extra[: limits.refits]]]
+    chosen = [*best, *extra[: limits.refits]]
+    surest = sorted(ranked, key=lambda s: (s.p_value, -s.statistic))[: limits.surest]
+    there = [next((s for s in ranked if s.effect.location == place), None) for place in places]
+    for other in (*surest, *there):
+        if other is not None and other not in chosen:
+            chosen.append(other)
+    return [(s.effect, s.step) for s in chosen]
 
 
-def compose(search: Search, nominal: Fit, screened: Screened) -> tuple[tuple[Fit, ...], tuple[Added, ...]]:
-    """Add effects one after the other while the held-out gap closes, then try without each.
+def compose(
+    search: Search, nominal: Fit, screened: Screened, places: Sequence[str] = ()
+) -> tuple[tuple[Fit, ...], tuple[Added, ...]]:
+    """Add effects one after the other while the held-out gap closes, then try others in the place of each, and without.
 
     Parameters
     ----------
@@ -166,6 +199,8 @@ def compose(search: Search, nominal: Fit, screened: Screened) -> tuple[tuple[Fit
         Without any effect.
     screened : Screened
         All candidates at that fit.
+    places : sequence of str
+        Where the smoother says that the gap lies.
 
     Returns
     -------
@@ -182,57 +217,106 @@ def compose(search: Search, nominal: Fit, screened: Screened) -> tuple[tuple[Fit
         if added:
             search.progress(f"scoring what is left beside {', '.join(e.label for e in base)}")
             screened = screen(search.problem, base, current.values, limits)
-        tried = shortlist([s for s in screened.scores if s.p_value < limits.level], screened.alike, limits)
-        fits = refit_all(search, base, tried, current.values)
+        fits = refit_all(search, base, _significant(screened, limits, places), current.values)
         if not fits:
             break
         near = within_reach(fits, limits)
-        chosen = near[0]
         if not added:
-            first = (chosen, *sorted((fit for fit in fits if fit is not chosen), key=lambda fit: fit.loss.mean))
-        gained, error = gain(current.loss, chosen.loss)
-        closes = gained > error and gained >= limits.closure * current.loss.gap and current.loss.gap > 0
-        if not closes and not far_likelier(current.loss, chosen.loss, limits):
+            first = (near[0], *sorted((fit for fit in fits if fit is not near[0]), key=lambda fit: fit.loss.mean))
+        chosen = next((fit for fit in near if _worth_adding(current, fit, limits)), None)
+        if chosen is None:
             break
         total = closure(nominal.loss, chosen.loss, limits=limits)
-        added.append(Added(chosen.effects[-1], chosen, total, tuple(fit.effects[-1] for fit in near)))
+        rivals = (chosen, *(fit for fit in near if fit is not chosen))
+        added.append(Added(chosen.effects[-1], chosen, total, tuple(fit.effects[-1] for fit in rivals)))
         said = "" if np.isnan(total.value) else f": {100 * total.value:.3g} % of the held-out gap closed"
         search.progress(f"added {chosen.effects[-1].label}{said}")
         current = chosen
         if current.loss.mean < 1 + limits.smallest_gap:
             break
-    return first, _pruned(search, nominal, tuple(added))
+    return first, _reconsidered(search, nominal, added)
 
 
-def _pruned(search: Search, nominal: Fit, added: tuple[Added, ...]) -> tuple[Added, ...]:
-    """Leave out effects without which held-out recordings are predicted as well."""
-    kept = list(added)
-    for entry in added[:-1]:
-        if len(kept) < 2:
-            break
-        rest = [other for other in kept if other.effect is not entry.effect]
-        full = kept[-1].fit
-        # it begins elsewhere than a refit of the same effects in an earlier round
-        name = f"{describe(full.effects)} without {entry.effect.label}"
-        without = _again(search, [other.effect for other in rest], full, name)
-        if without is None:
-            continue
-        gained, error = gain(without.loss, full.loss)
-        if gained <= error:
-            search.progress(f"left {entry.effect.label} out again: the others do as well")
-            kept = _rebuilt(search, nominal, rest, without)
-    return tuple(kept)
+def _significant(
+    screened: Screened, limits: Thresholds, places: Sequence[str] = ()
+) -> list[tuple[EffectBase, Mapping[str, float]]]:
+    return shortlist([s for s in screened.scores if s.p_value < limits.level], screened.alike, limits, places)
 
 
-def _rebuilt(search: Search, nominal: Fit, rest: Sequence[Added], last: Fit) -> list[Added]:
-    """Effects that were kept when another was left out, each with the fit of all up to it."""
+def _worth_adding(current: Fit, chosen: Fit, limits: Thresholds) -> bool:
+    """Whether the last effect of a fit closes a sure and relevant part of the gap, and is there at all."""
+    gained, error = gain(current.loss, chosen.loss)
+    closes = gained > error and gained >= limits.closure * current.loss.gap and current.loss.gap > 0
+    if not closes and not far_likelier(current.loss, chosen.loss, limits):
+        return False
+    return stands_out(chosen.effects[-1], chosen, limits) and relevant(current.loss, chosen.loss, limits)
+
+
+def _reconsidered(search: Search, nominal: Fit, added: Sequence[Added]) -> tuple[Added, ...]:
+    """Every effect tried for its place again beside the others: without it, and others instead of it.
+
+    What was added first was chosen while the others were missing, and may be there in their stead. The last one was
+    chosen beside all others and needs no second look unless one of these has changed.
+    """
+    kept = tuple(added)
+    seen = {_labels(kept)}
+    position, last = 0, len(kept) - 1
+    while position < last and len(kept) > 1:
+        revised = _revised(search, nominal, kept, position)
+        if _labels(revised) in seen:
+            kept = revised if _labels(revised) == _labels(kept) else kept
+            position += 1
+        else:
+            seen.add(_labels(revised))
+            kept, position, last = revised, 0, len(revised)
+    return kept
+
+
+def _labels(added: Sequence[Added]) -> frozenset[str]:
+    return frozenset(entry.effect.label for entry in added)
+
+
+def _revised(search: Search, nominal: Fit, kept: tuple[Added, ...], position: int) -> tuple[Added, ...]:
+    """The effects without one of them, with another in its place, or as they are with what would do as well."""
+    limits, full, entry = search.limits, kept[-1].fit, kept[position]
+    rest = [other.effect for other in kept if other is not entry]
+    # it begins elsewhere than a refit of the same effects in an earlier round
+    without = _again(search, rest, full, f"{describe(full.effects)} without {entry.effect.label}")
+    if without is None:
+        return kept
+    if not _needed(without, full, entry.effect, limits):
+        search.progress(f"left {entry.effect.label} out again: the others do as well")
+        return _rebuilt(search, nominal, [other for other in kept if other is not entry], without)
+    search.progress(f"looking for others in the place of {entry.effect.label}")
+    screened = screen(search.problem, rest, without.values, limits)
+    tried = [pair for pair in _significant(screened, limits)[: limits.refits] if pair[0].label != entry.effect.label]
+    own = replace(full, effects=(*rest, entry.effect))
+    near = within_reach([own, *refit_all(search, rest, tried, without.values)], limits)
+    chosen = next((fit for fit in near if _needed(without, fit, fit.effects[-1], limits)), own)
+    rivals = (chosen.effects[-1], *(fit.effects[-1] for fit in near if fit is not chosen))
+    placed = [replace(e, effect=chosen.effects[-1], rivals=rivals) if e is entry else e for e in kept]
+    if chosen is own:
+        return tuple(placed)
+    search.progress(f"put {chosen.effects[-1].label} in the place of {entry.effect.label}")
+    return _rebuilt(search, nominal, placed, replace(chosen, effects=tuple(e.effect for e in placed)))
+
+
+def _needed(without: Fit, full: Fit, effect: EffectBase, limits: Thresholds) -> bool:
+    """Whether held-out recordings are surely predicted worse without an effect, and it is there at all."""
+    gained, error = gain(without.loss, full.loss)
+    sure = gained > error or far_likelier(without.loss, full.loss, limits)
+    return sure and stands_out(effect, full, limits) and relevant(without.loss, full.loss, limits)
+
+
+def _rebuilt(search: Search, nominal: Fit, entries: Sequence[Added], last: Fit) -> tuple[Added, ...]:
+    """Effects in their order, each with the fit of all up to it, the whole one known."""
     found = []
-    for i, entry in enumerate(rest):
-        effects = [other.effect for other in rest[: i + 1]]
-        fit = last if i == len(rest) - 1 else _again(search, effects, last, f"{describe(effects)} again")
+    for i, entry in enumerate(entries):
+        effects = [other.effect for other in entries[: i + 1]]
+        fit = last if i == len(entries) - 1 else _again(search, effects, last, f"{describe(effects)} again")
         if fit is not None:
-            found.append(Added(entry.effect, fit, closure(nominal.loss, fit.loss, limits=search.limits), entry.rivals))
-    return found
+            found.append(replace(entry, fit=fit, closure=closure(nominal.loss, fit.loss, limits=search.limits)))
+    return tuple(found)
 
 
 def _again(search: Search, effects: Sequence[EffectBase], near: Fit, name: str) -> Fit | None:

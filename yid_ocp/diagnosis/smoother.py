@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.linalg
@@ -89,6 +89,8 @@ class Smoothed:
         neither ("none" is 0).
     worth : float
         Rise of the log evidence that is more than chance.
+    instead : dict of Source to tuple of Source
+        Groups that would do nearly as well in the place of each group at work.
     """
 
     traces: tuple[Trace, ...]
@@ -101,6 +103,7 @@ class Smoothed:
     degrees_after: float
     evidence: dict[str, float]
     worth: float = DEFAULTS.worth
+    instead: Mapping[Source, tuple[Source, ...]] = field(default_factory=dict)
 
     @property
     def explainable(self) -> float:
@@ -376,10 +379,11 @@ def smooth(problem: EstimationProblem, x: Array, evaluation: Evaluation, limits:
         variance, state = max(found.values(), key=lambda entry: entry[1].evidence)
         before, after, taken, samples = _explained(models, variance, nothing, state)
         degrees = max(float(samples) - len(nothing.shift), 1.0)
+        weight = _weights(models, variance, state)
         return Smoothed(
             tuple(_trace(model, done, state) for model, done in zip(models, state.passes, strict=True)),
             variance,
-            _weights(models, variance, state),
+            weight,
             # what unknowns of the reference size add to r'r on average is the variance of their scores
             {s: math.sqrt(limits.noticed / max(v, 1e-300)) for s, (_, v) in _scores(models, nothing).items()},
             before,
@@ -388,6 +392,7 @@ def smooth(problem: EstimationProblem, x: Array, evaluation: Evaluation, limits:
             max(degrees - taken, 1.0),
             evidence,
             limits.worth,
+            _instead(models, variance, state.evidence, weight, limits),
         )
 
 
@@ -428,3 +433,28 @@ def _weights(models: Sequence[Linear], variance: dict[Source, float], state: _St
         less = _run(models, variance | {source: 0.0}, smooth=False)
         weight[source] = max(state.evidence - less.evidence, 0.0)
     return weight
+
+
+def _instead(
+    models: Sequence[Linear],
+    variance: dict[Source, float],
+    evidence: float,
+    weight: Mapping[Source, float],
+    limits: Thresholds,
+) -> dict[Source, tuple[Source, ...]]:
+    """Groups that would keep most of what each group at work raises the evidence by, or all but what is chance."""
+    found: dict[Source, tuple[Source, ...]] = {}
+    for source in [s for s, v in variance.items() if v]:
+        less = variance | {source: 0.0}
+        scores = _scores(models, _run(models, less))
+        others = [s for s, v in variance.items() if not v and scores[s][0] > scores[s][1]]
+        others.sort(key=lambda s: -scores[s][0] / max(scores[s][1], 1e-300))
+
+        def tried(other: Source, less: dict[Source, float] = less) -> float:
+            return _largest_evidence(models, less, other)[0]
+
+        asked = others[:LATER]
+        lost = max(limits.worth, (1 - limits.as_well) * weight[source])
+        reached = zip(asked, map_threads(tried, asked), strict=True)
+        found[source] = tuple(other for other, reach in reached if reach >= evidence - lost)
+    return found

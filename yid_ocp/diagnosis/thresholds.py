@@ -33,6 +33,8 @@ class Thresholds:
         Values tried of every shape parameter; the best counts as the best of that many tries.
     refits : int
         Candidates refitted in a round, and once more as many that are like them.
+    surest : int
+        Candidates of the smallest p-values that are refitted in any case.
     alike : float
         Part of a signature explained by another candidate from which both are refitted.
     poor, promising : float
@@ -40,6 +42,10 @@ class Thresholds:
         from the initial values of the nominal parameters.
     effects : int
         How many may be added.
+    away : float
+        Standard deviations that an effect must be away from neutral to be kept.
+    relevance : float
+        Part of the held-out error, of all channels together or of any one, that an effect must take away.
     closure : float
         A held-out closure whose lower end is below this is no improvement; nor is an effect that closes a smaller part
         of what is left.
@@ -68,6 +74,8 @@ class Thresholds:
         Reference standard deviation of a sensor's unknown bias, in standard deviations of its noise.
     sure : float
         Standard deviations that an unknown must be away from zero to say when the gap is there.
+    as_well : float
+        Part of what a place raises the log evidence by that another must reach to be named beside it.
     mapped : float
         1 - posterior/prior variance from which an unknown's value is informed by the data.
     """
@@ -84,11 +92,14 @@ class Thresholds:
     detection: Annotated[float, Gt(0), About("standard deviations of a detectable amplitude")] = 2.576 + 1.282
     shape_values: Annotated[int, Ge(1), About("values tried of every shape parameter")] = 4
     refits: Annotated[int, Ge(1), About("candidates refitted in a round")] = 6
+    surest: Annotated[int, Ge(0), About("candidates of the smallest p-values refitted in any case")] = 2
     alike: Annotated[float, Gt(0), Le(1), About("part of a signature from which two candidates are alike")] = 0.9
     poor: Annotated[float, Gt(0), About("chi2/n above which a refit may be tried again")] = 1.1
     promising: Annotated[float, Gt(0), Lt(1), About("part of the excess explained by a refit tried again")] = 0.2
     # which effects are added
     effects: Annotated[int, Ge(1), Le(10), About("how many effects may be added")] = 3
+    away: Annotated[float, Ge(0), About("standard deviations from neutral below which no effect is kept")] = 2.0
+    relevance: Annotated[float, Ge(0), Lt(1), About("part of a held-out error that an effect must take away")] = 0.02
     closure: Annotated[float, Ge(0), Lt(1), About("part of the held-out gap that must be closed")] = 0.05
     tie: Annotated[float, Ge(0), About("part of chi2/n within which models are equal")] = 0.01
     stand_in: Annotated[float, Ge(0), About("part of chi2/n by which an unlikely shape must be better")] = 0.05
@@ -103,6 +114,9 @@ class Thresholds:
     offset: Annotated[float, Gt(0), About("unknown offset of a grasp", "m")] = 2e-3
     bias: Annotated[float, Gt(0), About("unknown bias over the noise of its sensor")] = 3.0
     sure: Annotated[float, Gt(0), About("standard deviations from zero at which the gap is there")] = 3.0
+    as_well: Annotated[float, Gt(0), Le(1), About("part of a place's evidence at which another is named beside it")] = (
+        0.9
+    )
     mapped: Annotated[float, Ge(0), Lt(1), About("1 - posterior/prior variance of an informed value")] = 0.5
 
     @property

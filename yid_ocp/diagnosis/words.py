@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 from yid_ocp.diagnosis.finding import Finding
-from yid_ocp.diagnosis.localise import Place
+from yid_ocp.diagnosis.localise import Place, main_places
 from yid_ocp.diagnosis.refit import Fit
 from yid_ocp.diagnosis.screening import Visibility
 from yid_ocp.diagnosis.select import Added
@@ -15,8 +15,8 @@ from yid_ocp.effects import EffectBase
 from yid_ocp.effects.base import ASPECTS
 from yid_ocp.problem.null_test import NullTest
 
-NAMED = 0.1
-"""Share of the gap from which a place is named, and relative change from which a nominal parameter is."""
+MOVED = 0.1
+"""Relative change from which a nominal parameter is named."""
 ROOM = 0.25
 """Part of its range by which an amplitude may leave it unnoticed."""
 SIDES = {
@@ -124,10 +124,14 @@ def _gap(finding: Finding) -> str:
 
 def _places(finding: Finding) -> str:
     """Where it lies; empty where nothing says so."""
-    main = [p for p in finding.where if p.share > NAMED] or list(finding.where[:1])
-    named = " and ".join(f"{p.location} ({100 * p.share:.0f} %)" for p in main[:3])
+    named = " and ".join(f"{_one_of(p)} ({100 * p.share:.0f} %)" for p in main_places(finding.where))
     side = "" if finding.smoothed is None else SIDES.get(finding.smoothed.side, "")
     return f"It lies in {named}{side}." if named else ""
+
+
+def _one_of(place: Place) -> str:
+    """A place and those that the data cannot tell from it."""
+    return " or ".join([place.location, *place.also])
 
 
 def _effects(finding: Finding) -> list[str]:
@@ -150,7 +154,7 @@ def _effects(finding: Finding) -> list[str]:
     if odd:
         text.append(f"Beyond what one would expect, and so perhaps standing in for something else: {', '.join(odd)}.")
     text.append(_remains(finding))
-    moved = [a for a in finding.absorbed if abs(a.after - a.before) > NAMED * max(abs(a.before), 1e-9)]
+    moved = [a for a in finding.absorbed if abs(a.after - a.before) > MOVED * max(abs(a.before), 1e-9)]
     if moved:
         steps = (f"{a.name} goes from {a.before:.3g} to {a.after:.3g}" for a in moved[:6])
         text.append(f"With it {', '.join(steps)}.")

@@ -9,7 +9,7 @@ of the equations of `yid_ocp.effects` take part, except for effects that only ch
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -24,9 +24,9 @@ from yid_ocp.errors import ConfigError, nearest
 from yid_ocp.model.system import System
 from yid_ocp.virtual.experiment import VirtualExperiment, virtual_experiment
 from yid_ocp.virtual.mjcf import Evaluator, mujoco_module
+from yid_ocp.virtual.outside import OUTSIDE, Force, Scene
 
 Array = NDArray[np.float64]
-Force = Callable[[Any, Any], None]
 
 AIR_DENSITY = 1.2
 """[kg/m^3]"""
@@ -73,9 +73,6 @@ SENSOR_ERRORS: tuple[str, ...] = (
 )
 KINDS = (*DESCRIBED, *MODELLED, *FORCED, *SENSOR_ERRORS)
 """Kinds of the vocabulary that can be done in the other engine."""
-OUTSIDE = ("torque_ripple", "cross_stiffness", "quadratic_stiffness", "gusts")
-"""Effects that are in no library: torque that ripples with the joint's angle, a spring that couples the two bends, one
-that is stiffer one way than the other, wind that comes and goes."""
 
 
 @dataclass(frozen=True)
@@ -165,52 +162,45 @@ class InjectedTerms:
     def __init__(self, system: System, values: Mapping[str, float], effects: Sequence[InjectedEffect]) -> None:
         self._system, self._effects = system, tuple(effects)
         value = Evaluator(system, values)
-        self._stiffness = {s.joint: float(value(s.stiffness)[0]) for s in system.elastic}
-        self._rest = {s.joint: float(value(s.rest)[0]) for s in system.elastic}
+        self._scene = Scene(
+            system,
+            {s.joint: float(value(s.stiffness)[0]) for s in system.elastic},
+            {s.joint: float(value(s.rest)[0]) for s in system.elastic},
+        )
         self._shape = {
             s.name: (float(value(s.radius)[0]), [float(value(x)[0]) for x in s.lengths]) for s in system.segments
         }
         self._forces: list[Force] = []
-        self._running = False
 
     def prepare(self, model: Any) -> None:
         """Edit a compiled `mujoco.MjModel` and work out the forces."""
         for effect in self._effects:
             size, place = effect.values, effect.location
             if effect.kind == "kelvin_voigt":
-                for joint in self._joints(place):
-                    model.dof_damping[model.joint(joint).id] += size["tau"] * self._stiffness[joint]
+                at, stiffness, _ = self._scene.springs(model, place)
+                model.dof_damping[at] += size["tau"] * stiffness
             elif effect.kind == "joint_viscous":
                 model.dof_damping[model.joint(place).id] += size["b"]
             elif effect.kind == "rotor_inertia":
                 model.dof_armature[model.joint(place).id] += size["armature"]
+            elif effect.kind in OUTSIDE:
+                self._forces.append(OUTSIDE[effect.kind](self._scene, model, place, size["size"]))
             else:
                 self._forces.append(getattr(self, f"_{effect.kind}")(model, place, size))
 
     def begin(self, data: Any) -> None:
         """The motion begins: effects with a memory start to remember."""
-        self._running = True
+        self._scene.running = True
 
     def force(self, model: Any, data: Any) -> None:
         """Add the forces to `qfrc_passive`."""
         for push in self._forces:
             push(model, data)
 
-    def _joints(self, segment: str) -> list[str]:
-        return [joint for link in self._system.segment(segment).links for joint in link if joint in self._stiffness]
-
-    def _springs(self, model: Any, segment: str) -> tuple[Array, Array, Array]:
-        joints = self._joints(segment)
-        return (
-            np.array([model.joint(j).id for j in joints]),
-            np.array([self._stiffness[j] for j in joints]),
-            np.array([self._rest[j] for j in joints]),
-        )
-
     # -- effects of the vocabulary ------------------------------------------------------------------------------------
 
     def _cubic_stiffness(self, model: Any, place: str, size: Mapping[str, float]) -> Force:
-        at, _, rest = self._springs(model, place)
+        at, _, rest = self._scene.springs(model, place)
         k3 = size["k3"]
 
         def push(_: Any, data: Any) -> None:
@@ -219,12 +209,12 @@ class InjectedTerms:
         return push
 
     def _standard_linear_solid(self, model: Any, place: str, size: Mapping[str, float]) -> Force:
-        at, stiffness, _ = self._springs(model, place)
+        at, stiffness, _ = self._scene.springs(model, place)
         branch, time = size["ratio"] * stiffness, size["relaxation_time"]
         state: dict[str, Any] = {"z": None, "t": 0.0}
 
         def push(_: Any, data: Any) -> None:
-            if not self._running:
+            if not self._scene.running:
                 return
             q = np.array(data.qpos[at])
             if state["z"] is None:
@@ -238,12 +228,12 @@ class InjectedTerms:
         return push
 
     def _hysteresis(self, model: Any, place: str, size: Mapping[str, float]) -> Force:
-        at, _, _ = self._springs(model, place)
+        at, _, _ = self._scene.springs(model, place)
         stiffness, angle = size["stiffness"], size["yield_angle"]
         state: dict[str, Any] = {"z": np.zeros(len(at)), "t": 0.0}
 
         def push(_: Any, data: Any) -> None:
-            if not self._running:
+            if not self._scene.running:
                 return
             v = np.array(data.qvel[at])
             step = float(data.time) - state["t"]
@@ -307,58 +297,6 @@ class InjectedTerms:
             v = float(data.qvel[at])
             fall = math.exp(-((v / size["v_stribeck"]) ** 2))
             data.qfrc_passive[at] -= size["tau_s"] * fall * math.tanh(v / SMOOTHING)
-
-        return push
-
-    # -- effects outside it -------------------------------------------------------------------------------------------
-
-    def _torque_ripple(self, model: Any, place: str, size: Mapping[str, float]) -> Force:
-        at = model.joint(place).id
-
-        def push(_: Any, data: Any) -> None:
-            data.qfrc_passive[at] += size["size"] * math.sin(60.0 * data.qpos[at])
-
-        return push
-
-    def _bends(self, model: Any, place: str) -> tuple[Array, Array]:
-        links = self._system.segment(place).links
-        return (
-            np.array([model.joint(link[0]).id for link in links]),
-            np.array([model.joint(link[1]).id for link in links]),
-        )
-
-    def _cross_stiffness(self, model: Any, place: str, size: Mapping[str, float]) -> Force:
-        x, y = self._bends(model, place)
-
-        def push(_: Any, data: Any) -> None:
-            qx, qy = np.array(data.qpos[x]), np.array(data.qpos[y])
-            data.qfrc_passive[x] -= size["size"] * qy
-            data.qfrc_passive[y] -= size["size"] * qx
-
-        return push
-
-    def _quadratic_stiffness(self, model: Any, place: str, size: Mapping[str, float]) -> Force:
-        both = np.concatenate(self._bends(model, place))
-
-        def push(_: Any, data: Any) -> None:
-            data.qfrc_passive[both] -= size["size"] * data.qpos[both] ** 2
-
-        return push
-
-    def _gusts(self, model: Any, place: str, size: Mapping[str, float]) -> Force:
-        mujoco = mujoco_module()
-        links = self._system.segment(place).links
-        bodies = [int(model.jnt_bodyid[model.joint(link[-1]).id]) for link in links]
-        rng = np.random.default_rng(int(1e6 * abs(size["size"])) % 2**32)
-        rates, phases = rng.uniform(0.4, 1.6, 3), rng.uniform(0, 2 * math.pi, 3)
-
-        def push(model: Any, data: Any) -> None:
-            if not self._running:
-                return
-            gust = size["size"] * float(np.sum(np.sin(2 * math.pi * rates * data.time + phases)))
-            for body in bodies:
-                wind = np.array([gust, 0.5 * gust, 0.0]) / len(bodies)
-                mujoco.mj_applyFT(model, data, wind, np.zeros(3), data.xipos[body], body, data.qfrc_passive)
 
         return push
 

@@ -25,8 +25,9 @@ from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.virtual.experiment import PointCamera, VirtualExperiment
-from yid_ocp.virtual.injected import KINDS, OUTSIDE, InjectedEffect, injected_experiment
+from yid_ocp.virtual.injected import KINDS, InjectedEffect, injected_experiment
 from yid_ocp.virtual.motion import Excitation, multisine
+from yid_ocp.virtual.outside import OUTSIDE
 
 SIZES = (1.0, 3.0, 10.0)
 """Multiples of the detectable size."""
@@ -34,6 +35,23 @@ SHARES: Mapping[str, float] = {"null": 0.2, "single": 0.5, "outside": 0.15, "lef
 """What an ensemble is made of; the rest has a finer chain."""
 SPREAD = 1.5
 """Factor by which true stiffnesses lie above or below the problem's start, at most."""
+OUTSIDE_SIZES: Mapping[str, tuple[str, float, float, bool]] = {
+    "torque_ripple": ("joint", 0.5, 2.0, False),
+    "saturating_drive": ("joint", 2.0, 6.0, False),
+    "warming_gear": ("joint", 1.0, 4.0, False),
+    "shifting_load": ("joint", 0.5, 2.0, False),
+    "slipping_grasp": ("grasp", 0.004, 0.01, False),
+    "cross_stiffness": ("segment", 0.3, 0.6, True),
+    "quadratic_stiffness": ("segment", 2.0, 5.0, True),
+    "crease": ("segment", 0.3, 0.7, True),
+    "gusts": ("segment", 0.05, 0.15, False),
+    "tether": ("segment", 5.0, 20.0, False),
+    "magnet": ("segment", 0.1, 0.4, False),
+    "wall": ("segment", 10.0, 50.0, False),
+    "stiffness_drift": ("segment", 0.2, 0.5, False),
+    "one_way_damping": ("segment", 0.3, 1.0, False),
+}
+"""Of effects outside the library: where they sit, their least and largest size, whether in bending stiffnesses."""
 TRAVEL = 0.15
 """How far the grippers go [m]."""
 
@@ -316,20 +334,21 @@ class Ensemble:
 
     def _outside(self, rng: np.random.Generator) -> InjectedEffect:
         system = self.problem.system
-        kind = str(rng.choice(OUTSIDE if system.segments else OUTSIDE[:1]))
-        if kind == "torque_ripple":
-            joint = str(rng.choice(system.driven[: max(len(system.driven) // 2, 1)]))
-            return InjectedEffect(kind, joint, {"size": float(rng.uniform(0.5, 2.0))})
-        segment = str(rng.choice([s.name for s in system.segments]))
-        start = dict(zip(system.parameters.names, self.problem.theta, strict=True))
-        springs = [s for s in segment_springs(system, segment) if s.kind == "bend"]
-        stiffness = float(start.get(f"{segment}.bend", 10.0)) if springs else 10.0
-        sizes = {
-            "cross_stiffness": stiffness * rng.uniform(0.3, 0.6),
-            "quadratic_stiffness": stiffness * rng.uniform(2.0, 5.0),
-            "gusts": rng.uniform(0.05, 0.15),
+        places: dict[str, tuple[str, ...]] = {
+            "joint": system.driven[: max(len(system.driven) // 2, 1)],
+            "segment": tuple(segment.name for segment in system.segments),
+            "grasp": tuple(grasp.name for grasp in system.grasps),
         }
-        return InjectedEffect(kind, segment, {"size": float(sizes[kind])})
+        known = [kind for kind in OUTSIDE if places[OUTSIDE_SIZES[kind][0]]]
+        kind = str(rng.choice(known))
+        place, low, high, of_stiffness = OUTSIDE_SIZES[kind]
+        location = str(rng.choice(places[place]))
+        size = float(rng.uniform(low, high))
+        if of_stiffness:
+            start = dict(zip(system.parameters.names, self.problem.theta, strict=True))
+            bends = any(spring.kind == "bend" for spring in segment_springs(system, location))
+            size *= float(start.get(f"{location}.bend", 10.0)) if bends else 10.0
+        return InjectedEffect(kind, location, {"size": size})
 
 
 def finer_values(nominal: System, finer: System, truth: Mapping[str, float]) -> dict[str, float]:
