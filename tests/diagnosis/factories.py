@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 from made_series import seeing
 
+from yid_ocp.diagnosis.carry_over import Carried
 from yid_ocp.diagnosis.finding import Absorbed, Finding
 from yid_ocp.diagnosis.localise import Place
 from yid_ocp.diagnosis.refit import Fit, Loss
@@ -141,6 +142,11 @@ def added(of: EffectBase, rivals: Sequence[EffectBase] = (), fitted: Fit | None 
     return Added(of, fitted or fit([of]), part or closed(), (of, *rivals))
 
 
+def carried(label="friction@elbow", name="a", values=(0.5, 0.9), stds=(0.01, 0.02), agrees=False) -> Carried:
+    """An amplitude on the recordings to estimate on and on the held-out ones."""
+    return Carried(label, name, "N m", values[0], stds[0], values[1], stds[1], agrees)
+
+
 # -- smoother ---------------------------------------------------------------------------------------------------------
 
 FORCE, OTHER_FORCE = Source("T1", "force"), Source("T2", "force")
@@ -218,6 +224,7 @@ def finding(verdict="effect", **changed) -> Finding:
         "message": "",
         "limits": Thresholds(),
         "seconds": {"nominal": 1.0},
+        "reason": "none" if verdict == "unknown" else "",
     }
     return Finding(**(usual | changed))
 

@@ -236,6 +236,7 @@ class Steps:
             "blocks": False,
             "disturbed": False,
             "elsewhere": None,
+            "carried": (),
         } | given
         self.taken, self.said = [], []
         self.nominal = fit(lost=loss(2.0, 2.1), cost=100.0, values=VALUES)
@@ -253,6 +254,7 @@ class Steps:
         monkeypatch.setattr(module, "smooth_fit", self.step("smooth", self.given["smoothed"]))
         refits = tuple(entry.fit for entry in self.given["added"])
         monkeypatch.setattr(module, "compose", self.step("compose", (refits, self.given["added"])))
+        monkeypatch.setattr(module, "carried_over", lambda search, of: self.given["carried"])
 
     def step(self, name, result):
         def taken(*given):
@@ -306,13 +308,21 @@ def test_a_gap_is_screened_located_and_closed(monkeypatch):
     assert [(e.label, e.angles) for e in screened.effects] == [(e.label, {"T1": 0.5}) for e in steps.effects]
     assert steps.taken[2][1] == (steps.nominal, Thresholds())
     assert steps.taken[3][1][0].problem is screened
-    assert steps.taken[3][1][1:] == (steps.nominal, steps.given["screened"])
+    assert steps.taken[3][1][1:] == (steps.nominal, steps.given["screened"], ["T1"])
     assert found.closure.value == pytest.approx(1 - 0.05 / 1.05)
     assert (found.added, found.fits[0]) == (steps.given["added"], steps.given["added"][0].fit)
     assert found.held_out == ("other",)
     assert found.absorbed[0].before == 1.0
     assert found.summary.startswith("The gap is real")
-    assert list(found.seconds) == ["nominal", "screening", "other_starts", "localisation", "refits", "remaining"]
+    assert list(found.seconds) == [
+        "nominal",
+        "screening",
+        "other_starts",
+        "localisation",
+        "refits",
+        "carry_over",
+        "remaining",
+    ]
     assert all(0 <= value < 5 for value in found.seconds.values())
     assert steps.said[:3] == ["fitting the nominal model", "screening 2 candidates", "locating the gap"]
 

@@ -19,7 +19,9 @@ from yid_ocp.diagnosis.select import (
     gain,
     out_of_shape,
     oversized,
+    relevant,
     shortlist,
+    stands_out,
     within_reach,
 )
 from yid_ocp.diagnosis.thresholds import Thresholds
@@ -262,8 +264,8 @@ def ranked(**decreases):
     ]
 
 
-def shortlisted(scores, table, **limits):
-    return [of.kind for of, _ in shortlist(scores, table, Thresholds(**limits))]
+def shortlisted(scores, table, places=(), **limits):
+    return [of.kind for of, _ in shortlist(scores, table, Thresholds(**{"surest": 0} | limits), places)]
 
 
 def test_the_best_are_refitted_and_those_that_can_stand_in_for_them():
@@ -289,6 +291,23 @@ def test_as_many_more_as_are_refitted_and_each_once():
     assert (of.kind, step) == ("a", {"a@x.a": 9.0})
 
 
+def test_the_surest_are_refitted_wherever_they_stand():
+    scores = ranked(a=9.0, b=8.0, c=7.0, d=6.0)
+    scores[3] = score(scores[3].effect, p=1e-30, decrease=6.0, statistic=100.0)
+    scores[2] = score(scores[2].effect, p=1e-30, decrease=7.0, statistic=90.0)
+    table = alike([s.effect.label for s in scores], np.eye(4))
+    assert shortlisted(scores, table, refits=1, surest=1) == ["a", "d"]
+    assert shortlisted(scores, table, refits=1, surest=2) == ["a", "d", "c"]
+    assert shortlisted(scores, table, refits=4, surest=2) == ["a", "b", "c", "d"]
+
+
+def test_the_best_of_every_place_of_the_gap_is_refitted():
+    scores = [score(effect(label), decrease=9.0 - i) for i, label in enumerate(("a@x", "b@y", "c@y", "d@z"))]
+    table = alike([s.effect.label for s in scores], np.eye(4))
+    assert shortlisted(scores, table, ("y",), refits=1) == ["a", "b"]
+    assert shortlisted(scores, table, ("z", "y", "x", "nowhere"), refits=1) == ["a", "d", "b"]
+
+
 # -- one effect after the other ---------------------------------------------------------------------------------------
 
 A, B, C = (effect(f"{name}@x", amplitude()) for name in "abc")
@@ -297,8 +316,9 @@ A, B, C = (effect(f"{name}@x", amplitude()) for name in "abc")
 class Rounds:
     """Refits whose held-out losses are given by the effects' kinds, screened as wanted; remembers what was asked."""
 
-    def __init__(self, monkeypatch, losses, p_values=(1e-9, 1e-9, 1e-9), fails=()):
+    def __init__(self, monkeypatch, losses, p_values=(1e-9, 1e-9, 1e-9), fails=(), absent=()):
         self.losses, self.fails, self.refits, self.screens, self.said = losses, fails, [], [], []
+        self.absent = absent
         kinds = [score(of, p=p, decrease=9.0 - i) for i, (of, p) in enumerate(zip((A, B, C), p_values, strict=True))]
         self.scores = tuple(kinds)
         monkeypatch.setattr(select, "refit_all", self.refit_all)
@@ -306,7 +326,9 @@ class Rounds:
         monkeypatch.setattr(select, "screen", self.screen)
 
     def fit(self, effects):
-        return fit(effects, loss(*self.losses["".join(of.kind for of in effects)]), values={"k": float(len(effects))})
+        known = "".join(sorted(of.kind for of in effects))
+        values = {f"{of.label}.a": 0.0 if of.kind in self.absent else 1.0 for of in effects}
+        return fit(effects, loss(*self.losses[known]), values={"k": float(len(effects)), **values})
 
     def screened(self, base=()):
         labels = {of.label for of in base}
@@ -320,11 +342,12 @@ class Rounds:
 
     def refit_all(self, search, base, tried, values):
         self.refits.append(([of.kind for of in base], [of.kind for of, _ in tried], values["k"]))
-        return [self.fit((*base, of)) for of, _ in tried if "".join(e.kind for e in (*base, of)) in self.losses]
+        known = [(*base, of) for of, _ in tried]
+        return [self.fit(effects) for effects in known if "".join(sorted(e.kind for e in effects)) in self.losses]
 
     def refit(self, problem, effects, start, store, name, limits):
         self.refits.append((name, [of.kind for of in effects], start["k"]))
-        kinds = "".join(of.kind for of in effects)
+        kinds = "".join(sorted(of.kind for of in effects))
         return None if kinds in self.fails else self.fit(effects)
 
     def compose(self, **limits):
@@ -369,7 +392,7 @@ def test_effects_are_added_while_the_gap_closes(monkeypatch):
     first, chosen, added = rounds.compose()
     assert (first, chosen) == (["a", "b", "c"], ["a", "b", "c"])
     assert rounds.refits[:3] == [([], ["a", "b", "c"], 0.0), (["a"], ["b", "c"], 1.0), (["a", "b"], ["c"], 2.0)]
-    assert [screened[:2] for screened in rounds.screens] == [(["a"], 1.0), (["a", "b"], 2.0)]
+    assert [screened[:2] for screened in rounds.screens[:2]] == [(["a"], 1.0), (["a", "b"], 2.0)]
     assert rounds.screens[0][3] == Thresholds()
     assert [entry.closure.value for entry in added] == pytest.approx([1 - 2.1 / 4.1, 1 - 1.1 / 4.1, 1 - 0.6 / 4.1])
     assert [len(entry.fit.effects) for entry in added] == [1, 2, 3]
@@ -458,12 +481,14 @@ def test_an_effect_that_others_make_superfluous_is_left_out_again(monkeypatch):
     assert [len(entry.fit.effects) for entry in added] == [1, 2]
     assert added[1].fit.loss.mean == pytest.approx(1.5)
     assert [entry.closure.value for entry in added] == pytest.approx([1 - 3.1 / 4.1, 1 - 0.5 / 4.1])
-    tried = rounds.refits[3:]
-    assert tried == [
+    assert rounds.refits[3:] == [
         ("a@x and b@x and c@x without a@x", ["b", "c"], 3.0),
         ("b@x again", ["b"], 2.0),
         ("b@x and c@x without b@x", ["c"], 2.0),
-    ]
+        (["c"], ["a"], 1.0),
+        ("b@x and c@x without c@x", ["b"], 2.0),
+        (["b"], ["a"], 1.0),
+    ], "without each, and others in its place, as both stand in another company than when they were added"
     assert [entry.effect for entry in added] == [B, C]
     assert "left a@x out again: the others do as well" in rounds.said
 
@@ -491,11 +516,63 @@ def test_an_effect_stays_where_the_others_do_worse_or_cannot_be_fitted(monkeypat
     assert [entry[0] for entry in rounds.refits[3:]] == [
         "a@x and b@x and c@x without a@x",
         "a@x and b@x and c@x without b@x",
+        ["a", "c"],
     ]
 
 
-def test_of_two_effects_the_first_is_tried_without(monkeypatch):
+def test_of_two_effects_the_first_is_tried_without_and_others_in_its_place(monkeypatch):
     losses = GROWING | {"ab": (2.0, 2.2), "b": (3.4, 3.5), "ac": (2.5, 2.7)}
     rounds = Rounds(monkeypatch, losses)
     assert rounds.compose(effects=2)[1] == ["a", "b"]
-    assert [entry[:2] for entry in rounds.refits[2:]] == [("a@x and b@x without a@x", ["b"])]
+    assert [entry[:2] for entry in rounds.refits[2:]] == [("a@x and b@x without a@x", ["b"]), (["b"], ["c"])]
+
+
+def test_a_later_effect_shows_what_an_earlier_one_stood_in_for(monkeypatch):
+    # a looks best alone and b beside it; beside b, c does better than a
+    losses = GROWING | {"ab": (2.0, 2.2), "b": (3.4, 3.5), "bc": (1.2, 1.3)}
+    rounds = Rounds(monkeypatch, losses)
+    _, chosen, added = rounds.compose(effects=2)
+    assert chosen == ["c", "b"]
+    assert added[-1].fit.loss.mean == pytest.approx(1.25)
+    assert [e.label for e in added[-1].fit.effects] == ["c@x", "b@x"], "in the order in which they stand"
+    assert [len(entry.fit.effects) for entry in added] == [1, 2]
+    assert "put c@x in the place of a@x" in rounds.said
+    assert [of.kind for of in added[0].rivals] == ["c"]
+
+
+def test_what_does_as_well_beside_the_others_is_a_rival(monkeypatch):
+    losses = GROWING | {"ab": (2.0, 2.2), "b": (3.4, 3.5), "bc": (2.001, 2.201)}
+    _, chosen, added = Rounds(monkeypatch, losses).compose(effects=2)
+    assert chosen == ["a", "b"]
+    assert [of.kind for of in added[0].rivals] == ["a", "c"]
+
+
+@pytest.mark.parametrize(("std", "there"), [(0.5, True), (0.51, False)])
+def test_an_effect_within_two_standard_deviations_of_neutral_is_not_there(std, there):
+    of = effect("wide@x", amplitude("a", neutral=1.0), amplitude("b"), shape("s"))
+    found = fit([of], values={"wide@x.a": 2.0, "wide@x.b": 0.01}, std={"wide@x.a": std, "wide@x.b": 1.0})
+    assert stands_out(of, found) is there
+    assert stands_out(of, found, Thresholds(away=1.9)) or std > 0.52
+
+
+def test_an_effect_that_is_not_there_is_not_added(monkeypatch):
+    losses = {"": (3.0, 3.2), "a": (1.0, 1.1), "b": (2.0, 2.2), "c": (2.5, 2.7)}
+    assert Rounds(monkeypatch, losses, absent=("a",)).compose()[1] == []
+    tied = losses | {"b": (1.001, 1.101)}
+    assert Rounds(monkeypatch, tied, absent=("a",)).compose()[1] == ["b"], "another that does as well may be there"
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "counts"),
+    [
+        (loss(3.0, 3.0), loss(2.93, 2.93), True),
+        (loss(3.0, 3.0), loss(2.95, 2.95), False),
+        (loss(3.0, 3.0, channels={"tip": (1e-3, "m")}), loss(2.99, 2.99, channels={"tip": (0.98e-3, "m")}), True),
+        (loss(3.0, 3.0, channels={"tip": (1e-3, "m")}), loss(2.99, 2.99, channels={"tip": (0.995e-3, "m")}), False),
+        (loss(0.99, 1.04), loss(0.93, 0.98), True),
+        (loss(math.inf, 3.0), loss(2.0, 2.0), True),
+    ],
+    ids=["all channels", "too little", "one channel", "too little of one", "far likelier", "not predicted before"],
+)
+def test_an_effect_counts_by_what_it_takes_away_of_an_error(before, after, counts):
+    assert relevant(before, after) is counts

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from typing import get_args
 
 import pytest
 from factories import (
@@ -12,6 +14,7 @@ from factories import (
     absorbed,
     added,
     amplitude,
+    carried,
     closed,
     effect,
     finding,
@@ -25,7 +28,9 @@ from factories import (
 )
 
 from yid_ocp.diagnosis.finding import which
-from yid_ocp.diagnosis.words import sentences
+from yid_ocp.diagnosis.hypotheses import Cut
+from yid_ocp.diagnosis.verdict import Reason
+from yid_ocp.diagnosis.words import NAMELESS, sentences
 
 FRICTION, OFFSET = effect("friction@elbow"), effect("offset@wrist", amplitude(lower=-9.0))
 NO_EFFECT = {"added": (), "fits": ()}
@@ -206,12 +211,12 @@ def test_six_parameters_at_most_are_said_to_move():
 
 def test_an_unknown_gap_names_the_best_attempt():
     said = sentences(finding("unknown", fits=(fit([OFFSET]), fit([FRICTION])), added=()))
-    assert "No known effect explains it (the best, offset@wrist, does not explain enough of it)." in said
+    assert "No known effect explains it (the best, offset@wrist, is not sure to be there and to close a part)." in said
 
 
 def test_blocks_and_the_next_experiment_come_last():
     said = sentences(with_effect(FRICTION, 0.5, in_blocks=True, next_experiment="Repeat."))
-    assert said.endswith("alternate blocks of it were held out. Next experiment: Repeat.")
+    assert said.endswith("alternate blocks of what is estimated on were held out. Next experiment: Repeat.")
     assert "blocks" not in sentences(with_effect(FRICTION, 0.5))
 
 
@@ -267,10 +272,12 @@ def test_the_result_holds_what_was_found():
         "p_value": 0.4,
     }
     assert result["gap"]["before"]["unit"] == {"points.tip": "m"}
-    assert result["where"] == [{"location": "T1", "share": 0.7, "observable": True, "windows": [[0.0, 1.0]]}]
+    assert result["where"] == [
+        {"location": "T1", "share": 0.7, "observable": True, "windows": [[0.0, 1.0]], "also": []}
+    ]
     assert result["remaining"] == {
         "p_value": 0.4,
-        "where": [{"location": "T2", "share": 0.3, "observable": False, "windows": []}],
+        "where": [{"location": "T2", "share": 0.3, "observable": False, "windows": [], "also": []}],
     }
     both = [{"kind": "friction", "location": "elbow"}, {"kind": "offset", "location": "wrist"}]
     assert result["confusable"] == [both]
@@ -318,3 +325,76 @@ def test_a_refit_without_a_score_is_listed_as_insignificant():
 def test_an_unknown_gap_lists_refits_before_scores():
     made = finding("unknown", fits=(fit([OFFSET]),), scores=(score(FRICTION), score(OFFSET)))
     assert [entry["kind"] for entry in which(made)] == ["offset", "friction"]
+
+
+# -- why a gap has no name --------------------------------------------------------------------------------------------
+
+
+def nameless(reason, **changed):
+    return sentences(finding("unknown", reason=reason, **changed))
+
+
+@pytest.mark.parametrize(
+    ("reason", "changed", "said"),
+    [
+        ("unsure", {"closure": closed(0.4, 0.01, 0.7)}, "closes 40 % of it, but not surely: at least 1 %, where 5 %"),
+        ("little", {"explained": 0.31}, "explains 31 % of what unknown forces, offsets and biases explain; below 50 %"),
+        (
+            "stand_in",
+            {"closure": closed(0.91), "carried": (carried(),)},
+            "imitates it (closing 91 % on held-out motions)",
+        ),
+    ],
+)
+def test_why_a_gap_has_no_name_is_said_with_the_numbers_that_decide_it(reason, changed, said):
+    assert said in nameless(reason, **changed)
+    assert "friction@elbow" in nameless(reason, **changed)
+
+
+def test_what_does_not_carry_over_is_named_with_both_values():
+    entries = (carried(agrees=True, name="b", values=(3.0, 3.1)), carried(values=(0.5, 0.9), stds=(0.01, 0.02)))
+    text = nameless("stand_in", carried=entries)
+    assert "friction@elbow.a is 0.5 ± 0.01 N m on the recordings to estimate on and 0.9 ± 0.02 on the held-out" in text
+    assert "friction@elbow.b" not in text
+
+
+@pytest.mark.parametrize("reason", get_args(Reason))
+def test_every_reason_has_a_sentence(reason):
+    assert reason == "" or reason in NAMELESS
+
+
+def test_stand_ins_are_shown_as_such_in_the_result():
+    told = finding("unknown", reason="stand_in", carried=(carried(),)).to_dict()
+    assert told["stand_ins"] == [{"kind": "friction", "location": "elbow"}]
+    assert (told["reason"], told["effects"]) == ("stand_in", [])
+    [entry] = told["carried_over"]
+    assert (entry["value"], entry["again"], entry["agrees"]) == (0.5, 0.9, False)
+    assert finding("unknown", reason="little").to_dict()["stand_ins"] == []
+
+
+# -- places and recordings --------------------------------------------------------------------------------------------
+
+
+def test_places_that_cannot_be_told_apart_are_named_together():
+    at = replace(place("T3"), also=("T1", "T2"))
+    text = sentences(finding(where=(at,)))
+    assert "It lies in T3 or T1 or T2 (100 %)" in text
+    assert finding(where=(at,)).to_dict()["where"][0]["also"] == ["T1", "T2"]
+
+
+@pytest.mark.parametrize(
+    ("kept", "said"),
+    [
+        (1.8, "The nominal model follows other for 1.8 of 5 s only; the rest is left out."),
+        (0.0, "The nominal model cannot follow other at all, which is left out."),
+    ],
+)
+def test_a_recording_that_cannot_be_followed_is_named(kept, said):
+    made = finding(cuts=(Cut("other", kept, 5.0),))
+    assert said in sentences(made)
+    assert made.to_dict()["gap"]["cut"] == [{"recording": "other", "kept": kept, "whole": 5.0}]
+
+
+def test_blocks_for_want_of_a_recording_that_can_be_followed_are_said():
+    text = sentences(finding(cuts=(Cut("other", 0.0, 5.0),), in_blocks=True))
+    assert "No held-out recording is left: alternate blocks" in text

@@ -11,16 +11,17 @@ import numpy as np
 import threadpoolctl
 
 from yid_ocp.data.recording import Recording
+from yid_ocp.diagnosis.carry_over import carried_over
 from yid_ocp.diagnosis.finding import Finding, absorption
-from yid_ocp.diagnosis.hypotheses import CandidateProblem, Choice, chosen_effects
+from yid_ocp.diagnosis.hypotheses import MARGINS, CandidateProblem, Choice, Cut, chosen_effects
 from yid_ocp.diagnosis.localise import Place, attributed, localise, main_places, merged
 from yid_ocp.diagnosis.refit import Fit, Progress, Search, Store, recalled, refit
 from yid_ocp.diagnosis.screening import Screened, screen
 from yid_ocp.diagnosis.select import Added, Closure, closure, compose
 from yid_ocp.diagnosis.smoother import Smoothed, smooth
 from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
-from yid_ocp.diagnosis.verdict import decide, explained_part, has_gap, shapeless
-from yid_ocp.diagnosis.words import next_experiment, sentences, shortage
+from yid_ocp.diagnosis.verdict import decide, explained_part, has_gap, shapeless, why_unknown
+from yid_ocp.diagnosis.words import cut_short, next_experiment, sentences, shortage
 from yid_ocp.errors import DataError, SolverError
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.null_test import NullTest, noise_floor, null_test, residual_series
@@ -83,6 +84,7 @@ def _diagnosed(problem: EstimationProblem, search: Search, solution: Solution | 
     limits, progress = search.limits, search.progress
     progress("fitting the nominal model")
     nominal = nominal_fit(problem, search.problem, solution, search.store, limits)
+    search, nominal, cuts = _followed(search, nominal)
     clock.lap("nominal")
     search, before, held, screened = _tested(search, nominal)
     clock.lap("screening")
@@ -91,7 +93,7 @@ def _diagnosed(problem: EstimationProblem, search: Search, solution: Solution | 
     smoothed, trusted, gap = None, None, has_gap(before, held, limits, screened.scores, offsets)
     other = elsewhere(search, nominal) if gap and enough and before.chi2_per_dof < limits.poor else None
     if other is not None:
-        nominal = other
+        search, nominal, cuts = _followed(search, other, cuts)
         search, before, held, screened = _tested(search, nominal)
         gap = has_gap(before, held, limits, screened.scores, offsets)
     clock.lap("other_starts")
@@ -108,9 +110,12 @@ def _diagnosed(problem: EstimationProblem, search: Search, solution: Solution | 
         there = () if smoothed is None else main_places(localise(smoothed, limits.sure))
         fits, added = compose(search, nominal, screened, [place.location for place in there])
     clock.lap("refits")
+    carried = carried_over(search, added[-1].fit) if added else ()
+    clock.lap("carry_over")
     total = closure(nominal.loss, added[-1].fit.loss, limits=limits) if added else Closure(np.nan, np.nan, np.nan)
     explained = explained_part(nominal, added, trusted)
-    verdict = decide(gap, screened.visible, added, total, limits, enough, explained)
+    same = all(entry.agrees for entry in carried)
+    verdict = decide(gap, screened.visible, added, total, limits, enough, explained, same)
     accepted = added if verdict in ("effect", "confusable") else ()
     remaining, where, rest_where = _after(nominal, accepted, smoothed, before, held, limits)
     clock.lap("remaining")
@@ -136,6 +141,10 @@ def _diagnosed(problem: EstimationProblem, search: Search, solution: Solution | 
         in_blocks=search.problem.blocks,
         message=shortage(verdict, before, len(nominal.values), screened.visible, limits),
         limits=limits,
+        cuts=cuts,
+        reason=why_unknown(added, total, limits, explained, same) if verdict == "unknown" else "",
+        explained=explained,
+        carried=carried,
         seconds=clock.laps,
     )
     return replace(finding, summary=sentences(finding))
@@ -150,6 +159,24 @@ def _tested(search: Search, nominal: Fit) -> tuple[Search, NullTest, NullTest, S
     search.progress(f"screening {len(composed.effects)} candidates")
     screened = screen(composed, (), nominal.values, limits)
     return replace(search, problem=composed), before, held, screened
+
+
+def _followed(search: Search, nominal: Fit, before: tuple[Cut, ...] = ()) -> tuple[Search, Fit, tuple[Cut, ...]]:
+    """The nominal model beside held-out recordings as far as it can follow them, fitted again where they were cut."""
+    found = before
+    for margin in MARGINS:
+        if np.isfinite(nominal.loss.mean):
+            break
+        composed, cuts = replace(search.problem, problem=nominal.problem).followed(nominal.values, margin)
+        for cut in cuts:
+            search.progress(cut_short(cut))
+        names = {cut.recording for cut in cuts}
+        found = (*(cut for cut in found if cut.recording not in names), *cuts)
+        name = f"the nominal model beside what it can follow ({margin:g})"
+        again = _settled(composed, nominal.values, search.store, name, search.limits)
+        if again is not None:
+            search, nominal = replace(search, problem=composed), again
+    return search, nominal, found
 
 
 def _offsets_stated(problem: EstimationProblem) -> bool:

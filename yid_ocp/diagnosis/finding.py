@@ -7,12 +7,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from yid_ocp.diagnosis.carry_over import Carried
+from yid_ocp.diagnosis.hypotheses import Cut
 from yid_ocp.diagnosis.localise import Place
 from yid_ocp.diagnosis.refit import Fit
 from yid_ocp.diagnosis.screening import Confusability, Score, Visibility
 from yid_ocp.diagnosis.select import Added, Closure, closure
 from yid_ocp.diagnosis.smoother import Smoothed
 from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.diagnosis.verdict import Reason
 from yid_ocp.effects import EffectBase
 from yid_ocp.problem.null_test import Floor, NullTest
 
@@ -78,6 +81,14 @@ class Finding:
     seconds : dict of stage to float
     summary : str
         The report in words; see `words.sentences`.
+    cuts : tuple of Cut
+        Held-out recordings that the nominal model cannot follow to their end.
+    reason : str
+        Why a gap has no name; see `verdict.Reason`.
+    explained : float
+        What the effects explain over what unknown forces, offsets and biases explain.
+    carried : tuple of Carried
+        The effects' amplitudes on the held-out recordings.
     """
 
     verdict: str
@@ -103,6 +114,10 @@ class Finding:
     limits: Thresholds
     seconds: Mapping[str, float]
     summary: str = ""
+    cuts: tuple[Cut, ...] = ()
+    reason: Reason = ""
+    explained: float = 1.0
+    carried: tuple[Carried, ...] = ()
 
     @property
     def effects(self) -> tuple[EffectBase, ...]:
@@ -125,11 +140,30 @@ class Finding:
                 "closure": _number(self.closure.value) if self.effects else None,
                 "closure_ci": [_number(self.closure.low), _number(self.closure.high)] if self.effects else None,
                 "held_out": list(self.held_out),
+                "cut": [{"recording": c.recording, "kept": c.kept, "whole": c.whole} for c in self.cuts],
             },
             "where": [_place(p) for p in self.where],
             "which": which(self),
             "effects": [{"kind": e.kind, "location": e.location} for e in self.effects],
             "remaining": {"p_value": self.remaining.p_value, "where": [_place(p) for p in self.remaining_where]},
+            "reason": self.reason,
+            "stand_ins": [
+                {"kind": e.effect.kind, "location": e.effect.location}
+                for e in (self.added if self.reason == "stand_in" else ())
+            ],
+            "carried_over": [
+                {
+                    "effect": c.effect,
+                    "parameter": c.name,
+                    "value": c.value,
+                    "std": _number(c.std),
+                    "again": c.again,
+                    "again_std": _number(c.again_std),
+                    "unit": c.unit,
+                    "agrees": c.agrees,
+                }
+                for c in self.carried
+            ],
             "confusable": [
                 [{"kind": e.kind, "location": e.location} for e in entry.rivals]
                 for entry in self.added

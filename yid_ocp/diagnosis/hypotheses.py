@@ -15,7 +15,7 @@ from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.integrator.step import compile_alike
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.episodes import Episode, beginning
 from yid_ocp.problem.inputs import sensors_present
 
 Array = NDArray[np.float64]
@@ -23,6 +23,11 @@ Choice = Literal["all"] | Sequence[str]
 
 BLOCK = 1.0
 """Length of the blocks in which a single recording is split [s]."""
+FOLLOWED = 1.0
+"""Shortest beginning of a held-out recording that is worth predicting [s]."""
+MARGINS = (0.9, 0.5, 0.0)
+"""Parts of what a model can be rolled out on that are kept, one after the other while it still fails: near its end a
+model is lost already, and a fit on less of the recording may fail earlier."""
 
 
 def chosen_effects(system: System, recordings: Sequence[Recording], choice: Choice) -> list[EffectBase]:
@@ -79,6 +84,24 @@ def chosen_effects(system: System, recordings: Sequence[Recording], choice: Choi
 
 
 @dataclass(frozen=True)
+class Cut:
+    """A held-out recording that the nominal model cannot follow to its end.
+
+    Attributes
+    ----------
+    recording : str
+    kept : float
+        How much of it is compared [s]; 0 where nothing is.
+    whole : float
+        Its length [s].
+    """
+
+    recording: str
+    kept: float
+    whole: float
+
+
+@dataclass(frozen=True)
 class CandidateProblem:
     """The estimation problem of a system with all candidates, of which any part can be freed at no cost.
 
@@ -119,8 +142,7 @@ class CandidateProblem:
         extra = [name for effect in effects for name in effect.parameters.names]
         made = EstimationProblem(joint, estimate, problem.free, problem.options, values, held, extra)
         if not held:
-            others = [replace(_masked(e, 1), shares_start_of=i) for i, e in enumerate(made.episodes)]
-            made = made.on([_masked(episode, 0) for episode in made.episodes], others)
+            made = _in_blocks(made)
         return CandidateProblem(made, tuple(effects), not held)
 
     @property
@@ -135,6 +157,32 @@ class CandidateProblem:
         """
         x = self.problem.vector(values)
         return replace(self, problem=self.problem.weighted_at(x, rounds=2).held_out_weighted_at(x))
+
+    def followed(self, values: Mapping[str, float], margin: float) -> tuple[CandidateProblem, tuple[Cut, ...]]:
+        """The same with held-out recordings only as far as the model can be rolled out on them, and what was cut.
+
+        A gap may be so large that the nominal model cannot follow a recording at all; what it says until then is
+        compared all the same. Where nothing worth predicting is left, those to estimate on are split in blocks. Weights
+        are those of the sensors' noise; see `weighted_at`. `margin` is the part that is kept of what it follows.
+        """
+        problem, x = self.problem, self.problem.vector(values)
+        kept, cuts = [], []
+        for episode in problem.held_out:
+            whole = episode.grid.steps
+            steps = _steps_followed(problem, episode, x)
+            if steps < whole:
+                steps = round(margin * steps)
+            h = episode.grid.time_step
+            usable = steps * h >= FOLLOWED
+            if steps < whole:
+                cuts.append(Cut(episode.name, steps * h if usable else 0.0, whole * h))
+            if usable or steps == whole:
+                kept.append(episode if steps == whole else beginning(episode, steps))
+        if not cuts:
+            return self, ()
+        if kept:
+            return replace(self, problem=problem.on(problem.episodes, kept)), tuple(cuts)
+        return replace(self, problem=_in_blocks(problem), blocks=True), tuple(cuts)
 
     def freeing(self, effects: Sequence[EffectBase]) -> EstimationProblem:
         """The problem with the parameters of some effects free beside the nominal ones."""
@@ -162,6 +210,28 @@ def _same(a: Recording, b: Recording) -> bool:
     return len(first) == len(second) and all(
         x.shape == y.shape and np.array_equal(x, y, equal_nan=True) for x, y in zip(first, second, strict=True)
     )
+
+
+def _in_blocks(problem: EstimationProblem) -> EstimationProblem:
+    """The problem with every other block of its recordings held out."""
+    others = [replace(_masked(e, 1), shares_start_of=i) for i, e in enumerate(problem.episodes)]
+    return problem.on([_masked(episode, 0) for episode in problem.episodes], others)
+
+
+def _steps_followed(problem: EstimationProblem, episode: Episode, x: Array) -> int:
+    """Steps of a held-out recording that can be rolled out at some unknowns, to a sixty-fourth of its length."""
+
+    def runs(steps: int) -> bool:
+        [(_, result)] = problem.on(problem.episodes, [beginning(episode, steps)]).validate(x)
+        return not isinstance(result, str)
+
+    low, high = 0, episode.grid.steps
+    if runs(high):
+        return high
+    while high - low > max(episode.grid.steps // 64, 1):
+        middle = (low + high) // 2
+        low, high = (middle, high) if runs(middle) else (low, middle)
+    return low
 
 
 def _masked(episode: Episode, parity: int) -> Episode:

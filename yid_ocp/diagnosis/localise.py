@@ -174,4 +174,5 @@ def units(system: System, trace: Trace) -> tuple[str, ...]:
     sliding = {joint.name for joint in tree.joints if joint.kind == "prismatic"}
     forces = {name: "N" if name in sliding else "N m" for name in tree.joint_names}
     pairs = zip(trace.unknowns, trace.sources, strict=True)
-    return tuple(forces[name] if source.kind == "force" else "m" for name, source in pairs)
+    other = {"push": "N", "offset": "m", "bias": "m"}
+    return tuple(forces[name] if source.kind == "force" else other[source.kind] for name, source in pairs)

@@ -1,6 +1,7 @@
 """The linear model of a recording: how unknown forces, grasp offsets and sensor biases would move its residual.
 
-About the rollout of a fitted model every DEL row gets an unknown generalized force, every grasp an unknown offset and
+About the rollout of a fitted model every DEL row gets an unknown generalized force, every segment an unknown push (a
+force in the world on a point of it, which all joints between it and the ground feel), every grasp an unknown offset and
 every output of a point sensor an unknown bias. To first order
 
     x_{k+1} = A_k x_k + E_k d_j,   y_k = C_k x_k + b_j + noise,
@@ -26,6 +27,7 @@ from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
 from yid_ocp.effects.base import grasp_names, robot_joints
 from yid_ocp.integrator.linear import Loads, linear_steps, live_states
 from yid_ocp.integrator.step_model import Rollout
+from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, apparent_inertia
@@ -34,12 +36,14 @@ from yid_ocp.problem.prediction import EpisodeResult
 from yid_ocp.sensors import Sensor
 
 Array = NDArray[np.float64]
-Kind = Literal["force", "offset", "bias"]
+Kind = Literal["force", "push", "offset", "bias"]
 
 MEMORY = 0.5
 """Time in which an unknown forgets its value [s]."""
 INTERVAL = 0.1
 """Shortest time over which unknowns are constant [s]."""
+PUSHED = "75%"
+"""Where a segment is pushed, by arc length: what acts on its tip and what acts all along it are both near that."""
 INTERVALS = 150
 """Number of intervals of a long recording, beyond which they become longer."""
 
@@ -51,7 +55,7 @@ class Source:
     Attributes
     ----------
     location : str
-    kind : "force", "offset" or "bias"
+    kind : "force", "push", "offset" or "bias"
     read : bool
         Whether a bias of an effort sensor would be the same: a force at a prescribed joint whose effort is measured.
     """
@@ -203,13 +207,15 @@ class _Unknowns:
     Attributes
     ----------
     names : tuple of str, length nd
-        Coordinate, grasp and axis, or channel and axis: first forces, then offsets, then biases.
+        Coordinate, grasp, segment or channel, and axis: first forces, then offsets, pushes and biases.
     sources : tuple of Source, length nd
     reference : ndarray, shape (nd,)
     forced : ndarray of int
         Coordinates with an unknown force.
     grasped : ndarray of int
         Constraint rows with an unknown offset.
+    pushed : tuple of str
+        Segments with an unknown push.
     biased : tuple of (int, int)
         Group of samples and column with an unknown bias.
     """
@@ -219,12 +225,18 @@ class _Unknowns:
     reference: Array
     forced: NDArray[np.int64]
     grasped: NDArray[np.int64]
+    pushed: tuple[str, ...]
     biased: tuple[tuple[int, int], ...]
+
+    @property
+    def loading(self) -> int:
+        """How many of them add the same to every step."""
+        return len(self.forced) + len(self.grasped)
 
     @property
     def driving(self) -> int:
         """How many of them move the state."""
-        return len(self.forced) + len(self.grasped)
+        return self.loading + 3 * len(self.pushed)
 
 
 def _unknowns(course: _Course, limits: Thresholds) -> _Unknowns:
@@ -236,6 +248,12 @@ def _unknowns(course: _Course, limits: Thresholds) -> _Unknowns:
         sources += [Source(name, "offset")] * 3
         reference += [limits.offset] * 3
         row += grasp.equations
+    pushed = []
+    for segment, weight in _weights_of(course).items():
+        pushed.append(segment)
+        names += [f"{segment}.push_{axis}" for axis in "xyz"]
+        sources += [Source(segment, "push")] * 3
+        reference += [limits.force * weight] * 3
     biased = []
     for k, samples in enumerate(course.episode.samples):
         sensor = samples.sensor
@@ -250,7 +268,41 @@ def _unknowns(course: _Course, limits: Thresholds) -> _Unknowns:
             names.append(f"{channel}{axis}")
             sources.append(Source(_seen_by(course.system, sensor, frame), "bias"))
             reference.append(limits.bias * float(np.nanmedian(samples.std[:, column])))
-    return _Unknowns(tuple(names), tuple(sources), np.array(reference), forced, np.array(grasped, int), tuple(biased))
+    held = np.array(grasped, int)
+    return _Unknowns(tuple(names), tuple(sources), np.array(reference), forced, held, tuple(pushed), tuple(biased))
+
+
+def _weights_of(course: _Course) -> dict[str, float]:
+    """Weight of every segment of the object that can be pushed [N]; those without mass are left out."""
+    system, tree = course.system, course.system.mechanism
+    masses = {}
+    for segment in system.segments:
+        joints = [tree.joints[tree.joint_index(name)] for link in segment.links for name in link]
+        if tree.has_frame(f"{segment.name}:{PUSHED}"):
+            masses[segment.name] = sum((body.mass for joint in joints for body in joint.bodies), ca.SX(0))
+    gravity = ca.norm_2(ca.SX(system.gravity))
+    if not masses:
+        return {}
+    value = ca.Function("weights", [system.parameters.symbols], [gravity * ca.vertcat(*masses.values())])
+    found = np.array(value(course.theta)).ravel()
+    return {name: float(weight) for name, weight in zip(masses, found, strict=True) if weight > 0}
+
+
+def _forces_of_pushes(course: _Course, unknowns: _Unknowns) -> Array:
+    """Unknown forces that pushes of their reference size amount to at every node, shape (N + 1, forces, pushes)."""
+    system, forces = course.system, len(unknowns.forced)
+    state = course.rollout.state[:, : system.size]
+    if not unknowns.pushed:
+        return np.zeros((len(state), forces, 0))
+    q = ca.SX.sym("q", system.size)
+    moved = forward_kinematics(system.mechanism, q)
+    jacobian = ca.vertcat(*(moved.point_jacobian(f"{segment}:{PUSHED}") for segment in unknowns.pushed))
+    function = ca.Function("pushed", [q, system.parameters.symbols], [jacobian.T])
+    rows = 3 * len(unknowns.pushed)
+    found = np.array(function.map(len(state))(state.T, np.tile(course.theta[:, None], len(state))))
+    by_push = found.reshape(system.size, len(state), rows).transpose(1, 0, 2)[:, unknowns.forced]
+    size = unknowns.reference[unknowns.loading : unknowns.driving]
+    return np.asarray(by_push * size / unknowns.reference[:forces, None])
 
 
 def _unknown_forces(course: _Course, part: float) -> tuple[list[str], list[Source], list[float], NDArray[np.int64]]:
@@ -306,21 +358,24 @@ def _loads_of(course: _Course, unknowns: _Unknowns) -> Loads:
     """What unknown forces and grasp offsets of their reference size add to every step."""
     step = course.problem.step
     n, nz, m = (step.sizes[key] for key in ("n", "nz", "m"))
-    forces, driving = len(unknowns.forced), unknowns.driving
-    rows, momentum = np.zeros((n + nz + m, driving)), np.zeros((n, driving))
+    forces, loading = len(unknowns.forced), unknowns.loading
+    rows, momentum = np.zeros((n + nz + m, loading)), np.zeros((n, loading))
     # an unknown force is held over the step and shared by both equations like any other
     first_share = 1.0 if step.force_split == "left" else 0.5
     impulse = step.time_step * unknowns.reference[:forces]
     rows[unknowns.forced, np.arange(forces)] = first_share * impulse
     momentum[unknowns.forced, np.arange(forces)] = (1 - first_share) * impulse
-    rows[n + nz + unknowns.grasped, np.arange(forces, driving)] = unknowns.reference[forces:driving]
+    rows[n + nz + unknowns.grasped, np.arange(forces, loading)] = unknowns.reference[forces:loading]
     return Loads(rows, momentum)
 
 
 def _steps(
-    course: _Course, loads: Loads, moving: NDArray[np.int64], first: int, last: int
+    course: _Course, loads: Loads, pushes: Array, moving: NDArray[np.int64], first: int, last: int
 ) -> tuple[Array, Array, Array]:
-    """A_k (steps, ns, ns), E_k (steps, ns, nd') and the effort's slopes (steps, nc, ns + nd') of some steps."""
+    """A_k (steps, ns, ns), E_k (steps, ns, nd') and the effort's slopes (steps, nc, ns + nd') of some steps.
+
+    `pushes` (N + 1, forces, np) says what forces pushes amount to.
+    """
     a, e, effort = [], [], []
     feedback = course.episode.feedback
     found = linear_steps(course.problem.step, course.theta, course.rollout, loads, slice(first, last))
@@ -330,9 +385,11 @@ def _steps(
             by_state, effort_by_state = by_state.copy(), effort_by_state.copy()
             by_state[:, feedback.index] -= one.by_torque @ feedback.gain[k]
             effort_by_state[:, feedback.index] -= one.effort_by_torque @ feedback.gain[k]
+        forces = pushes.shape[1]
         a.append(by_state[np.ix_(moving, moving)])
-        e.append(one.by_load[moving])
-        effort.append(np.hstack([effort_by_state[:, moving], one.effort_by_load]))
+        e.append(np.hstack([one.by_load[moving], one.by_load[moving, :forces] @ pushes[k]]))
+        pushed = one.effort_by_load[:, :forces] @ pushes[k]
+        effort.append(np.hstack([effort_by_state[:, moving], one.effort_by_load, pushed]))
     return np.stack(a), np.stack(e), np.stack(effort)
 
 
@@ -345,7 +402,7 @@ def _recording(course: _Course, observed: Array, limits: Thresholds) -> Linear:
     length = int(max(round(INTERVAL / h), math.ceil(steps / INTERVALS), 1))
     edges = np.unique(np.append(np.arange(0, steps, length), steps))
     unknowns = _unknowns(course, limits)
-    loads = _loads_of(course, unknowns)
+    loads, pushes = _loads_of(course, unknowns), _forces_of_pushes(course, unknowns)
     linear = partial(linear_steps, course.problem.step, course.theta, course.rollout, loads)
     ends = [*linear(slice(0, 1)), *linear(slice(steps - 1, steps))]
     moving = np.flatnonzero(live_states(course.problem.step, ends))
@@ -355,7 +412,7 @@ def _recording(course: _Course, observed: Array, limits: Thresholds) -> Linear:
     at_rest = np.zeros((ns, len(unknowns.names)))
     intervals = []
     for j in range(len(edges) - 1):
-        slopes = _steps(course, loads, moving, int(edges[j]), int(edges[j + 1]))
+        slopes = _steps(course, loads, pushes, moving, int(edges[j]), int(edges[j + 1]))
         if j == 0 and rests:
             # rest under constant unknowns, x = A x + E d; what has no stiffness does not come to rest
             at_rest[:, :driving] = np.linalg.lstsq(np.eye(ns) - slopes[0][0], slopes[1][0], rcond=1e-6)[0]

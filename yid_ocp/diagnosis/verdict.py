@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 from yid_ocp.diagnosis.refit import Fit
 from yid_ocp.diagnosis.screening import Score, Visibility
@@ -10,6 +11,9 @@ from yid_ocp.diagnosis.select import Added, Closure
 from yid_ocp.diagnosis.smoother import Smoothed
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.problem.null_test import NullTest, more_than_noise
+
+Reason = Literal["", "none", "unsure", "little", "stand_in"]
+"""Why a gap has no name: no candidate closes a part of it, none surely, none enough, or what does only imitates."""
 
 
 def has_gap(
@@ -65,6 +69,7 @@ def decide(
     limits: Thresholds,
     enough: bool,
     explained: float = 1.0,
+    carried: bool = True,
 ) -> str:
     """The verdict of step eight.
 
@@ -81,14 +86,29 @@ def decide(
         Whether there are samples enough for the unknowns.
     explained : float
         What the effects explain over what unknown forces, offsets and biases explain.
+    carried : bool
+        Whether the effects come out alike on the held-out recordings.
     """
     if not enough or not any(entry.visible for entry in visible):
         return "insufficient_data"
     if not gap:
         return "no_gap"
-    if not added or not (total.low > limits.closure or total.sure) or explained < limits.explained:
+    if why_unknown(added, total, limits, explained, carried):
         return "unknown"
     return "confusable" if len(added[0].rivals) > 1 else "effect"
+
+
+def why_unknown(
+    added: Sequence[Added], total: Closure, limits: Thresholds, explained: float = 1.0, carried: bool = True
+) -> Reason:
+    """Why no effect is named where there is a gap; empty where one is."""
+    if not added:
+        return "none"
+    if not (total.low > limits.closure or total.sure):
+        return "unsure"
+    if explained < limits.explained:
+        return "little"
+    return "" if carried else "stand_in"
 
 
 def explained_part(nominal: Fit, added: Sequence[Added], smoothed: Smoothed | None) -> float:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from yid_ocp.diagnosis.carry_over import disagreeing
 from yid_ocp.diagnosis.finding import Finding
+from yid_ocp.diagnosis.hypotheses import Cut
 from yid_ocp.diagnosis.localise import Place, main_places
 from yid_ocp.diagnosis.refit import Fit
 from yid_ocp.diagnosis.screening import Visibility
@@ -36,6 +38,18 @@ NEXT = {
     "effect": "Repeat with other motions to see whether the effect's parameters stay.",
 }
 """The next experiment."""
+
+
+NAMELESS = {
+    "nothing": "No known effect explains it.",
+    "none": "No known effect explains it (the best, {best}, is not sure to be there and to close a part).",
+    "unsure": "{names} closes {closure:.3g} % of it, but not surely: at least {low:.3g} %, where {least:.3g} % are "
+    "asked.",
+    "little": "{names} explains {explained:.3g} % of what unknown forces, offsets and biases explain; below "
+    "{enough:.3g} % no effect is named.",
+    "stand_in": "{names} imitates it (closing {closure:.3g} % on held-out motions) and is not its cause: {apart}.",
+}
+"""Why a gap has no name, by `verdict.Reason`."""
 
 
 def separating(rivals: Sequence[EffectBase]) -> str:
@@ -86,6 +100,15 @@ def shortage(verdict: str, before: NullTest, unknowns: int, seen: Sequence[Visib
     )
 
 
+def cut_short(cut: Cut) -> str:
+    """How far the nominal model can follow a held-out recording."""
+    if cut.kept == 0:
+        return f"The nominal model cannot follow {cut.recording} at all, which is left out."
+    return (
+        f"The nominal model follows {cut.recording} for {cut.kept:.3g} of {cut.whole:.3g} s only; the rest is left out."
+    )
+
+
 def sentences(finding: Finding) -> str:
     """The report in words."""
     text = [_gap(finding)]
@@ -94,11 +117,11 @@ def sentences(finding: Finding) -> str:
     if finding.effects:
         text += _effects(finding)
     elif finding.verdict == "unknown":
-        best = finding.fits[0] if finding.fits else None
-        said = "" if best is None else f" (the best, {best.effects[0].label}, does not explain enough of it)"
-        text.append(f"No known effect explains it{said}.")
+        text.append(_nameless(finding))
+    text += [cut_short(cut) for cut in finding.cuts]
     if finding.in_blocks:
-        text.append("Only one set of recordings was given: alternate blocks of it were held out.")
+        why = "No held-out recording is left" if finding.cuts else "Only one set of recordings was given"
+        text.append(f"{why}: alternate blocks of what is estimated on were held out.")
     text.append(f"Next experiment: {finding.next_experiment}")
     return " ".join(part for part in text if part)
 
@@ -127,6 +150,28 @@ def _places(finding: Finding) -> str:
     named = " and ".join(f"{_one_of(p)} ({100 * p.share:.0f} %)" for p in main_places(finding.where))
     side = "" if finding.smoothed is None else SIDES.get(finding.smoothed.side, "")
     return f"It lies in {named}{side}." if named else ""
+
+
+def _nameless(finding: Finding) -> str:
+    """Why no effect is named, with the numbers that say so."""
+    if finding.reason == "none":
+        best = finding.fits[0] if finding.fits else None
+        return NAMELESS["nothing"] if best is None else NAMELESS["none"].format(best=best.effects[0].label)
+    names = " and ".join(entry.effect.label for entry in finding.added)
+    apart = [
+        f"{entry.effect}.{entry.name} is {entry.value:.3g} ± {entry.std:.2g} {entry.unit} on the recordings to "
+        f"estimate on and {entry.again:.3g} ± {entry.again_std:.2g} on the held-out ones"
+        for entry in disagreeing(finding.carried)
+    ]
+    return NAMELESS[finding.reason].format(
+        names=names,
+        closure=100 * finding.closure.value,
+        low=100 * finding.closure.low,
+        least=100 * finding.limits.closure,
+        explained=100 * finding.explained,
+        enough=100 * finding.limits.explained,
+        apart="; ".join(apart[:2]),
+    )
 
 
 def _one_of(place: Place) -> str:

@@ -1,0 +1,96 @@
+"""Unknown pushes on segments, and places that the data cannot tell apart."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import casadi as ca
+import numpy as np
+import pytest
+from test_smoother import random_model
+
+from yid_ocp.diagnosis import smoother
+from yid_ocp.diagnosis.localise import localise
+from yid_ocp.diagnosis.smoother import _instead, _run
+from yid_ocp.diagnosis.smoother_model import PUSHED, Source, _forces_of_pushes, _weights_of
+from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.model.kinematics import forward_kinematics
+from yid_ocp.virtual.experiment import paper_system
+
+SYSTEM = paper_system(1)
+THETA = np.array([parameter.value for parameter in SYSTEM.parameters])
+
+
+def test_a_push_is_what_virtual_work_says():
+    rng = np.random.default_rng(3)
+    q = 0.3 * rng.standard_normal((2, SYSTEM.size))
+    forced = np.array([i for i in range(SYSTEM.size) if i % 3 != 1])
+    forces = len(forced)
+    reference = rng.uniform(0.5, 2.0, forces + 2 + 6)
+    unknowns = SimpleNamespace(
+        forced=forced, pushed=("T1", "T3"), reference=reference, loading=forces + 2, driving=forces + 8
+    )
+    course = SimpleNamespace(system=SYSTEM, theta=THETA, rollout=SimpleNamespace(state=np.hstack([q, q, q])))
+    found = _forces_of_pushes(course, unknowns)
+    assert found.shape == (2, forces, 6)
+    symbol = ca.SX.sym("q", SYSTEM.size)
+    at = ca.vertcat(*(forward_kinematics(SYSTEM.mechanism, symbol).position(f"{s}:{PUSHED}") for s in ("T1", "T3")))
+    place = ca.Function("place", [symbol, SYSTEM.parameters.symbols], [at])
+    for k, row in enumerate(q):
+        for i, index in enumerate(forced):
+            step = np.zeros(SYSTEM.size)
+            step[index] = 1e-6
+            moved = (np.array(place(row + step, THETA)) - np.array(place(row - step, THETA))).ravel() / 2e-6
+            expected = moved * reference[forces + 2 :] / reference[i]
+            assert found[k, i] == pytest.approx(expected, abs=1e-7)
+
+
+def test_pushes_are_measured_by_the_weight_of_their_segment():
+    found = _weights_of(SimpleNamespace(system=SYSTEM, theta=THETA))
+    assert found == pytest.approx({"T1": 9.81 * 0.064, "T2": 9.81 * 0.015, "T3": 9.81 * 0.016})
+
+
+# -- places that do as well -------------------------------------------------------------------------------------------
+
+HERE, LIKE, OTHER = Source("here", "force"), Source("there", "push"), Source("elsewhere", "force")
+
+
+@pytest.fixture
+def twice():
+    """A model in which two unknowns at two places do the same, a third something else, and the first one is at work."""
+    model = random_model(2, unknowns=3, count=12, rows=8)
+    rng = np.random.default_rng(0)
+    intervals = []
+    for one in model.intervals:
+        by, drive = one.by_unknown.copy(), one.drive.copy()
+        by[:, 1] = by[:, 0] + 0.02 * rng.standard_normal(len(by))
+        drive[:, 1] = drive[:, 0]
+        observed = 0.1 * one.observed
+        observed[:, 0] += 8.0 * by[:, 0]
+        intervals.append(type(one)(observed, one.by_state, by, one.transition, drive, one.rest, one.samples))
+    kept = {**vars(model), "intervals": tuple(intervals), "sources": (HERE, LIKE, OTHER)}
+    return type(model)(**kept)
+
+
+def test_a_place_that_does_as_well_is_told(twice):
+    variance = {HERE: 50.0, LIKE: 0.0, OTHER: 0.0}
+    state = _run([twice], variance)
+    weight = smoother._weights([twice], variance, state)
+    assert weight[HERE] > 100
+    found = _instead([twice], variance, state.evidence, weight, Thresholds())
+    assert found == {HERE: (LIKE,)}
+    strict = Thresholds(as_well=1.0, worth=1e-9)
+    assert LIKE not in _instead([twice], variance, state.evidence + 1e3, weight, strict)[HERE]
+
+
+def test_it_is_named_beside_the_place_but_its_own_other_unknowns_are_not():
+    same = Source("here", "push")
+    seen = SimpleNamespace(
+        weight={HERE: 9.0, LIKE: 0.0, same: 0.0},
+        detectable=dict.fromkeys((HERE, LIKE, same), 0.5),
+        variance={HERE: 1.0, LIKE: 0.0, same: 0.0},
+        traces=(),
+        instead={HERE: (LIKE, same)},
+    )
+    first, *_ = localise(seen)
+    assert (first.location, first.also) == ("here", ("there",))

@@ -1,0 +1,125 @@
+"""Whether effects come out the same on other recordings, rule by rule."""
+
+from __future__ import annotations
+
+import pytest
+from factories import amplitude, carried, effect, fit, shape
+
+from yid_ocp.diagnosis import carry_over
+from yid_ocp.diagnosis.carry_over import carried_over, compared, disagreeing
+from yid_ocp.diagnosis.hypotheses import CandidateProblem
+from yid_ocp.diagnosis.refit import Search
+from yid_ocp.diagnosis.thresholds import Thresholds
+
+SPRING = effect("spring@elbow", amplitude("k", lower=-9.0, expected=(0.0, 10.0)), shape("s"))
+SHIFT = effect(
+    "shift@grasp",
+    amplitude("x", lower=-9.0, expected=(-1.0, 1.0), unit="m"),
+    amplitude("y", lower=-9.0, expected=(-1.0, 1.0), unit="m"),
+)
+
+
+def of(label, values, stds, effects=(SPRING,)):
+    return fit(
+        effects,
+        values={f"{label}.{name}": value for name, value in values.items()},
+        std={f"{label}.{name}": std for name, std in stds.items()},
+    )
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "agrees"),
+    [
+        # 3 apart, with 0.6 and 0.8 together 1: 3 standard deviations
+        ((2.0, 0.6), (5.0, 0.8), True),
+        ((2.0, 0.6), (5.4, 0.8), False),
+        # sure, and by no more than three tenths of the larger
+        ((10.0, 0.01), (7.1, 0.01), True),
+        ((10.0, 0.01), (6.9, 0.01), False),
+        ((6.9, 0.01), (10.0, 0.01), False),
+        ((5.0, 0.01), (-5.0, 0.01), False),
+    ],
+)
+def test_values_agree_within_their_errors_or_a_part_of_their_size(first, second, agrees):
+    one, other = (of("spring@elbow", {"k": value}, {"k": std}) for value, std in (first, second))
+    [entry] = compared(SPRING, one, other)
+    assert entry.agrees is agrees
+    assert (entry.effect, entry.name, entry.unit) == ("spring@elbow", "k", "N m")
+    assert (entry.value, entry.std, entry.again, entry.again_std) == (*first, *second)
+
+
+def test_how_far_they_may_differ_is_two_thresholds():
+    one, other = (of("spring@elbow", {"k": v}, {"k": 0.01}) for v in (10.0, 6.9))
+    assert compared(SPRING, one, other, Thresholds(carried=0.32))[0].agrees
+    assert compared(SPRING, one, other, Thresholds(carried_stds=250.0))[0].agrees
+
+
+def test_a_small_part_of_a_vector_may_differ_by_a_part_of_the_whole():
+    stds = {"x": 1e-3, "y": 1e-3}
+    one, other = (of("shift@grasp", values, stds, (SHIFT,)) for values in ({"x": 1.0, "y": 0.1}, {"x": 1.0, "y": -0.1}))
+    assert [entry.agrees for entry in compared(SHIFT, one, other)] == [True, True]
+    far = of("shift@grasp", {"x": 1.0, "y": -0.3}, stds, (SHIFT,))
+    assert [entry.agrees for entry in compared(SHIFT, one, far)] == [True, False]
+
+
+def test_those_that_do_not_carry_over_are_told():
+    entries = (carried(agrees=True), carried(name="b"))
+    assert disagreeing(entries) == entries[1:]
+
+
+class Problem:
+    """Episodes and held-out ones that can change places."""
+
+    def __init__(self, episodes=("own",), held_out=("other",), disturbed=False):
+        self.episodes, self.held_out, self.disturbed = episodes, held_out, disturbed
+        self.free, self.weighted = ("k",), []
+
+    def on(self, episodes, held_out):
+        return Problem(episodes, held_out, self.disturbed)
+
+
+def test_the_held_out_recordings_are_fitted_with_the_same_effects(monkeypatch):
+    asked = []
+    first = of("spring@elbow", {"k": 2.0}, {"k": 0.1})
+    again = of("spring@elbow", {"k": 7.0}, {"k": 0.1})
+    first.values.update({"k": 3.0, "start.tip[own]": 0.2})
+
+    def refitted(problem, effects, start, store, name, limits):
+        asked.append((problem.problem.episodes, problem.problem.held_out, effects, dict(start), store, name, limits))
+        return again
+
+    monkeypatch.setattr(carry_over, "refit", refitted)
+    search = Search(CandidateProblem(Problem(), (SPRING,), False), Thresholds(), lambda text: None, "store")
+    [entry] = carried_over(search, first)
+    assert (entry.value, entry.again, entry.agrees) == (2.0, 7.0, False)
+    [(episodes, held_out, effects, start, store, name, limits)] = asked
+    assert (episodes, held_out, effects, store, limits) == (("other",), ("own",), (SPRING,), "store", Thresholds())
+    assert start == {"k": 3.0, "spring@elbow.k": 2.0, "spring@elbow.s": 0.5}, "no start of a single recording"
+    assert name == "spring@elbow on the held-out recordings"
+
+
+@pytest.mark.parametrize(("blocks", "effects"), [(True, (SPRING,)), (False, ())], ids=["in blocks", "no effect"])
+def test_nothing_is_compared_where_there_is_nothing_to_compare(monkeypatch, blocks, effects):
+    monkeypatch.setattr(carry_over, "refit", lambda *_: pytest.fail("not asked for"))
+    search = Search(CandidateProblem(Problem(), (SPRING,), blocks), Thresholds(), lambda text: None)
+    assert carried_over(search, fit(effects)) == ()
+
+
+def test_a_model_that_cannot_be_fitted_there_is_no_evidence(monkeypatch):
+    monkeypatch.setattr(carry_over, "refit", lambda *_: None)
+    search = Search(CandidateProblem(Problem(), (SPRING,), False), Thresholds(), lambda text: None)
+    assert carried_over(search, fit([SPRING])) == ()
+
+
+def test_noise_that_drives_the_motion_weighs_there_too(monkeypatch):
+    problem = Problem(disturbed=True)
+    seen = []
+    composed = CandidateProblem(problem, (SPRING,), False)
+    monkeypatch.setattr(CandidateProblem, "weighted_at", lambda self, values: seen.append(dict(values)) or "weighted")
+    monkeypatch.setattr(CandidateProblem, "nominal", ("k",), raising=False)
+    monkeypatch.setattr(carry_over, "_shared", lambda turned, fitted: {})
+    asked = []
+    monkeypatch.setattr(carry_over, "refit", lambda problem, *_: asked.append(problem))
+    carried_over(Search(composed, Thresholds(), lambda text: None), fit([SPRING], values={"k": 4.0}))
+    assert asked == ["weighted"]
+    assert seen[0]["k"] == 4.0

@@ -1,0 +1,90 @@
+"""Whether what an effect was found to be on some recordings is found on others: what only imitates moves.
+
+Two or three effects together imitate almost anything on the recordings on which they were fitted. What is true of the
+robot comes out the same wherever it is fitted; what stands in for something else has to be something else for every
+motion. The recordings that are held out are fitted in turn, with the same effects, and the values are compared.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from yid_ocp.diagnosis.hypotheses import CandidateProblem
+from yid_ocp.diagnosis.refit import Fit, Search, refit
+from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
+from yid_ocp.effects import EffectBase
+
+
+@dataclass(frozen=True)
+class Carried:
+    """An effect's parameter as it was found, and as it is found on the held-out recordings alone.
+
+    Attributes
+    ----------
+    effect, name, unit : str
+    value, std : float
+        On the recordings to estimate on.
+    again, again_std : float
+        On the held-out ones.
+    agrees : bool
+    """
+
+    effect: str
+    name: str
+    unit: str
+    value: float
+    std: float
+    again: float
+    again_std: float
+    agrees: bool
+
+
+def carried_over(search: Search, fit: Fit) -> tuple[Carried, ...]:
+    """Every amplitude of a model's effects on held-out recordings; nothing where one recording is split in blocks.
+
+    Nothing, too, where the model cannot be fitted there: no evidence against it.
+    """
+    if search.problem.blocks or not fit.effects:
+        return ()
+    search.progress("fitting the held-out recordings with the same effects")
+    problem = search.problem.problem
+    turned = replace(search.problem, problem=problem.on(problem.held_out, problem.episodes))
+    if problem.disturbed:
+        turned = turned.weighted_at(fit.values)
+    name = f"{' and '.join(effect.label for effect in fit.effects)} on the held-out recordings"
+    again = refit(turned, fit.effects, _shared(turned, fit), search.store, name, search.limits)
+    if again is None:
+        return ()
+    return tuple(entry for effect in fit.effects for entry in compared(effect, fit, again, search.limits))
+
+
+def _shared(turned: CandidateProblem, fit: Fit) -> dict[str, float]:
+    """Values of what both sets of recordings have in common: parameters, and nothing of single recordings' starts."""
+    names = {*turned.nominal, *(name for effect in fit.effects for name in effect.parameters.names)}
+    return {name: value for name, value in fit.values.items() if name in names}
+
+
+def compared(effect: EffectBase, first: Fit, second: Fit, limits: Thresholds = DEFAULTS) -> list[Carried]:
+    """The amplitudes of one effect in two fits.
+
+    They agree where they differ by no more than `carried_stds` standard deviations, those of both together, or than the
+    part `carried` of the effect's size; sizes of several amplitudes are compared in widths of their ranges.
+    """
+    neutral, found = effect.neutral, []
+    width = {name: high - low for name, (low, high) in effect.prior_range.items()}
+    size = max(abs(fit.values[n] - neutral[n]) / width[n] for fit in (first, second) for n in effect.amplitudes)
+    for name in effect.amplitudes:
+        apart = abs(first.values[name] - second.values[name])
+        spread = math.hypot(first.std[name], second.std[name])
+        agrees = apart <= limits.carried_stds * spread or apart <= limits.carried * size * width[name]
+        parameter = effect.parameters[name]
+        own = (first.values[name], first.std[name], second.values[name], second.std[name])
+        found.append(Carried(effect.label, name.removeprefix(f"{effect.label}."), parameter.unit, *own, agrees))
+    return found
+
+
+def disagreeing(entries: Sequence[Carried]) -> tuple[Carried, ...]:
+    """Those that do not carry over."""
+    return tuple(entry for entry in entries if not entry.agrees)
