@@ -8,7 +8,7 @@ import pytest
 from factories import BIAS, FORCE, READ_FORCE, added, closed, effect, fit, outcome, score, smoothed, visible
 
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.diagnosis.verdict import decide, explained_part, has_gap, shapeless
+from yid_ocp.diagnosis.verdict import decide, explained_part, has_gap, shapeless, why_unknown
 
 LIMITS = Thresholds()
 ONE, OTHER = effect("friction@elbow"), effect("offset@elbow")
@@ -182,6 +182,12 @@ CERTAIN = closed(0.9, 0.8, 0.95)
         ({"added": (added(ONE, [OTHER]), added(OTHER))}, "confusable"),
         ({"added": (added(ONE), added(OTHER, [ONE]))}, "effect"),
         ({"added": (added(ONE, [OTHER]),), "explained": 0.1}, "unknown"),
+        ({"added": (added(ONE), added(OTHER)), "explained": 0.74}, "unknown"),
+        ({"added": (added(ONE), added(OTHER)), "explained": 0.75}, "effect"),
+        ({"added": (added(ONE), added(OTHER), added(ONE)), "explained": 0.87}, "unknown"),
+        ({"added": (added(ONE), added(OTHER), added(ONE)), "explained": 0.88}, "effect"),
+        ({"carried": False}, "unknown"),
+        ({"carried": False, "gap": False}, "no_gap"),
     ],
     ids=[
         "an effect",
@@ -204,15 +210,43 @@ CERTAIN = closed(0.9, 0.8, 0.95)
         "two that do the same, and more",
         "only later ones do the same",
         "confusable but explains little",
+        "two explain too little for two",
+        "two explain enough",
+        "three explain too little for three",
+        "three explain enough",
+        "does not carry over",
+        "does not carry over where there is no gap",
     ],
 )
 def test_the_verdict(changed, verdict):
     usual = {"gap": True, "visible": SEEN, "added": (added(ONE),), "total": CERTAIN, "enough": True, "explained": 1.0}
-    said = usual | changed
+    said = usual | {"carried": True} | changed
     found = decide(
-        said["gap"], said["visible"], said["added"], said["total"], LIMITS, said["enough"], said["explained"]
+        said["gap"],
+        said["visible"],
+        said["added"],
+        said["total"],
+        LIMITS,
+        said["enough"],
+        said["explained"],
+        said["carried"],
     )
     assert found == verdict
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason"),
+    [
+        ({}, ""),
+        ({"added": (), "explained": 0.1, "carried": False}, "none"),
+        ({"total": closed(0.9, 0.04, 1.0), "explained": 0.1}, "unsure"),
+        ({"explained": 0.1, "carried": False}, "little"),
+        ({"carried": False}, "stand_in"),
+    ],
+)
+def test_the_first_reason_that_holds_is_why_a_gap_has_no_name(changed, reason):
+    said = {"added": (added(ONE),), "total": CERTAIN, "explained": 1.0, "carried": True} | changed
+    assert why_unknown(said["added"], said["total"], LIMITS, said["explained"], said["carried"]) == reason
 
 
 def test_without_a_smoother_the_explained_part_is_whole():

@@ -98,15 +98,24 @@ def decide(
     return "confusable" if len(added[0].rivals) > 1 else "effect"
 
 
+def needed(count: int, limits: Thresholds) -> float:
+    """Part of the smoother's explanation that so many effects have to reach."""
+    return 1.0 - (1.0 - limits.explained) ** count
+
+
 def why_unknown(
     added: Sequence[Added], total: Closure, limits: Thresholds, explained: float = 1.0, carried: bool = True
 ) -> Reason:
-    """Why no effect is named where there is a gap; empty where one is."""
+    """Why no effect is named where there is a gap; empty where one is.
+
+    Several effects have to explain more than one: each further one at least the part `explained` of what could be left.
+    Two or three together imitate almost anything, but only in part.
+    """
     if not added:
         return "none"
     if not (total.low > limits.closure or total.sure):
         return "unsure"
-    if explained < limits.explained:
+    if explained < needed(len(added), limits):
         return "little"
     return "" if carried else "stand_in"
 

@@ -13,6 +13,7 @@ from yid_ocp.diagnosis.refit import Fit
 from yid_ocp.diagnosis.screening import Visibility
 from yid_ocp.diagnosis.select import Added
 from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.diagnosis.verdict import needed
 from yid_ocp.effects import EffectBase
 from yid_ocp.effects.base import ASPECTS
 from yid_ocp.problem.null_test import NullTest
@@ -45,8 +46,8 @@ NAMELESS = {
     "none": "No known effect explains it (the best, {best}, is not sure to be there and to close a part).",
     "unsure": "{names} closes {closure:.3g} % of it, but not surely: at least {low:.3g} %, where {least:.3g} % are "
     "asked.",
-    "little": "{names} explains {explained:.3g} % of what unknown forces, offsets and biases explain; below "
-    "{enough:.3g} % no effect is named.",
+    "little": "{names} explains {explained:.3g} % of what unknown forces, offsets and biases explain, where "
+    "{enough:.3g} % are asked of so many effects.",
     "stand_in": "{names} imitates it (closing {closure:.3g} % on held-out motions) and is not its cause: {apart}.",
 }
 """Why a gap has no name, by `verdict.Reason`."""
@@ -169,7 +170,7 @@ def _nameless(finding: Finding) -> str:
         low=100 * finding.closure.low,
         least=100 * finding.limits.closure,
         explained=100 * finding.explained,
-        enough=100 * finding.limits.explained,
+        enough=100 * needed(len(finding.added), finding.limits),
         apart="; ".join(apart[:2]),
     )
 
