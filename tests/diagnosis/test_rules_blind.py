@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -363,6 +364,18 @@ def test_effects_outside_the_library_have_the_size_of_what_they_act_on(drawn):
         assert low <= min(ratios) < max(ratios) <= high
         assert {f.location for f in by_kind[kind]} == {"T1", "T2"}
     assert all(0.05 <= f.values["size"] <= 0.15 for f in by_kind["gusts"])
+
+
+def test_a_drive_saturates_at_a_part_of_the_torque_that_was_recorded(drawn):
+    ensemble = drawn()
+    joints = ensemble.problem.episodes[0].recording.joints
+    effort = np.zeros(joints.position.shape)
+    effort[:, joints.names.index("s0")] = [5.0, -20.0]
+    recording = replace(ensemble.problem.episodes[0].recording, joints=replace(joints, effort=effort))
+    ensemble.problem.episodes = (SimpleNamespace(recording=recording),)
+    found = [ensemble._outside(np.random.default_rng(seed)) for seed in range(300)]
+    sizes = [f.values["size"] for f in found if f.kind == "saturating_drive"]
+    assert 15.0 <= min(sizes) < max(sizes) <= 18.0
 
 
 def test_every_effect_outside_the_library_has_a_size():

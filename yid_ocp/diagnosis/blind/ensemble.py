@@ -35,23 +35,23 @@ SHARES: Mapping[str, float] = {"null": 0.2, "single": 0.5, "outside": 0.15, "lef
 """What an ensemble is made of; the rest has a finer chain."""
 SPREAD = 1.5
 """Factor by which true stiffnesses lie above or below the problem's start, at most."""
-OUTSIDE_SIZES: Mapping[str, tuple[str, float, float, bool]] = {
-    "torque_ripple": ("joint", 0.5, 2.0, False),
-    "saturating_drive": ("joint", 2.0, 6.0, False),
-    "warming_gear": ("joint", 1.0, 4.0, False),
-    "shifting_load": ("joint", 0.5, 2.0, False),
-    "slipping_grasp": ("grasp", 0.004, 0.01, False),
-    "cross_stiffness": ("segment", 0.3, 0.6, True),
-    "quadratic_stiffness": ("segment", 2.0, 5.0, True),
-    "crease": ("segment", 0.3, 0.7, True),
-    "gusts": ("segment", 0.05, 0.15, False),
-    "tether": ("segment", 5.0, 20.0, False),
-    "magnet": ("segment", 0.1, 0.4, False),
-    "wall": ("segment", 10.0, 50.0, False),
-    "stiffness_drift": ("segment", 0.2, 0.5, False),
-    "one_way_damping": ("segment", 0.3, 1.0, False),
+OUTSIDE_SIZES: Mapping[str, tuple[str, float, float, str]] = {
+    "torque_ripple": ("joint", 0.5, 2.0, ""),
+    "saturating_drive": ("joint", 0.75, 0.9, "torque"),
+    "warming_gear": ("joint", 1.0, 4.0, ""),
+    "shifting_load": ("joint", 0.5, 2.0, ""),
+    "slipping_grasp": ("grasp", 0.004, 0.01, ""),
+    "cross_stiffness": ("segment", 0.3, 0.6, "stiffness"),
+    "quadratic_stiffness": ("segment", 2.0, 5.0, "stiffness"),
+    "crease": ("segment", 0.3, 0.7, "stiffness"),
+    "gusts": ("segment", 0.05, 0.15, ""),
+    "tether": ("segment", 5.0, 20.0, ""),
+    "magnet": ("segment", 0.1, 0.4, ""),
+    "wall": ("segment", 10.0, 50.0, ""),
+    "stiffness_drift": ("segment", 0.2, 0.5, ""),
+    "one_way_damping": ("segment", 0.3, 1.0, ""),
 }
-"""Of effects outside the library: where they sit, their least and largest size, whether in bending stiffnesses."""
+"""Of effects outside the library: where they sit, their least and largest size, and what of it they are parts of."""
 TRAVEL = 0.15
 """How far the grippers go [m]."""
 
@@ -341,14 +341,23 @@ class Ensemble:
         }
         known = [kind for kind in OUTSIDE if places[OUTSIDE_SIZES[kind][0]]]
         kind = str(rng.choice(known))
-        place, low, high, of_stiffness = OUTSIDE_SIZES[kind]
+        place, low, high, part_of = OUTSIDE_SIZES[kind]
         location = str(rng.choice(places[place]))
         size = float(rng.uniform(low, high))
-        if of_stiffness:
+        if part_of == "torque":
+            size *= self._largest_torque(location)
+        elif part_of == "stiffness":
             start = dict(zip(system.parameters.names, self.problem.theta, strict=True))
             bends = any(spring.kind == "bend" for spring in segment_springs(system, location))
             size *= float(start.get(f"{location}.bend", 10.0)) if bends else 10.0
         return InjectedEffect(kind, location, {"size": size})
+
+    def _largest_torque(self, joint: str) -> float:
+        """Of a joint in the problem's first recording [N m]; 10 where none is recorded."""
+        recorded = self.problem.episodes[0].recording.joints
+        if recorded is None or recorded.effort is None or joint not in recorded.names:
+            return 10.0
+        return float(np.nanmax(np.abs(recorded.effort[:, recorded.names.index(joint)])))
 
 
 def finer_values(nominal: System, finer: System, truth: Mapping[str, float]) -> dict[str, float]:
