@@ -37,7 +37,16 @@ def test_every_threshold_says_what_it_is():
 
 def test_the_whole_diagnosis_goes_by_what_it_is_given(bench, usual):
     other = found(
-        bench, window=1.0, detection=2 * 3.858, shape_values=2, force=0.2, noticed=40.0, worth=6.0, refits=1, alike=1.0
+        bench,
+        window=1.0,
+        detection=2 * 3.858,
+        shape_values=2,
+        force=0.2,
+        noticed=40.0,
+        worth=6.0,
+        refits=1,
+        alike=1.0,
+        surest=0,
     )
     assert usual.verdict == other.verdict == "effect"
     assert max(round(w.end - w.begin, 6) for w in usual.before.windows) == 0.5
