@@ -39,6 +39,7 @@ MODELLED = {
     "effort_sign": "effort_gain",
     "effort_offset": "effort_offset",
     "effort_lag": "effort_delay",
+    "clock_offset": "camera_latency",
 }
 """Effects by which a model takes such an error into account."""
 MOST_BLAMED = 3
@@ -164,6 +165,8 @@ def _modelled(system: System, doubt: Doubt) -> bool:
     """Whether the model has as an effect what the doubt is about."""
     kind = MODELLED.get(doubt.cause, "")
     places = {effect.location for effect in system.effects if effect.kind == kind}
+    if kind == "camera_latency" and kind not in doubt.setting:  # no camera's clock
+        return False
     joint = doubt.channel.partition(".")[2]
     return bool(places) and (not joint or joint in places)
 
