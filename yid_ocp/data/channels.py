@@ -13,6 +13,8 @@ from yid_ocp.data.doubt import FEWEST, LIMITS, Array, Choices, Doubt, group_name
 from yid_ocp.data.recording import Recording
 from yid_ocp.sensors.joints import DIFFERENCES, EFFORT, POSITION
 
+REPEATS = 0.1
+"""Part of a channel's samples that may repeat the one before."""
 COMPUTED = 1e-2
 """Less than this part of the stated noise is none."""
 SLOWEST = 0.02
@@ -199,6 +201,8 @@ def overstated(recording: Recording, choice: Choices) -> Iterator[Doubt]:
         if len(t) < 100 or not 0 < step <= SLOWEST:
             continue
         columns = values.reshape(len(t), -1).T
+        if np.mean(np.diff(columns, axis=1) == 0) > REPEATS:
+            continue  # it is cut off, coarse or stuck, and says too little of its noise
         strides = [2**k for k in range(12) if 2**k * step <= SLOWEST]
         sizes = [white(t[::k], column[::k]) for k in strides for column in columns]
         seen = max([*sizes, *(quantum(column) / math.sqrt(12) for column in columns)])

@@ -100,7 +100,8 @@ def guess_doubts(entries: Sequence[Mapping[str, Any]], units: Mapping[str, str])
                     error / (CLEARLY * guesses[best]) if guesses[best] > 0 else MOST,
                     "look at the residuals, and let `yid-ocp diagnose` say what the model lacks",
                     entry["recording"],
-                    *group.split(".", 1),
+                    group.partition(".")[0],
+                    group.partition(".")[2],
                 )
             )
     return found

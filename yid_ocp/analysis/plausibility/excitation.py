@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from yid_ocp.data.channels import white
 from yid_ocp.data.doubt import LIMITS, Doubt, period
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.sensors.base import Choice
-from yid_ocp.sensors.joints import EFFORT, by_joint
+from yid_ocp.sensors.joints import EFFORT, POSITION, by_joint
 
 Array = NDArray[np.float64]
 
@@ -60,8 +60,8 @@ def check_motion(arm: Arm, recording: Recording, effort: Choice) -> Iterator[Dou
         j = int(np.argmax(size / band))
         yield Doubt(
             "weak_excitation",
-            f"speed and acceleration ask {arm.names[j]} for {size[j]:.2g} N m (rms), beside noise of {noise[j]:.2g} N m "
-            "from sample to sample; no joint tells more",
+            f"speed and acceleration ask {arm.names[j]} for {size[j]:.2g} N m (rms), beside noise of {noise[j]:.2g} "
+            "N m from sample to sample; no joint tells more",
             "warning",
             SEEN / max(seen, 1e-9),
             "move faster; from postures alone weight and stiffness can be found, no damping, friction or inertia",
@@ -80,14 +80,17 @@ def _noise(joints: JointGroup, names: Sequence[str], effort: Choice) -> Array:
     return np.array([white(joints.t, joints.effort[:, joints.names.index(name)]) for name in names])
 
 
-def check_asked(recordings: Sequence[Recording], asked: dict[str, tuple[str, ...]], position: Choice) -> Iterator[Doubt]:
+def check_asked(
+    recordings: Sequence[Recording], asked: Mapping[str, Sequence[str]], position: Choice
+) -> Iterator[Doubt]:
     """Joints with free parameters of their own that hardly turn in any recording.
 
     Parameters
     ----------
     recordings : sequence of Recording
         All that are estimated on.
-    asked : dict of joint to names of its free parameters
+    asked : mapping of str to sequence of str
+        By joint the free parameters that are its own.
     position : Choice
         How angles are used.
     """
@@ -99,8 +102,9 @@ def check_asked(recordings: Sequence[Recording], asked: dict[str, tuple[str, ...
                 continue
             angle = joints.position[:, joints.names.index(joint)]
             given = position.std if position.std is not None else joints.position_std
-            known = 0.0 if given is None else float(by_joint(given, joints.names, (joint,), "sensors.joints.position.std")[0])
-            limit = max(limit, 6 * max(known, white(joints.t, angle)))
+            if given is not None:
+                limit = max(limit, 6 * float(by_joint(given, joints.names, (joint,), f"sensors.{POSITION}.std")[0]))
+            limit = max(limit, 6 * white(joints.t, angle))
             width = float(np.ptp(angle))
             if not name or width > widest:
                 widest, name = width, recording.name
