@@ -2,11 +2,13 @@
 
     python benchmarks/kills.py [--kills 200] [--pairs 20] [--disks 40] [--caches 10] [--seed 0]
 
-Commands run on a double pendulum, whose runs take seconds: solve, compare, diagnose, check, simulate. A run is ended by
-a random signal at a random moment; two runs share one second or one `--out`; files cannot grow beyond a random size, as
-on a full disk; compiled code in the cache is damaged. Afterwards every folder that bears a name has to be whole, only a
-killed process may leave its hidden folder, no exit code may say that it was our mistake, and running again has to give
-the numbers of an undisturbed run. Exit code 1 where something does not hold.
+Commands run on a double pendulum, whose runs take seconds (solve, compare, diagnose, check, simulate, and a blind proof
+of two cases), and on three frames of a camera (track); they take turns. A run is ended by a random signal at a random
+moment; two runs share one second or one `--out`; files cannot grow beyond a random size, as on a full disk; compiled
+code in the cache is damaged. Afterwards every folder that bears a name has to be whole, only a killed process may leave
+its hidden folder, no process may go on, no exit code may say that it was our mistake, and running again has to give the
+numbers of an undisturbed run. A blind proof goes on in the folder that it left, until it ends with the numbers of an
+undisturbed one. Exit code 1 where something does not hold.
 """
 
 from __future__ import annotations
@@ -28,11 +30,30 @@ from typing import Any
 import numpy as np
 from fuzz import CONFIG, REPOSITORY, made_recording, originals
 
-from yid_ocp.data import write_recording
+from yid_ocp.data import read_recording, write_recording
+from yid_ocp.errors import YidError
 
-COMMANDS = ("solve", "compare", "diagnose", "check", "simulate")
+COMMANDS = {
+    **dict.fromkeys(("solve", "compare", "diagnose", "check", "simulate"), ("pendulum.yaml",)),
+    "track": ("track.yaml",),
+    "blind": ("driven.yaml", "--cases", "2", "--seed", "3"),
+}
+"""Arguments of each command."""
+PROOF = "blind"
+"""The command that goes on in the folder it finds, instead of taking a hidden one."""
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 FULL = (50_000.0, 3_000.0)  # geometric mean and least of the sizes of a file on a full disk [bytes]
+LINGER = 20.0
+"""How long what a run started may go on when it has ended [s]."""
+TRACK = """\
+model:
+  robot: package:baxter
+  arms: {{joints: [left_s0, left_s1, left_e0, left_e1, left_w0, left_w1, left_w2]}}
+  object: {{kind: y}}
+  grasp: {{left: {{holder: left_gripper, held: w_T2}}}}
+recordings: {{estimate: [{data}/joints.h5]}}
+track: {{frames: {data}/frames, pictures: 1}}
+"""
 Random = np.random.Generator
 
 
@@ -62,12 +83,30 @@ class Room:
             if limit is not None:
                 resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
-        line = [sys.executable, "-m", "yid_ocp", command, "pendulum.yaml", *arguments]
+        line = [sys.executable, "-m", "yid_ocp", command, *COMMANDS[command], *arguments]
         environment = {**os.environ, "YID_OCP_CACHE": str(self.folder / "cache"), "PYTHONPATH": str(REPOSITORY)}
         with (self.folder / "said.txt").open("wb") as said:
             return subprocess.Popen(
-                line, cwd=self.folder, env=environment, stdout=said, stderr=said, preexec_fn=limited
+                line,
+                cwd=self.folder,
+                env=environment,
+                stdout=said,
+                stderr=said,
+                preexec_fn=limited,
+                start_new_session=True,
             )
+
+    def alone(self, process: subprocess.Popen[bytes], after: str) -> None:
+        """Whether nothing that a run started goes on when it has ended."""
+        begun = time.monotonic()
+        while time.monotonic() - begun < LINGER:
+            known = subprocess.run(["ps", "-A", "-o", "pgid=,stat="], capture_output=True, text=True, check=True)
+            states = [line.split() for line in known.stdout.splitlines()]
+            if not any(group == str(process.pid) and not state.startswith("Z") for group, state in states):
+                return
+            time.sleep(0.2)
+        os.killpg(process.pid, signal.SIGKILL)
+        self.wrong.append(f"after {after}, a process of it goes on for more than {LINGER:g} s")
 
     def run(self, command: str, *arguments: str) -> Any:
         """Run to the end; returns the numbers that it left."""
@@ -86,6 +125,10 @@ class Room:
         if self.run(command) != self.usual[command][0]:
             self.wrong.append(f"after {after}, {command} gives other numbers")
 
+    def say(self, before: int) -> None:
+        """Print what was found wrong since then."""
+        print("\n".join(self.wrong[before:]), end="\n" if self.wrong[before:] else "", flush=True)
+
     def said(self) -> str:
         return (self.folder / "said.txt").read_text(errors="replace")[-600:]
 
@@ -96,6 +139,8 @@ class Room:
                 self.wrong.append(f"after {after}, {path.name} is left")
         runs = [*self.folder.glob("runs/*"), *self.folder.glob("mine*")]
         for path in runs:
+            if (path / "sealed").exists():
+                continue  # a proof, see `proof`
             if path.name.endswith(".partial"):
                 if path.name.startswith(".") and not hidden:
                     self.wrong.append(f"after {after}, {path.name} is left")
@@ -105,6 +150,34 @@ class Room:
             except (OSError, ValueError) as error:
                 self.wrong.append(f"after {after}, {path.name} looks whole: {error}")
         subprocess.run(["rm", "-rf", *map(str, runs), str(self.folder / "runs")], check=True)
+
+    def proof(self, after: str, done: bool) -> None:
+        """Whether all that stands in a blind proof is whole; what is `done` has its numbers and is taken away."""
+        for folder in (*self.folder.glob("driven-blind-*"), *self.folder.glob("mine*")):
+            for path in folder.rglob("*.*"):
+                if path.name.startswith("."):
+                    continue
+                try:
+                    if path.suffix == ".json":
+                        json.loads(path.read_text())
+                    if path.suffix == ".h5":
+                        read_recording(path)
+                except (OSError, ValueError, YidError) as error:
+                    self.wrong.append(f"after {after}, {path.name} of a proof looks whole: {error}")
+            if done:
+                result = folder / "result.json"
+                if not result.exists() or numbers(json.loads(result.read_text())) != self.usual[PROOF][0]:
+                    self.wrong.append(f"after {after}, a proof that went on has other numbers, or none")
+                subprocess.run(["rm", "-r", str(folder)], check=True)
+
+    def finished_proof(self, after: str) -> None:
+        """Go on with the proof that was left, to its end."""
+        if not [*self.folder.glob("driven-blind-*")]:
+            return
+        code = self.start(PROOF).wait(timeout=600)
+        if code:
+            self.wrong.append(f"after {after}, a proof ends with {code}: {self.said()}")
+        self.proof(after, done=True)
 
 
 def numbers(result: Mapping[str, Any]) -> Any:
@@ -121,9 +194,9 @@ def numbers(result: Mapping[str, Any]) -> Any:
     return kept(result)
 
 
-def killed(room: Room, rng: Random) -> str:
+def killed(room: Room, rng: Random, command: str) -> str:
     """End a run at a random moment."""
-    command, number = str(rng.choice(COMMANDS)), SIGNALS[int(rng.integers(len(SIGNALS)))]
+    number = SIGNALS[int(rng.integers(len(SIGNALS)))]
     delay = float(rng.uniform(0.0, 1.1 * room.usual[command][1]))
     process = room.start(command)
     time.sleep(delay)
@@ -138,17 +211,25 @@ def killed(room: Room, rng: Random) -> str:
         return what
     if code not in (0, 1, -number, 128 + number):
         room.wrong.append(f"{what}: ended with {code}: {room.said()}")
+    room.alone(process, what)
+    if command == PROOF:
+        room.proof(what, done=code == 0)
     room.look(what, hidden=code == -number)
     return what
 
 
-def pair(room: Room, rng: Random) -> str:
+def pair(room: Room, rng: Random, command: str) -> str:
     """Two runs at once, with names of their own or one `--out`."""
-    command, named = str(rng.choice(COMMANDS)), bool(rng.random() < 0.5)
+    named = bool(rng.random() < 0.5)
     arguments = ("--out", "mine") if named else ()
     both = [room.start(command, *arguments) for _ in range(2)]
     codes = sorted(process.wait(timeout=600) for process in both)
     what = f"two runs of {command} {' '.join(arguments)}"
+    if command == PROOF:
+        if codes != [0, 0]:
+            room.wrong.append(f"{what}: exit codes {codes}: {room.said()}")
+        room.proof(what, done=True)
+        return what
     runs = [path for path in (*room.folder.glob("runs/*"), *room.folder.glob("mine*")) if not path.name.startswith(".")]
     runs = [path for path in runs if not path.name.endswith(".partial")]
     finished = sum(code in (0, 1) for code in codes)
@@ -158,9 +239,8 @@ def pair(room: Room, rng: Random) -> str:
     return what
 
 
-def full(room: Room, rng: Random) -> str:
+def full(room: Room, rng: Random, command: str) -> str:
     """A run whose files cannot grow."""
-    command = str(rng.choice(COMMANDS))
     limit = int(max(FULL[1], FULL[0] * np.exp(rng.normal())))
     process = room.start(command, limit=limit)
     code = process.wait(timeout=600)
@@ -169,11 +249,14 @@ def full(room: Room, rng: Random) -> str:
         room.wrong.append(f"{what}: ended with {code}: {room.said()}")
     if code == 2 and ".partial/" in room.said():
         room.wrong.append(f"{what}: an error names the unfinished folder: {room.said()}")
+    room.alone(process, what)
+    if command == PROOF:
+        room.proof(what, done=code == 0)
     room.look(what, hidden=False)
     return what
 
 
-def damaged(room: Room, rng: Random) -> str:
+def damaged(room: Room, rng: Random, command: str) -> str:
     """Compiled code with a block of zeros, cut off, or unreadable."""
     libraries = sorted((room.folder / "cache").glob("*.so"))
     if libraries:
@@ -202,12 +285,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         originals(room.folder)
         write_recording(made_recording(1.0), room.folder / "held_out.h5")
         text = CONFIG.format(urdf="robot.urdf").replace("compiler: false", "compiler: true")
+        driven = text.replace("mode: prescribed", "mode: driven")
+        (room.folder / "driven.yaml").write_text(driven + "diagnosis: {candidates: [joint_viscous]}\n")
+        (room.folder / "track.yaml").write_text(TRACK.format(data=REPOSITORY / "tests" / "vision" / "data"))
         text += "compare: {methods: {gauss_newton: {}, steepest_descent: {iterations: 20}}}\n"
         (room.folder / "pendulum.yaml").write_text(text.replace("held_out: []", "held_out: [held_out.h5]"))
         for command in COMMANDS:
             room.run(command)
             room.again(command, "nothing")
-        tests: Sequence[tuple[int, Callable[[Room, Random], str]]] = (
+        room.say(0)
+        tests: Sequence[tuple[int, Callable[[Room, Random, str], str]]] = (
             (given.kills, killed),
             (given.pairs, pair),
             (given.disks, full),
@@ -216,10 +303,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         for count, disturb in tests:
             for i in range(count):
                 before = len(room.wrong)
-                what = disturb(room, rng)
+                what = disturb(room, rng, list(COMMANDS)[i % len(COMMANDS)])
                 print(f"{i + 1} of {count}: {what}", file=sys.stderr, flush=True)
-                print("\n".join(room.wrong[before:]), end="\n" if room.wrong[before:] else "", flush=True)
+                room.say(before)
+            before = len(room.wrong)
             room.again("solve", f"{count} times '{disturb.__name__}'")
+            room.finished_proof(f"{count} times '{disturb.__name__}'")
+            room.say(before)
         print(json.dumps({"kills": given.kills, "pairs": given.pairs, "disks": given.disks, "wrong": len(room.wrong)}))
         return 1 if room.wrong else 0
 

@@ -181,6 +181,24 @@ def noisy(factor: float) -> Damage:
     return damage
 
 
+def tenfold(group: PointGroup) -> Mapping[str, Any]:
+    """Ten times the noise that a group of points states."""
+    assert group.std is not None
+    return {"std": 10 * group.std}
+
+
+def held_still(column: int) -> Damage:
+    """A joint that turns by a thousandth of what it did, as its velocity says."""
+
+    def less(values: np.ndarray | None) -> np.ndarray:
+        assert values is not None
+        made = np.array(values)
+        made[:, column] = values[0, column] + 1e-3 * (values[:, column] - values[0, column])
+        return made
+
+    return joints(position=lambda g: less(g.position), velocity=lambda g: less(g.velocity))
+
+
 def clipped(recording: Recording) -> Recording:
     """Efforts cut off at what nine in ten of their samples stay within."""
     group = recording.joints
@@ -325,6 +343,12 @@ def cases() -> list[Case]:
         Case("points' clocks + 3 s", y, times(lambda t: t + 3, "points_arm", "points_camera"), ("clock_offset",)),
         Case("camera's clock + 3 s", y, times(lambda t: t + 3, "points_camera"), ("clock_offset",)),
         Case("arm's points 0.3 s late", y, times(lambda t: t + 0.3, "points_arm"), ("clock_offset",)),
+        Case("arm's points 20 ms late", y, times(lambda t: t + 0.02, "points_arm"), ("clock_offset",)),
+        Case("arm's points 1 % fast", y, times(lambda t: 1.01 * t, "points_arm"), ("clock_drift",)),
+        Case("arm's points 5 % slow", two, times(lambda t: 0.95 * t, "points_arm"), ("clock_drift",)),
+        Case("noise of efforts stated 10 x", y, joints(effort_std=lambda g: 10 * g.effort_std), ("noise_overstated",)),
+        Case("noise of points stated 10 x", two, points("points_arm", tenfold), ("noise_overstated",)),
+        Case("a wrist that does not turn", "baxter_arm", held_still(6), ("weak_excitation",)),
         Case("joints since 1970", y, times(lambda t: t + 1.7e9, "joints"), ("clock_base",), refused="1970"),
         Case("camera inverted", y, moved_points("points_camera", lambda p: back * p), ("point_mirrored",)),
         Case("camera mirrored", y, moved_points("points_camera", lambda p: mirror * p), ("point_mirrored",)),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +16,7 @@ from yid_ocp.analysis.plausibility import (
     check_limits,
     check_reach,
 )
+from yid_ocp.analysis.plausibility.clocks import by_clock, clock_error
 from yid_ocp.data import read_recording
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.model.cable import Cable
@@ -191,6 +193,83 @@ def test_points_on_a_late_clock(arms, runs):
     (doubt,) = check_held_points(arms[2], replace(runs[2], points=tuple(groups)), usual)
     assert doubt.cause == "clock_offset"
     assert "taken +0.4 s" in doubt.what
+
+
+def stamped(recording: Recording, late: float = 0.0, drift: float = 0.0) -> Recording:
+    """The arm's points on a clock that is late, and runs fast, from the middle on."""
+    groups = [replace(g, t=g.t + late + drift * (g.t - g.t.mean())) if "arm" in g.name else g for g in recording.points]
+    return replace(recording, points=tuple(groups))
+
+
+CLOCKS = {
+    "as recorded": (1, 0.0, 0.0, None),
+    "as recorded by two": (2, 0.0, 0.0, None),
+    "late by less than a period": (1, 0.005, 0.0, None),
+    "late by two periods": (1, 0.02, 0.0, "clock_offset"),
+    "early by two periods": (2, -0.02, 0.0, "clock_offset"),
+    "a part per thousand apart": (2, 0.0, 0.001, None),
+    "a hundredth apart": (1, 0.0, 0.01, "clock_drift"),
+    "late and apart": (2, 0.01, -0.02, "clock_drift"),
+}
+
+
+@pytest.mark.parametrize("case", CLOCKS)
+def test_a_clock_that_is_a_little_off(arms, runs, case):
+    count, late, drift, cause = CLOCKS[case]
+    found = list(check_held_points(arms[count], stamped(runs[count], late, drift), usual))
+    assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
+    for doubt in found:
+        size, std = (float(number) for number in re.search(r"([-+\d.]+) ± ([\d.]+)", doubt.what).groups())
+        told = 1e-3 * size * (-1 if "slowly" in doubt.what else 1)
+        assert told == pytest.approx(drift if drift else late, rel=0.05, abs=3e-3 * std)
+        assert (doubt.group, doubt.weight, doubt.setting) == (
+            "points_arm",
+            "not_trusted",
+            "sensors.points_arm.use: false",
+        )
+
+
+def test_clocks_that_run_far_apart(arms, runs):
+    (doubt,) = check_held_points(arms[1], stamped(runs[1], drift=0.05), usual)
+    assert doubt.cause == "clock_drift"
+    assert re.search(r"\+4[78][.\d]* parts per thousand fast", doubt.what)
+
+
+def test_a_camera_that_is_late_is_answered_by_its_latency(arms, runs):
+    (group,) = stamped(runs[1], 0.03).points[:1]
+    seen = replace(group, name="points_camera", sensor="camera")
+    (doubt,) = check_held_points(arms[1], replace(runs[1], points=(seen,)), usual)
+    assert re.search(r"kind: camera_latency, location: camera, values: {delay: 0.03\d*}", doubt.setting)
+
+
+def test_a_zero_that_is_a_little_off_is_no_clock(arms, runs):
+    moved = with_joints(runs[1], position=lambda j: j.position + 0.005 * (np.arange(7) == 1))
+    assert list(check_held_points(arms[1], moved, usual)) == []
+
+
+def test_at_rest_nothing_tells_of_clocks(arms, runs):
+    joints = runs[1].joints
+    still = with_joints(runs[1], position=lambda j: np.repeat(j.position[:1], len(j.t), axis=0))
+    place = arms[1].places(("left_gripper",), joints.position[:1])[0]
+    rng = np.random.default_rng(0)
+    at_rest = with_points(still, "points_arm", lambda p: place + 1e-3 * rng.standard_normal(p.shape))
+    assert list(check_held_points(arms[1], stamped(at_rest, 0.5), usual)) == []
+
+
+def test_the_error_of_a_clock_and_its_standard_deviation():
+    """Of a sine with white noise, beside a constant that is not known."""
+    t, noise, rng = np.linspace(0, 10, 400), 0.05, np.random.default_rng(1)
+    found = []
+    for _ in range(60):
+        true = np.sin(2 * (t - 0.01 - 0.002 * (t - 5)))
+        residual = (np.sin(2 * t) - true - 0.3 + noise * rng.standard_normal(len(t))) / noise
+        own = by_clock(t, 2 * np.cos(2 * t) / noise, (0.0, 10.0))
+        found.append(clock_error(t, residual, own, np.full((len(t), 1), 1 / noise), np.ones(1), (0.0, 10.0)))
+    for name, std, truth in (("late", "late_std", 0.01), ("drift", "drift_std", 0.002)):
+        values, stated = (np.array([getattr(one, key) for one in found]) for key in (name, std))
+        assert np.mean(values) == pytest.approx(truth, abs=4 * np.std(values) / 60**0.5 + 0.02 * truth)
+        assert 0.75 < np.std(values) / np.mean(stated) < 1.25
+    assert all(one.excess > 0.5 for one in found)
 
 
 def test_what_no_change_explains_is_said_so(arms, runs):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -148,6 +149,36 @@ def test_noise_that_settings_state_counts_instead_of_the_recorded():
     assert causes(recording, joints_effort=SensorOptions(std=0.5)) == set()
     assert causes(recording, joints_effort=SensorOptions(std=dict.fromkeys(NAMES, 0.1))) == {"noise"}
     assert causes(made(), joints_effort=SensorOptions(std=0.005)) == {"noise"}
+
+
+def test_noise_stated_far_above_what_is_there():
+    recording = changed(made(), effort_std=np.array([1.0, 0.05, 1.0]))
+    (doubt,) = check_recording(recording, lambda _: SensorOptions())
+    assert (doubt.cause, doubt.weight, doubt.group) == ("noise_overstated", "warning", "joints")
+    assert re.fullmatch(r"sensors.joints.effort.std: {a: 0.05\d*, b: 0.05, c: 0.05\d*}", doubt.setting)
+    assert "1 is stated, and so for 2 of 3 channels" in doubt.what
+    # one number for all joints holds for the noisiest
+    noisy = column(EFFORT, 0, lambda x: x + 0.5 * np.random.default_rng(3).standard_normal(len(x)))
+    assert causes(changed(made(), effort=noisy, effort_std=0.5)) == set()
+    assert causes(changed(made(), effort_std=0.2)) == set()
+
+
+def test_noise_that_a_sensor_smooths_is_not_overstated():
+    recording = made(rate=1000.0)
+    slow = np.random.default_rng(5).standard_normal((len(recording.joints.t) + 20, 3))
+    slow = np.stack([np.convolve(x, np.full(21, 21**-0.5), "valid") for x in slow.T], axis=1)
+    smooth = 5 * np.sin(recording.joints.t)[:, None] + 0.05 * slow
+    assert causes(changed(recording, effort=smooth)) == set()
+
+
+def test_what_is_computed_or_weighed_by_settings_is_not_overstated():
+    recording = changed(made(), effort_std=1.0)
+    assert causes(recording) == {"noise_overstated"}
+    assert causes(recording, joints_effort=SensorOptions(std=1.0)) == set()
+    assert causes(recording, joints_effort=SensorOptions(use=False)) == set()
+    assert causes(changed(recording, effort_kind="command")) == set()
+    exact = 5 * np.sin(recording.joints.t)[:, None] * np.ones(3)
+    assert causes(changed(recording, effort=exact)) == set()
 
 
 def test_a_camera_that_runs_longer_than_the_joints_at_both_ends_is_not_late():

@@ -146,7 +146,6 @@ def test_broken_files_fail_when_loaded(folder, capfd):
 
 
 def test_more_points_than_a_file_can_hold_are_refused(folder):
-    """Open3D would make room for them first."""
     cloud = next(folder.glob("*.ply"))
     cloud.write_bytes(cloud.read_bytes().replace(b"element vertex 3", b"element vertex 3000000000"))
     with pytest.raises(DataError, match=r"declares 3e\+09 points"):

@@ -13,6 +13,13 @@ from yid_ocp.data.doubt import FEWEST, LIMITS, Array, Choices, Doubt, group_name
 from yid_ocp.data.recording import Recording
 from yid_ocp.sensors.joints import DIFFERENCES, EFFORT, POSITION
 
+REPEATS = 0.1
+"""Part of a channel's samples that may repeat the one before."""
+COMPUTED = 1e-2
+"""Less than this part of the stated noise is none."""
+SLOWEST = 0.02
+"""Motion of an arm is slow beside samples that are as near as this [s]."""
+
 
 def _channels(recording: Recording, *wanted: str) -> Iterator[tuple[str, str, Array, Array]]:
     """Group, channel, times and values (N,) or (N, 3) of what was measured."""
@@ -174,6 +181,54 @@ def steps_and_noise(recording: Recording, choice: Choices) -> Iterator[Doubt]:
                 channel,
                 setting=f"{setting}: {seen:.2g}",
             )
+
+
+def overstated(recording: Recording, choice: Choices) -> Iterator[Doubt]:
+    """Channels far less noisy than the recording itself says, all that are said to be equally noisy taken together.
+
+    What settings state may stand for what a model misses, and only a fit can say whether it is too much. Noise need not
+    be white: the largest of what all samples say, every other one, and so on up to `SLOWEST` counts, and so do steps.
+    What has no noise at all was computed, as commands are.
+    """
+    found: dict[str, list[tuple[str, float, float]]] = {}
+    commanded = recording.joints is not None and recording.joints.effort_taken_as == "command"
+    for group, channel, t, values in _channels(recording, "position", "effort", "points"):
+        sensor = f"joints.{channel.partition('.')[0]}" if group == "joints" else group
+        said, step = choice(sensor), period(t)
+        stated = _stated(recording, choice, group, channel)
+        if stated <= 0 or said.std is not None or said.use is False or (commanded and sensor == EFFORT):
+            continue
+        if len(t) < 100 or not 0 < step <= SLOWEST:
+            continue
+        columns = values.reshape(len(t), -1).T
+        if np.mean(np.diff(columns, axis=1) == 0) > REPEATS:
+            continue  # it is cut off, coarse or stuck, and says too little of its noise
+        strides = [2**k for k in range(12) if 2**k * step <= SLOWEST]
+        sizes = [white(t[::k], column[::k]) for k in strides for column in columns]
+        seen = max([*sizes, *(quantum(column) / math.sqrt(12) for column in columns)])
+        found.setdefault(sensor, []).append((channel, stated, seen))
+    for sensor, entries in found.items():
+        seen_of = {name: max(s for _, also, s in entries if also == stated) for name, stated, _ in entries}
+        low = {name for name, stated, _ in entries if COMPUTED * stated < LIMITS.overstated * seen_of[name] < stated}
+        if not low:
+            continue
+        channel, stated = max(((name, s) for name, s, _ in entries if name in low), key=lambda e: e[1] / seen_of[e[0]])
+        own = {name.partition(".")[2] or name: seen_of[name] if name in low else s for name, s, _ in entries}
+        line = f"{{{', '.join(f'{name}: {size:.2g}' for name, size in own.items())}}}"
+        if len(set(own.values())) == 1 or not sensor.startswith("joints."):  # a group of points takes one number
+            line = f"{max(own.values()):.2g}"
+        yield Doubt(
+            "noise_overstated",
+            f"{channel} has noise of {seen_of[channel]:.2g} or less; {stated:.2g} is stated"
+            + (f", and so for {len(low)} of {len(entries)} channels" if len(low) > 1 else ""),
+            "warning",
+            stated / (LIMITS.overstated * seen_of[channel]),
+            "state the noise that is there: as stated every ± is too wide, and a small gap is not seen",
+            "",
+            sensor.partition(".")[0],
+            channel,
+            setting=f"sensors.{sensor}.std: {line}" if len(low) == len(entries) or line[0] == "{" else "",
+        )
 
 
 def _clock(recording: Recording, name: str) -> str:

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 import scipy.signal
 
-from yid_ocp.data.channels import saturated, steps_and_noise, stuck, white
+from yid_ocp.data.channels import overstated, saturated, steps_and_noise, stuck, white
 from yid_ocp.data.doubt import (
     CLOCK_UNITS,
     DEGREE,
@@ -57,6 +57,7 @@ def check_recording(recording: Recording, choice: Choices, driving: bool = True)
             _velocities(recording),
             stuck(recording),
             steps_and_noise(recording, choice),
+            overstated(recording, choice),
             saturated(recording),
             _standstill(recording),
         )

@@ -43,6 +43,8 @@ class Limits:
         Factor by which angles may turn faster or more slowly than the recorded velocity says.
     noise : float
         Factor by which noise may exceed what is stated.
+    overstated : float
+        Factor by which it may stay below.
     stuck_time : float
         How long a channel that is noisy elsewhere may repeat one value [s].
     stuck_samples : int
@@ -63,6 +65,7 @@ class Limits:
     clock_off: float = 0.2
     rate: float = 1.3
     noise: float = 3.0
+    overstated: float = 5.0
     stuck_time: float = 0.3
     stuck_samples: int = 12
     turned: float = 0.03
@@ -143,6 +146,7 @@ CAUSES: Mapping[str, str] = {
     "quantised": "a channel has steps larger than its noise",
     "saturated": "a channel is cut off at its extreme",
     "noise": "more noise than stated",
+    "noise_overstated": "less noise than stated",
     "same_data": "the same data twice",
     "degrees": "angles are in degrees",
     "angle_scale": "an angle is multiplied by something",
@@ -164,6 +168,8 @@ CAUSES: Mapping[str, str] = {
     "point_reach": "points are where the object cannot be",
     "encoder_offset": "an encoder's zero is off",
     "point_unlike": "points are not where the robot holds them",
+    "weak_excitation": "the motion is too weak to tell what is asked",
+    "worse_than_guess": "a prediction without a model is nearer",
 }
 """What may be wrong with a recording, in the words of tables."""
 

@@ -427,6 +427,14 @@ def estimates(
     return result
 
 
+def distrusted(known: Mapping[str, Estimate]) -> dict[str, Estimate]:
+    """Estimates of a fit that turned out to be in grave doubt: what was found or weak is not trusted."""
+    return {
+        name: replace(entry, verdict="not_trusted") if entry.free and entry.verdict != "not_identifiable" else entry
+        for name, entry in known.items()
+    }
+
+
 def bound_side(value: float, lower: float, upper: float, size: float) -> int:
     """-1 where a value lies at its lower bound, 1 at its upper one, 0 elsewhere."""
     near = AT_BOUND * size

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import DataError, OutputError, nearest
 from yid_ocp.files import new_file
+from yid_ocp.vision.ply import read_ply
 
 Array = NDArray[np.float64]
 
@@ -31,8 +32,8 @@ UNITS: Mapping[str, float] = {"m": 1.0, "mm": 1e-3}
 """Units in which a folder's clouds may be, and their size in metres."""
 
 _KEYS = ("format", "pose", "frame", "unit", "intrinsics", "depth_unit", "description")
-_HEAD = 10_000  # [bytes]; where a cloud's file says how many points it has
-_COUNT = re.compile(rb"^(?:element vertex|POINTS)\s+(\d{1,18})\b", re.MULTILINE)
+_HEAD = 10_000  # [bytes]; where a PCD file says how many points it has
+_COUNT = re.compile(rb"^POINTS\s+(\d{1,18})\b", re.MULTILINE)
 _LARGEST_DEPTH = 65.535  # [m]; what sixteen bits of millimetres hold
 
 
@@ -379,9 +380,11 @@ def _read_stamps(path: Path) -> tuple[tuple[str, ...], Array]:
 
 
 def _read_cloud(path: Path) -> Array:
-    o3d = open3d_module()
     if not path.is_file():
         raise DataError("the file of the cloud is missing", where=str(path))
+    if path.suffix.lower() == ".ply":
+        return read_ply(path)
+    o3d = open3d_module()
     with path.open("rb") as file:
         declared = _COUNT.search(file.read(_HEAD))
     if declared is not None and int(declared[1]) > path.stat().st_size:  # each takes several bytes

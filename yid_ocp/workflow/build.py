@@ -482,7 +482,7 @@ def build_problem(run: Run, step: Step | None = None) -> EstimationProblem:
             "there is no recording to estimate on", "recordings", "estimate", hint="list at least one recording"
         )
     _check_sensors(run, [*estimate, *held_out])
-    seen = examined(run, system, build_cable(run), estimate, held_out)
+    seen = examined(run, system, build_cable(run), free, estimate, held_out)
     options = problem_options(run, system.parameters, [*seen.estimate, *seen.held_out])
     step = build_step(run, system) if step is None else step
     said = replace(options, doubts=seen.doubts)

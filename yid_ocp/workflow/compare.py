@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from yid_ocp.workflow.command import DONE, FAILED, carry_out
 from yid_ocp.workflow.doubts import doubts_result
 from yid_ocp.workflow.folder import new_run_folder
 from yid_ocp.workflow.progress import SILENT, Progress
-from yid_ocp.workflow.solve import solve_result
+from yid_ocp.workflow.solve import doubted, solve_result
 
 FORMAT = "yid-compare/1"
 
@@ -96,10 +96,13 @@ def run_compare(run: Run, out: str | Path | None = None, progress: Progress = SI
 
         comparison = compare(problem, solvers, truth, iterate, run.diagnosis.of_a_fit)
         draw_convergence(folder.path / "convergence.png", comparison)
+        own = comparison.judged.problem or problem
+        judged, doubts = doubted(own, comparison.judged, comparison.judged_held_out)
+        comparison = replace(comparison, judged=judged)
         experiment = run.compare.published
         said = published_sentences(experiment, comparison.judged.parameters, truth) if experiment else ()
         about = {
-            "doubts": doubts_result(problem.options.doubts),
+            "doubts": doubts_result(doubts),
             "published": published,
             "published_explained": list(said),
             "truth": truth,

@@ -15,10 +15,12 @@ import numpy as np
 
 from yid_ocp.analysis.plausibility import (
     Arm,
+    check_asked,
     check_cable,
     check_efforts,
     check_held_points,
     check_limits,
+    check_motion,
     check_object,
     check_reach,
 )
@@ -32,6 +34,7 @@ from yid_ocp.model.cable import Cable
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem, SensorOptions
 from yid_ocp.problem.prediction import EpisodeResult
+from yid_ocp.sensors.joints import EFFORT, POSITION
 
 MODELLED = {
     "encoder_offset": "encoder_offset",
@@ -39,8 +42,11 @@ MODELLED = {
     "effort_sign": "effort_gain",
     "effort_offset": "effort_offset",
     "effort_lag": "effort_delay",
+    "clock_offset": "camera_latency",
 }
 """Effects by which a model takes such an error into account."""
+MOVING = ("damping", "viscous", "coulomb", "stribeck", "inertia", "tau")
+"""Words in the names of parameters that nothing at rest tells."""
 MOST_BLAMED = 3
 """Doubts that an error quotes."""
 
@@ -55,7 +61,12 @@ class Examined:
 
 
 def examined(
-    run: Run, system: System, cable: Cable | None, estimate: Sequence[Recording], held_out: Sequence[Recording]
+    run: Run,
+    system: System,
+    cable: Cable | None,
+    free: Sequence[str],
+    estimate: Sequence[Recording],
+    held_out: Sequence[Recording],
 ) -> Examined:
     """Check recordings before a model is moved by them; leave out what was given twice, and gaps.
 
@@ -65,6 +76,8 @@ def examined(
     system : System
     cable : Cable, optional
         The run's object, where it is one.
+    free : sequence of str
+        Parameters that are sought.
     estimate, held_out : sequence of Recording
 
     Raises
@@ -90,6 +103,8 @@ def examined(
             for part in parts.recordings:
                 doubts += _beside_the_model(run, system, arm, cable, part)
             kept[role] += parts.recordings
+    if arm is not None:
+        doubts += _excitation(run, arm, free, kept[0])
     stop_at(run, doubts)
     if not kept[0]:
         raise DataError(
@@ -160,10 +175,28 @@ def _beside_the_model(
     return found + list(check_reach(arm, system, theta, recording, _choice(run)))
 
 
+def _excitation(run: Run, arm: Arm, free: Sequence[str], recordings: Sequence[Recording]) -> list[Doubt]:
+    """Whether the motion can tell what is sought, as far as that shows without the object."""
+    choice, found = _choice(run), list[Doubt]()
+    asked: dict[str, list[str]] = {}
+    for name in free:
+        joint, _, quantity = name.rpartition(".")
+        if joint in arm.names and quantity in ("damping", "stiffness"):
+            asked.setdefault(joint, []).append(name)
+    found += check_asked(recordings, asked, choice(POSITION))
+    if any(word in name for name in free for word in MOVING):
+        weak = [list(check_motion(arm, one, choice(EFFORT))) for one in recordings if arm.is_in(one)]
+        if all(weak):  # one recording that tells is enough
+            found += [doubt for doubts in weak for doubt in doubts]
+    return found
+
+
 def _modelled(system: System, doubt: Doubt) -> bool:
     """Whether the model has as an effect what the doubt is about."""
     kind = MODELLED.get(doubt.cause, "")
     places = {effect.location for effect in system.effects if effect.kind == kind}
+    if kind == "camera_latency" and kind not in doubt.setting:  # no camera's clock
+        return False
     joint = doubt.channel.partition(".")[2]
     return bool(places) and (not joint or joint in places)
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from yid_ocp.data.doubt import MOST, Doubt
 from yid_ocp.model.cable import Cable
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
@@ -69,6 +70,46 @@ def worse_than_guess(entries: Sequence[Mapping[str, Any]], units: Mapping[str, s
                 }
                 worse.append(said | {"baseline": best, "guess": guesses[best]})
     return worse
+
+
+def guess_doubts(entries: Sequence[Mapping[str, Any]], units: Mapping[str, str]) -> list[Doubt]:
+    """Doubts for every sensor of a recording that a guess without a model predicts better, all its channels together.
+
+    Single channels that say little of what the model is about may well be worse; see `worse_than_guess`.
+    """
+    found = []
+    for entry in entries:
+        groups: dict[str, list[str]] = {}
+        for channel in entry["rmse"]:
+            if channel in units:  # not the sum over a group
+                groups.setdefault(channel.rpartition(".")[0], []).append(channel)
+        for group, channels in groups.items():
+            error = _together(entry["rmse"], channels)
+            known = {name: errors for name, errors in entry["baselines"].items() if set(channels) <= set(errors)}
+            guesses = {name: _together(errors, channels) for name, errors in known.items()}
+            best = min(guesses, key=guesses.__getitem__, default=None)
+            if best is None or not error > CLEARLY * guesses[best]:
+                continue
+            unit = _unit(channels[0], units)
+            found.append(
+                Doubt(
+                    "worse_than_guess",
+                    f"the model is off by {error:.3g} {unit} (rms), the guess '{best}' without a model by "
+                    f"{guesses[best]:.3g} {unit}",
+                    "not_trusted",
+                    error / (CLEARLY * guesses[best]) if guesses[best] > 0 else MOST,
+                    "look at the residuals, and let `yid-ocp diagnose` say what the model lacks",
+                    entry["recording"],
+                    group.partition(".")[0],
+                    group.partition(".")[2],
+                )
+            )
+    return found
+
+
+def _together(errors: Mapping[str, float], channels: Sequence[str]) -> float:
+    """Root mean square over channels."""
+    return float(np.sqrt(np.mean([errors[channel] ** 2 for channel in channels])))
 
 
 def _unit(channel: str, units: Mapping[str, str]) -> str:

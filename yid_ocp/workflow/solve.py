@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from yid_ocp.analysis.plausibility import check_fit
 from yid_ocp.analysis.profile import with_intervals
 from yid_ocp.analysis.start_in_motion import safe_start
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import Run
+from yid_ocp.data.doubt import Doubt
 from yid_ocp.model.cable import Cable
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
@@ -21,11 +23,12 @@ from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import Findings
 from yid_ocp.report.terminal import solve_summary
 from yid_ocp.solvers import Iterate, Solution, Status, solve
+from yid_ocp.solvers.judgement import distrusted
 from yid_ocp.workflow.build import build_cable, build_problem
 from yid_ocp.workflow.command import DONE, FAILED, carry_out
 from yid_ocp.workflow.doubts import doubts_result
 from yid_ocp.workflow.folder import new_run_folder
-from yid_ocp.workflow.held_out import held_out_entry, worse_than_guess
+from yid_ocp.workflow.held_out import guess_doubts, held_out_entry, worse_than_guess
 from yid_ocp.workflow.progress import SILENT, Progress
 from yid_ocp.workflow.refine import Discretisation, counted, discretisation, steadied, wanted
 from yid_ocp.workflow.torque_offsets import torque_offsets
@@ -108,22 +111,53 @@ def run_solve(run: Run, out: str | Path | None = None, progress: Progress = SILE
         data_std, solution = solution.std, counted(solution, finer)
         progress.stage("predicting the held-out recordings")
         held_out = problem.validate(solution.x)
+        cable = build_cable(run)
+        solution, doubts = doubted(problem, solution, held_out, cable)
         folder.log("end", status=solution.status.value, message=solution.message, seconds_solving=solution.seconds)
         write_trajectories(folder.path / "trajectories.h5", problem, solution, held_out)
         more = {
-            "doubts": doubts_result(problem.options.doubts),
+            "doubts": doubts_result(doubts),
             "safeguard": safe.message,
             "discretisation": finer.result(data_std),
             "discretisation_notes": list(finer.notes),
             "stability": stability,
             "torque_offsets": {} if solution.evaluation is None else torque_offsets(problem, solution.x),
         }
-        written = folder.finish(solve_result(problem, solution, held_out, build_cable(run)) | more)
+        written = folder.finish(solve_result(problem, solution, held_out, cable) | more)
         if run.output.report:
             progress.stage("writing the report")
             findings = Findings(run.name, run.description, written, problem, solution, tuple(held_out))
             write_report(folder.path / "report.html", findings)
     return SolveOutcome(folder.path, written, solution, problem)
+
+
+def doubted(
+    problem: EstimationProblem,
+    solution: Solution,
+    held_out: Sequence[tuple[Episode, EpisodeResult | str]],
+    cable: Cable | None = None,
+) -> tuple[Solution, tuple[Doubt, ...]]:
+    """A solution as far as it is to be believed, and all doubts, those that only its fit shows among them.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+        As it was solved.
+    solution : Solution
+    held_out : sequence of (Episode, EpisodeResult or str)
+        From `EstimationProblem.validate`.
+    cable : Cable, optional
+        For the baselines that it has.
+    """
+    if solution.evaluation is None:
+        return solution, problem.options.doubts
+    fitted, predicted, residuals = _predictions(problem, solution, held_out, cable)
+    found = check_fit(problem, solution.x, solution.evaluation) + guess_doubts([*predicted, *fitted], _units(residuals))
+    if all(doubt.weight == "warning" for doubt in found):
+        return solution, (*problem.options.doubts, *found)
+    believed = replace(solution.fit, believed=False)
+    solution = replace(solution, fit=believed, parameters=distrusted(solution.parameters))
+    return solution, (*problem.options.doubts, *found)
 
 
 def solve_result(
@@ -133,15 +167,7 @@ def solve_result(
     cable: Cable | None = None,
 ) -> dict[str, Any]:
     """`yid-solve/1` without inputs and versions; a cable has baselines of its own."""
-    residuals: Mapping[str, Any] = {}
-    fitted: list[dict[str, Any]] = []
-    if solution.evaluation is not None:
-        done = solution.predicted
-        able = [(r, e) for r, e in zip(done, problem.episodes, strict=True) if not isinstance(r, str)]
-        residuals = channel_errors([result for result, _ in able], [episode for _, episode in able])
-        fitted = [held_out_entry(problem, *pair, cable) for pair in zip(problem.episodes, done, strict=True)]
-    predicted = [held_out_entry(problem, episode, outcome, cable) for episode, outcome in held_out]
-    units = {channel: entry["unit"] for channel, entry in residuals.items()}
+    fitted, predicted, residuals = _predictions(problem, solution, held_out, cable)
     return {
         "format": FORMAT,
         "status": solution.status.value,
@@ -151,7 +177,29 @@ def solve_result(
         "iterations": solution.iterations,
         "evaluations": solution.evaluations,
         "seconds": solution.seconds,
-        "fit": asdict(solution.fit) | {"worse_than_guess": worse_than_guess([*predicted, *fitted], units)},
+        "fit": asdict(solution.fit) | {"worse_than_guess": worse_than_guess([*predicted, *fitted], _units(residuals))},
         "residuals": residuals,
         "held_out": predicted,
     }
+
+
+def _predictions(
+    problem: EstimationProblem,
+    solution: Solution,
+    held_out: Sequence[tuple[Episode, EpisodeResult | str]],
+    cable: Cable | None,
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]], Mapping[str, Any]]:
+    """Errors of the recordings that were fitted and of those held out beside guesses, and of every channel fitted."""
+    residuals: Mapping[str, Any] = {}
+    fitted: list[dict[str, Any]] = []
+    if solution.evaluation is not None:
+        done = solution.predicted
+        able = [(r, e) for r, e in zip(done, problem.episodes, strict=True) if not isinstance(r, str)]
+        residuals = channel_errors([result for result, _ in able], [episode for _, episode in able])
+        fitted = [held_out_entry(problem, *pair, cable) for pair in zip(problem.episodes, done, strict=True)]
+    return fitted, [held_out_entry(problem, episode, outcome, cable) for episode, outcome in held_out], residuals
+
+
+def _units(residuals: Mapping[str, Any]) -> dict[str, str]:
+    """Unit of every channel."""
+    return {channel: entry["unit"] for channel, entry in residuals.items()}

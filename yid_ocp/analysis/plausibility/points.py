@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -13,6 +13,7 @@ import scipy.interpolate
 from numpy.typing import NDArray
 
 from yid_ocp.analysis.plausibility.arm import Arm, effect_line
+from yid_ocp.analysis.plausibility.clocks import Path, best_clock, check_held_clock, remedy
 from yid_ocp.data.doubt import Doubt, Weight, period
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.model.cable import Cable
@@ -33,7 +34,9 @@ BETTER = 0.5
 SCALES = (1e-3, 1e-2, 0.0254, 0.1, 0.3048, 1 / 0.3048, 10.0, 1 / 0.0254, 100.0, 1e3)
 """By what lengths are wrong that are in another unit, or read so, and a power of ten for what was typed wrongly."""
 LATE = 0.05
-"""Offset between two clocks that counts [s]."""
+"""Offset between two clocks that explains points far from where they should be [s]."""
+DENSE = 50.0
+"""Rate at which the way of the held points is worked out; splines join what lies between [Hz]."""
 STRETCH = 0.2
 """Part by which lengths that cannot change may seem to."""
 
@@ -85,12 +88,17 @@ def check_held_points(arm: Arm, recording: Recording, choice: Choices) -> Iterat
         place, by_angle = arm.places(tuple(frames.values()), course(t))
         error = _rms(seen - place)
         noise = _noise(group)
+        knots = float(joints.t[0]), float(joints.t[-1])
+        dense = np.linspace(*knots, int(np.clip(DENSE * (knots[1] - knots[0]), 400, 20_000)))
+        path = scipy.interpolate.CubicSpline(dense, arm.places(tuple(frames.values()), course(dense))[0], axis=0)
         if not error > max(CLOSE, 5 * noise):
+            for doubt in check_held_clock(joints, group, t, seen, by_angle, noise, path):
+                yield replace(doubt, recording=recording.name)
             continue
         changes = [
             *_changed_lengths(seen, place),
             *_changed_names(seen, place, tuple(frames)),
-            *_changed_times(arm, tuple(frames.values()), course, t, seen),
+            *_changed_times(path, knots, t, seen),
             *_changed_zeros(arm, tuple(frames.values()), course(t), seen, (place, by_angle)),
             *_moved(seen, place),
         ]
@@ -162,28 +170,27 @@ def _changed_names(seen: Array, place: Array, names: Sequence[str]) -> Iterator[
         yield _Change("point_swapped", words, advice, _rms(seen[:, order] - place))
 
 
-def _changed_times(
-    arm: Arm, frames: tuple[str, ...], course: scipy.interpolate.CubicSpline, t: Array, seen: Array
-) -> Iterator[_Change]:
-    """Points recorded earlier or later than the angles: a coarse search, then a fine one."""
-    knots = course.x
-    dense = np.linspace(knots[0], knots[-1], 400)
-    path = scipy.interpolate.CubicSpline(dense, arm.places(frames, course(dense))[0], axis=0)
+def _changed_times(path: Path, knots: tuple[float, float], t: Array, seen: Array) -> Iterator[_Change]:
+    """Points recorded earlier or later than the angles, or by a clock that runs faster or more slowly."""
+    before, middle = _rms(seen - path(t)), 0.5 * (t[0] + t[-1])
 
-    def error(late: float) -> float:
-        at = t - late
-        inside = (at >= knots[0]) & (at <= knots[-1])
-        return _rms(seen[inside] - path(at[inside])) if inside.sum() > max(3, len(t) // 2) else math.inf
+    def left(late: float, drift: float) -> float:
+        at = t - late - drift * (t - middle)
+        inside = (at >= knots[0]) & (at <= knots[1])
+        return _rms(seen[inside] - path(at[inside]))
 
-    width = 0.5 * (knots[-1] - knots[0])
-    best = 0.0
-    for step in (width / 100, width / 1000, width / 10000):
-        trials = best + step * np.arange(-100 if step == width / 100 else -12, 101 if step == width / 100 else 13)
-        best = float(min(trials, key=error))
+    late, _ = best_clock(path, knots, t, seen)
+    error = left(late, 0.0)
     # of a search over so many times some always fits better
-    if abs(best) >= LATE and error(best) < 0.5 * BETTER * error(0.0):
-        words, advice = f"taken {best:+.3g} s from the joints", f"subtract {best:.3g} s from their times"
-        yield _Change("clock_offset", words, advice, error(best))
+    if abs(late) >= LATE and error < 0.5 * BETTER * before:
+        words, advice = f"taken {late:+.3g} s from the joints", f"subtract {late:.3g} s from their times"
+        yield _Change("clock_offset", words, advice, error)
+        return
+    late, drift = best_clock(path, knots, t, seen, drifts=True)
+    error = left(late, drift)
+    if abs(drift) * (t[-1] - t[0]) >= LATE and error < 0.5 * BETTER * before:
+        words = f"taken {late:+.3g} s from the joints, by a clock that runs {1e3 * drift:+.3g} parts per thousand fast,"
+        yield _Change("clock_drift", words, remedy(late, drift, middle), error)
 
 
 def _changed_zeros(

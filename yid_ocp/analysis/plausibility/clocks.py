@@ -1,0 +1,278 @@
+"""Clocks of points beside that of the joints: how late one is, and how much faster it runs.
+
+A point that is seen at the stamp t is where it was at t - late - drift (t - middle), so that to first order
+
+    expected - seen = speed (late + drift (t - middle)) + what else the expected place may be wrong by,
+
+which is linear. Standard deviations count that errors of neighbouring samples are alike (blocks of time, Cameron,
+Gelbach, Miller 2011, doi:10.1198/jbes.2010.07136). Only motion tells: at rest the columns of both are zero.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.optimize
+from numpy.typing import NDArray
+
+from yid_ocp.data.doubt import Doubt, period
+from yid_ocp.data.recording import JointGroup, PointGroup
+
+Array = NDArray[np.float64]
+Path = Callable[[Array], Array]
+"""From times on the joints' clock (N,) to places (N, np, 3) [m]."""
+
+SURE = 5.0
+"""Standard deviations from which on a clock's error counts."""
+SHUTTER = 0.04
+"""No sensor takes longer for one sample: a slow camera knows when a frame was taken better than to its period [s]."""
+BLOCKS = 10
+"""Blocks of time whose errors count as independent of each other."""
+WIDEST = 0.05
+"""Part by which clocks that were meant to agree may run apart."""
+STRIDE = 0.2
+"""How far clocks run apart between two drifts that are tried first [s]."""
+PASSES = 3
+"""So many times a fit is repeated at the times that the last one found."""
+FRAME, ZERO = 0.02, 0.02
+"""Usual errors of a frame [m, rad] and of an encoder's zero [rad], which must not pass for a clock's."""
+
+
+@dataclass(frozen=True)
+class ClockError:
+    """How the times of one group are beside another clock, with standard deviations.
+
+    Attributes
+    ----------
+    begin, end : float
+        First and last time of the group [s].
+    late, late_std : float
+        By how much its stamps are late, in the middle [s].
+    drift, drift_std : float
+        By how much faster they run; 0.001 is a part per thousand.
+    excess : float
+        Part of the sum of squares beyond the noise's that goes away with both; NaN where there is none beyond.
+    """
+
+    begin: float
+    end: float
+    late: float
+    late_std: float
+    drift: float
+    drift_std: float
+    excess: float
+
+    @property
+    def apart(self) -> float:
+        """By how much the clocks run apart from begin to end [s]."""
+        return self.drift * (self.end - self.begin)
+
+    @property
+    def drifts(self) -> bool:
+        """Whether it is sure that the clocks run apart."""
+        return abs(self.drift) > SURE * self.drift_std
+
+    @property
+    def lags(self) -> bool:
+        """Whether it is sure that stamps are late or early."""
+        return abs(self.late) > SURE * self.late_std
+
+
+def allowed(joints: JointGroup, group: PointGroup) -> float:
+    """By how much stamps may differ because a sample stands for a period, and nobody says for which part of it [s]."""
+    return 0.5 * (period(joints.t) + min(period(group.t), SHUTTER))
+
+
+def by_clock(t: Array, speed: Array, span: tuple[float, float]) -> Array:
+    """Derivatives of what is expected by the offset of a clock and by how far it runs apart, shape (R, 2)."""
+    return np.stack([speed, speed * (t - 0.5 * sum(span)) / max(span[1] - span[0], 1e-9)], axis=1)
+
+
+def clock_error(
+    t: Array, residual: Array, own: Array, others: Array, size: Array, span: tuple[float, float]
+) -> ClockError | None:
+    """Fit an offset and a drift of a clock to a residual, beside other unknowns.
+
+    Parameters
+    ----------
+    t : ndarray, shape (R,)
+    residual : ndarray, shape (R,)
+        Expected less seen, in units of the noise.
+    own : ndarray, shape (R, 2)
+        Its derivatives by how late stamps are in the middle and by how far they run apart; see `by_clock` [1/s].
+    others : ndarray, shape (R, k)
+        Its derivatives by other unknowns.
+    size : ndarray, shape (k,)
+        Their usual sizes.
+    span : (float, float)
+        First and last time of the group [s].
+
+    Returns
+    -------
+    ClockError or None
+        None where the motion does not tell.
+    """
+    begin, end = span
+    length, data = max(end - begin, 1e-9), len(t)
+    if not np.all(np.sum(own**2, axis=0) > 0) or data < 3 * BLOCKS:
+        return None
+    rows = np.vstack([np.hstack([own, others]), np.hstack([np.zeros((len(size), 2)), np.diag(1 / size)])])
+    target = np.concatenate([residual, np.zeros(len(size))])
+    scale = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
+    inverse = np.linalg.pinv((rows / scale).T @ (rows / scale), rcond=1e-12, hermitian=True) / np.outer(scale, scale)
+    found = inverse @ (rows.T @ target)
+    remains = target - rows @ found
+    plain = rows[:, 2:]
+    base = target - plain @ np.linalg.lstsq(plain, target, rcond=None)[0]
+    after, before = (float(np.sum(x[:data] ** 2)) for x in (remains, base))
+    block = np.clip(((t - begin) / length * BLOCKS).astype(int), 0, BLOCKS - 1)
+    scores = np.zeros((BLOCKS, rows.shape[1]))
+    np.add.at(scores, block, rows[:data] * remains[:data, None])
+    middle = scores.T @ scores * BLOCKS / (BLOCKS - 1)
+    mean_square = max(after / max(data - 2 - len(size), 1), 1.0)
+    spread = np.maximum(np.diag(inverse @ middle @ inverse), mean_square * np.diag(inverse))
+    std = np.sqrt(spread)
+    beyond = before - data
+    excess = (before - after) / beyond if beyond > 0 else math.nan
+    return ClockError(
+        begin, end, float(found[0]), float(std[0]), float(found[1]) / length, float(std[1]) / length, float(excess)
+    )
+
+
+def check_held_clock(
+    joints: JointGroup, group: PointGroup, t: Array, seen: Array, by_angle: Array, std: float, path: Path
+) -> Iterator[Doubt]:
+    """Points that follow from the angles, late or early by less than would show in their places.
+
+    Parameters
+    ----------
+    joints : JointGroup
+    group : PointGroup
+    t : ndarray, shape (N,)
+        Times at which they are compared.
+    seen : ndarray, shape (N, np, 3)
+        [m]
+    by_angle : ndarray, shape (N, np, 3, k)
+        Derivative of their places by the angles.
+    std : float
+        Noise of the points [m]; zero where nobody says.
+    path : callable
+    """
+    begin, end, step = float(t[0]), float(t[-1]), 0.5 * period(joints.t)
+    shifted = np.broadcast_to(np.eye(3), (*seen.shape, 3))
+    size = np.concatenate([np.full(by_angle.shape[3], ZERO), np.full(6, FRAME)])
+    late = drift = 0.0
+    found: ClockError | None = None
+    for _ in range(PASSES):
+        at = t - late - drift * (t - 0.5 * (begin + end))
+        place, speed = path(at), (path(at + step) - path(at - step)) / (2 * step)
+        good = np.isfinite(seen) & ((at > joints.t[0]) & (at < joints.t[-1]))[:, None, None]
+        if not good.any():
+            return
+        noise = std if std > 0 else max(float(np.sqrt(np.mean((seen - place)[good] ** 2))), 1e-9)
+        middle = place[good.all(axis=2)].mean(axis=0)
+        turned = np.stack([np.cross(axis, place - middle) for axis in np.eye(3)], axis=3)
+        others = np.concatenate([by_angle, shifted, turned], axis=3)[good] / noise
+        when = np.broadcast_to(t[:, None, None], seen.shape)[good]
+        own = by_clock(when, speed[good] / noise, (begin, end))
+        more = clock_error(when, (place - seen)[good] / noise, own, others, size, (begin, end))
+        if more is None:
+            return
+        late, drift = late + more.late, drift + more.drift
+        found = replace(more, begin=begin, end=end, late=late, drift=drift)
+    assert found is not None
+    moved = float(np.sqrt(np.mean(np.sum(speed**2, axis=2))))
+    yield from _said(found, joints, group, moved * max(abs(found.late), abs(found.apart)) > noise)
+
+
+def _said(found: ClockError, joints: JointGroup, group: PointGroup, matters: bool) -> Iterator[Doubt]:
+    limit = allowed(joints, group)
+    camera = "camera" in group.name.lower() or "camera" in group.sensor.lower() or group.pose is not None
+    use = f"sensors.{group.name}.use: false"
+    if found.drifts and abs(found.apart) > limit:
+        yield drift_doubt(found, group.name, limit, matters)
+    elif found.lags and abs(found.late) > limit:
+        known = f"model.effects: [{{kind: camera_latency, location: camera, values: {{delay: {found.late:.3g}}}}}]"
+        yield Doubt(
+            "clock_offset",
+            f"{group.name} is stamped {1e3 * found.late:+.3g} ± {1e3 * found.late_std:.2g} ms from the joints; "
+            f"{1e3 * limit:.3g} ms are in doubt anyway, as samples stand for a period",
+            "not_trusted" if matters else "warning",
+            abs(found.late) / limit,
+            f"subtract {found.late:.3g} s from their times",
+            "",
+            group.name,
+            "t",
+            setting=known if camera and found.late > 0 else use,
+        )
+
+
+def drift_doubt(found: ClockError, group: str, limit: float, matters: bool) -> Doubt:
+    """The doubt that two clocks run apart."""
+    first, last = found.late - 0.5 * found.apart, found.late + 0.5 * found.apart
+    return Doubt(
+        "clock_drift",
+        f"{group} is stamped {1e3 * first:+.3g} ms from the joints at its beginning, {1e3 * last:+.3g} ms at its end: "
+        f"its clock runs {1e3 * abs(found.drift):.2g} ± {1e3 * found.drift_std:.1g} parts per thousand too "
+        f"{'fast' if found.drift > 0 else 'slowly'}",
+        "not_trusted" if matters else "warning",
+        abs(found.apart) / limit,
+        remedy(found.late, found.drift, 0.5 * (found.begin + found.end)),
+        "",
+        group,
+        "t",
+        setting=f"sensors.{group}.use: false",
+    )
+
+
+def remedy(late: float, drift: float, middle: float) -> str:
+    """What to do with times that are late and drift."""
+    return f"replace its times t by t {-late:+.4g} {-drift:+.4g} (t - {middle:.6g})"
+
+
+# -- clocks that are far apart ----------------------------------------------------------------------------------------
+
+
+def best_clock(
+    path: Path, knots: tuple[float, float], t: Array, seen: Array, drifts: bool = False
+) -> tuple[float, float]:
+    """Offset [s], and where asked for drift, with which points are nearest to a path: a coarse search, then finer ones.
+
+    Parameters
+    ----------
+    path : callable
+    knots : (float, float)
+        First and last time at which it is known [s].
+    t : ndarray, shape (N,)
+    seen : ndarray, shape (N, np, 3)
+        [m]
+    drifts : bool
+        Whether the clock may run apart as well, by up to `WIDEST`.
+    """
+    middle, span = 0.5 * float(t[0] + t[-1]), float(t[-1] - t[0])
+
+    def error(late: float, drift: float) -> float:
+        at = t - late - drift * (t - middle)
+        inside = (at >= knots[0]) & (at <= knots[1])
+        if inside.sum() <= max(3, len(t) // 2):
+            return math.inf
+        return float(np.nanmean(np.sum((seen[inside] - path(at[inside])) ** 2, axis=2)))
+
+    def nearest(drift: float, *searches: tuple[float, int]) -> tuple[float, float]:
+        late = 0.0
+        for step, reach in searches:
+            late = min((late + step * k for k in range(-reach, reach + 1)), key=lambda one: error(one, drift))
+        return error(late, drift), late
+
+    width = 0.5 * (knots[1] - knots[0])
+    if not drifts:
+        return nearest(0.0, (width / 100, 100), (width / 1000, 12), (width / 10000, 12))[1], 0.0
+    trials = np.linspace(-WIDEST, WIDEST, 1 + 2 * int(np.clip(WIDEST * span / STRIDE, 10, 100)))
+    _, late, drift = min((*nearest(float(rate), (width / 48, 12), (width / 400, 8)), float(rate)) for rate in trials)
+    fine = scipy.optimize.minimize(
+        lambda x: min(error(x[0], x[1] / span), 1e300), [late, drift * span], method="Nelder-Mead"
+    )
+    return float(fine.x[0]), float(fine.x[1]) / span

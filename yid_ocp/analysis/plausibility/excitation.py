@@ -1,0 +1,123 @@
+"""Motion beside the noise of what measures it: whether it can tell what depends on how the arm moves at all."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.analysis.plausibility.arm import MOTION_BAND, Arm, recorded_motion
+from yid_ocp.analysis.plausibility.efforts import VISCOUS
+from yid_ocp.data.channels import white
+from yid_ocp.data.doubt import LIMITS, Doubt, period
+from yid_ocp.data.recording import JointGroup, Recording
+from yid_ocp.sensors.base import Choice
+from yid_ocp.sensors.joints import EFFORT, POSITION, by_joint
+
+Array = NDArray[np.float64]
+
+SEEN = 5.0
+"""Standard deviations from which on a signal counts as seen, all samples and joints together."""
+
+
+def check_motion(arm: Arm, recording: Recording, effort: Choice) -> Iterator[Doubt]:
+    """Efforts that speed and acceleration ask for, beside the noise of the efforts.
+
+    What is the same however slowly the arm moves, such as weight and stiffness, is found from postures; dampings,
+    frictions and inertias only from what speed and acceleration add, by the bodies' inverse dynamics and by friction of
+    a usual size.
+
+    Parameters
+    ----------
+    arm : Arm
+    recording : Recording
+        In which the arm `is_in`.
+    effort : Choice
+        How efforts are used; states their noise or leaves it to the recording.
+    """
+    joints = recording.joints
+    motion = None if joints is None else recorded_motion(joints, arm.names)
+    if joints is None or motion is None or motion.effort is None or effort.use is False:
+        return
+    if float(np.max(np.ptp(motion.q, axis=0))) < LIMITS.motion:
+        return  # it stands still, which is said already
+    noise = _noise(joints, arm.names, effort)
+    if not np.all(noise > 0):
+        return
+    still = np.zeros_like(motion.q)
+    moving = arm.inverse_dynamics(motion.q, motion.v, motion.a) - arm.inverse_dynamics(motion.q, still, still)
+    limit = np.array([joint.effort_limit for joint in arm.joints])
+    friction = np.where(np.isfinite(limit), VISCOUS * limit, 0.0) * motion.v
+    # noise beyond the band of motion is smoothed away, so that so many samples count as one
+    apart = max(1.0, 1 / (2 * MOTION_BAND * period(joints.t)))
+    samples = len(joints.t) / apart
+    band = noise / math.sqrt(apart)
+    size = np.sqrt(np.mean(moving**2 + friction**2, axis=0))
+    seen = float(np.sqrt(samples * np.sum((size / band) ** 2)))
+    if seen < SEEN:
+        j = int(np.argmax(size / band))
+        yield Doubt(
+            "weak_excitation",
+            f"speed and acceleration ask {arm.names[j]} for {size[j]:.2g} N m (rms), beside noise of {noise[j]:.2g} "
+            "N m from sample to sample; no joint tells more",
+            "warning",
+            SEEN / max(seen, 1e-9),
+            "move faster; from postures alone weight and stiffness can be found, no damping, friction or inertia",
+            recording.name,
+            "joints",
+            "position",
+        )
+
+
+def _noise(joints: JointGroup, names: Sequence[str], effort: Choice) -> Array:
+    """White noise of efforts, as stated, else as seen, shape (k,) [N m]."""
+    given = effort.std if effort.std is not None else joints.effort_std
+    if given is not None:
+        return by_joint(given, joints.names, names, f"sensors.{EFFORT}.std")
+    assert joints.effort is not None
+    return np.array([white(joints.t, joints.effort[:, joints.names.index(name)]) for name in names])
+
+
+def check_asked(
+    recordings: Sequence[Recording], asked: Mapping[str, Sequence[str]], position: Choice
+) -> Iterator[Doubt]:
+    """Joints with free parameters of their own that hardly turn in any recording.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+        All that are estimated on.
+    asked : mapping of str to sequence of str
+        By joint the free parameters that are its own.
+    position : Choice
+        How angles are used.
+    """
+    for joint, parameters in asked.items():
+        widest, limit, name = 0.0, LIMITS.motion, ""
+        for recording in recordings:
+            joints = recording.joints
+            if joints is None or joint not in joints.names:
+                continue
+            angle = joints.position[:, joints.names.index(joint)]
+            given = position.std if position.std is not None else joints.position_std
+            if given is not None:
+                limit = max(limit, 6 * float(by_joint(given, joints.names, (joint,), f"sensors.{POSITION}.std")[0]))
+            limit = max(limit, 6 * white(joints.t, angle))
+            width = float(np.ptp(angle))
+            if not name or width > widest:
+                widest, name = width, recording.name
+        if name and widest < limit:
+            yield Doubt(
+                "weak_excitation",
+                f"{joint} turns by {widest:.2g} rad at most, in {name}; {limit:.2g} rad is the least that tells "
+                f"{', '.join(parameters)} from a constant effort",
+                "warning",
+                limit / max(widest, 1e-9),
+                f"record a motion that turns {joint}, or fix {parameters[0]}",
+                name,
+                "joints",
+                f"position.{joint}",
+                setting="; ".join(f"parameters.{parameter}.free: false" for parameter in parameters),
+            )
