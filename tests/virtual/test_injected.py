@@ -69,7 +69,9 @@ def symbolic(kind, location, values, q, v):
     sq, sv = ca.SX.sym("q", SYSTEM.size), ca.SX.sym("v", SYSTEM.size)
     none = ca.SX(0, 1)
     u, reaction = ca.SX.sym("u", len(SYSTEM.driven)), ca.SX.sym("r", SYSTEM.constraint_count)
-    state = MidpointState(changed, forward_kinematics(changed.mechanism, sq), sq, sv, none, none, u, reaction, {})
+    state = MidpointState(
+        changed, forward_kinematics(changed.mechanism, sq), sq, sv, none, none, u, reaction, {}, ca.SX(1)
+    )
     terms = effect.terms(state)
     total = ca.gradient(terms.lagrangian, sq)
     for force in (terms.force, terms.viscous, None if terms.closed is None else terms.closed.force):

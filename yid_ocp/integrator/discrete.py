@@ -316,7 +316,7 @@ class _SummedTerms:
 def _summed_terms(system: System, at: _Symbols, kinematics: Kinematics) -> _SummedTerms:
     names = tuple(system.internal)
     rows = {name: i for i, name in enumerate(names)}
-    state = MidpointState(system, kinematics, at.qm, at.vm, at.zm, at.z_rate, at.u, at.pull_rate, rows)
+    state = MidpointState(system, kinematics, at.qm, at.vm, at.zm, at.z_rate, at.u, at.pull_rate, rows, at.h)
     energy = -system.elastic_energy(at.qm)
     force, viscous = system.input_force(at.u), system.viscous_force(at.vm)
     equations: dict[str, ca.SX] = {}
