@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
+
 import casadi as ca
 import numpy as np
 
@@ -10,6 +13,7 @@ from yid_ocp.effects.base import (
     Carried,
     EffectBase,
     Quantity,
+    Reported,
     carried,
     link_ends,
     link_frames,
@@ -26,12 +30,16 @@ from yid_ocp.model.system import MidpointState, System, Terms
 
 REACH = 0.5
 """How far from its frame a payload's mass may sit [m]."""
+SHIFT = 0.05
+"""By how much the centre of a link may be elsewhere than the model has it, without any mass added [m]."""
 REMOVABLE = 0.9
 """Part of a link's mass that may turn out not to be there."""
 FAR = 2.0
 """Distance beyond which a payload's own inertia is no longer that of a point [m]."""
 LIGHT = 1e-2
 """Mass below which a payload has no inertia of its own [kg]."""
+FREE = 0.95
+"""Part of a payload's moments above which the limit of its place hardly counts."""
 THIN = 1e-3
 """Least root mean square extent of a link [m]."""
 
@@ -118,8 +126,10 @@ class PointMass(EffectBase):
 class Payload(EffectBase):
     """A mass at (mx, my, mz)/mass in a frame, moving with it; a negative one is a part that the model has in excess.
 
-    With M, C and Sigma the mass, the centre and the integral of r r' dm about the centre of what the joint carries, and
-    e = (mx, my, mz) + mass (frame - C), the link gets `mass`, the first moment e about C, and the second moment
+    The place is within `REACH` of the frame: moments beyond L = sqrt((`REACH` mass)^2 + (`SHIFT` M)^2) do not grow any
+    more, s = (mx, my, mz) (1 + (|(mx, my, mz)|/L)^8)^(-1/8), and s is what is reported. M, C and Sigma are mass, centre
+    and integral of r r' dm about the centre of what the joint carries (M at least 1 kg in L). With
+    e = s + mass (frame - C) the link gets `mass`, the first moment e about C, and the second moment
 
         K = e e' (1/(M + mass) + c h),  c = w(mass) M/(M + mass),  w(mass) = mass^3/(mass^4 + (|e|/`FAR`)^4 + `LIGHT`^4)
 
@@ -161,13 +171,28 @@ class Payload(EffectBase):
         )
         return (Quantity("mass", "kg", 0.0, lower, upper, (lower, expected), "mass added to the link"), *moments)
 
+    def reported(
+        self, values: Mapping[str, float] | None = None, stds: Mapping[str, float] | None = None
+    ) -> dict[str, Reported]:
+        """The moments as they act; without a standard deviation where the limit of their place keeps them."""
+        found = super().reported(values, stds)
+        mass, *moments = (found[quantity.name].value for quantity in self.quantities)
+        own = -self.quantities[0].lower / REMOVABLE
+        kept = float(_kept(ca.SX(mass), ca.SX(ca.DM(moments)), own))
+        for name in ("mx", "my", "mz"):
+            said = found[name]
+            found[name] = Reported(kept * said.value, said.std if kept > FREE else math.nan, said.unit)
+        return found
+
     def modify(self, system: System) -> System:
         """See the class."""
         frame = system.mechanism.frame(self.location)
         joint, link = system.mechanism.joints[frame.joint], carried(system, frame.joint)
         mass, centre = self["mass"], ca.SX(ca.DM(link.com))
-        moment = frame.placement.rotation @ ca.vertcat(*(self[f"m{axis}"] for axis in "xyz"))
-        first = moment + mass * (frame.placement.translation - centre)
+        moment = ca.vertcat(*(self[f"m{axis}"] for axis in "xyz"))
+        first = frame.placement.rotation @ (moment * _kept(mass, moment, link.mass)) + mass * (
+            frame.placement.translation - centre
+        )
         second = ca.densify(first @ first.T) * _spread(mass, first, link) - first @ first.T
         tensor = (second[0, 0] + second[1, 1] + second[2, 2]) * ca.SX.eye(3) - second
         # two bodies, of which one weighs 1 kg, so that nothing is divided by the mass
@@ -176,6 +201,12 @@ class Payload(EffectBase):
             Inertia(mass - 1, centre, ca.SX(ca.DM.zeros(3, 3))),
         )
         return with_bodies(system, {joint.name: (*joint.bodies, *pair)})
+
+
+def _kept(mass: ca.SX, moment: ca.SX, own: float) -> ca.SX:
+    """Part of the first moments that acts; see `Payload`."""
+    most = (REACH * mass) ** 2 + (SHIFT * max(own, 1.0)) ** 2
+    return (1 + (ca.dot(moment, moment) / most) ** 4) ** (-1 / 8)
 
 
 def _spread(mass: ca.SX, first: ca.SX, link: Carried) -> ca.SX:
