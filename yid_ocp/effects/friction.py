@@ -98,7 +98,9 @@ class JointPresliding(EffectBase):
 
     at x = |d|/yield_angle is its solution and its mean for a motion that does not turn round within the step. It stays
     within -1 and 1 and takes energy out whatever the step is, where a midpoint rule would ring at steps longer than the
-    yield angle. The |d| beside s_k is rounded off below `STILL`. What s was before a recording begins is not known: it
+    yield angle. The |d| beside s_k is rounded off below `STILL`. A loaded joint whose arm rings on the friction's own
+    stiffness, tau_c/yield_angle, faster than the steps follow creeps a little instead of resting, as Dahl's law has it
+    of anything that is shaken: shorter steps hold it. What s was before a recording begins is not known: it
     is estimated with every recording.
 
     References
