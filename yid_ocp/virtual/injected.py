@@ -358,7 +358,7 @@ class InjectedTerms:
         """Put a point of some mass, or take it, at (mx, my, mz)/mass in a frame."""
         mujoco, value, where = mujoco_module(), self._value, f"payload@{place}"
         frame, reach = self._system.mechanism.frame(place), np.array([size.get(f"m{a}", 0.0) for a in "xyz"])
-        body = model.body(f"{self._system.mechanism.joints[frame.joint].name}_body").id
+        body = int(model.jnt_bodyid[model.joint(self._system.mechanism.joints[frame.joint].name).id])
         turn = value(frame.placement.rotation).reshape(3, 3, order="F")
         mass = size["mass"]
         if not np.linalg.norm(reach) <= FARTHEST * abs(mass):
