@@ -23,6 +23,7 @@ KINDS = {
     "effort_gain": {"left_a": {"scale": 0.93}, "left_b": {"scale": 1.04}},
     "effort_offset": {"left_b": {"offset": -0.3}},
     "effort_delay": {"left": {"delay": 0.013}},
+    "effort_lag": {"left_a": {"time_constant": 0.015}, "left_c": {"time_constant": 0.03}},
     "camera_latency": {"camera": {"delay": 0.0217}},
     "camera_rotation": {"camera": {"rx": 0.02}},
     "clock_scale": {"clock": {"scale": 0.97}},
@@ -92,6 +93,7 @@ def test_neutral_readings_change_nothing(mode, feedback, benches) -> None:
     # the momentum that an LQR filter follows depends on how fast the clock runs
     assert full.with_free(["T1.bend", "clock_scale@clock.scale"]).as_recorded is (feedback != "lqr")
     assert not full.with_free(["effort_delay@left.delay"]).as_recorded
+    assert not full.with_free(["effort_lag@left_c.time_constant"]).as_recorded
     assert not full.with_free(["camera_latency@camera.delay"]).as_recorded
     with pytest.raises(SolverError, match="gauss_newton"):
         Transcription(full, 1)
@@ -104,7 +106,7 @@ def test_derivatives_agree_with_differences_and_with_the_adjoint(mode, feedback,
     result = task.evaluate(x)
     assert result.ok, result.message
     for column, name in enumerate(task.names):
-        width = 1e-5 if name.endswith(("delay", "offset", "width", "compliance")) else 1e-4
+        width = 1e-5 if name.endswith(("delay", "offset", "width", "compliance", "time_constant")) else 1e-4
         shift = np.zeros(len(x))
         shift[column] = width
         above, below = (task.evaluate(x + sign * shift, derivatives=False).residual for sign in (1, -1))

@@ -171,7 +171,7 @@ def test_a_torque_acts_as_it_was_recorded_less_what_its_sensor_adds(urdf_folder)
     neutral = {
         "effort_delay@gripper.delay": 0.0,
         "effort_offset@shoulder.offset": 0.0,
-        "effort_gain@shoulder.scale": 1.0,
+        "effort_gain@shoulder.inverse": 1.0,
         "encoder_offset@shoulder.offset": 0.0,
     }
     assert set(neutral) <= set(problem.names)
@@ -190,7 +190,7 @@ def test_a_problem_is_as_recorded_unless_an_effect_may_change_it(urdf_folder):
     assert plain.as_recorded
     for case in ("prescribed", "prescribed gears", "driven", "driven, filtered", "robust"):
         assert not problem_of(urdf_folder, case, seeds=(1,)).as_recorded, case
-    neutral = {"encoder_offset@shoulder.offset": 0.0, "effort_gain@shoulder.scale": 1.0}
+    neutral = {"encoder_offset@shoulder.offset": 0.0, "effort_gain@shoulder.inverse": 1.0}
     made = problem_of(urdf_folder, "all prescribed", seeds=(1,))
     assert not made.at(neutral).as_recorded, "a free one may change it"
     fixed = made.freeing(("elbow.damping",))

@@ -37,7 +37,7 @@ class Drift:
 
 CAMERA = PointSensor("points_camera", ("w_T1", "w_T2"), ("w_T1", "w_T2"), tuple(map(tuple, np.eye(4))))
 EFFORT = EffortSensor(("left_a", "left_b"))
-NAMES = ("T1.length", "drift@left.gain", "camera_scale@camera.scale", "effort_gain@left_b.scale")
+NAMES = ("T1.length", "drift@left.gain", "camera_scale@camera.scale", "effort_gain@left_b.inverse")
 
 
 @pytest.fixture(scope="module")

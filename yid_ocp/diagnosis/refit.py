@@ -194,6 +194,14 @@ def refit(
         }
         again = _attempt(own, effects, fresh) if len(fresh) < len(start) else None
         best = again if again is not None and again[1].cost < best[1].cost else best
+    for effect in effects:
+        moved = effect.elsewhere(start)
+        if moved is None:
+            continue
+        there = _placed(problem, effects, {**start, **moved})
+        again = _attempt(there, effects, {**start, **moved})
+        if again is not None and (best is None or again[1].cost < best[1].cost):
+            own, best = there, again
     if best is None:
         return None
     outcome, finish = best

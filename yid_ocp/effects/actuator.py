@@ -7,11 +7,12 @@ recorded one through `measure`.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import casadi as ca
 
-from yid_ocp.effects.base import EFFECTS, EffectBase, Quantity, arms, robot_joints
+from yid_ocp.effects.base import EFFECTS, EffectBase, Quantity, arms, robot_joints, strength
 from yid_ocp.model.system import NodeState, System
 
 PLAY_TORQUE = 0.2
@@ -86,7 +87,10 @@ class Backlash(EffectBase):
 
 @EFFECTS.register("effort_gain")
 class EffortGain(EffectBase):
-    """Measured effort = scale x true effort."""
+    """Measured effort = scale x true effort; a negative scale is a flipped sign.
+
+    Kept inside as 1/scale, by which a recorded torque is multiplied, so that a driven joint's may go through zero.
+    """
 
     equation = "measured effort = scale x true"
     depends_on = "how it stands against gravity"
@@ -99,16 +103,28 @@ class EffortGain(EffectBase):
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """Scale [1]."""
-        return (Quantity("scale", "1", 1.0, 0.3, 3.0, (0.8, 1.2), "measured over true effort"),)
+        """1/scale [1], reported as scale."""
+        text, expected = "true over measured effort", (1 / 1.2, 1 / 0.8)
+        return (Quantity("inverse", "1", 1.0, -1.5, 3.0, expected, text, reciprocal="scale 1"),)
+
+    def elsewhere(self, start: Mapping[str, float]) -> Mapping[str, float] | None:
+        """From the flipped sign as well, where the linear model goes further than to no effort at all.
+
+        Compared efforts are linear in scale, torques that drive in 1/scale: a flipped sign is two away either way.
+        """
+        [name] = self.parameters.names
+        value = start.get(name, 1.0)
+        if abs(value - 1) < 1:
+            return None
+        return {name: 1.0 if value < 0 else -1.0}
 
     def measure(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
         """See the class."""
-        return output * self["scale"] if channel == f"joints.effort.{self.location}" else output
+        return output / self["inverse"] if channel == f"joints.effort.{self.location}" else output
 
     def correct(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
         """See the class."""
-        return reading / self["scale"] if channel == f"joints.effort.{self.location}" else reading
+        return reading * self["inverse"] if channel == f"joints.effort.{self.location}" else reading
 
 
 @EFFECTS.register("effort_offset")
@@ -127,7 +143,8 @@ class EffortOffset(EffectBase):
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
         """Offset [N m]."""
-        return (Quantity("offset", "N m", 0.0, -10.0, 10.0, (-1.5, 1.5), "measured less true effort"),)
+        bound, width = (size * strength(system, location) for size in (10.0, 1.5))
+        return (Quantity("offset", "N m", 0.0, -bound, bound, (-width, width), "measured less true effort"),)
 
     def measure(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
         """See the class."""
@@ -172,6 +189,35 @@ class EffortDelay(EffectBase):
         if joint not in self.joints:
             return ca.SX(0)
         return {"torque": self["delay"], "joints.effort": -self["delay"]}.get(quantity, ca.SX(0))
+
+
+@EFFECTS.register("effort_lag")
+class EffortLag(EffectBase):
+    """Torque follows its command: time_constant dz/dt = command - z, z the torque that acts.
+
+    A driven joint's recorded torque is the command; of a prescribed joint the measured effort follows the one that the
+    motion needs in the same way. Before a recording begins both are what they are at its start.
+    """
+
+    equation = "time_constant dz/dt = command - z"
+    depends_on = "when it is read"
+    needs: ClassVar[frozenset[str]] = frozenset({"joints.effort"})
+
+    @classmethod
+    def locations(cls, system: System) -> tuple[str, ...]:
+        """Arm joints that are driven or prescribed."""
+        return _recorded(system)
+
+    @classmethod
+    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
+        """time_constant [s]."""
+        text = "with which torque follows its command"
+        return (Quantity("time_constant", "s", 0.0, 0.0, 0.5, (0.0, 0.05), text),)
+
+    def lag(self, channel: str) -> ca.SX:
+        """See the class."""
+        ours = (f"torque.{self.location}", f"joints.effort.{self.location}")
+        return self["time_constant"] if channel in ours else ca.SX(0)
 
 
 def _recorded(system: System) -> tuple[str, ...]:

@@ -13,7 +13,8 @@ import numpy as np
 
 from yid_ocp.errors import ConfigError, nearest
 from yid_ocp.model.flexible import ElasticJoint
-from yid_ocp.model.mechanism import Inertia, Placement
+from yid_ocp.model.kinematics import forward_kinematics
+from yid_ocp.model.mechanism import Inertia, Mechanism, Placement, merged
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.system import Grasp, MidpointState, NodeState, System, Terms
 from yid_ocp.registry import Registry
@@ -32,6 +33,12 @@ ASPECTS = (
     "how long it is",
 )
 """What equations of the library depend on, in the order in which sentences name it."""
+BAXTER_LIMIT = 50.0
+"""Effort limit of the joints that the ranges of arms are about [N m]; they grow with that of a stronger joint."""
+NO_LIMIT = 2e4
+"""Effort limits from here on are a file's way to say that there is none [N m]."""
+SAME_PLACE = 1e-6
+"""Points of arms that are nearer to each other than this wherever the arm stands are one [m]."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +59,8 @@ class Quantity:
     shape : bool
         Whether it says nothing while the others are neutral (a relaxation time, a yield angle).
     reciprocal : str
-        `name unit` under which 1/value is reported, for a stiffness whose neutral value is infinite.
+        `name unit` under which 1/value is reported, for a stiffness whose neutral value is infinite, or a factor that
+        goes through infinity when it changes its sign.
     """
 
     name: str
@@ -141,6 +149,15 @@ class EffectBase(ABC):
         """Joints that it must know by name, where a location stands for several."""
         return ()
 
+    @property
+    def unknown_at_start(self) -> Mapping[str, float]:
+        """Internal coordinates whose value at the start of a recording nothing tells: name to their largest size."""
+        return {}
+
+    def elsewhere(self, start: Mapping[str, float]) -> Mapping[str, float] | None:
+        """Another place from which a search that begins at `start` should begin as well; None where one is enough."""
+        return None
+
     def __getitem__(self, quantity: str) -> ca.SX:
         return self.parameters[f"{self.kind}@{self.location}.{quantity}"].symbol
 
@@ -221,6 +238,10 @@ class EffectBase(ABC):
         """How long before its recorded time a reading was true [s]."""
         return ca.SX(0)
 
+    def lag(self, channel: str) -> ca.SX:
+        """Time constant with which an effort follows its command, or a reading an effort [s]."""
+        return ca.SX(0)
+
 
 EFFECTS: Registry[type[EffectBase]] = Registry("effect")
 
@@ -237,8 +258,10 @@ def build(kind: str, location: str, system: System, values: Mapping[str, float] 
             raise ConfigError(f"{kind} has no quantity '{name}'", where=label, hint=nearest(name, names))
         quantity = names[name]
         if name != quantity.name:
-            if not value > 0:
-                raise ConfigError(f"{name} = {value}", where=label, allowed=f"a positive number {quantity.reported[1]}")
+            signed = quantity.lower < 0
+            if not (value > 0 or (signed and value < 0)):
+                kind_of = "a number other than zero" if signed else "a positive number"
+                raise ConfigError(f"{name} = {value}", where=label, allowed=f"{kind_of} {quantity.reported[1]}")
             value = 1 / value
         given[quantity.name] = float(value)
     entries = (
@@ -315,6 +338,103 @@ def arm_tips(system: System) -> tuple[str, ...]:
         named = [f for word in ("gripper", "tcp", "hand", "tool") for f in frames if f.endswith(word)]
         tips += (named or frames[-1:])[:1]
     return tuple(tips)
+
+
+def strength(system: System, joint: str) -> float:
+    """How much stronger a joint is than Baxter's, by its effort limit; 1 for a weaker one and where there is none."""
+    limit = system.mechanism.joints[system.mechanism.joint_index(joint)].effort_limit
+    return max(1.0, limit / BAXTER_LIMIT) if limit < NO_LIMIT else 1.0
+
+
+@dataclass(frozen=True)
+class Carried:
+    """What a joint carries, as the nominal parameters have it, in its own frame.
+
+    Attributes
+    ----------
+    mass : float
+        [kg]
+    com : ndarray, shape (3,)
+        Centre of mass [m]; the joint's origin where it carries none.
+    spread : ndarray, shape (3, 3)
+        Integral of r r' dm about the centre of mass [kg m^2].
+    """
+
+    mass: float
+    com: np.ndarray
+    spread: np.ndarray
+
+
+def carried(system: System, joint: int) -> Carried:
+    """What one joint carries, up to the next joints."""
+    bodies = [replace(body, gravity_fraction=None) for body in system.mechanism.joints[joint].bodies]
+    whole = merged(bodies)
+    if whole is None:
+        return Carried(0.0, np.zeros(3), np.zeros((3, 3)))
+    parameters = system.parameters
+    function = ca.Function("carried", [parameters.symbols], [whole.mass, whole.com, whole.about_com])
+    mass, com, tensor = (np.array(ca.densify(x)) for x in function(parameters.vector()))
+    return Carried(float(mass[0, 0]), com.ravel(), np.trace(tensor) / 2 * np.eye(3) - tensor)
+
+
+def link_ends(system: System) -> tuple[str, ...]:
+    """Where an arm's links end: a frame at the next joint, or at the tip; of frames that move alike the first one.
+
+    A frame stands for the place where it is, whichever of two links that meet there carries it. A place on an axis that
+    no other joint moves is none.
+    """
+    tree = system.mechanism
+    if not robot_joints(system):
+        return ()
+    own = {tree.joint_index(name) for name in robot_joints(system)}
+    # a link's own frame is where the link before it ends
+    first: dict[int, str] = {}
+    for name, frame in tree.frames.items():
+        if frame.joint in own:
+            first.setdefault(frame.joint, name)
+    names = (*arm_tips(system), *(first[joint] for joint in sorted(first)))
+    held = [end for grasp in system.grasps for end in (grasp.holder, grasp.held)]
+    paths = _paths(system, tree, (*names, *held))
+    known = [path for name, path in paths.items() if name in held]
+    found = []
+    for name in dict.fromkeys(names):
+        path = paths[name]
+        moves = np.ptp(path, axis=0).max() > SAME_PLACE
+        if moves and not any(np.abs(path - other).max() < SAME_PLACE for other in known):
+            found.append(name)
+            known.append(path)
+    return tuple(found)
+
+
+def link_frames(system: System) -> tuple[str, ...]:
+    """One frame on every link of an arm that carries mass: where a grasp holds, else a gripper's, else the first.
+
+    What slides on a link and carries nothing else, a finger for example, counts as part of that link.
+    """
+    tree = system.mechanism
+    preferred = [*(grasp.holder for grasp in system.grasps), *arm_tips(system)]
+    parents = {joint.parent for joint in tree.joints}
+    found = []
+    for name in robot_joints(system):
+        index = tree.joint_index(name)
+        finger = tree.joints[index].kind == "prismatic" and index not in parents and tree.joints[index].parent >= 0
+        frames = [frame for frame, entry in tree.frames.items() if entry.joint == index]
+        if not finger and frames and tree.joints[index].bodies:
+            found.append(next((frame for frame in preferred if frame in frames), frames[0]))
+    return tuple(found)
+
+
+def _paths(system: System, tree: Mechanism, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Where frames are in some postures of the arms, shape (postures, 3) each [m]."""
+    if not names:
+        return {}
+    q = ca.SX.sym("q", len(tree.joints))
+    kinematics = forward_kinematics(tree, q)
+    places = ca.horzcat(*(kinematics.position(name) for name in names))
+    function = ca.Function("places", [q, system.parameters.symbols], [places])
+    rng, theta = np.random.default_rng(0), system.parameters.vector()
+    at = [np.array(ca.densify(function(rng.uniform(-1.0, 1.0, len(tree.joints)), theta))) for _ in range(3)]
+    return {name: np.stack([place[:, i] for place in at]) for i, name in enumerate(names)}
 
 
 def roots(system: System) -> dict[str, tuple[str, ...]]:

@@ -18,6 +18,7 @@ from yid_ocp.effects.base import (
     roots,
     segment_names,
     segment_springs,
+    strength,
     typical_stiffness,
     with_springs,
 )
@@ -157,8 +158,9 @@ class JointSpring(EffectBase):
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
         """Stiffness [N m/rad] and rest_angle [rad]."""
+        size = strength(system, location)
         return (
-            Quantity("stiffness", "N m/rad", 0.0, 0.0, 300.0, (0.0, 60.0), "stiffness of the spring"),
+            Quantity("stiffness", "N m/rad", 0.0, 0.0, 300.0 * size, (0.0, 60.0 * size), "stiffness of the spring"),
             Quantity("rest_angle", "rad", 0.0, -math.pi, math.pi, (-2.0, 2.0), "where it is relaxed", shape=True),
         )
 

@@ -2,21 +2,46 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
+
 import casadi as ca
+import numpy as np
 
 from yid_ocp.effects.base import (
     EFFECTS,
+    Carried,
     EffectBase,
     Quantity,
-    arm_tips,
+    Reported,
+    carried,
+    link_ends,
+    link_frames,
+    object_joints,
     robot_joints,
     segment_names,
     segment_of_frame,
+    strength,
     substituted,
     with_bodies,
 )
 from yid_ocp.model.mechanism import Inertia
 from yid_ocp.model.system import MidpointState, System, Terms
+
+REACH = 0.5
+"""How far from its frame a payload's mass may sit [m]."""
+SHIFT = 0.05
+"""By how much the centre of a link may be elsewhere than the model has it, without any mass added [m]."""
+REMOVABLE = 0.9
+"""Part of a link's mass that may turn out not to be there."""
+FAR = 2.0
+"""Distance beyond which a payload's own inertia is no longer that of a point [m]."""
+LIGHT = 1e-2
+"""Mass below which a payload has no inertia of its own [kg]."""
+FREE = 0.95
+"""Part of a payload's moments above which the limit of its place hardly counts."""
+THIN = 1e-3
+"""Least root mean square extent of a link [m]."""
 
 
 @EFFECTS.register("density")
@@ -78,16 +103,15 @@ class PointMass(EffectBase):
 
     @classmethod
     def likely(cls, system: System) -> tuple[str, ...]:
-        """Tips of segments, junctions, and the end of every arm that holds nothing."""
+        """Tips of segments, junctions, and where an arm's links end."""
         tree = system.mechanism
         ends = (f"{prefix}_{s.name}" for s in system.segments for prefix in ("w", "junction"))
-        return (*(name for name in ends if name in tree.frames), *arm_tips(system))
+        return (*(name for name in ends if name in tree.frames), *link_ends(system))
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
-        """Mass [kg]; much less is expected on the object than on a gripper."""
-        light = segment_of_frame(system, location) is not None
-        upper, expected = (0.5, 0.05) if light else (10.0, 3.0)
+        """Mass [kg]: on the object up to the object's own, on an arm as much as that can bear."""
+        upper, expected = _bearable(system, location)
         return (Quantity("mass", "kg", 0.0, 0.0, upper, (0.0, expected), "mass of the point"),)
 
     def modify(self, system: System) -> System:
@@ -96,6 +120,119 @@ class PointMass(EffectBase):
         joint = system.mechanism.joints[frame.joint]
         point = Inertia(self["mass"], frame.placement.translation, ca.SX(ca.DM.zeros(3, 3)))
         return with_bodies(system, {joint.name: (*joint.bodies, point)})
+
+
+@EFFECTS.register("payload")
+class Payload(EffectBase):
+    """A mass at (mx, my, mz)/mass in a frame, moving with it; a negative one is a part that the model has in excess.
+
+    The place is within `REACH` of the frame: moments beyond L = sqrt((`REACH` mass)^2 + (`SHIFT` M)^2) do not grow any
+    more, s = (mx, my, mz) (1 + (|(mx, my, mz)|/L)^8)^(-1/8), and s is what is reported. M, C and Sigma are mass, centre
+    and integral of r r' dm about the centre of what the joint carries (M at least 1 kg in L). With
+    e = s + mass (frame - C) the link gets `mass`, the first moment e about C, and the second moment
+
+        K = e e' (1/(M + mass) + c h),  c = w(mass) M/(M + mass),  w(mass) = mass^3/(mass^4 + (|e|/`FAR`)^4 + `LIGHT`^4)
+
+    about C. w is 1/mass, and K = e e'/mass that of a point, but for a place further off than `FAR` and next to neutral,
+    where all goes smoothly to nothing. About its own centre the link then has Sigma + c h e e', where h is 1 for a mass
+    that is added and (1 + a^4)^(-1/4), a = c e' Sigma^-1 e, for one that is taken away: almost 1 while what is taken
+    away was there, and never so large that the link would be left without inertia.
+    """
+
+    equation = "a mass at (mx, my, mz)/mass, moving with the frame"
+    depends_on = "how it stands against gravity"
+
+    @classmethod
+    def locations(cls, system: System) -> tuple[str, ...]:
+        """All named points that move."""
+        return tuple(name for name, frame in system.mechanism.frames.items() if frame.joint >= 0)
+
+    @classmethod
+    def likely(cls, system: System) -> tuple[str, ...]:
+        """One frame on every link of an arm: loads at two frames of one link differ in nothing but their numbers."""
+        return link_frames(system)
+
+    @classmethod
+    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
+        """Mass [kg], down to `REMOVABLE` of the link's taken away, and mx, my, mz [kg m], `REACH` times as much."""
+        upper, expected = _bearable(system, location)
+        lower = -REMOVABLE * carried(system, system.mechanism.frame(location).joint).mass
+        moments = (
+            Quantity(
+                f"m{axis}",
+                "kg m",
+                0.0,
+                -REACH * upper,
+                REACH * upper,
+                (-REACH * expected, REACH * expected),
+                f"mass times its place along {axis}",
+            )
+            for axis in "xyz"
+        )
+        return (Quantity("mass", "kg", 0.0, lower, upper, (lower, expected), "mass added to the link"), *moments)
+
+    def reported(
+        self, values: Mapping[str, float] | None = None, stds: Mapping[str, float] | None = None
+    ) -> dict[str, Reported]:
+        """The moments as they act; without a standard deviation where the limit of their place keeps them."""
+        found = super().reported(values, stds)
+        mass, *moments = (found[quantity.name].value for quantity in self.quantities)
+        own = -self.quantities[0].lower / REMOVABLE
+        kept = float(_kept(ca.SX(mass), ca.SX(ca.DM(moments)), own))
+        for name in ("mx", "my", "mz"):
+            said = found[name]
+            found[name] = Reported(kept * said.value, said.std if kept > FREE else math.nan, said.unit)
+        return found
+
+    def modify(self, system: System) -> System:
+        """See the class."""
+        frame = system.mechanism.frame(self.location)
+        joint, link = system.mechanism.joints[frame.joint], carried(system, frame.joint)
+        mass, centre = self["mass"], ca.SX(ca.DM(link.com))
+        moment = ca.vertcat(*(self[f"m{axis}"] for axis in "xyz"))
+        first = frame.placement.rotation @ (moment * _kept(mass, moment, link.mass)) + mass * (
+            frame.placement.translation - centre
+        )
+        second = ca.densify(first @ first.T) * _spread(mass, first, link) - first @ first.T
+        tensor = (second[0, 0] + second[1, 1] + second[2, 2]) * ca.SX.eye(3) - second
+        # two bodies, of which one weighs 1 kg, so that nothing is divided by the mass
+        pair = (
+            Inertia(ca.SX(1), centre + first, ca.densify(tensor)),
+            Inertia(mass - 1, centre, ca.SX(ca.DM.zeros(3, 3))),
+        )
+        return with_bodies(system, {joint.name: (*joint.bodies, *pair)})
+
+
+def _kept(mass: ca.SX, moment: ca.SX, own: float) -> ca.SX:
+    """Part of the first moments that acts; see `Payload`."""
+    most = (REACH * mass) ** 2 + (SHIFT * max(own, 1.0)) ** 2
+    return (1 + (ca.dot(moment, moment) / most) ** 4) ** (-1 / 8)
+
+
+def _spread(mass: ca.SX, first: ca.SX, link: Carried) -> ca.SX:
+    """The factor of e e' in K, 1/mass for a point; see `Payload`."""
+    far = ca.dot(first, first) / FAR**2
+    inverse = mass**3 / (mass**4 + far**2 + LIGHT**4)
+    if link.mass == 0:
+        return inverse
+    whole = link.mass + mass
+    beyond = inverse * link.mass / whole
+    size, axes = np.linalg.eigh(link.spread)
+    stretch = ca.SX(ca.DM(axes / np.sqrt(np.maximum(size, link.mass * THIN**2)))).T @ first
+    taken = ca.fmin(beyond, 0) * ca.dot(stretch, stretch)
+    return 1 / whole + beyond / ca.sqrt(ca.sqrt(1 + taken**4))
+
+
+def _bearable(system: System, frame: str) -> tuple[float, float]:
+    """Largest mass at a frame, and the largest that one would expect [kg]."""
+    tree = system.mechanism
+    joint = tree.frame(frame).joint
+    if segment_of_frame(system, frame) is not None:
+        whole = sum(carried(system, tree.joint_index(name)).mass for name in object_joints(system))
+        return max(0.5, whole), max(0.05, whole)
+    moving = set(robot_joints(system)) & {tree.joints[i].name for i in tree.ancestors(joint)}
+    size = max((strength(system, name) for name in moving), default=1.0)
+    return 10.0 * size, 3.0 * size
 
 
 @EFFECTS.register("length_scale")
@@ -136,7 +273,8 @@ class RotorInertia(EffectBase):
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
         """Armature [kg m^2]."""
-        return (Quantity("armature", "kg m^2", 0.0, 0.0, 5.0, (0.0, 1.0), "inertia of the rotor at the joint"),)
+        size, text = strength(system, location), "inertia of the rotor at the joint"
+        return (Quantity("armature", "kg m^2", 0.0, 0.0, 5.0 * size, (0.0, size), text),)
 
     def terms(self, state: MidpointState) -> Terms:
         """See the class."""

@@ -155,7 +155,7 @@ class DiscreteEquations:
     @property
     def residual(self) -> ca.SX:
         """Residual of the step's unknowns: free rows of the balance, internal and constraint equations."""
-        return ca.vertcat(self.momentum_balance[list(self.system.free_indices)], self.internal, self.constraint)
+        return ca.vertcat(self.momentum_balance[list(self.system.free_indices), 0], self.internal, self.constraint)
 
     @property
     def closed_impulses(self) -> tuple[ca.SX, ca.SX] | None:
@@ -175,7 +175,7 @@ class DiscreteEquations:
     @property
     def unknowns(self) -> ca.SX:
         """Unknowns of the step: free coordinates of q1, then z1, then lam."""
-        return ca.vertcat(self.q1[list(self.system.free_indices)], self.z1, self.lam)
+        return ca.vertcat(self.q1[list(self.system.free_indices), 0], self.z1, self.lam)
 
 
 def discrete_equations(
@@ -316,7 +316,7 @@ class _SummedTerms:
 def _summed_terms(system: System, at: _Symbols, kinematics: Kinematics) -> _SummedTerms:
     names = tuple(system.internal)
     rows = {name: i for i, name in enumerate(names)}
-    state = MidpointState(system, kinematics, at.qm, at.vm, at.zm, at.z_rate, at.u, at.pull_rate, rows)
+    state = MidpointState(system, kinematics, at.qm, at.vm, at.zm, at.z_rate, at.u, at.pull_rate, rows, at.h)
     energy = -system.elastic_energy(at.qm)
     force, viscous = system.input_force(at.u), system.viscous_force(at.vm)
     equations: dict[str, ca.SX] = {}

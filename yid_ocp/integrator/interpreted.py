@@ -60,7 +60,7 @@ class InterpretedKernel:
 
     def _made(self, _: None) -> list[ca.Function]:
         e, point = self._model.equations, ca.vertcat(*self._model.equations.arguments)
-        effort = -e.momentum_balance[list(self._model.system.prescribed_indices)] / e.h
+        effort = -e.momentum_balance[list(self._model.system.prescribed_indices), 0] / e.h
         outputs = ca.cse(ca.vertcat(e.momentum_balance, e.internal, e.constraint, e.p1, effort))
         slope = ca.jacobian(outputs[self._residual.tolist()], e.unknowns)
         wanted = (outputs, slope, ca.jacobian(outputs, point))

@@ -111,7 +111,7 @@ class Statics:
         p_rest, balance, internal, constraint = at_rest(e.p1, e.momentum_balance, e.internal_at_rest, e.constraint)
         balance = ca.substitute(balance, e.p0, p_rest) / h
         w = ca.vertcat(sought, z, force)
-        residual = ca.vertcat(balance[list(self.unknown)], internal, constraint)
+        residual = ca.vertcat(balance[list(self.unknown), 0], internal, constraint)
         inputs = [w, given, held, stiffness, e.theta, e.time_step]
         weight = ca.substitute(e.rigid.potential, ca.vertcat(e.q0, e.q1), ca.vertcat(q, q))
         potential = system.elastic_energy(q) + weight

@@ -134,6 +134,8 @@ class MidpointState:
         lam_k / h [N or N m].
     internal : mapping of str to int
         Row of each internal coordinate in `z`, by name.
+    h : casadi.SX
+        Length of the step [s].
     """
 
     system: System
@@ -145,6 +147,7 @@ class MidpointState:
     u: ca.SX
     constraint_force: ca.SX
     internal: Mapping[str, int]
+    h: ca.SX
 
 
 @dataclass(frozen=True)
@@ -284,6 +287,13 @@ class RecordedEffect(Effect, Protocol):
 
         `channel` is as in `measure`, or `torque.JOINT` for a recorded torque that drives the model: it then acts so
         much later than it was recorded.
+        """
+        ...
+
+    def lag(self, channel: str) -> ca.SX:
+        """Time constant with which what acts follows a recorded torque, or a reading follows an effort [s].
+
+        `channel` is `torque.JOINT` or `joints.effort.JOINT`.
         """
         ...
 

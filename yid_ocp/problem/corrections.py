@@ -116,6 +116,11 @@ class InputCorrections:
         self.corrects_efforts = _depends(true_effort, theta)
         self.angles_need_effort = _depends(true_angle, effort)
         self.delays_torque = _depends(late, theta)
+        self._lags = {
+            kind: self._lag_function(kind, joints)
+            for kind, joints in (("torque", system.driven), ("joints.effort", system.prescribed))
+        }
+        self.lags_torque = self._lags["torque"] is not None
         chosen = ca.vertcat(ca.SX(0, 1), *(system.parameters[name].symbol for name in names))
         self._late = ca.Function("delay", [theta], [late, ca.jacobian(late, chosen)])
         slope = ca.vertcat(ca.SX(0, 1), *(ca.jacobian(true_effort[i], effort[i]) for i in range(count)))
@@ -173,6 +178,28 @@ class InputCorrections:
     def torque_delay(self, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array]:
         """How long after it was recorded each driven joint's torque acts, shape (nu,) [s], and its derivative."""
         return self._evaluate(self._late, theta, wanted)
+
+    def torque_lag(self, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array] | None:
+        """Time constant with which each driven joint's torque follows, (nu,) [s], and its derivative; None if none."""
+        function = self._lags["torque"]
+        return None if function is None else self._evaluate(function, theta, wanted)
+
+    def effort_lag(self, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array] | None:
+        """The same of each prescribed joint's measured effort, shape (nc,)."""
+        function = self._lags["joints.effort"]
+        return None if function is None else self._evaluate(function, theta, wanted)
+
+    def _lag_function(self, kind: str, joints: tuple[str, ...]) -> ca.Function | None:
+        theta = self.system.parameters.symbols
+        lags = [
+            sum((effect.lag(f"{kind}.{joint}") for effect in self._effects), ca.SX(0)) / self.system.time_scale
+            for joint in joints
+        ]
+        expression = ca.vertcat(ca.SX(0, 1), *lags)
+        if not _depends(expression, theta):
+            return None
+        chosen = ca.vertcat(ca.SX(0, 1), *(self.system.parameters[name].symbol for name in self._names))
+        return ca.Function("lag", [theta], [expression, ca.jacobian(expression, chosen)])
 
     def sensor_delay(self, sensor: Sensor, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array] | None:
         """How long before its recorded time each output was true, shape (k,) [s], and its derivative; None if never."""

@@ -16,6 +16,7 @@ from yid_ocp.problem.corrections import Inputs
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.functions import ModelFunctions
 from yid_ocp.problem.inputs import held_torque, held_torque_slope
+from yid_ocp.problem.lag import Lag
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.noise import Course, Innovations, innovations
 from yid_ocp.problem.options import ProblemOptions
@@ -114,8 +115,12 @@ class Predictor:
     def start_rows(self) -> tuple[int, ...]:
         """Rows of the initial state that are estimated, in the order of `Unknowns.start`."""
         joints, n = self.system.mechanism.joint_index, self.system.size
+        hidden = list(self.system.internal)
         split = (name.split(".", 1) for name in self.unknowns.start)
-        return tuple(joints(joint) + (n if kind == "p" else 0) for kind, joint in split)
+        return tuple(
+            2 * n + hidden.index(name) if kind == "z" else joints(name) + (n if kind == "p" else 0)
+            for kind, name in split
+        )
 
     def fitted(self, episode: Episode, theta: Array) -> Episode:
         """The episode with its start fitted to the first measured points at given parameters, where it is fitted."""
@@ -203,9 +208,7 @@ class Predictor:
     def _corrected(self, episode: Episode, theta: Array, wanted: tuple[str, ...]) -> Inputs:
         """The recording's torques, angles and paths as the effects say they truly were."""
         corrections = self.functions.corrections
-        # what readings are wrong by is taken off them, before an effect says what they mean
-        wrong = 0.0 if episode.errors is None else episode.errors.taken_off
-        torque, arm, path = episode.torque - wrong, episode.measured_arm, episode.path
+        torque, arm, path = episode.torque, episode.measured_arm, episode.path
         nu, nc = torque.shape[1], path.shape[1]
         first = torque[0] if nu else np.zeros(0)
         by_torque = by_first = by_arm = by_path = None
@@ -215,7 +218,7 @@ class Predictor:
             where = (joints, self.system.driven, episode.grid, episode.name)
             delay, by_delay = corrections.torque_delay(theta, wanted)
             if corrections.delays_torque:
-                torque = held_torque(*where, delay) - wrong
+                torque = held_torque(*where, delay)
             readings = np.pad(np.vstack([torque, first]), ((0, 0), (0, nc)))
             _, true, _, by_theta, by_reading = corrections.true(np.zeros_like(readings), readings, theta, wanted)
             by_theta = by_theta[:, :nu].copy()
@@ -223,6 +226,12 @@ class Predictor:
                 slope = by_reading[:-1, :nu] * held_torque_slope(*where, delay)
                 by_theta[:-1] += slope[:, :, None] * by_delay
             torque, first, by_torque, by_first = true[:-1, :nu], true[-1, :nu], by_theta[:-1], by_theta[-1]
+        lag = corrections.torque_lag(theta, wanted)
+        if lag is not None:
+            torque, by_torque = Lag(*lag, self.step.time_step).of_steps(torque, by_torque)
+        if episode.errors is not None:
+            # errors are those of the torque that acts, whatever lies between it and what was recorded
+            torque, first = torque - episode.errors.taken_off, first - episode.errors.taken_off[0]
         if corrections.corrects_angles:
             true, _, by_angle, _, _ = corrections.true(np.hstack([arm, path]), episode.load, theta, wanted)
             arm, path, by_arm, by_path = true[:, :nu], true[:, nu:], by_angle[:, :nu], by_angle[:, nu:]
@@ -260,9 +269,9 @@ class Predictor:
                 by_applied += directions.torque
             if feedback is not None:
                 by_applied -= feedback.gain @ rollout.by_state[:-1, feedback.index]
-        predicted, sensitivities = [], []
+        predicted, sensitivities, read = [], [], self._with_lag(rollout, theta, wanted)
         for samples in episode.samples:
-            values, by_all = self._predict(samples, rollout, by_applied, theta, wanted)
+            values, by_all = self._predict(samples, read, by_applied, theta, wanted)
             predicted.append(values)
             sensitivities.append(by_all)
         correction = by_correction = None
@@ -404,6 +413,14 @@ class Predictor:
         found = self.functions.corrections.sensor_delay(samples.sensor, theta, wanted)
         return None if found is None else (found[0] / self.step.time_step, found[1] / self.step.time_step)
 
+    def _with_lag(self, rollout: Rollout, theta: Array, wanted: tuple[str, ...]) -> Rollout:
+        """The rollout with efforts of prescribed joints as sensors follow them."""
+        lag = self.functions.corrections.effort_lag(theta, wanted)
+        if lag is None:
+            return rollout
+        effort, by_effort = Lag(*lag, self.step.time_step).of_nodes(rollout.effort, rollout.by_effort)
+        return replace(rollout, effort=effort, by_effort=by_effort)
+
     def _predict(
         self, samples: Measurements, rollout: Rollout, by_applied: Array | None, theta: Array, wanted: tuple[str, ...]
     ) -> tuple[Array, Array]:
@@ -457,9 +474,13 @@ class Predictor:
         theta = self.own_theta(episode, theta)
         by_state = np.zeros((episode.grid.steps + 1, self.step.sizes["nx"]))
         by_effort, by_applied = np.zeros_like(rollout.effort), np.zeros_like(rollout.torque)
-        total = np.zeros(len(wanted))
+        total, read = np.zeros(len(wanted)), self._with_lag(rollout, theta, ())
         for samples, pull in zip(episode.samples, pulls, strict=True):
-            total += self._pull(samples, pull, rollout, theta, _Pulls(by_state, by_effort, by_applied))
+            total += self._pull(samples, pull, read, theta, _Pulls(by_state, by_effort, by_applied))
+        lag = self.functions.corrections.effort_lag(theta, wanted)
+        if lag is not None:
+            by_effort, by_lag = Lag(*lag, self.step.time_step).pulled(rollout.effort, by_effort)
+            total += by_lag
         feedback = episode.feedback
         if feedback is not None:
             by_state[:-1, feedback.index] -= np.einsum("kub,ku->kb", feedback.gain, by_applied)

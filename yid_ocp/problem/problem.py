@@ -28,6 +28,7 @@ from yid_ocp.problem.unknowns import (
     check_free,
     replaced,
     soft_logarithm,
+    start_limits,
     start_names,
     stated_std,
 )
@@ -141,12 +142,12 @@ class EstimationProblem:
         self.unknowns = Unknowns(
             tuple(name for name in free if name not in options.local),
             tuple(name for name in free if name in options.local),
-            start_names(functions.step.system) if options.initial_state == "estimated" else (),
+            start_names(functions.step.system, options, free, theta),
             tuple(episode.name for episode in episodes),
         )
         self.predictor = Predictor(functions, options, self.unknowns)
         inertia = partial(apparent_inertia, functions.step, theta)
-        self._prior_std = stated_std(self.unknowns, options, inertia)
+        self._prior_std = stated_std(self.unknowns, options, functions.step.system, inertia)
         bare = options.weighting == "paper" or options.weak_prior_factor <= 1
         weak = np.zeros(len(self.names), bool) if bare else self.positive & ~np.isfinite(self._prior_std)
         self._weak: NDArray[np.int64] = np.flatnonzero(weak)
@@ -198,7 +199,7 @@ class EstimationProblem:
     def bounds(self) -> tuple[Array, Array]:
         """Lower and upper bounds of the unknown vector."""
         shared, local = (self.system.parameters.bounds(part) for part in (self.shared, self.local))
-        wide = np.full(len(self.unknowns.start), np.inf)
+        wide = start_limits(self.system, self.unknowns.start)
         lower, upper = (
             self.unknowns.spread(shared[side], local[side], wide * (-1 if side == 0 else 1)) for side in (0, 1)
         )
@@ -234,10 +235,7 @@ class EstimationProblem:
 
     @property
     def as_recorded(self) -> bool:
-        """Whether no effect on recorded inputs or times is at work: none is free, and all others are neutral.
-
-        What the tracking filter follows counts as such an input.
-        """
+        """Whether no effect on recorded inputs (what a filter follows too) or times is free or other than neutral."""
         wanted = self.unknowns.parameters
         for episode in self.episodes:
             inputs = self.predictor.inputs(episode, self.theta, wanted)
@@ -245,6 +243,7 @@ class EstimationProblem:
             slopes = [x for x in (inputs.by_torque, inputs.by_path, inputs.by_arm, inputs.by_momentum) if x is not None]
             if inputs.momentum is not None:
                 return False
+            slopes += self.functions.corrections.effort_lag(self.theta, wanted) or ()
             for samples in episode.samples:
                 slopes += self.predictor.lateness(samples, self.theta, wanted) or ()
             if any(np.any(x) for x in slopes) or not all(np.array_equal(a, b) for a, b in pairs):
@@ -453,7 +452,7 @@ class EstimationProblem:
         if not len(offset):
             return offset
         short = beginning(episode, max(round(HELD_OUT_START / self.step.time_step), 2))
-        weight, guess = 1.0 / self.start_std, None
+        weight, guess, limit = 1.0 / self.start_std, None, start_limits(self.system, self.unknowns.start)
         for _ in range(HELD_OUT_ITERATIONS):
             result = self.predictor.run(short, theta, offset, True, guess)
             if isinstance(result, str) or result.sensitivities is None:
@@ -466,6 +465,7 @@ class EstimationProblem:
                 rows.append(part.residual)
                 slopes += [] if part.jacobian is None else [part.jacobian]
             offset = offset - np.linalg.lstsq(np.vstack(slopes), np.concatenate(rows), rcond=None)[0]
+            offset = np.clip(offset, -limit, limit)
         return offset
 
     # -- problems like this one ---------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,6 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from yid_ocp.effects import EffectBase
 from yid_ocp.errors import ConfigError, nearest
 from yid_ocp.model.system import System
 from yid_ocp.problem.options import ProblemOptions
@@ -28,7 +30,8 @@ class Unknowns:
     shared, local : tuple of str
         Free parameters with one value for all recordings, and with a value in each.
     start : tuple of str
-        Rows of an estimated initial state, `q.JOINT` and `p.JOINT`.
+        Rows of an estimated initial state, `q.JOINT` and `p.JOINT`, and of internal coordinates that nothing tells,
+        `z.NAME`.
     recordings : tuple of str
     """
 
@@ -79,11 +82,15 @@ def replaced(x: Array, names: Sequence[str], values: Mapping[str, float]) -> Arr
     return np.array([values.get(name, value) for name, value in zip(names, x, strict=True)], float)
 
 
-def stated_std(unknowns: Unknowns, options: ProblemOptions, inertia: Callable[[tuple[str, ...]], Array]) -> Array:
+def stated_std(
+    unknowns: Unknowns, options: ProblemOptions, system: System, inertia: Callable[[tuple[str, ...]], Array]
+) -> Array:
     """Standard deviation of every unknown's stated Gaussian prior about its start, infinite where there is none.
 
-    `inertia` gives the diagonal of the mass matrix for named joints, by which a start's velocity becomes a momentum.
+    `inertia` gives the diagonal of the mass matrix for named joints, by which a start's velocity becomes a momentum. An
+    internal coordinate may begin anywhere within its limits; the standard deviation is that of such a uniform prior.
     """
+    limits = hidden_starts(system)
     stds = []
     for name in unknowns.names:
         base = name.split("[")[0]
@@ -92,17 +99,44 @@ def stated_std(unknowns: Unknowns, options: ProblemOptions, inertia: Callable[[t
         elif base.startswith(f"{START}p."):
             mass = float(inertia((base.removeprefix(f"{START}p."),))[0])
             stds.append(options.velocity_std * max(mass, 1e-9))
+        elif base.startswith(f"{START}z."):
+            stds.append(limits[base.removeprefix(f"{START}z.")] / math.sqrt(3))
         else:
             stds.append(float(options.priors.get(base, np.inf)))
     return np.array(stds)
 
 
-def start_names(system: System) -> tuple[str, ...]:
-    """q and p of the coordinates that are neither driven, nor prescribed, nor follow their load at once."""
-    known = set(system.driven_indices) | set(system.prescribed_indices)
-    known |= {system.mechanism.joint_index(joint) for joint in system.compliant}
-    free = [name for i, name in enumerate(system.mechanism.joint_names) if i not in known]
-    return (*(f"q.{name}" for name in free), *(f"p.{name}" for name in free))
+def start_names(system: System, options: ProblemOptions, free: Sequence[str], theta: Array) -> tuple[str, ...]:
+    """Estimated rows of an initial state.
+
+    Where starts are estimated, q and p of the coordinates that are neither driven, nor prescribed, nor follow their
+    load at once; in any case the internal coordinates that nothing tells, of effects that are free or not neutral.
+    """
+    found: list[str] = []
+    if options.initial_state == "estimated":
+        known = set(system.driven_indices) | set(system.prescribed_indices)
+        known |= {system.mechanism.joint_index(joint) for joint in system.compliant}
+        coordinates = [name for i, name in enumerate(system.mechanism.joint_names) if i not in known]
+        found = [*(f"q.{name}" for name in coordinates), *(f"p.{name}" for name in coordinates)]
+    for effect in system.effects:
+        if isinstance(effect, EffectBase) and effect.unknown_at_start:
+            index = system.parameters.index
+            names = effect.amplitudes
+            if any(name in free or theta[index(name)] != effect.neutral[name] for name in names):
+                found += [f"z.{name}" for name in effect.unknown_at_start]
+    return tuple(found)
+
+
+def hidden_starts(system: System) -> dict[str, float]:
+    """Internal coordinates that nothing tells at the start of a recording, and how large they may be."""
+    effects = [effect for effect in system.effects if isinstance(effect, EffectBase)]
+    return {name: size for effect in effects for name, size in effect.unknown_at_start.items()}
+
+
+def start_limits(system: System, names: Sequence[str]) -> Array:
+    """How far estimated rows of an initial state may be off, infinite for coordinates and momenta."""
+    limits = hidden_starts(system)
+    return np.array([limits[name.removeprefix("z.")] if name.startswith("z.") else np.inf for name in names])
 
 
 def check_free(system: System, free: Sequence[str], options: ProblemOptions) -> None:

@@ -87,7 +87,7 @@ class Transcription:
         self.problem = problem
         self.step = problem.step
         self.interval = interval
-        self.free_start = problem.options.initial_state == "estimated"
+        self.free_start = bool(problem.unknowns.start)
         sizes = problem.step.sizes
         self.nx, self.n, self.nz, self.m = sizes["nx"], sizes["n"], sizes["nz"], sizes["m"]
         self.has_multipliers = interval == 1 and multipliers

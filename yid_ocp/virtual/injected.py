@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.effects import make_effect
 from yid_ocp.effects.base import arms, object_joints
-from yid_ocp.errors import ConfigError, nearest
+from yid_ocp.errors import ConfigError, ModelError, nearest
 from yid_ocp.model.system import System
 from yid_ocp.virtual.experiment import VirtualExperiment, virtual_experiment
 from yid_ocp.virtual.mjcf import Evaluator, mujoco_module
@@ -32,6 +32,8 @@ AIR_DENSITY = 1.2
 """[kg/m^3]"""
 SMOOTHING = 0.02
 """v_s of dry friction [rad/s]."""
+FARTHEST = 1.0
+"""Distance of a payload's mass from its frame [m]."""
 
 # a change of the system's description
 DESCRIBED: tuple[str, ...] = (
@@ -45,7 +47,7 @@ DESCRIBED: tuple[str, ...] = (
     "grasp_offset",
 )
 # a term that MuJoCo's own model has
-MODELLED: tuple[str, ...] = ("kelvin_voigt", "joint_viscous", "rotor_inertia")
+MODELLED: tuple[str, ...] = ("kelvin_voigt", "joint_viscous", "rotor_inertia", "payload")
 # a force that is worked out here
 FORCED: tuple[str, ...] = (
     "cubic_stiffness",
@@ -56,6 +58,8 @@ FORCED: tuple[str, ...] = (
     "joint_spring",
     "joint_coulomb",
     "joint_stribeck",
+    "joint_presliding",
+    "effort_lag",
 )
 # an error of a sensor or clock
 SENSOR_ERRORS: tuple[str, ...] = (
@@ -125,6 +129,8 @@ def injected_experiment(
     ------
     ConfigError
         A kind that cannot be done here.
+    ModelError
+        A payload that is too far off, or takes away what is not there.
     ConfigError, ModelError, DataError
         As `virtual_experiment`.
     """
@@ -161,7 +167,7 @@ class InjectedTerms:
 
     def __init__(self, system: System, values: Mapping[str, float], effects: Sequence[InjectedEffect]) -> None:
         self._system, self._effects = system, tuple(effects)
-        value = Evaluator(system, values)
+        self._value = value = Evaluator(system, values)
         self._scene = Scene(
             system,
             {s.joint: float(value(s.stiffness)[0]) for s in system.elastic},
@@ -185,6 +191,8 @@ class InjectedTerms:
                 model.dof_armature[model.joint(place).id] += size["armature"]
             elif effect.kind in OUTSIDE:
                 self._forces.append(OUTSIDE[effect.kind](self._scene, model, place, size["size"]))
+            elif effect.kind == "payload":
+                self._weigh(model, place, size)
             else:
                 self._forces.append(getattr(self, f"_{effect.kind}")(model, place, size))
 
@@ -299,6 +307,68 @@ class InjectedTerms:
             data.qfrc_passive[at] -= size["tau_s"] * fall * math.tanh(v / SMOOTHING)
 
         return push
+
+    def _joint_presliding(self, model: Any, place: str, size: Mapping[str, float]) -> Force:
+        at = model.joint(place).id
+        state = {"s": 0.0, "t": 0.0}
+
+        def push(_: Any, data: Any) -> None:
+            if not self._scene.running:
+                return
+            v, step = float(data.qvel[at]), float(data.time) - state["t"]
+            if step > 0:
+                way = math.copysign(1.0, v)
+                state["s"] = way + (state["s"] - way) * math.exp(-abs(v) * step / size["yield_angle"])
+                state["t"] = float(data.time)
+            data.qfrc_passive[at] -= size["tau_c"] * state["s"]
+
+        return push
+
+    def _effort_lag(self, model: Any, place: str, size: Mapping[str, float]) -> Force:
+        at, apart = model.joint(place).id, int(mujoco_module().mjtDisableBit.mjDSBL_EQUALITY)
+        state: dict[str, Any] = {"z": None, "command": 0.0, "t": 0.0}
+
+        def push(model: Any, data: Any) -> None:
+            # the controller works with a model of its own, whose grasps are off: there no torque is applied
+            if not self._scene.running or model.opt.disableflags & apart:
+                return
+            command, step = float(data.qfrc_applied[at]), float(data.time) - state["t"]
+            if state["z"] is None:
+                state["z"] = command
+            elif step > 0:
+                # until now the command was the one before
+                held = state["command"]
+                state["z"] = held + (state["z"] - held) * math.exp(-step / size["time_constant"])
+            state["t"], state["command"] = float(data.time), command
+            data.qfrc_passive[at] += state["z"] - command
+
+        return push
+
+    def _weigh(self, model: Any, place: str, size: Mapping[str, float]) -> None:
+        """Put a point of some mass, or take it, at (mx, my, mz)/mass in a frame."""
+        mujoco, value, where = mujoco_module(), self._value, f"payload@{place}"
+        frame, reach = self._system.mechanism.frame(place), np.array([size.get(f"m{a}", 0.0) for a in "xyz"])
+        body = int(model.jnt_bodyid[model.joint(self._system.mechanism.joints[frame.joint].name).id])
+        turn = value(frame.placement.rotation).reshape(3, 3, order="F")
+        mass = size["mass"]
+        if not np.linalg.norm(reach) <= FARTHEST * abs(mass):
+            raise ModelError("its mass sits too far from its frame", where=where, allowed=f"within {FARTHEST:g} m")
+        point = value(frame.placement.translation) + turn @ reach / mass
+        own, centre = float(model.body_mass[body]), np.array(model.body_ipos[body])
+        w, x, y, z = model.body_iquat[body]
+        axes = Rotation.from_quat([x, y, z, w]).as_matrix()
+        apart = point - centre
+        tensor = axes @ np.diag(model.body_inertia[body]) @ axes.T
+        tensor += own * mass / (own + mass) * (apart @ apart * np.eye(3) - np.outer(apart, apart))
+        moments, axes = np.linalg.eigh(tensor)
+        if own + mass <= 0 or moments[0] <= 0:
+            raise ModelError("more is taken away than the link has there", where=where, hint="less mass, or nearer by")
+        axes[:, 2] *= np.linalg.det(axes)
+        x, y, z, w = Rotation.from_matrix(axes).as_quat()
+        model.body_mass[body] = own + mass
+        model.body_ipos[body] = (own * centre + mass * point) / (own + mass)
+        model.body_inertia[body], model.body_iquat[body] = moments, [w, x, y, z]
+        mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
 # -- sensors and clocks -----------------------------------------------------------------------------------------------

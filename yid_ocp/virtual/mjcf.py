@@ -216,9 +216,8 @@ def _own_terms(system: System, effect: Effect) -> ca.SX:
     q, v = ca.SX.sym("q", system.size), ca.SX.sym("v", system.size)
     u, reaction = ca.SX.sym("u", len(system.driven)), ca.SX.sym("reaction", system.constraint_count)
     none = ca.SX(0, 1)
-    terms = effect.terms(
-        MidpointState(system, forward_kinematics(system.mechanism, q), q, v, none, none, u, reaction, {})
-    )
+    kinematics = forward_kinematics(system.mechanism, q)
+    terms = effect.terms(MidpointState(system, kinematics, q, v, none, none, u, reaction, {}, ca.SX.sym("h")))
     forces = (terms.force, terms.viscous, None if terms.closed is None else terms.closed.force)
     return ca.vertcat(terms.lagrangian, *(none if force is None else force for force in forces))
 

@@ -1,0 +1,88 @@
+"""First-order lags beside the differential equation, their derivatives, and the way back."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from yid_ocp.problem.lag import Lag
+
+H, N = 0.01, 40
+RNG = np.random.default_rng(4)
+VALUE = RNG.normal(size=(N, 2))
+SLOPE = RNG.normal(size=(N, 2, 3))
+BY = np.array([[1.0, 0.0, 0.3], [0.0, 1.0, 0.0]])
+
+
+def lag(first: float = 0.02, second: float = 0.004) -> Lag:
+    return Lag(np.array([first, second]), BY, H)
+
+
+def solved(course, time_constant: float, start: float, times: np.ndarray, breaks: np.ndarray) -> np.ndarray:
+    """T dz/dt = x(t) - z by another integrator, from break to break."""
+    found, z = [], start
+    for a, b in itertools.pairwise(breaks):
+        inside = times[(times >= a) & (times < b)]
+        run = solve_ivp(
+            lambda t, y: (course(t) - y) / time_constant, (a, b), [z], dense_output=True, rtol=1e-9, atol=1e-11
+        )
+        found += [float(run.sol(t)[0]) for t in inside]
+        z = float(run.y[0, -1])
+    return np.array(found)
+
+
+def test_steps_have_the_mean_of_the_differential_equation() -> None:
+    mean, _ = lag().of_steps(VALUE, None)
+    breaks = H * np.arange(N + 1)
+    fine = H / 20 * (np.arange(20 * N) + 0.5)
+    for column, time in enumerate((0.02, 0.004)):
+        held = VALUE[:, column]
+        z = solved(lambda t, x=held: x[min(int(t / H + 1e-9), N - 1)], time, held[0], fine, breaks)
+        np.testing.assert_allclose(mean[:, column], z.reshape(N, 20).mean(1), atol=2e-3)
+
+
+def test_nodes_follow_straight_lines_between_them() -> None:
+    followed, _ = lag().of_nodes(VALUE, None)
+    times = H * np.arange(N)
+    for column, time in enumerate((0.02, 0.004)):
+        x = VALUE[:, column]
+        z = solved(lambda t, x=x: np.interp(t, times, x), time, x[1], times[1:-1], times[1:])
+        np.testing.assert_allclose(followed[1:-1, column], z, atol=1e-6)
+        assert followed[0, column] == x[0]
+
+
+def test_without_a_time_constant_all_is_followed_at_once() -> None:
+    at_once = lag(0.0, 0.0)
+    np.testing.assert_array_equal(at_once.of_steps(VALUE, None)[0], VALUE)
+    np.testing.assert_array_equal(at_once.of_nodes(VALUE, None)[0], VALUE)
+    # and there is a slope all the same, that of a delay
+    _, slope = at_once.of_steps(VALUE, None)
+    np.testing.assert_allclose(slope[1:, 0, 0], -np.diff(VALUE[:, 0]) / H)
+    _, slope = at_once.of_nodes(VALUE, np.zeros((N, 2, 3)))
+    np.testing.assert_allclose(slope[2:, 0, 0], -np.diff(VALUE[1:, 0]) / H)
+
+
+@pytest.mark.parametrize("form", ["of_steps", "of_nodes"])
+@pytest.mark.parametrize("size", [0.02, 1e-3])
+def test_derivatives_agree_with_differences(form, size) -> None:
+    """By the time constant directly, and through what is followed."""
+    _, slope = getattr(lag(size), form)(VALUE, SLOPE)
+    for direction in range(3):
+        above, below = (
+            getattr(Lag(np.array([size, 0.004]) + s * BY[:, direction], BY, H), form)(
+                VALUE + s * SLOPE[:, :, direction], None
+            )[0]
+            for s in (1e-7, -1e-7)
+        )
+        np.testing.assert_allclose(slope[:, :, direction], (above - below) / 2e-7, rtol=1e-5, atol=1e-5)
+
+
+def test_a_pull_comes_back_by_the_transpose() -> None:
+    pull = np.random.default_rng(5).normal(size=(N, 2))
+    _, slope = lag().of_nodes(VALUE, SLOPE)
+    back, direct = lag().pulled(VALUE, pull)
+    total = np.einsum("kn,knd->d", back, SLOPE) + direct
+    np.testing.assert_allclose(total, np.einsum("kn,knd->d", pull, slope), rtol=1e-12)

@@ -1,0 +1,142 @@
+"""A small arm moved by MuJoCo with something wrong about it, which the library's equations find back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from yid_ocp.data.recording import Recording
+from yid_ocp.diagnosis.diagnose import nominal_fit
+from yid_ocp.diagnosis.hypotheses import CandidateProblem
+from yid_ocp.diagnosis.refit import refit
+from yid_ocp.diagnosis.screening import screen
+from yid_ocp.effects import make_effect
+from yid_ocp.errors import ModelError
+from yid_ocp.integrator.step import compile_step
+from yid_ocp.model import Mechanism, System
+from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement
+from yid_ocp.model.rotations import transform
+from yid_ocp.problem import EstimationProblem, ProblemOptions
+from yid_ocp.solvers import GaussNewton, solve
+from yid_ocp.virtual.engine import Simulation
+from yid_ocp.virtual.experiment import ArmNoise, VirtualExperiment
+from yid_ocp.virtual.injected import InjectedEffect, InjectedTerms, injected_experiment
+from yid_ocp.virtual.mjcf import compiled_model, mujoco_xml
+
+mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
+
+POSTURE = {"shoulder": 0.4, "elbow": 0.7}
+
+
+def arm(mode: str = "driven") -> System:
+    """Two joints across each other, 0.3 m links of 1 kg, a hand at the end."""
+    along = Placement.of(transform(np.eye(3), [0.0, 0.0, 0.3]))
+    body = Inertia.of(1.0, [0.0, 0.01, 0.15], np.diag([9e-3, 8e-3, 2e-3]))
+    joints = (
+        Joint("shoulder", "revolute", -1, Placement.identity(), (0.0, 1.0, 0.0), (body,)),
+        Joint("elbow", "revolute", 0, along, (1.0, 0.0, 0.0), (body,)),
+    )
+    frames = {"upper": Frame(0, Placement.identity()), "hand": Frame(1, along)}
+    return System.build(Mechanism("arm", joints, frames), damping=0.1, points=(), **{mode: [*POSTURE]})
+
+
+def recorded(effects: list[InjectedEffect], seed: int = 1, duration: float = 1.6) -> Recording:
+    noise = ArmNoise(position=5e-5, velocity=1e-3, effort=0.0)
+    simulation = Simulation(duration, time_step=2.5e-4)
+    experiment = VirtualExperiment(None, POSTURE, simulation, noise, camera=None, seed=seed)
+    return injected_experiment(arm(), {}, effects, experiment)
+
+
+def fitted(kind: str, place: str, recording: Recording, mode: str, **start: float) -> dict[str, tuple[float, float]]:
+    """Value and standard deviation of an effect's quantities, fitted beside the dampings."""
+    system = arm(mode)
+    effect = make_effect(kind, place, system, start)
+    step = compile_step(system.with_effects([effect]), 0.01, use_compiler=False)
+    free = (*effect.parameters.names, "shoulder.damping", "elbow.damping")
+    problem = EstimationProblem(step, [recording], free, ProblemOptions(path_cutoff=20.0))
+    found = solve(problem, GaussNewton(iterations=25))
+    values = dict(zip(found.names, found.x, strict=True))
+    stds = {name: found.std[name] for name in effect.parameters.names}
+    return {name: (entry.value, entry.std) for name, entry in effect.reported(values, stds).items()}
+
+
+def agrees(found: tuple[float, float], true: float, rel: float = 0.0) -> bool:
+    """Within three standard deviations, or a small part of the value that steps of different lengths make."""
+    return abs(found[0] - true) <= max(3 * found[1], rel * abs(true))
+
+
+@pytest.mark.parametrize("mode", [pytest.param("driven", marks=pytest.mark.slow), "prescribed"])
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"mass": 0.4, "mx": 0.02, "my": -0.03, "mz": 0.02},
+        {"mass": -0.3, "mx": 0.0, "my": -0.003, "mz": 0.03},
+    ],
+    ids=["added", "taken away"],
+)
+def test_a_payload_is_found_with_its_place(values, mode) -> None:
+    found = fitted("payload", "hand", recorded([InjectedEffect("payload", "hand", values)]), mode)
+    for name, true in values.items():
+        assert agrees(found[name], true, 2e-3), name
+        assert found[name][1] < 0.01, name
+
+
+def test_a_payload_that_cannot_be_is_refused() -> None:
+    system = arm()
+    for values, text in (({"mass": 0.01, "mx": 0.05}, "too far"), ({"mass": -0.9, "mz": 0.0}, "more is taken away")):
+        model = compiled_model(mujoco_xml(system, {}))
+        with pytest.raises(ModelError, match=text):
+            InjectedTerms(system, {}, [InjectedEffect("payload", "hand", values)]).prepare(model)
+
+
+def test_friction_that_holds_is_found() -> None:
+    values = {"tau_c": 0.5, "yield_angle": 0.01}
+    found = fitted(
+        "joint_presliding", "elbow", recorded([InjectedEffect("joint_presliding", "elbow", values)]), "prescribed"
+    )
+    assert agrees(found["tau_c"], 0.5, 5e-3)
+    assert agrees(found["yield_angle"], 0.01, 0.02)
+
+
+def test_torque_that_follows_its_command_late_is_found() -> None:
+    """The other engine lets the torque creep at every inner step, the library in closed form from sample to sample."""
+    recording = recorded([InjectedEffect("effort_lag", "elbow", {"time_constant": 0.02})])
+    assert agrees(fitted("effort_lag", "elbow", recording, "driven")["time_constant"], 0.02, 3e-3)
+
+
+def test_a_sensor_that_follows_the_effort_late_is_found() -> None:
+    """Of a prescribed joint the measured effort is late; here it is filtered sample by sample."""
+    recording = recorded([])
+    true, decay = recording.joints.effort[:, 1], np.exp(-0.01 / 0.03)
+    effort = recording.joints.effort.copy()
+    for k in range(len(true) - 1):
+        # the torque is held from sample to sample
+        effort[k + 1, 1] = true[k] + (effort[k, 1] - true[k]) * decay
+    late = replace(recording, joints=replace(recording.joints, effort=effort, effort_kind="sample"))
+    found, there = (fitted("effort_lag", "elbow", r, "prescribed")["time_constant"] for r in (late, recording))
+    assert agrees(found, 0.03, 0.1)
+    assert found[0] > 3 * found[1]
+    assert there[0] < 3 * there[1] + 0.003
+
+
+@pytest.mark.slow
+def test_a_flipped_sign_is_found_where_torques_drive() -> None:
+    recording = recorded([InjectedEffect("effort_gain", "elbow", {"scale": -1.0})])
+    assert agrees(fitted("effort_gain", "elbow", recording, "driven")["scale"], -1.0, 1e-3)
+
+
+def test_a_flipped_sign_is_found_where_efforts_are_compared() -> None:
+    """Downhill from 1 lies a gain without end; the refit of a diagnosis begins at -1 as well."""
+    system = arm("prescribed")
+    flipped = [InjectedEffect("effort_gain", "elbow", {"scale": -1.0})]
+    runs = [recorded(flipped, seed, 1.0) for seed in (1, 2)]
+    step = compile_step(system, 0.01, use_compiler=False)
+    nominal = EstimationProblem(step, runs[:1], ("shoulder.damping", "elbow.damping"), ProblemOptions(path_cutoff=20.0))
+    composed = CandidateProblem.of(nominal, [make_effect("effort_gain", "elbow", system)], runs[1:])
+    start = nominal_fit(nominal, composed)
+    [score] = screen(composed, (), start.values).scores
+    found = refit(composed, composed.effects, {**start.values, **score.step})
+    assert found.reported(composed.effects[0])["scale"].value == pytest.approx(-1.0, abs=0.01)
+    assert found.loss.mean < 0.01 * start.loss.mean

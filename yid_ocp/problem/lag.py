@@ -1,0 +1,139 @@
+"""A value that follows another one with a time constant, T dz/dt = x - z, solved exactly from node to node."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.signal
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Lag:
+    """First-order lags of some channels.
+
+    With E = exp(-h/T) and f = T/h (1 - E), both zero at T = 0, where a value is followed at once.
+
+    Attributes
+    ----------
+    time_constant : ndarray, shape (k,)
+        T [s]
+    by_parameters : ndarray, shape (k, d)
+    time_step : float
+        h [s]
+    """
+
+    time_constant: Array
+    by_parameters: Array
+    time_step: float
+
+    def of_steps(self, value: Array, slope: Array | None) -> tuple[Array, Array]:
+        """Means over each step of what follows values held over steps; at first both are the same.
+
+        Parameters
+        ----------
+        value : ndarray, shape (N, k)
+        slope : ndarray, shape (N, k, d), or None
+
+        Returns
+        -------
+        mean : ndarray, shape (N, k)
+            x + (z - x) f, with z_{k+1} = x + (z - x) E.
+        by_parameters : ndarray, shape (N, k, d)
+        """
+        decay, share, decay_slope, share_slope = self._factors()
+        held = self._following(value, np.zeros(value.shape), decay)
+        gap = held - value
+        by_value = np.zeros((*value.shape, self.by_parameters.shape[1])) if slope is None else slope
+        by_time = self._following(np.zeros(value.shape), decay_slope * gap, decay)
+        mean_by_time = (gap * share_slope + share * by_time)[:, :, None] * self.by_parameters
+        followed = self._following(by_value, np.zeros(by_value.shape), decay[:, None])
+        through = by_value + share[:, None] * (followed - by_value)
+        return value + share * gap, through + mean_by_time
+
+    def of_nodes(self, value: Array, slope: Array | None) -> tuple[Array, Array | None]:
+        """What follows values at nodes, straight between them, from node 1 on, before which a motion only sets in.
+
+        Parameters
+        ----------
+        value : ndarray, shape (N, k)
+        slope : ndarray, shape (N, k, d), or None
+            By all directions, the first ones of which are the parameters of `by_parameters`.
+
+        Returns
+        -------
+        followed : ndarray, shape (N, k)
+            z_{k+1} = E z_k + (f - E) x_k + (1 - f) x_{k+1}
+        slope : ndarray, shape (N, k, d), or None
+        """
+        decay, share, _, _ = self._factors()
+        followed = self._straight(value, decay, share)
+        if slope is None:
+            return followed, None
+        total = self._straight(slope, decay[:, None], share[:, None])
+        width = self.by_parameters.shape[1]
+        total[:, :, :width] += self._by_time(value, followed)[:, :, None] * self.by_parameters
+        return followed, total
+
+    def pulled(self, value: Array, pull: Array) -> tuple[Array, Array]:
+        """The pull at what follows, as `of_nodes` has it, passed on to what is followed and to the parameters.
+
+        Parameters
+        ----------
+        value, pull : ndarray, shape (N, k)
+
+        Returns
+        -------
+        pull : ndarray, shape (N, k)
+        by_parameters : ndarray, shape (d,)
+        """
+        decay, share, _, _ = self._factors()
+        direct = np.sum(pull * self._by_time(value, self._straight(value, decay, share)), axis=0) @ self.by_parameters
+        back = pull.copy()
+        for k in range(len(back) - 2, 0, -1):
+            back[k] += decay * back[k + 1]
+        passed = back.copy()
+        passed[2:] *= 1 - share
+        passed[1:-1] += (share - decay) * back[2:]
+        return passed, direct
+
+    def _factors(self) -> tuple[Array, Array, Array, Array]:
+        """E, f and their derivatives by T."""
+        ratio = np.maximum(self.time_constant, 0.0) / self.time_step
+        inverse = 1.0 / np.maximum(ratio, 1e-3)  # beyond it exp(-1/ratio) is zero
+        decay = np.where(ratio > 1e-3, np.exp(-inverse), 0.0)
+        decay_slope = decay * inverse**2 / self.time_step
+        return decay, ratio * (1 - decay), decay_slope, (1 - decay - decay * inverse) / self.time_step
+
+    def _by_time(self, value: Array, followed: Array) -> Array:
+        """Derivative of `of_nodes` by each channel's time constant, shape (N, k)."""
+        decay, _, decay_slope, share_slope = self._factors()
+        driven = np.zeros_like(value)
+        driven[2:] = decay_slope * (followed[1:-1] - value[1:-1]) - share_slope * (value[2:] - value[1:-1])
+        return _filtered(driven, decay)
+
+    @staticmethod
+    def _following(value: Array, extra: Array, decay: Array) -> Array:
+        """z_k with z_{k+1} = x_k + (z_k - x_k) E + extra_k, z_0 = x_0."""
+        driven = np.empty_like(value)
+        driven[0] = value[0]
+        driven[1:] = (1 - decay) * value[:-1] + extra[:-1]
+        return _filtered(driven, decay)
+
+    @staticmethod
+    def _straight(value: Array, decay: Array, share: Array) -> Array:
+        driven = value.copy()
+        driven[2:] = (share - decay) * value[1:-1] + (1 - share) * value[2:]
+        driven[1:] = _filtered(driven[1:], decay)
+        return driven
+
+
+def _filtered(driven: Array, decay: Array) -> Array:
+    """z_k = E z_{k-1} + driven_k along the first axis, with each channel's E."""
+    result = np.empty_like(driven)
+    for i, factor in enumerate(np.ravel(decay)):
+        result[:, i] = scipy.signal.lfilter([1.0], [1.0, -factor], driven[:, i], axis=0)
+    return result
