@@ -11,6 +11,7 @@ import numpy as np
 import threadpoolctl
 
 from yid_ocp.data.recording import Recording
+from yid_ocp.diagnosis.events import NOTHING, Events, find_events, without_events
 from yid_ocp.diagnosis.finding import Finding, absorption
 from yid_ocp.diagnosis.hypotheses import CandidateProblem, Choice, chosen_effects
 from yid_ocp.diagnosis.localise import Place, attributed, localise, merged
@@ -28,6 +29,9 @@ from yid_ocp.solvers import GaussNewton, Solution, solve
 from yid_ocp.solvers.base import RESTARTS
 
 log = logging.getLogger(__name__)
+
+ROUNDS = 3
+"""Fits of the nominal model without the events found about the one before."""
 
 
 def diagnose(
@@ -84,23 +88,29 @@ def _diagnosed(problem: EstimationProblem, search: Search, solution: Solution | 
     progress("fitting the nominal model")
     nominal = nominal_fit(problem, search.problem, solution, search.store, limits)
     clock.lap("nominal")
+    progress("looking for events")
+    whole = _undivided(search.problem, problem)
+    search, nominal, events, smoothed = _without_events(search, nominal, whole)
+    clock.lap("events")
     search, before, held, screened = _tested(search, nominal)
     clock.lap("screening")
     enough = before.degrees >= limits.samples_per_unknown * len(nominal.values)
     offsets = _offsets_stated(nominal.problem)
-    smoothed, trusted, gap = None, None, has_gap(before, held, limits, screened.scores, offsets)
+    trusted, gap = None, has_gap(before, held, limits, screened.scores, offsets)
     other = elsewhere(search, nominal) if gap and enough and before.chi2_per_dof < limits.poor else None
     if other is not None:
-        nominal = other
+        nominal, smoothed = other, None
         search, before, held, screened = _tested(search, nominal)
         gap = has_gap(before, held, limits, screened.scores, offsets)
     clock.lap("other_starts")
     if gap and enough:
         progress("locating the gap")
-        smoothed = smooth_fit(nominal, limits)
+        smoothed = smoothed or smooth_fit(nominal, limits)
         # it knows noise of torques by its spectrum only: too little for a verdict to rest on what it explains
         trusted = None if nominal.problem.disturbed else smoothed
         gap = not shapeless(trusted, screened.scores, before, held, limits)
+    else:
+        smoothed = None
     clock.lap("localisation")
     fits: tuple[Fit, ...] = ()
     added: tuple[Added, ...] = ()
@@ -112,6 +122,9 @@ def _diagnosed(problem: EstimationProblem, search: Search, solution: Solution | 
     verdict = decide(gap, screened.visible, added, total, limits, enough, explained)
     accepted = added if verdict in ("effect", "confusable") else ()
     remaining, where, rest_where = _after(nominal, accepted, smoothed, before, held, limits)
+    if accepted:
+        # what a better model explains was no event
+        events, _ = _happened(whole, accepted[-1].fit, limits)
     clock.lap("remaining")
     finding = Finding(
         verdict=verdict,
@@ -136,8 +149,51 @@ def _diagnosed(problem: EstimationProblem, search: Search, solution: Solution | 
         message=shortage(verdict, before, len(nominal.values), screened.visible, limits),
         limits=limits,
         seconds=clock.laps,
+        events=events,
     )
     return replace(finding, summary=sentences(finding))
+
+
+def _undivided(composed: CandidateProblem, problem: EstimationProblem) -> EstimationProblem:
+    """The composed problem with all samples, although a diagnosis divides a single recording in blocks."""
+    pairs = zip(composed.problem.episodes, problem.episodes, strict=True)
+    episodes = [replace(episode, samples=own.samples) for episode, own in pairs]
+    return composed.problem.on(episodes, () if composed.blocks else composed.problem.held_out)
+
+
+def _happened(whole: EstimationProblem, fit: Fit, limits: Thresholds) -> tuple[Events, Smoothed | None]:
+    """Events about a fit in all that was recorded, and what the smoother says of it where it was asked."""
+    own, x = fit.problem.on(whole.episodes, whole.held_out), fit.problem.vector(fit.values)
+    smoothed = None
+    if own.system.free_indices and any(window.flagged for window in fitted_test(fit, limits).windows):
+        smoothed = smooth_fit(fit, limits)
+    evaluation = own.evaluate(x, smoothed is not None, fit.evaluation.warm)
+    return find_events(own, x, evaluation, smoothed, limits) if evaluation.ok else NOTHING, smoothed
+
+
+def _without_events(
+    search: Search, nominal: Fit, whole: EstimationProblem
+) -> tuple[Search, Fit, Events, Smoothed | None]:
+    """All that follows without what events explain, the nominal model fitted to that, and the events about it.
+
+    Pushes pull a fit towards them: about a fit without those that were found, others may show.
+    """
+    composed, limits = search.problem, search.limits
+    events, smoothed = _happened(whole, nominal, limits)
+    for round_ in range(ROUNDS):
+        if not events:
+            return search, nominal, NOTHING, smoothed
+        cleaned = replace(composed, problem=without_events(composed.problem, events))
+        search.progress(f"fitting the nominal model without {len(events.found)} events")
+        name = f"the nominal model without events, round {round_ + 1}"
+        again = _settled(cleaned, nominal.values, search.store, name, limits)
+        if again is None:
+            break
+        search, nominal, before = replace(search, problem=cleaned), again, events
+        events, _ = _happened(whole, nominal, limits)
+        if events.like(before):
+            break
+    return search, nominal, events, None
 
 
 def _tested(search: Search, nominal: Fit) -> tuple[Search, NullTest, NullTest, Screened]:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from yid_ocp.diagnosis.events import NOTHING, Events
 from yid_ocp.diagnosis.localise import Place
 from yid_ocp.diagnosis.refit import Fit
 from yid_ocp.diagnosis.screening import Confusability, Score, Visibility
@@ -78,6 +79,8 @@ class Finding:
     seconds : dict of stage to float
     summary : str
         The report in words; see `words.sentences`.
+    events : Events
+        Taken out of the recordings before the rest was judged, as far as that can be done.
     """
 
     verdict: str
@@ -103,6 +106,7 @@ class Finding:
     limits: Thresholds
     seconds: Mapping[str, float]
     summary: str = ""
+    events: Events = NOTHING
 
     @property
     def effects(self) -> tuple[EffectBase, ...]:
@@ -135,6 +139,8 @@ class Finding:
                 for entry in self.added
                 if self.effects and len(entry.rivals) > 1
             ],
+            "events": [event.to_dict() for event in self.events.found],
+            "not_judged": [{"recording": f.recording, "joint": f.joint, "from": f.time} for f in self.events.falls],
             "next_experiment": self.next_experiment,
             "side": None if self.smoothed is None else self.smoothed.side,
             "evidence": {} if self.smoothed is None else dict(self.smoothed.evidence),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from yid_ocp.diagnosis.events import event_sentences
 from yid_ocp.diagnosis.finding import Finding
 from yid_ocp.diagnosis.localise import Place
 from yid_ocp.diagnosis.refit import Fit
@@ -99,6 +100,7 @@ def sentences(finding: Finding) -> str:
         text.append(f"No known effect explains it{said}.")
     if finding.in_blocks:
         text.append("Only one set of recordings was given: alternate blocks of it were held out.")
+    text.append(event_sentences(finding.events))
     text.append(f"Next experiment: {finding.next_experiment}")
     return " ".join(part for part in text if part)
 
