@@ -90,27 +90,25 @@ def _diagnosed(problem: EstimationProblem, search: Search, solution: Solution | 
     clock.lap("nominal")
     progress("looking for events")
     whole = _undivided(search.problem, problem)
-    search, nominal, events, smoothed = _without_events(search, nominal, whole)
+    search, nominal, events = _without_events(search, nominal, whole)
     clock.lap("events")
     search, before, held, screened = _tested(search, nominal)
     clock.lap("screening")
     enough = before.degrees >= limits.samples_per_unknown * len(nominal.values)
     offsets = _offsets_stated(nominal.problem)
-    trusted, gap = None, has_gap(before, held, limits, screened.scores, offsets)
+    smoothed, trusted, gap = None, None, has_gap(before, held, limits, screened.scores, offsets)
     other = elsewhere(search, nominal) if gap and enough and before.chi2_per_dof < limits.poor else None
     if other is not None:
-        nominal, smoothed = other, None
+        nominal = other
         search, before, held, screened = _tested(search, nominal)
         gap = has_gap(before, held, limits, screened.scores, offsets)
     clock.lap("other_starts")
     if gap and enough:
         progress("locating the gap")
-        smoothed = smoothed or smooth_fit(nominal, limits)
+        smoothed = smooth_fit(nominal, limits)
         # it knows noise of torques by its spectrum only: too little for a verdict to rest on what it explains
         trusted = None if nominal.problem.disturbed else smoothed
         gap = not shapeless(trusted, screened.scores, before, held, limits)
-    else:
-        smoothed = None
     clock.lap("localisation")
     fits: tuple[Fit, ...] = ()
     added: tuple[Added, ...] = ()
@@ -124,7 +122,7 @@ def _diagnosed(problem: EstimationProblem, search: Search, solution: Solution | 
     remaining, where, rest_where = _after(nominal, accepted, smoothed, before, held, limits)
     if accepted:
         # what a better model explains was no event
-        events, _ = _happened(whole, accepted[-1].fit, limits)
+        events = _happened(whole, accepted[-1].fit, limits)
     clock.lap("remaining")
     finding = Finding(
         verdict=verdict,
@@ -161,28 +159,34 @@ def _undivided(composed: CandidateProblem, problem: EstimationProblem) -> Estima
     return composed.problem.on(episodes, () if composed.blocks else composed.problem.held_out)
 
 
-def _happened(whole: EstimationProblem, fit: Fit, limits: Thresholds) -> tuple[Events, Smoothed | None]:
-    """Events about a fit in all that was recorded, and what the smoother says of it where it was asked."""
+def _happened(whole: EstimationProblem, fit: Fit, limits: Thresholds) -> Events:
+    """Events about a fit in all that was recorded; NOTHING where that cannot be predicted."""
     own, x = fit.problem.on(whole.episodes, whole.held_out), fit.problem.vector(fit.values)
     smoothed = None
-    if own.system.free_indices and any(window.flagged for window in fitted_test(fit, limits).windows):
-        smoothed = smooth_fit(fit, limits)
+    if own.system.free_indices:
+        judged = own.weighted_at(x, fit.evaluation.warm) if own.disturbed else own
+        residual = judged.evaluate(x, False, fit.evaluation.warm)
+        if not residual.ok:
+            return NOTHING
+        test = null_test(residual_series(judged), residual.residual, len(fit.values), limits.level, limits.window)
+        if any(window.flagged for window in test.windows):
+            smoothed = smooth_fit(
+                replace(fit, problem=own, evaluation=own.evaluate(x, warm=fit.evaluation.warm)), limits
+            )
     evaluation = own.evaluate(x, smoothed is not None, fit.evaluation.warm)
-    return find_events(own, x, evaluation, smoothed, limits) if evaluation.ok else NOTHING, smoothed
+    return find_events(own, x, evaluation, smoothed, limits) if evaluation.ok else NOTHING
 
 
-def _without_events(
-    search: Search, nominal: Fit, whole: EstimationProblem
-) -> tuple[Search, Fit, Events, Smoothed | None]:
+def _without_events(search: Search, nominal: Fit, whole: EstimationProblem) -> tuple[Search, Fit, Events]:
     """All that follows without what events explain, the nominal model fitted to that, and the events about it.
 
     Pushes pull a fit towards them: about a fit without those that were found, others may show.
     """
     composed, limits = search.problem, search.limits
-    events, smoothed = _happened(whole, nominal, limits)
+    events = _happened(whole, nominal, limits)
     for round_ in range(ROUNDS):
         if not events:
-            return search, nominal, NOTHING, smoothed
+            return search, nominal, events
         cleaned = replace(composed, problem=without_events(composed.problem, events))
         search.progress(f"fitting the nominal model without {len(events.found)} events")
         name = f"the nominal model without events, round {round_ + 1}"
@@ -190,10 +194,10 @@ def _without_events(
         if again is None:
             break
         search, nominal, before = replace(search, problem=cleaned), again, events
-        events, _ = _happened(whole, nominal, limits)
+        events = _happened(whole, nominal, limits)
         if events.like(before):
             break
-    return search, nominal, events, None
+    return search, nominal, events
 
 
 def _tested(search: Search, nominal: Fit) -> tuple[Search, NullTest, NullTest, Screened]:
