@@ -21,7 +21,7 @@ import threadpoolctl
 from numpy.typing import NDArray
 
 from yid_ocp.data.channels import quantum
-from yid_ocp.diagnosis.pulses import History, Pulse, discoveries, pulses
+from yid_ocp.diagnosis.pulses import RARE, History, Pulse, discoveries, pulses
 from yid_ocp.diagnosis.smoother import Smoothed, history_of_force
 from yid_ocp.diagnosis.smoother_model import Linear, linear_model, seen_by
 from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
@@ -43,8 +43,6 @@ Run = tuple[Episode, EpisodeResult, Array]
 
 INTERVAL = 0.05
 """Time over which an unknown force is constant where events are sought [s]."""
-RARE = 1 / 3
-"""Part of the time from which a force that is surely there is none of events."""
 LONGEST_RUN = 3
 """Wrong samples in a row; more of them are a gap or a stuck channel."""
 NEIGHBOURS = 20
@@ -117,11 +115,32 @@ class Fall:
 
 
 @dataclass(frozen=True)
+class Force:
+    """An unknown force over time where there was an event, for people to look at.
+
+    Attributes
+    ----------
+    recording, channel, unit : str
+    t, value, allowed : ndarray, shape (M,)
+        Since the start of the recording [s]; the force beside what the model and the recording have, each point for
+        itself, and what the model may be wrong by, in `unit`.
+    """
+
+    recording: str
+    channel: str
+    unit: str
+    t: Array
+    value: Array
+    allowed: Array
+
+
+@dataclass(frozen=True)
 class Events:
-    """All events of a diagnosis, by recording and time, and where nothing could be judged."""
+    """All events of a diagnosis, by recording and time, the forces there, and where nothing could be judged."""
 
     found: tuple[Event, ...] = ()
     falls: tuple[Fall, ...] = ()
+    forces: tuple[Force, ...] = ()
 
     def __bool__(self) -> bool:
         return bool(self.found or self.falls)
@@ -177,7 +196,13 @@ def find_events(
         if not isinstance(outcome, str):
             runs.append((episode, outcome, problem.predictor.own_theta(episode, shared)))
     falls = tuple(fall for run in runs for fall in _falls(problem, run, limits))
-    wrong = [event for run in runs for event in _wrong_samples(problem, run)]
+    until = {fall.recording: fall.time for fall in falls}
+    wrong = [
+        event
+        for run in runs
+        for event in _wrong_samples(problem, run)
+        if event.end < until.get(event.recording, math.inf)
+    ]
     histories = [history for run in runs for history in _read_forces(problem, run, limits)]
     if smoothed is not None:
         histories += _driving_forces(problem, x, evaluation, runs, smoothed, limits)
@@ -193,7 +218,13 @@ def find_events(
     times = {(e.recording, 0.5 * (e.begin + e.end)) for e in wrong}
     forces = [f for f in forces if not any(f.recording == name and f.begin <= t <= f.end for name, t in times)]
     everything = sorted([*forces, *wrong], key=lambda event: (event.recording, event.begin, event.location))
-    return Events(tuple(everything), falls)
+    there = {(event.recording, event.channel) for event in forces}
+    shown = [
+        Force(h.recording, h.unknown, h.unit, h.t, h.values, np.hypot(h.error, h.held))
+        for h in cut
+        if (h.recording, h.unknown) in there
+    ]
+    return Events(tuple(everything), falls, tuple(shown))
 
 
 # -- forces -----------------------------------------------------------------------------------------------------------

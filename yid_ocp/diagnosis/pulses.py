@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 QUICK, SLOW = 0.3, 2.0
 """Times in which the error of a model and the rest forget their values, a and b [s]."""
 ERRORS, FLOORS, RESTS = (1.0, 2.0, 4.0), (0.0, 0.5, 1.0), (0.25, 1.0)
-"""c, and w and s in units of the robust spread of the history."""
+"""c, w in units of the robust spread of the history, s in units of its root mean square."""
 FEWEST = 2.5
 """Points that the shortest pulse covers."""
 GROWTH = 1.25
@@ -42,6 +42,12 @@ FLAT = 0.5
 """Part of a flat pulse in which it rises and falls."""
 MOST = 12
 """Pulses and what is like them in one history."""
+RARE = 1 / 3
+"""Part of the time from which forces in short windows are none of events: the model errs everywhere."""
+MARGIN = 0.5
+"""Lengths of a pulse for which the history must go on before and after it."""
+PROMINENT = 2.0
+"""Times the median size of a pulse of the same length anywhere in the history that one must have."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +87,12 @@ class History:
     def spacing(self) -> float:
         """From point to point [s]."""
         return float(np.median(np.diff(self.t)))
+
+    @property
+    def values(self) -> Array:
+        """The force that the data ask for by themselves, shape (M,)."""
+        least = 1e-6 * max(float(np.mean(np.diag(self.information))), 1e-300)
+        return np.asarray(np.linalg.solve(self.information + least * np.eye(len(self.t)), self.score))
 
 
 @dataclass(frozen=True)
@@ -204,6 +216,11 @@ class _Rest:
         told, sure = self._sizes(profiles)
         return np.where(sure > 0, 0.5 * told**2 / np.where(sure > 0, sure, 1.0), 0.0)
 
+    def sizes(self, profiles: Array) -> Array:
+        """Best size of each profile, shape (k,), zero where the data say nothing."""
+        told, sure = self._sizes(profiles)
+        return np.where(sure > 0, told / np.where(sure > 0, sure, 1.0), 0.0)
+
     def _sizes(self, profiles: Array) -> tuple[Array, Array]:
         sure = np.sum(profiles * (self.precision @ profiles), axis=0)
         seen = np.sum(profiles**2, axis=0) * max(float(np.trace(self.precision)) / len(self.scored), 1e-300)
@@ -239,7 +256,8 @@ def pulses(history: History, limits: Thresholds = DEFAULTS) -> tuple[list[Pulse]
         beside = [rest.beside(taken) for rest in rests]
         gains = [free * rest.gains(profiles) for rest in beside]
         totals = [rest.evidence + float(gain.max()) for rest, gain in zip(beside, gains, strict=True)]
-        rest, gain = beside[int(np.argmax(totals))], gains[int(np.argmax(totals))]
+        likeliest = int(np.argmax(totals))
+        rest, gain = beside[likeliest], gains[likeliest]
         rise = max(totals) - max(rest.evidence for rest in beside)
         if rise < limits.worth:
             break
@@ -247,10 +265,15 @@ def pulses(history: History, limits: Thresholds = DEFAULTS) -> tuple[list[Pulse]
         own = seen(window, history.t)
         rise += float(rest.gains(own)[0] - gain.max())
         other = _other(history, rest, window, seen)
+        if other is None and not _stands_out(history, rests[likeliest], rest, window, seen, limits):
+            other = own
         taken = np.column_stack([taken, own if other is None else other])
         if other is None:
             found.append((window, rise))
         free &= (windows.end <= window.begin[0]) | (windows.begin >= window.end[0])
+    covered = sum(float(window.end[0] - window.begin[0]) for window, _ in found)
+    if covered > RARE * float(history.t[-1] - history.t[0]):
+        return [], tries
     return _sized(history, rests, found, taken, seen), tries
 
 
@@ -282,7 +305,7 @@ def _windows(history: History, limits: Thresholds) -> tuple[_Windows, float]:
     lengths = [FEWEST * spacing]
     while lengths[-1] * GROWTH <= limits.pulse:
         lengths.append(lengths[-1] * GROWTH)
-    begins = [np.arange(first, last - length + 1e-9, spacing) for length in lengths]
+    begins = [np.arange(first + MARGIN * length, last - (1 + MARGIN) * length + 1e-9, spacing) for length in lengths]
     begin = np.concatenate(begins)
     end = begin + np.repeat(lengths, [len(b) for b in begins])
     flat = np.repeat([False, True], len(begin))
@@ -291,12 +314,11 @@ def _windows(history: History, limits: Thresholds) -> tuple[_Windows, float]:
 
 
 def _rests(history: History) -> list[_Rest]:
-    diagonal = np.diag(history.information)
-    known = history.information + 1e-6 * max(float(diagonal.mean()), 1e-300) * np.eye(len(diagonal))
-    values = np.linalg.solve(known, history.score)
+    values = history.values
     spread = max(1.4826 * float(np.median(np.abs(values - np.median(values)))), 1e-9 + float(np.median(history.error)))
+    slowest = max(float(np.sqrt(np.mean(values**2))), spread)
     grid = product(ERRORS, FLOORS, RESTS)
-    return [_Rest.of(history, error, floor * spread, slow * spread) for error, floor, slow in grid]
+    return [_Rest.of(history, error, floor * spread, slow * slowest) for error, floor, slow in grid]
 
 
 def _refined(
@@ -312,7 +334,8 @@ def _refined(
         while True:
             ends = np.array([begin, end]) + moves
             length = ends[:, 1] - ends[:, 0]
-            ends = ends[(length >= shortest) & (length <= limits.pulse) & (ends[:, 0] >= first) & (ends[:, 1] <= last)]
+            inside = (ends[:, 0] >= first + MARGIN * length) & (ends[:, 1] <= last - MARGIN * length)
+            ends = ends[inside & (length >= shortest) & (length <= limits.pulse)]
             both = np.tile(ends, (2, 1))
             tried = _Windows(both[:, 0], both[:, 1], np.repeat([False, True], len(ends)))
             gains = rest.gains(seen(tried, history.t)) if len(ends) else np.zeros(1)
@@ -344,6 +367,22 @@ def _other(history: History, rest: _Rest, window: _Windows, seen: _Filter) -> Ar
     gains = rest.gains(profiles)
     best = int(gains.argmax())
     return profiles[:, best] if gains[best] >= gain else None
+
+
+def _stands_out(
+    history: History, bare: _Rest, rest: _Rest, window: _Windows, seen: _Filter, limits: Thresholds
+) -> bool:
+    """Whether a pulse is shorter than the longest, and larger than what the history holds everywhere.
+
+    `bare` is the rest with nothing taken in, `rest` that beside what was.
+    """
+    length = float(window.end[0] - window.begin[0])
+    if length > 0.98 * limits.pulse:
+        return False
+    begin = np.arange(float(history.t[0]), float(history.t[-1]) - length, history.spacing)
+    everywhere = _Windows(begin, begin + length, np.repeat(window.flat, len(begin)))
+    usual = float(np.median(np.abs(bare.sizes(seen(everywhere, history.t)))))
+    return abs(float(rest.sizes(seen(window, history.t))[0])) > PROMINENT * usual
 
 
 def _sized(
