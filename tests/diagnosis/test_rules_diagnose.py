@@ -27,6 +27,7 @@ from factories import (
 )
 from made_series import series
 
+from yid_ocp.diagnosis.events import NOTHING, Event, Events
 from yid_ocp.diagnosis.hypotheses import CandidateProblem
 from yid_ocp.diagnosis.refit import Search
 from yid_ocp.diagnosis.screening import Screened
@@ -237,6 +238,7 @@ class Steps:
             "disturbed": False,
             "elsewhere": None,
             "carried": (),
+            "events": [NOTHING],
         } | given
         self.taken, self.said = [], []
         self.nominal = fit(lost=loss(2.0, 2.1), cost=100.0, values=VALUES)
@@ -252,6 +254,13 @@ class Steps:
         monkeypatch.setattr(module, "screen", self.step("screen", self.given["screened"]))
         monkeypatch.setattr(module, "elsewhere", self.step("elsewhere", self.given["elsewhere"]))
         monkeypatch.setattr(module, "smooth_fit", self.step("smooth", self.given["smoothed"]))
+        happened = list(self.given["events"])
+        monkeypatch.setattr(module, "_undivided", lambda composed, problem: "whole")
+        monkeypatch.setattr(
+            module, "_happened", lambda whole, of, limits: happened.pop(0) if len(happened) > 1 else happened[0]
+        )
+        monkeypatch.setattr(module, "without_events", lambda problem, events: f"{problem} without {len(events.found)}")
+        monkeypatch.setattr(module, "_settled", self.step("settled", self.nominal))
         refits = tuple(entry.fit for entry in self.given["added"])
         monkeypatch.setattr(module, "compose", self.step("compose", (refits, self.given["added"])))
         monkeypatch.setattr(module, "carried_over", lambda search, of: self.given["carried"])
@@ -314,17 +323,11 @@ def test_a_gap_is_screened_located_and_closed(monkeypatch):
     assert found.held_out == ("other",)
     assert found.absorbed[0].before == 1.0
     assert found.summary.startswith("The gap is real")
-    assert list(found.seconds) == [
-        "nominal",
-        "screening",
-        "other_starts",
-        "localisation",
-        "refits",
-        "carry_over",
-        "remaining",
-    ]
+    stages = ["nominal", "events", "screening", "other_starts", "localisation", "refits", "carry_over", "remaining"]
+    assert list(found.seconds) == stages
     assert all(0 <= value < 5 for value in found.seconds.values())
-    assert steps.said[:3] == ["fitting the nominal model", "screening 2 candidates", "locating the gap"]
+    said = ["fitting the nominal model", "looking for events", "screening 2 candidates", "locating the gap"]
+    assert steps.said[:4] == said
 
 
 NOISE = {"before": outcome(p=0.4, degrees=100.0), "held": outcome(p=0.5)}
@@ -446,3 +449,35 @@ def test_an_effect_that_is_accepted_is_where_the_gap_was(monkeypatch):
     assert (found.absorbed[0].after, found.absorbed[0].std) == (2.0, 0.5)
     assert found.in_blocks
     assert found.next_experiment.startswith("Repeat")
+
+
+def happening(begin, channel="elbow"):
+    return Event("run", channel, channel, "force", begin, begin + 0.4, 0.5, 0.1, 0.01, "N m")
+
+
+def test_what_events_explain_is_taken_out_before_the_rest_is_judged(monkeypatch):
+    events = Events((happening(1.0),))
+    steps = Steps(monkeypatch, events=[events, events])
+    found = steps.run()
+    name, (composed, start, store, label, _) = steps.taken[1]
+    assert (name, composed.problem, start, store) == ("settled", "problem without 1", VALUES, "store")
+    assert label == "the nominal model without events, round 1"
+    assert steps.names.count("settled") == 1
+    assert found.events is events
+    assert "elbow is pushed by up to +0.5 N m from 1.00 to 1.40 s in run (+0.1 ± 0.01 N m s)" in found.summary
+
+
+def test_events_are_sought_again_about_the_fit_without_them_until_they_stay(monkeypatch):
+    first, more = Events((happening(1.0),)), Events((happening(1.0), happening(3.0, "shoulder")))
+    steps = Steps(monkeypatch, events=[first, more, more])
+    assert steps.run().events is more
+    cleaned = [given[0].problem for name, given in steps.taken if name == "settled"]
+    assert cleaned == ["problem without 1", "problem without 2"]
+
+
+def test_what_the_accepted_effects_explain_was_no_event(monkeypatch):
+    events = Events((happening(1.0),))
+    steps = Steps(monkeypatch, events=[events, events, NOTHING])
+    found = steps.run()
+    assert found.verdict == "effect"
+    assert found.events is NOTHING

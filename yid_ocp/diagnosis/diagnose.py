@@ -12,6 +12,7 @@ import threadpoolctl
 
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.carry_over import carried_over
+from yid_ocp.diagnosis.events import NOTHING, Events, find_events, without_events
 from yid_ocp.diagnosis.finding import Finding, absorption
 from yid_ocp.diagnosis.hypotheses import MARGINS, CandidateProblem, Choice, Cut, chosen_effects
 from yid_ocp.diagnosis.localise import Place, attributed, localise, main_places, merged
@@ -29,6 +30,9 @@ from yid_ocp.solvers import GaussNewton, Solution, solve
 from yid_ocp.solvers.base import RESTARTS
 
 log = logging.getLogger(__name__)
+
+ROUNDS = 3
+"""Fits of the nominal model without the events found about the one before."""
 
 
 def diagnose(
@@ -86,6 +90,10 @@ def _diagnosed(problem: EstimationProblem, search: Search, solution: Solution | 
     nominal = nominal_fit(problem, search.problem, solution, search.store, limits)
     search, nominal, cuts = _followed(search, nominal)
     clock.lap("nominal")
+    progress("looking for events")
+    whole = _undivided(search.problem, problem)
+    search, nominal, events = _without_events(search, nominal, whole)
+    clock.lap("events")
     search, before, held, screened = _tested(search, nominal)
     clock.lap("screening")
     enough = before.degrees >= limits.samples_per_unknown * len(nominal.values)
@@ -118,6 +126,9 @@ def _diagnosed(problem: EstimationProblem, search: Search, solution: Solution | 
     verdict = decide(gap, screened.visible, added, total, limits, enough, explained, same)
     accepted = added if verdict in ("effect", "confusable") else ()
     remaining, where, rest_where = _after(nominal, accepted, smoothed, before, held, limits)
+    if accepted:
+        # what a better model explains was no event
+        events = _happened(whole, accepted[-1].fit, limits)
     clock.lap("remaining")
     finding = Finding(
         verdict=verdict,
@@ -146,8 +157,57 @@ def _diagnosed(problem: EstimationProblem, search: Search, solution: Solution | 
         explained=explained,
         carried=carried,
         seconds=clock.laps,
+        events=events,
     )
     return replace(finding, summary=sentences(finding))
+
+
+def _undivided(composed: CandidateProblem, problem: EstimationProblem) -> EstimationProblem:
+    """The composed problem with all samples, although a diagnosis divides a single recording in blocks."""
+    pairs = zip(composed.problem.episodes, problem.episodes, strict=True)
+    episodes = [replace(episode, samples=own.samples) for episode, own in pairs]
+    return composed.problem.on(episodes, () if composed.blocks else composed.problem.held_out)
+
+
+def _happened(whole: EstimationProblem, fit: Fit, limits: Thresholds) -> Events:
+    """Events about a fit in all that was recorded; NOTHING where that cannot be predicted."""
+    own, x = fit.problem.on(whole.episodes, whole.held_out), fit.problem.vector(fit.values)
+    smoothed = None
+    if own.system.free_indices:
+        judged = own.weighted_at(x, fit.evaluation.warm) if own.disturbed else own
+        residual = judged.evaluate(x, False, fit.evaluation.warm)
+        if not residual.ok:
+            return NOTHING
+        test = null_test(residual_series(judged), residual.residual, len(fit.values), limits.level, limits.window)
+        if any(window.flagged for window in test.windows):
+            smoothed = smooth_fit(
+                replace(fit, problem=own, evaluation=own.evaluate(x, warm=fit.evaluation.warm)), limits
+            )
+    evaluation = own.evaluate(x, smoothed is not None, fit.evaluation.warm)
+    return find_events(own, x, evaluation, smoothed, limits) if evaluation.ok else NOTHING
+
+
+def _without_events(search: Search, nominal: Fit, whole: EstimationProblem) -> tuple[Search, Fit, Events]:
+    """All that follows without what events explain, the nominal model fitted to that, and the events about it.
+
+    Pushes pull a fit towards them: about a fit without those that were found, others may show.
+    """
+    composed, limits = search.problem, search.limits
+    events = _happened(whole, nominal, limits)
+    for round_ in range(ROUNDS):
+        if not events:
+            return search, nominal, events
+        cleaned = replace(composed, problem=without_events(composed.problem, events))
+        search.progress(f"fitting the nominal model without {len(events.found)} events")
+        name = f"the nominal model without events, round {round_ + 1}"
+        again = _settled(cleaned, nominal.values, search.store, name, limits)
+        if again is None:
+            break
+        search, nominal, before = replace(search, problem=cleaned), again, events
+        events = _happened(whole, nominal, limits)
+        if events.like(before):
+            break
+    return search, nominal, events
 
 
 def _tested(search: Search, nominal: Fit) -> tuple[Search, NullTest, NullTest, Screened]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from yid_ocp.diagnosis.carry_over import Carried
+from yid_ocp.diagnosis.events import NOTHING, Events
 from yid_ocp.diagnosis.hypotheses import Cut
 from yid_ocp.diagnosis.localise import Place
 from yid_ocp.diagnosis.refit import Fit
@@ -89,6 +90,8 @@ class Finding:
         What the effects explain over what unknown forces, offsets and biases explain.
     carried : tuple of Carried
         The effects' amplitudes on the held-out recordings.
+    events : Events
+        Taken out of the recordings before the rest was judged, as far as that can be done.
     """
 
     verdict: str
@@ -118,6 +121,7 @@ class Finding:
     reason: Reason = ""
     explained: float = 1.0
     carried: tuple[Carried, ...] = ()
+    events: Events = NOTHING
 
     @property
     def effects(self) -> tuple[EffectBase, ...]:
@@ -169,6 +173,8 @@ class Finding:
                 for entry in self.added
                 if self.effects and len(entry.rivals) > 1
             ],
+            "events": [event.to_dict() for event in self.events.found],
+            "not_judged": [{"recording": f.recording, "joint": f.joint, "from": f.time} for f in self.events.falls],
             "next_experiment": self.next_experiment,
             "side": None if self.smoothed is None else self.smoothed.side,
             "evidence": {} if self.smoothed is None else dict(self.smoothed.evidence),

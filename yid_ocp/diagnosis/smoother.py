@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import scipy.linalg
@@ -394,6 +394,43 @@ def smooth(problem: EstimationProblem, x: Array, evaluation: Evaluation, limits:
             limits.worth,
             _instead(models, variance, state.evidence, weight, limits),
         )
+
+
+def history_of_force(model: Linear, variance: Mapping[Source, float], unknown: int) -> tuple[Array, Array]:
+    """What one recording says of the values f of one unknown over its intervals: log p = g'f - f'L f / 2 + constant.
+
+    Parameters
+    ----------
+    model : Linear
+    variance : mapping of Source to float
+        Of all groups of unknowns beside it, squared reference.
+    unknown : int
+        Place among the model's unknowns.
+
+    Returns
+    -------
+    score : ndarray, shape (J,)
+        g, f in units of the unknown's reference.
+    information : ndarray, shape (J, J)
+        L; free parameters, states and all other unknowns are integrated out.
+    """
+    count, parameters = len(model.intervals), model.intervals[0].observed.shape[1] - 1
+    moved = np.zeros((len(model.loose), count))
+    intervals = []
+    for j, interval in enumerate(model.intervals):
+        seen = interval.by_state @ moved
+        seen[:, j] += interval.by_unknown[:, unknown]
+        moved = interval.transition @ moved
+        moved[:, j] += interval.drive[:, unknown]
+        rest = np.pad(interval.rest, (0, count))
+        intervals.append(replace(interval, observed=np.hstack([interval.observed, seen]), rest=rest))
+    own = np.array([variance[source] for source in model.sources]) + model.known
+    products = _filter(replace(model, intervals=tuple(intervals)), own, False).products
+    split = 1 + parameters
+    free = products[1:split, 1:split] + np.eye(parameters) / 9.0
+    cross = products[split:, 1:split]
+    weighed = np.linalg.solve(free, np.column_stack([products[1:split, 0], cross.T]))
+    return products[split:, 0] - cross @ weighed[:, 0], products[split:, split:] - cross @ weighed[:, 1:]
 
 
 # -- what it says -----------------------------------------------------------------------------------------------------

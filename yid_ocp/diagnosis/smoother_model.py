@@ -133,7 +133,11 @@ class Linear:
 
 
 def linear_model(
-    problem: EstimationProblem, x: Array, evaluation: Evaluation, limits: Thresholds = DEFAULTS
+    problem: EstimationProblem,
+    x: Array,
+    evaluation: Evaluation,
+    limits: Thresholds = DEFAULTS,
+    interval: float = INTERVAL,
 ) -> tuple[Linear, ...]:
     """Linearise a problem about its rollouts at the unknowns `x`, with unknown forces, offsets and biases.
 
@@ -145,6 +149,8 @@ def linear_model(
         At `x`, with its Jacobian.
     limits : Thresholds
         For the reference size of unknowns.
+    interval : float
+        Shortest time over which unknowns are constant [s].
     """
     assert evaluation.jacobian is not None
     columns = -np.column_stack([evaluation.residual, evaluation.jacobian * problem.scales])
@@ -153,7 +159,7 @@ def linear_model(
         theta = problem.predictor.own_theta(episode, problem.split(x, i)[0])
         groups = problem.rows.measurements[i]
         observed = columns[groups[0].start : groups[-1].stop]
-        found.append(_recording(_Course(problem, episode, theta, result), observed, limits))
+        found.append(_recording(_Course(problem, episode, theta, result), observed, limits, interval))
     prior = columns[problem.rows.stated_priors]
     # stated priors of the free parameters are observations that no unknown reaches
     first, *later = found[0].intervals
@@ -266,7 +272,7 @@ def _unknowns(course: _Course, limits: Thresholds) -> _Unknowns:
             frame = sensor.frames[column // sensor.width] if sensor.frames else ""
             biased.append((k, column))
             names.append(f"{channel}{axis}")
-            sources.append(Source(_seen_by(course.system, sensor, frame), "bias"))
+            sources.append(Source(seen_by(course.system, sensor, frame), "bias"))
             reference.append(limits.bias * float(np.nanmedian(samples.std[:, column])))
     held = np.array(grasped, int)
     return _Unknowns(tuple(names), tuple(sources), np.array(reference), forced, held, tuple(pushed), tuple(biased))
@@ -324,7 +330,7 @@ def _unknown_forces(course: _Course, part: float) -> tuple[list[str], list[Sourc
     return names, sources, [size[place[name]] for name in names], forced
 
 
-def _seen_by(system: System, sensor: Sensor, frame: str) -> str:
+def seen_by(system: System, sensor: Sensor, frame: str) -> str:
     """What could be wrong where a point is misread: the camera, the arm that holds it, else the sensor's group."""
     if sensor.camera is not None:
         return "camera"
@@ -396,10 +402,10 @@ def _steps(
 # -- from steps to intervals ------------------------------------------------------------------------------------------
 
 
-def _recording(course: _Course, observed: Array, limits: Thresholds) -> Linear:
+def _recording(course: _Course, observed: Array, limits: Thresholds, shortest: float) -> Linear:
     """The linear model of one recording from its whitened residuals and their slopes."""
     h, steps = course.problem.step.time_step, course.episode.grid.steps
-    length = int(max(round(INTERVAL / h), math.ceil(steps / INTERVALS), 1))
+    length = int(max(round(shortest / h), math.ceil(steps * INTERVAL / (INTERVALS * shortest)), 1))
     edges = np.unique(np.append(np.arange(0, steps, length), steps))
     unknowns = _unknowns(course, limits)
     loads, pushes = _loads_of(course, unknowns), _forces_of_pushes(course, unknowns)

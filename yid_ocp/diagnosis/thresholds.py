@@ -82,6 +82,13 @@ class Thresholds:
         Part of what a place raises the log evidence by that another must reach to be named beside it.
     mapped : float
         1 - posterior/prior variance from which an unknown's value is informed by the data.
+    term_error : float
+        Part of every term of the inverse dynamics (inertia, Coriolis forces, gravity, springs, friction, the torque
+        itself) that a good model may be wrong by at any moment without making an event.
+    pulse : float
+        Length of the longest event [s]; what lasts longer is the model's.
+    fall : float
+        Speed of a joint beyond which the model is not held to anything for the rest of a recording [rad/s or m/s].
     """
 
     # is there a gap
@@ -124,6 +131,13 @@ class Thresholds:
         0.9
     )
     mapped: Annotated[float, Ge(0), Lt(1), About("1 - posterior/prior variance of an informed value")] = 0.5
+
+    # events
+    term_error: Annotated[float, Ge(0), Lt(1), About("part of every torque by which a good model may be wrong")] = 0.03
+    pulse: Annotated[float, Gt(0), About("length of the longest event", "s")] = 1.0
+    fall: Annotated[float, Gt(0), About("speed of a joint from which nothing is judged any more", "rad/s or m/s")] = (
+        20.0
+    )
 
     @property
     def gap(self) -> GapLimits:

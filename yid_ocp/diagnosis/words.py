@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 from yid_ocp.diagnosis.carry_over import disagreeing
+from yid_ocp.diagnosis.events import event_sentences
 from yid_ocp.diagnosis.finding import Finding
 from yid_ocp.diagnosis.hypotheses import Cut
 from yid_ocp.diagnosis.localise import Place, main_places
@@ -123,6 +124,7 @@ def sentences(finding: Finding) -> str:
     if finding.in_blocks:
         why = "No held-out recording is left" if finding.cuts else "Only one set of recordings was given"
         text.append(f"{why}: alternate blocks of what is estimated on were held out.")
+    text.append(event_sentences(finding.events))
     text.append(f"Next experiment: {finding.next_experiment}")
     return " ".join(part for part in text if part)
 

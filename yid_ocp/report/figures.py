@@ -63,6 +63,8 @@ class Curve:
     lines : mapping of name to (t (K,), value (K,))
     band : float or None
         Half the height of what is shaded about zero.
+    spans : sequence of (float, float)
+        Stretches of time that are marked.
     """
 
     title: str
@@ -70,6 +72,7 @@ class Curve:
     measured: Array
     lines: Mapping[str, tuple[Array, Array]]
     band: float | None = None
+    spans: Sequence[tuple[float, float]] = ()
 
 
 def measured_and_predicted(
@@ -119,6 +122,10 @@ def over_time(curves: Sequence[Curve], dots: str, lines: Mapping[str, str]) -> p
         if curve.band is not None:
             shade = {"fillcolor": PALE, "opacity": 0.7, "line_width": 0, "layer": "below"}
             figure.add_hrect(y0=-curve.band, y1=curve.band, row=row, col=1, **shade)
+        for begin, end in curve.spans:
+            figure.add_vrect(
+                x0=begin, x1=end, row=row, col=1, fillcolor=AFTER, opacity=0.2, line_width=0, layer="below"
+            )
         figure.update_yaxes(title_text=curve.title, row=row, col=1)
     figure = _styled(figure, 90 + 150 * len(curves), "", "")
     figure.update_xaxes(title_text="time [s]", row=len(curves), col=1)

@@ -78,6 +78,9 @@ def write_diagnosis_trajectories(path: Path, finding: Finding, predicted: Sequen
     forces, offsets and biases about the nominal model and `prior` (nd,), the standard deviation at the largest
     evidence, zero where a group was not taken in; the attributes `unknowns`, `locations`, `kinds`, `units` (nd,) each.
 
+    `events/RECORDING/CHANNEL/` where a force acted as an event: `t` (M,) [s], `value` (M,) the force beside what model
+    and recording have, `allowed` (M,) what the model may be wrong by; the attribute `unit`.
+
     Raises
     ------
     OutputError
@@ -102,6 +105,10 @@ def write_diagnosis_trajectories(path: Path, finding: Finding, predicted: Sequen
                 "prior": np.sqrt(variance) * trace.reference,
             }
             _store(group, arrays)
+        for force in finding.events.forces:
+            group = file.create_group(f"events/{force.recording}/{force.channel}")
+            group.attrs["unit"] = force.unit
+            _store(group, {"t": force.t, "value": force.value, "allowed": force.allowed})
 
 
 @contextlib.contextmanager

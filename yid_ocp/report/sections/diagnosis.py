@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.diagnosis import Finding
+from yid_ocp.diagnosis.events import event_sentences
 from yid_ocp.diagnosis.localise import informed_map, units
 from yid_ocp.diagnosis.smoother import Smoothed
 from yid_ocp.problem.episodes import Episode
@@ -58,6 +59,7 @@ def prepare(findings: Findings) -> Mapping[str, Any] | None:
     if finding is not None:
         chapters = {
             "gap": _gap(finding),
+            "events": _events(finding),
             "where": _where(finding),
             "which": _which(finding, result),
             "alike": _alike(finding, result),
@@ -229,6 +231,39 @@ def _surest(smoothed: Smoothed, shown: Sequence[str], ratio: Array | None) -> st
         f"Grey is where the data do not say; the surest value is that of {trace.unknowns[k]} between "
         f"{trace.edges[j]:.2f} and {trace.edges[j + 1]:.2f} s, {value:.3g} ± {std:.2g} {shown[k]}."
     )
+
+
+# -- events -----------------------------------------------------------------------------------------------------------
+
+
+def _events(finding: Finding) -> Chapter | None:
+    events = finding.events
+    if not events:
+        return None
+    sentences = [
+        "The force beside what the model and the recording have, point by point. Between the grey lines is what a good "
+        "model may be wrong by; windows of events are shaded, and the line is their shape. They are taken out of what "
+        "is judged below, as far as that can be done."
+        if events.forces
+        else "",
+        event_sentences(events),
+    ]
+    pictures = []
+    for name in dict.fromkeys(force.recording for force in events.forces):
+        curves = []
+        for force in (f for f in events.forces if f.recording == name):
+            own = [e for e in events.of(name) if e.channel == force.channel and e.pulse is not None]
+            shape = sum((e.pulse.values(force.t) for e in own if e.pulse is not None), np.zeros(len(force.t)))
+            lines = {
+                "event": (force.t, shape),
+                "allowed": (force.t, force.allowed),
+                "allowed, other side": (force.t, -force.allowed),
+            }
+            spans = [(event.begin, event.end) for event in own]
+            curves.append(Curve(f"{force.channel} [{force.unit}]", force.t, force.value, lines, spans=spans))
+        colors = {"event": figures.AFTER, "allowed": figures.MEASURED, "allowed, other side": figures.MEASURED}
+        pictures.append((f"Recording {name}", figures.html(figures.over_time(curves, figures.BEFORE, colors))))
+    return Chapter("What happened beside it", [text for text in sentences if text], pictures)
 
 
 # -- which ------------------------------------------------------------------------------------------------------------

@@ -1,0 +1,561 @@
+"""Events: pushes, snags and wrong samples, each in its place and window.
+
+A gap that lives in short windows is no effect of the model. Along prescribed joints whose efforts are compared the
+unknown force is measured minus needed torque, sample by sample; elsewhere it is what the smoother's linear model says
+of the force at one coordinate, everything else as the smoother has it. In both cases `pulses` looks for what rises and
+falls beside a rest that follows the load. What a sensor says for one to three samples alone is an event of that sensor.
+
+What events explain is taken out before anything else is judged: torques act beside the recorded ones, and samples that
+a prescribed joint or a sensor has in an event's window do not count.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import threadpoolctl
+from numpy.typing import NDArray
+
+from yid_ocp.data.channels import quantum
+from yid_ocp.diagnosis.pulses import RARE, History, Pulse, discoveries, pulses
+from yid_ocp.diagnosis.smoother import Smoothed, history_of_force
+from yid_ocp.diagnosis.smoother_model import Linear, linear_model, seen_by
+from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
+from yid_ocp.diagnosis.torque_terms import torque_terms
+from yid_ocp.effects.base import robot_joints
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.evaluation import Evaluation
+from yid_ocp.problem.low_pass import LowPass
+from yid_ocp.problem.measurements import Measurements
+from yid_ocp.problem.null_test import sample_times
+from yid_ocp.problem.options import SensorOptions
+from yid_ocp.problem.prediction import EpisodeResult
+from yid_ocp.sensors.joints import by_joint
+
+Array = NDArray[np.float64]
+Run = tuple[Episode, EpisodeResult, Array]
+"""A recording, its prediction and the parameters theta of that."""
+
+INTERVAL = 0.05
+"""Time over which an unknown force is constant where events are sought [s]."""
+LONGEST_RUN = 3
+"""Wrong samples in a row; more of them are a gap or a stuck channel."""
+NEIGHBOURS = 20
+"""Samples on either side with which one is compared."""
+ALONE = 3.0
+"""Times the largest deviation among its neighbours by which a wrong sample stands out."""
+SURE = 8.0
+"""Standard deviations of noise, and robust ones of its neighbours, by which it does."""
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happened in one place for a short time.
+
+    Attributes
+    ----------
+    recording, location : str
+    channel : str
+        Coordinate on which a force acted, or channel that was wrong.
+    kind : "force" or "sample"
+    begin, end : float
+        Since the start of the recording [s].
+    peak : float
+        Largest value with its sign, in `unit`: a force beside what the model and the recording have, or measured less
+        true.
+    impulse : float
+        Integral over time [unit x s].
+    std : float
+        Standard deviation of the impulse, counting what the model is allowed to be wrong by.
+    unit : str
+    pulse : Pulse or None
+        Shape of a force.
+    """
+
+    recording: str
+    location: str
+    channel: str
+    kind: str
+    begin: float
+    end: float
+    peak: float
+    impulse: float
+    std: float
+    unit: str
+    pulse: Pulse | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """As in result.json."""
+        return {
+            "recording": self.recording,
+            "location": self.location,
+            "channel": self.channel,
+            "kind": self.kind,
+            "from": self.begin,
+            "to": self.end,
+            "impulse": self.impulse,
+            "peak": self.peak,
+            "unit": self.unit,
+            "std": self.std,
+        }
+
+
+@dataclass(frozen=True)
+class Fall:
+    """From when on nothing is judged in a recording: a joint moves faster than the model can follow."""
+
+    recording: str
+    joint: str
+    time: float
+
+
+@dataclass(frozen=True)
+class Force:
+    """An unknown force over time where there was an event, for people to look at.
+
+    Attributes
+    ----------
+    recording, channel, unit : str
+    t, value, allowed : ndarray, shape (M,)
+        Since the start of the recording [s]; the force beside what the model and the recording have, each point for
+        itself, and what the model may be wrong by, in `unit`.
+    """
+
+    recording: str
+    channel: str
+    unit: str
+    t: Array
+    value: Array
+    allowed: Array
+
+
+@dataclass(frozen=True)
+class Events:
+    """All events of a diagnosis, by recording and time, the forces there, and where nothing could be judged."""
+
+    found: tuple[Event, ...] = ()
+    falls: tuple[Fall, ...] = ()
+    forces: tuple[Force, ...] = ()
+
+    def __bool__(self) -> bool:
+        return bool(self.found or self.falls)
+
+    def like(self, other: Events) -> bool:
+        """Whether the same happened in the same places at overlapping times."""
+        pairs = zip(self.found, other.found, strict=False)
+        return len(self.found) == len(other.found) and all(
+            (a.recording, a.channel) == (b.recording, b.channel) and a.begin < b.end and b.begin < a.end
+            for a, b in pairs
+        )
+
+    def of(self, recording: str) -> tuple[Event, ...]:
+        """Those of one recording."""
+        return tuple(event for event in self.found if event.recording == recording)
+
+
+NOTHING = Events()
+
+
+def find_events(
+    problem: EstimationProblem,
+    x: Array,
+    evaluation: Evaluation,
+    smoothed: Smoothed | None,
+    limits: Thresholds = DEFAULTS,
+) -> Events:
+    """Events in all recordings of a problem, estimated on or held out.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+        Whitened by the sensors' noise, with all samples.
+    x : ndarray, shape (nx,)
+        Its fit.
+    evaluation : Evaluation
+        At `x`, with its Jacobian.
+    smoothed : Smoothed or None
+        What the smoother found about that fit; forces that move the model are sought where it found some, in the
+        recordings that were estimated on.
+    limits : Thresholds
+
+    Returns
+    -------
+    Events
+        Those that are more than chance among all windows of all recordings, by the false-discovery rate `level`.
+    """
+    runs: list[Run] = []
+    for i, (episode, result) in enumerate(zip(problem.episodes, evaluation.episodes, strict=True)):
+        runs.append((episode, result, problem.predictor.own_theta(episode, problem.split(x, i)[0])))
+    shared = problem.split(x, 0)[0]
+    for episode, outcome in problem.validate(x):
+        if not isinstance(outcome, str):
+            runs.append((episode, outcome, problem.predictor.own_theta(episode, shared)))
+    falls = tuple(fall for run in runs for fall in _falls(problem, run, limits))
+    until = {fall.recording: fall.time for fall in falls}
+    wrong = [
+        event
+        for run in runs
+        for event in _wrong_samples(problem, run)
+        if event.end < until.get(event.recording, math.inf)
+    ]
+    histories = [history for run in runs for history in _read_forces(problem, run, limits)]
+    if smoothed is not None:
+        histories += _driving_forces(problem, x, evaluation, runs, smoothed, limits)
+    cut = [entry for entry in (_before_fall(history, falls, limits) for history in histories) if entry is not None]
+    found: list[tuple[History, Pulse]] = []
+    tries = 0.0
+    for history in cut:
+        own, looked = pulses(history, limits)
+        tries += looked
+        found += [(history, pulse) for pulse in own]
+    real = discoveries([pulse.p_value for _, pulse in found], tries, limits.level)
+    forces = _one_each([entry for entry, sure in zip(found, real, strict=True) if sure], problem)
+    times = {(e.recording, 0.5 * (e.begin + e.end)) for e in wrong}
+    forces = [f for f in forces if not any(f.recording == name and f.begin <= t <= f.end for name, t in times)]
+    everything = sorted([*forces, *wrong], key=lambda event: (event.recording, event.begin, event.location))
+    there = {(event.recording, event.channel) for event in forces}
+    shown = [
+        Force(h.recording, h.unknown, h.unit, h.t, h.values, np.hypot(h.error, h.held))
+        for h in cut
+        if (h.recording, h.unknown) in there
+    ]
+    return Events(tuple(everything), falls, tuple(shown))
+
+
+# -- forces -----------------------------------------------------------------------------------------------------------
+
+
+def _falls(problem: EstimationProblem, run: Run, limits: Thresholds) -> Iterator[Fall]:
+    """When a joint of the robot first moves faster than `fall`."""
+    episode, result, _ = run
+    names = problem.system.mechanism.joint_names
+    h = episode.grid.time_step
+    places = [names.index(name) for name in robot_joints(problem.system)]
+    if not places:
+        return
+    speed = np.abs(np.gradient(result.rollout.state[:, places], h, axis=0))
+    fast = np.flatnonzero(np.any(speed > limits.fall, axis=1))
+    if len(fast):
+        yield Fall(episode.name, names[places[int(speed[fast[0]].argmax())]], float(fast[0] * h))
+
+
+def _before_fall(history: History, falls: Sequence[Fall], limits: Thresholds) -> History | None:
+    """A history up to where its recording's motion gets too fast, less what a filter smears; None where too short."""
+    until = min((fall.time for fall in falls if fall.recording == history.recording), default=math.inf)
+    smear = LowPass(history.cutoff).settling if math.isfinite(history.cutoff) else 0.0
+    keep = np.flatnonzero(history.t <= until - (smear if math.isfinite(until) else 0.0))
+    if len(keep) < 10:
+        return None
+    return replace(
+        history,
+        t=history.t[keep],
+        score=history.score[keep],
+        information=history.information[np.ix_(keep, keep)],
+        error=history.error[keep],
+        held=history.held[keep],
+    )
+
+
+def _allowed(problem: EstimationProblem, run: Run, nodes: NDArray[np.int64], limits: Thresholds) -> tuple[Array, Array]:
+    """What the model of every coordinate's torque may be wrong by, and what friction may hold, shape (M, n)."""
+    episode, result, theta = run
+    terms = torque_terms(problem.system, theta, result.rollout, episode.grid.time_step, nodes)
+    joints = episode.recording.joints
+    # a torque is known at no better time than that of a sample
+    late = 0.0 if joints is None else float(np.median(np.diff(joints.t)))
+    return np.hypot(limits.term_error * terms.size, late * terms.rate), terms.held
+
+
+def _read_forces(problem: EstimationProblem, run: Run, limits: Thresholds) -> Iterator[History]:
+    """Histories of prescribed joints whose efforts are compared: needed less measured torque."""
+    episode, result, _ = run
+    tree = problem.system.mechanism
+    for samples, predicted in zip(episode.samples, result.predicted, strict=True):
+        if not samples.sensor.efforts or samples.node.ndim > 1 or len(samples.node) < 10:
+            continue
+        error, held = _allowed(problem, run, samples.node, limits)
+        weight = np.where(samples.seen, samples.weight, 0.0)
+        value = np.where(samples.seen, predicted - samples.value, 0.0)
+        for column, joint in enumerate(samples.sensor.efforts):
+            at, square = tree.joint_index(joint), weight[:, column] ** 2
+            unit = "N" if tree.joints[at].kind == "prismatic" else "N m"
+            yield History(
+                episode.name,
+                joint,
+                joint,
+                unit,
+                sample_times(episode, samples),
+                square * value[:, column],
+                np.diag(square),
+                error[:, at],
+                held[:, at],
+                problem.options.path_cutoff,
+            )
+
+
+def _driving_forces(
+    problem: EstimationProblem,
+    x: Array,
+    evaluation: Evaluation,
+    runs: Sequence[Run],
+    smoothed: Smoothed,
+    limits: Thresholds,
+) -> list[History]:
+    """Histories of coordinates that move under unknown forces, where the smoother found some for part of the time."""
+    sought = {trace.recording: _short(smoothed, i, limits) for i, trace in enumerate(smoothed.traces)}
+    if not any(sought.values()):
+        return []
+    found = []
+    with threadpoolctl.threadpool_limits(1):
+        for model, run in zip(linear_model(problem, x, evaluation, limits, INTERVAL), runs, strict=False):
+            for unknown in sought[model.recording]:
+                found.append(_driving_force(problem, model, run, model.unknowns.index(unknown), smoothed, limits))
+    return found
+
+
+def _short(smoothed: Smoothed, recording: int, limits: Thresholds) -> list[str]:
+    """Unknown forces that are surely there, but for a small part of the time only."""
+    trace, names = smoothed.traces[recording], []
+    for i, source in enumerate(trace.sources):
+        if source.kind != "force" or source.read or not smoothed.variance[source]:
+            continue
+        sure = np.abs(trace.mean[:, i]) > limits.sure * np.maximum(trace.std[:, i], 1e-12)
+        if np.any(sure) and np.mean(sure) <= RARE:
+            names.append(trace.unknowns[i])
+    return names
+
+
+def _driving_force(
+    problem: EstimationProblem, model: Linear, run: Run, unknown: int, smoothed: Smoothed, limits: Thresholds
+) -> History:
+    source, tree = model.sources[unknown], problem.system.mechanism
+    at = tree.joint_index(model.unknowns[unknown])
+    score, information = history_of_force(model, smoothed.variance | {source: 0.0}, unknown)
+    middle = (model.edges[:-1] + model.edges[1:]) / 2
+    error, held = _allowed(problem, run, np.rint(middle / run[0].grid.time_step).astype(np.int64), limits)
+    unit = "N" if tree.joints[at].kind == "prismatic" else "N m"
+    size = model.reference[unknown]
+    # the last interval is shorter than the others
+    full = slice(0, len(middle) - 1) if len(middle) > 1 else slice(None)
+    return History(
+        model.recording,
+        source.location,
+        model.unknowns[unknown],
+        unit,
+        middle[full],
+        score[full] / size,
+        information[full, full] / size**2,
+        error[full, at],
+        held[full, at],
+    )
+
+
+def _one_each(found: Sequence[tuple[History, Pulse]], problem: EstimationProblem) -> list[Event]:
+    """Events of forces; where one push moves the model, it is named at the coordinate that explains most of it."""
+    prescribed = set(problem.system.prescribed)
+    kept: list[tuple[History, Pulse]] = []
+    for history, pulse in sorted(found, key=lambda entry: entry[1].p_value):
+        same = [
+            p for h, p in kept if h.recording == history.recording and not {h.unknown, history.unknown} <= prescribed
+        ]
+        if all(pulse.end <= other.begin or pulse.begin >= other.end for other in same):
+            kept.append((history, pulse))
+    return [
+        Event(
+            history.recording,
+            history.location,
+            history.unknown,
+            "force",
+            pulse.begin,
+            pulse.end,
+            pulse.size,
+            pulse.impulse,
+            pulse.std * pulse.area,
+            history.unit,
+            pulse,
+        )
+        for history, pulse in kept
+    ]
+
+
+# -- wrong samples ----------------------------------------------------------------------------------------------------
+
+
+def _wrong_samples(problem: EstimationProblem, run: Run) -> Iterator[Event]:
+    """Samples that their neighbours contradict: of sensors beside their prediction, of joints as they were recorded."""
+    episode, result, _ = run
+    for samples, predicted in zip(episode.samples, result.predicted, strict=True):
+        if samples.sensor.efforts or samples.node.ndim > 1:
+            continue
+        t = sample_times(episode, samples)
+        for column, channel in enumerate(samples.channel_of_column):
+            seen = samples.seen[:, column]
+            axis = f".{'xyz'[column % 3]}" if samples.sensor.width == 3 else ""
+            frame = samples.sensor.frames[column // samples.sensor.width] if samples.sensor.frames else ""
+            location = seen_by(problem.system, samples.sensor, frame)
+            if samples.sensor.width == 1:
+                location = channel.rpartition(".")[2]
+            values = (samples.value - predicted)[seen, column]
+            about = (episode.name, location, f"{channel}{axis}", samples.sensor.unit)
+            yield from _alone(t[seen], values, samples.std[seen, column], about)
+    joints = episode.recording.joints
+    if joints is None:
+        return
+    for quantity, values, unit in (("position", joints.position, "rad"), ("effort", joints.effort, "N m")):
+        channels = [f"joints.{quantity}.{joint}" for joint in joints.names]
+        for column, (joint, channel) in enumerate(zip(joints.names, channels, strict=True)):
+            floor = _floor(problem, episode, joint, quantity)
+            if values is not None and floor is not None:
+                noise = np.full(len(joints.t), max(floor, quantum(values[:, column])))
+                about = (episode.name, joint, channel, unit)
+                yield from _alone(joints.t - episode.grid.start, values[:, column], noise, about)
+
+
+def _floor(problem: EstimationProblem, episode: Episode, joint: str, quantity: str) -> float | None:
+    """Noise of what one joint's raw channel says, where the model is moved by it or, smoothed, compared with it.
+
+    None where it is neither. A single effort that the filter of prescribed joints makes nothing of is no event.
+    """
+    joints, options = episode.recording.joints, problem.options
+    system = problem.system
+    assert joints is not None
+    if joint not in system.prescribed and (joint not in system.driven or quantity == "position"):
+        return None
+    group = f"joints.{quantity}"
+    choice = options.sensors.get(group, SensorOptions())
+    recorded = joints.position_std if quantity == "position" else joints.effort_std
+    given = choice.std if choice.std is not None else recorded
+    std = 0.0 if given is None else float(by_joint(given, joints.names, (joint,), f"sensors.{group}.std")[0])
+    if quantity == "effort" and joint in system.prescribed and math.isfinite(options.path_cutoff):
+        # of one sample that much is left: its share of the filter's time
+        share = 2 * options.path_cutoff * float(np.median(np.diff(joints.t)))
+        std /= min(math.sqrt(share), 1.0)
+    return std
+
+
+def _alone(t: Array, values: Array, noise: Array, about: tuple[str, str, str, str]) -> Iterator[Event]:
+    """Runs of at most `LONGEST_RUN` samples far from the median of what is around them, as none of these is."""
+    count, half = len(values), 2 * LONGEST_RUN
+    if count < 2 * NEIGHBOURS:
+        return
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(values, half, mode="reflect"), 2 * half + 1)
+    off = values - np.median(around, axis=1)
+    size = np.abs(off)
+    wide = np.lib.stride_tricks.sliding_window_view(np.pad(size, NEIGHBOURS, mode="reflect"), 2 * NEIGHBOURS + 1)
+    spread = 1.4826 * np.median(wide, axis=1)
+    odd = size > SURE * np.maximum(np.maximum(noise, spread), 1e-12)
+    for begin in np.flatnonzero(odd & ~np.roll(odd, 1)):
+        end = begin
+        while end + 1 < count and odd[end + 1]:
+            end += 1
+        if end - begin >= LONGEST_RUN or begin < LONGEST_RUN or end >= count - LONGEST_RUN:
+            continue
+        near = np.r_[max(begin - NEIGHBOURS, 0) : begin, end + 1 : min(end + 1 + NEIGHBOURS, count)]
+        if size[begin : end + 1].min() < ALONE * size[near].max(initial=0.0):
+            continue
+        period = float(np.median(np.diff(t[max(begin - NEIGHBOURS, 0) : end + NEIGHBOURS])))
+        peak = float(off[begin + int(size[begin : end + 1].argmax())])
+        spread_here = max(float(spread[begin]), float(noise[begin]))
+        recording, location, channel, unit = about
+        yield Event(
+            recording,
+            location,
+            channel,
+            "sample",
+            float(t[begin] - period / 2),
+            float(t[end] + period / 2),
+            peak,
+            float(off[begin : end + 1].sum() * period),
+            spread_here * period * math.sqrt(end - begin + 1),
+            unit,
+        )
+
+
+# -- the recordings without them --------------------------------------------------------------------------------------
+
+
+def without_events(problem: EstimationProblem, events: Events) -> EstimationProblem:
+    """The problem with what events explain taken out, as far as that can be done.
+
+    Forces at driven joints act beside the recorded torque. Samples of prescribed joints' efforts in the window of an
+    event of that joint, samples that are wrong themselves, and all that follows a fall do not count. Forces on an
+    object stay in.
+    """
+
+    def cleaned(episode: Episode) -> Episode:
+        own = events.of(episode.name)
+        fall = min((f.time for f in events.falls if f.recording == episode.name), default=math.inf)
+        if not own and not math.isfinite(fall):
+            return episode
+        torque = episode.torque.copy()
+        times = episode.grid.times[:-1] - episode.grid.start + episode.grid.time_step / 2
+        for event in own:
+            if event.pulse is not None and event.channel in problem.system.driven:
+                torque[:, problem.system.driven.index(event.channel)] += event.pulse.values(times)
+        smear = 1 / (2 * problem.options.path_cutoff)
+        parts = [_counting(episode, samples, own, fall, smear) for samples in episode.samples]
+        return replace(episode, torque=torque, samples=tuple(parts))
+
+    return problem.on([cleaned(e) for e in problem.episodes], [cleaned(e) for e in problem.held_out])
+
+
+def _counting(episode: Episode, samples: Measurements, own: Sequence[Event], fall: float, smear: float) -> Measurements:
+    """Samples without those that an event spoils."""
+    hidden = np.zeros(samples.value.shape, bool)
+    t = sample_times(episode, samples)
+    t = t if t.ndim > 1 else np.broadcast_to(t[:, None], hidden.shape)
+    if math.isfinite(fall) and samples.sensor.efforts:
+        hidden |= t > fall - LowPass(1 / (2 * smear)).settling if smear > 0 else t > fall
+    for event in own:
+        for column, channel in enumerate(samples.channel_of_column):
+            if samples.sensor.efforts:
+                # a wrong angle is smeared over what all joints need
+                spoilt = event.channel == channel.rpartition(".")[2] or event.kind == "sample"
+                inside = (t[:, column] > event.begin - smear) & (t[:, column] < event.end + smear)
+            else:
+                axis = f".{'xyz'[column % 3]}" if samples.sensor.width == 3 else ""
+                spoilt = event.channel == f"{channel}{axis}"
+                inside = (t[:, column] > event.begin) & (t[:, column] < event.end)
+            if spoilt:
+                hidden[:, column] |= inside
+    if not np.any(hidden & samples.seen):
+        return samples
+    return replace(samples, value=np.where(hidden, np.nan, samples.value), weight=np.where(hidden, 0.0, samples.weight))
+
+
+# -- in words ---------------------------------------------------------------------------------------------------------
+
+NAMED = 8
+"""Events that are told one by one."""
+
+
+def event_sentences(events: Events) -> str:
+    """What happened, where and when; empty where nothing did."""
+    text = []
+    if events.found:
+        count = len(events.found)
+        told = "; ".join(_said(event) for event in events.found[:NAMED])
+        more = f"; and {count - NAMED} more" if count > NAMED else ""
+        first = "One event stands" if count == 1 else f"{count} events stand"
+        text.append(f"{first} beside all this, short and in one place: {told}{more}.")
+    for fall in events.falls:
+        text.append(
+            f"From {fall.time:.3g} s on nothing is judged in {fall.recording}, where {fall.joint} moves too fast for "
+            "the model to follow."
+        )
+    return " ".join(text)
+
+
+def _said(event: Event) -> str:
+    if event.kind == "sample":
+        when = f"at {0.5 * (event.begin + event.end):.3f} s in {event.recording}"
+        return f"{event.channel} is off by {event.peak:+.3g} {event.unit} {when}"
+    return (
+        f"{event.channel} is pushed by up to {event.peak:+.2g} {event.unit} from {event.begin:.2f} to {event.end:.2f} "
+        f"s in {event.recording} ({event.impulse:+.2g} ± {event.std:.1g} {event.unit} s)"
+    )

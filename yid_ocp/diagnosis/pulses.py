@@ -1,0 +1,409 @@
+"""Pulses in the history of an unknown force: short, of one sign, beside a rest that varies slowly or follows the load.
+
+At one place the data say of the values f of an unknown force at points of time, up to a constant,
+
+    log p(data | f) = g'f - f'L f / 2.
+
+f is a sum of pulses and a rest, which is Gaussian with a standard deviation that grows with the torques at work:
+
+    cov f(s), f(t) = e(s) e(t) (delta(s, t) + exp(-|s - t|/a))/2 + s^2 exp(-|s - t|/b),   e^2 = (c m)^2 + w^2 + h^2/3,
+
+m the error that a model of these torques is allowed anyway, h what friction may hold. c >= 1, w and s are those of the
+largest evidence, with a pulse as without it, so that a model that errs everywhere makes no events. Pulses are taken in
+one after the other, that which raises the evidence most first; this is the search for shocks by auxiliary residuals
+(de Jong and Penzer 1998, doi:10.1080/01621459.1998.10473717) with pulses in place of impulses.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
+from yid_ocp.problem.low_pass import LowPass
+
+Array = NDArray[np.float64]
+
+QUICK, SLOW = 0.3, 2.0
+"""Times in which the error of a model and the rest forget their values, a and b [s]."""
+ERRORS, FLOORS, RESTS = (1.0, 2.0, 4.0), (0.0, 0.5, 1.0), (0.25, 1.0)
+"""c, w in units of the robust spread of the history, s in units of its root mean square."""
+FEWEST = 2.5
+"""Points that the shortest pulse covers."""
+GROWTH = 1.25
+"""From one length of a window to the next."""
+FLAT = 0.5
+"""Part of a flat pulse in which it rises and falls."""
+MOST = 12
+"""Pulses and what is like them in one history."""
+RARE = 1 / 3
+"""Part of the time from which forces in short windows are none of events: the model errs everywhere."""
+MARGIN = 0.5
+"""Lengths of a pulse for which the history must go on before and after it."""
+PROMINENT = 2.0
+"""Times the median size of a pulse of the same length anywhere in the history that one must have."""
+
+
+@dataclass(frozen=True)
+class History:
+    """What the data say of an unknown force at one place; see above.
+
+    Attributes
+    ----------
+    recording, location, unknown, unit : str
+        `unknown` is the coordinate.
+    t : ndarray, shape (M,)
+        Since the start of the recording, evenly spaced [s].
+    score : ndarray, shape (M,)
+        g
+    information : ndarray, shape (M, M)
+        L
+    error : ndarray, shape (M,)
+        m, in `unit`.
+    held : ndarray, shape (M,)
+        h, in `unit`.
+    cutoff : float
+        Of the filter through which a force at these points is seen [Hz]; infinite for none.
+    """
+
+    recording: str
+    location: str
+    unknown: str
+    unit: str
+    t: Array
+    score: Array
+    information: Array
+    error: Array
+    held: Array
+    cutoff: float = math.inf
+
+    @property
+    def spacing(self) -> float:
+        """From point to point [s]."""
+        return float(np.median(np.diff(self.t)))
+
+    @property
+    def values(self) -> Array:
+        """The force that the data ask for by themselves, shape (M,)."""
+        least = 1e-6 * max(float(np.mean(np.diag(self.information))), 1e-300)
+        return np.asarray(np.linalg.solve(self.information + least * np.eye(len(self.t)), self.score))
+
+
+@dataclass(frozen=True)
+class Pulse:
+    """A force that rises and falls within a window.
+
+    Attributes
+    ----------
+    begin, end : float
+        [s]
+    size : float
+        Largest value, with its sign, in the history's unit.
+    flat : bool
+        Whether it stays at its size for half of the time; else it is a sine squared.
+    std : float
+        Standard deviation of the size, counting the rest.
+    p_value : float
+        Of an evidence raised so far by chance in one window.
+    """
+
+    begin: float
+    end: float
+    size: float
+    flat: bool
+    std: float
+    p_value: float
+
+    @property
+    def area(self) -> float:
+        """Impulse of a pulse of size one [s]."""
+        return (self.end - self.begin) * (1 - FLAT / 2 if self.flat else 0.5)
+
+    @property
+    def impulse(self) -> float:
+        """Integral over time."""
+        return self.size * self.area
+
+    def values(self, t: Array, cutoff: float = math.inf) -> Array:
+        """The pulse at times, shape of t, as it is seen through a filter."""
+        return self.size * _Filter.of(cutoff)(_Windows.one(self.begin, self.end, self.flat), t)[:, 0]
+
+
+@dataclass(frozen=True)
+class _Windows:
+    """Profiles of size one: beginnings, ends, and whether they are flat, shape (k,) each."""
+
+    begin: Array
+    end: Array
+    flat: NDArray[np.bool_]
+
+    @staticmethod
+    def one(begin: float, end: float, flat: bool) -> _Windows:
+        return _Windows(np.array([begin]), np.array([end]), np.array([flat]))
+
+    def at(self, t: Array) -> Array:
+        """shape (M, k)"""
+        part = np.clip((t[:, None] - self.begin) / (self.end - self.begin), 0.0, 1.0)
+        ramp = np.where(self.flat, FLAT / 2, 0.5)
+        return np.asarray(np.sin(np.pi / 2 * np.minimum(np.minimum(part, 1 - part) / ramp, 1.0)) ** 2)
+
+
+@dataclass(frozen=True)
+class _Filter:
+    """A zero-phase filter as weights at delays, shape (L,) each."""
+
+    delay: Array
+    weight: Array
+
+    @staticmethod
+    def of(cutoff: float) -> _Filter:
+        if not math.isfinite(cutoff):
+            return _Filter(np.zeros(1), np.ones(1))
+        step = 0.1 / cutoff
+        length = 20
+        delay = np.asarray(step * np.arange(-length, length + 1), float)
+        impulse = np.zeros((len(delay), 1))
+        impulse[length] = 1.0
+        weight = LowPass(cutoff)(delay, impulse)[:, 0]
+        return _Filter(delay, weight / weight.sum())
+
+    def __call__(self, windows: _Windows, t: Array) -> Array:
+        return sum((w * windows.at(t - d) for d, w in zip(self.delay, self.weight, strict=True)), np.zeros(()))
+
+
+@dataclass(frozen=True)
+class _Rest:
+    """The data less a rest of known covariance: Sigma^-1 (M, M), Sigma^-1 y (M,), log evidence without pulses."""
+
+    precision: Array
+    scored: Array
+    evidence: float
+
+    @staticmethod
+    def of(history: History, error: float, floor: float, slow: float) -> _Rest:
+        apart = np.abs(history.t[:, None] - history.t)
+        quick = np.sqrt((error * history.error) ** 2 + floor**2 + history.held**2 / 3)
+        covariance = np.outer(quick, quick) * (np.eye(len(apart)) + np.exp(-apart / QUICK)) / 2
+        covariance += slow**2 * np.exp(-apart / SLOW)
+        covariance[np.diag_indices_from(covariance)] += 1e-9 * np.trace(covariance) / len(covariance)
+        factor = np.linalg.cholesky(covariance)
+        seen = history.information @ factor
+        inner = np.linalg.cholesky(np.eye(len(factor)) + factor.T @ seen)
+        half = scipy.linalg.solve_triangular(inner, seen.T, lower=True)
+        told = scipy.linalg.solve_triangular(inner, factor.T @ history.score, lower=True)
+        evidence = 0.5 * float(told @ told) - float(np.sum(np.log(np.diag(inner))))
+        return _Rest(history.information - half.T @ half, history.score - half.T @ told, evidence)
+
+    def beside(self, taken: Array) -> _Rest:
+        """The same with profiles (M, k) of any size taken in."""
+        if not taken.shape[1]:
+            return self
+        seen = self.precision @ taken
+        inner = scipy.linalg.cho_factor(taken.T @ seen + 1e-12 * np.eye(taken.shape[1]), lower=True)
+        size = scipy.linalg.cho_solve(inner, taken.T @ self.scored)
+        gain = 0.5 * float(size @ (taken.T @ self.scored))
+        precision = self.precision - seen @ scipy.linalg.cho_solve(inner, seen.T)
+        return _Rest(precision, self.scored - seen @ size, self.evidence + gain)
+
+    def gains(self, profiles: Array) -> Array:
+        """By how much the evidence rises with each of some profiles (M, k) of its best size, shape (k,)."""
+        told, sure = self._sizes(profiles)
+        return np.where(sure > 0, 0.5 * told**2 / np.where(sure > 0, sure, 1.0), 0.0)
+
+    def sizes(self, profiles: Array) -> Array:
+        """Best size of each profile, shape (k,), zero where the data say nothing."""
+        told, sure = self._sizes(profiles)
+        return np.where(sure > 0, told / np.where(sure > 0, sure, 1.0), 0.0)
+
+    def _sizes(self, profiles: Array) -> tuple[Array, Array]:
+        sure = np.sum(profiles * (self.precision @ profiles), axis=0)
+        seen = np.sum(profiles**2, axis=0) * max(float(np.trace(self.precision)) / len(self.scored), 1e-300)
+        return profiles.T @ self.scored, np.where(sure > 1e-6 * seen, sure, 0.0)
+
+
+def pulses(history: History, limits: Thresholds = DEFAULTS) -> tuple[list[Pulse], float]:
+    """Pulses of one history, those of the largest evidence first, and how many windows were looked at.
+
+    Parameters
+    ----------
+    history : History
+    limits : Thresholds
+        `worth` is the rise of the log evidence from which a pulse is looked at, `pulse` the length of the longest.
+
+    Returns
+    -------
+    list of Pulse
+        With p-values of single windows; see `discoveries`.
+    float
+        Windows that do not overlap, of all lengths together.
+    """
+    windows, tries = _windows(history, limits)
+    if not len(windows.begin):
+        return [], 0.0
+    seen = _Filter.of(history.cutoff)
+    profiles = seen(windows, history.t)
+    rests = _rests(history)
+    taken = np.zeros((len(history.t), 0))
+    found: list[tuple[_Windows, float]] = []
+    free = np.ones(len(windows.begin), bool)
+    while taken.shape[1] < MOST and np.any(free):
+        beside = [rest.beside(taken) for rest in rests]
+        gains = [free * rest.gains(profiles) for rest in beside]
+        totals = [rest.evidence + float(gain.max()) for rest, gain in zip(beside, gains, strict=True)]
+        likeliest = int(np.argmax(totals))
+        rest, gain = beside[likeliest], gains[likeliest]
+        rise = max(totals) - max(rest.evidence for rest in beside)
+        if rise < limits.worth:
+            break
+        window = _refined(history, rest, windows, int(gain.argmax()), seen, limits)
+        own = seen(window, history.t)
+        rise += float(rest.gains(own)[0] - gain.max())
+        other = _other(history, rest, window, seen)
+        if other is None and not _stands_out(history, rests[likeliest], rest, window, seen, limits):
+            other = own
+        taken = np.column_stack([taken, own if other is None else other])
+        if other is None:
+            found.append((window, rise))
+        free &= (windows.end <= window.begin[0]) | (windows.begin >= window.end[0])
+    covered = sum(float(window.end[0] - window.begin[0]) for window, _ in found)
+    if covered > RARE * float(history.t[-1] - history.t[0]):
+        return [], tries
+    return _sized(history, rests, found, taken, seen), tries
+
+
+def discoveries(p_values: Sequence[float], tries: float, level: float) -> list[bool]:
+    """Which of some pulses are more than chance among all windows that were looked at.
+
+    Benjamini and Hochberg (1995), doi:10.1111/j.2517-6161.1995.tb02031.x.
+
+    Parameters
+    ----------
+    p_values : sequence of float
+        Of the pulses that were found.
+    tries : float
+        Number of windows.
+    level : float
+        False-discovery rate.
+    """
+    order = np.argsort(p_values)
+    passed = np.flatnonzero(np.sort(p_values) <= level * np.arange(1, len(order) + 1) / max(tries, 1.0))
+    real = np.zeros(len(order), bool)
+    if len(passed):
+        real[order[: passed[-1] + 1]] = True
+    return [bool(r) for r in real]
+
+
+def _windows(history: History, limits: Thresholds) -> tuple[_Windows, float]:
+    """Windows to look at, and how many do not overlap."""
+    spacing, first, last = history.spacing, float(history.t[0]), float(history.t[-1])
+    lengths = [FEWEST * spacing]
+    while lengths[-1] * GROWTH <= limits.pulse:
+        lengths.append(lengths[-1] * GROWTH)
+    begins = [np.arange(first + MARGIN * length, last - (1 + MARGIN) * length + 1e-9, spacing) for length in lengths]
+    begin = np.concatenate(begins)
+    end = begin + np.repeat(lengths, [len(b) for b in begins])
+    flat = np.repeat([False, True], len(begin))
+    tries = sum((last - first) / length for length in lengths if length <= last - first)
+    return _Windows(np.tile(begin, 2), np.tile(end, 2), flat), tries
+
+
+def _rests(history: History) -> list[_Rest]:
+    values = history.values
+    spread = max(1.4826 * float(np.median(np.abs(values - np.median(values)))), 1e-9 + float(np.median(history.error)))
+    slowest = max(float(np.sqrt(np.mean(values**2))), spread)
+    grid = product(ERRORS, FLOORS, RESTS)
+    return [_Rest.of(history, error, floor * spread, slow * slowest) for error, floor, slow in grid]
+
+
+def _refined(
+    history: History, rest: _Rest, windows: _Windows, best: int, seen: _Filter, limits: Thresholds
+) -> _Windows:
+    """The best window among many, its ends moved to where the evidence is largest."""
+    first, last = float(history.t[0]), float(history.t[-1])
+    shortest = FEWEST * history.spacing
+    begin, end, flat = float(windows.begin[best]), float(windows.end[best]), bool(windows.flat[best])
+    gain = float(rest.gains(seen(_Windows.one(begin, end, flat), history.t))[0])
+    for step in history.spacing / np.array([2.0, 4.0, 8.0]):
+        moves = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]) * step
+        while True:
+            ends = np.array([begin, end]) + moves
+            length = ends[:, 1] - ends[:, 0]
+            inside = (ends[:, 0] >= first + MARGIN * length) & (ends[:, 1] <= last - MARGIN * length)
+            ends = ends[inside & (length >= shortest) & (length <= limits.pulse)]
+            both = np.tile(ends, (2, 1))
+            tried = _Windows(both[:, 0], both[:, 1], np.repeat([False, True], len(ends)))
+            gains = rest.gains(seen(tried, history.t)) if len(ends) else np.zeros(1)
+            if not float(gains.max()) > gain + 1e-3:
+                break
+            at = int(gains.argmax())
+            gain, begin, end, flat = (
+                float(gains[at]),
+                float(tried.begin[at]),
+                float(tried.end[at]),
+                bool(tried.flat[at]),
+            )
+    return _Windows.one(begin, end, flat)
+
+
+def _other(history: History, rest: _Rest, window: _Windows, seen: _Filter) -> Array | None:
+    """A step or a swing to both sides that explains as much as a pulse does, so that it is none; shape (M,)."""
+    t, begin, end = history.t, float(window.begin[0]), float(window.end[0])
+    length, gain = end - begin, float(rest.gains(seen(window, t))[0])
+    steps = np.arange(begin - length / 2, end + length / 2, history.spacing)
+    rising = [np.asarray(t > at, float) for at in steps]
+    rising = [step for step in rising if 1 < step.sum() < len(t) - 1]
+    swings = []
+    for wide in length * np.array([0.75, 1.0]):
+        for middle in (begin, begin + length / 4, (begin + end) / 2, end - length / 4, end):
+            part = np.clip((t - middle) / wide, -0.5, 0.5)
+            swings.append(np.sin(2 * np.pi * part))
+    profiles = np.stack([*rising, *swings], axis=1)
+    gains = rest.gains(profiles)
+    best = int(gains.argmax())
+    return profiles[:, best] if gains[best] >= gain else None
+
+
+def _stands_out(
+    history: History, bare: _Rest, rest: _Rest, window: _Windows, seen: _Filter, limits: Thresholds
+) -> bool:
+    """Whether a pulse is shorter than the longest, and larger than what the history holds everywhere.
+
+    `bare` is the rest with nothing taken in, `rest` that beside what was.
+    """
+    length = float(window.end[0] - window.begin[0])
+    if length > 0.98 * limits.pulse:
+        return False
+    begin = np.arange(float(history.t[0]), float(history.t[-1]) - length, history.spacing)
+    everywhere = _Windows(begin, begin + length, np.repeat(window.flat, len(begin)))
+    usual = float(np.median(np.abs(bare.sizes(seen(everywhere, history.t)))))
+    return abs(float(rest.sizes(seen(window, history.t))[0])) > PROMINENT * usual
+
+
+def _sized(
+    history: History, rests: Sequence[_Rest], found: Sequence[tuple[_Windows, float]], taken: Array, seen: _Filter
+) -> list[Pulse]:
+    """The pulses with their sizes, all together, beside the rest of the largest evidence."""
+    if not found:
+        return []
+    rest = max((rest.beside(taken) for rest in rests), key=lambda one: one.evidence)
+    rest = rests[[r.beside(taken).evidence for r in rests].index(rest.evidence)]
+    spread = np.linalg.pinv(taken.T @ rest.precision @ taken, hermitian=True)
+    size = spread @ (taken.T @ rest.scored)
+    result = []
+    for window, rise in found:
+        own = seen(window, history.t)[:, 0]
+        at = int(np.argmin(np.sum((taken - own[:, None]) ** 2, axis=0)))
+        p_value = math.erfc(math.sqrt(max(rise, 0.0)))
+        std = math.sqrt(max(float(spread[at, at]), 0.0))
+        result.append(
+            Pulse(float(window.begin[0]), float(window.end[0]), float(size[at]), bool(window.flat[0]), std, p_value)
+        )
+    # friction can change by twice what it slides with wherever the joint stands still, whatever moves it
+    stuck = [float(np.max(history.held[(history.t >= p.begin) & (history.t <= p.end)], initial=0.0)) for p in result]
+    return [pulse for pulse, friction in zip(result, stuck, strict=True) if abs(pulse.size) > 2 * friction]

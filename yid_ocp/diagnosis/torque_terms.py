@@ -1,0 +1,99 @@
+"""How large the terms of the inverse dynamics are: what a model's torque cannot be trusted beyond a few per cent of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.integrator.step_model import Rollout
+from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body
+from yid_ocp.model.system import MidpointState, System
+
+Array = NDArray[np.float64]
+
+STANDSTILL = 0.1
+"""Speed below which friction may hold with anything up to what it slides with [rad/s or m/s]."""
+
+
+@dataclass(frozen=True)
+class TorqueTerms:
+    """Sizes of torques at some nodes of a rollout, of every coordinate.
+
+    Attributes
+    ----------
+    size : ndarray, shape (M, n)
+        Root of the sum of squares of inertia (of every joint's acceleration by itself), Coriolis and centrifugal
+        forces, gravity, springs, friction, effects' forces and the torque that was applied or needed [N m or N].
+    rate : ndarray, shape (M, n)
+        Of the torque needed [N m/s or N/s].
+    held : ndarray, shape (M, n)
+        What friction may hold at rest, gone above `STANDSTILL` [N m or N].
+    """
+
+    size: Array
+    rate: Array
+    held: Array
+
+
+def torque_terms(
+    system: System, theta: Array, rollout: Rollout, time_step: float, nodes: NDArray[np.int64]
+) -> TorqueTerms:
+    """Terms of M(q) a + c(q, v) + g(q) = tau along a rollout, accelerations by differences of its nodes.
+
+    Parameters
+    ----------
+    system : System
+    theta : ndarray, shape (ntheta,)
+    rollout : Rollout
+    time_step : float
+        [s]
+    nodes : ndarray of int, shape (M,)
+        At which the terms are wanted, in order.
+    """
+    n = system.size
+    q, z = rollout.state[:, :n], rollout.state[:, 2 * n :]
+    v = np.gradient(q, time_step, axis=0)
+    a = np.gradient(v, time_step, axis=0)
+    function = _function(system).map(len(nodes))
+    squares, needed, held = (np.array(part).T for part in function(*(x[nodes].T for x in (q, v, a, z)), theta))
+    applied = np.zeros((len(nodes), n))
+    for indices, effort in ((system.driven_indices, rollout.torque), (system.prescribed_indices, rollout.effort)):
+        if indices:
+            applied[:, list(indices)] = effort[np.minimum(nodes, len(effort) - 1)]
+    rate = np.gradient(needed, time_step * nodes, axis=0) if len(nodes) > 1 else np.zeros_like(needed)
+    return TorqueTerms(np.sqrt(squares + applied**2), np.asarray(rate), np.abs(held))
+
+
+def _function(system: System) -> ca.Function:
+    """(q, v, a, z, theta) to the sum of squares of all terms, the torque needed, and what friction may hold."""
+    n, names = system.size, tuple(system.internal)
+    q, v, a, z = (ca.SX.sym(name, size) for name, size in (("q", n), ("v", n), ("a", n), ("z", len(names))))
+    kinematics = forward_kinematics(system.mechanism, q)
+    moving = rigid_body(kinematics, v, system.gravity)
+    weight = rigid_body(kinematics, ca.SX.zeros(n), system.gravity).by_q
+    rest, u = ca.SX.zeros(len(names)), ca.SX.zeros(len(system.driven))
+    pulls = ca.SX.zeros(system.constraint_count)
+    rows = {name: i for i, name in enumerate(names)}
+    state = MidpointState(system, kinematics, q, v, z, rest, u, pulls, rows)
+    energy, viscous, others = -system.elastic_energy(q), system.viscous_force(v), ca.SX.zeros(n)
+    for effect in system.effects:
+        terms = effect.terms(state)
+        energy += terms.lagrangian
+        viscous += 0 if terms.viscous is None else terms.viscous
+        others += 0 if terms.force is None else terms.force
+        others += 0 if terms.closed is None else terms.closed.force
+    mass = mass_matrix(moving, system.mechanism) + ca.hessian(energy, v)[0]
+    coriolis = ca.jtimes(moving.by_v, q, v) - (moving.by_q - weight)
+    springs = -ca.gradient(energy, q)
+    columns = mass * ca.repmat(a.T, n, 1)
+    squares = ca.sum2(columns**2) + coriolis**2 + weight**2 + springs**2 + viscous**2 + others**2
+    needed = ca.sum2(columns) + coriolis - weight + springs - viscous - others
+    faster, slower = (ca.substitute(viscous, v, v + sign * STANDSTILL) for sign in (1, -1))
+    outputs = [ca.densify(x) for x in (squares, needed, (faster - slower) / 2)]
+    if names:
+        symbols = ca.vertcat(*system.internal.values())
+        outputs = [ca.substitute(x, symbols, z) for x in outputs]
+    return ca.Function("torque_terms", [q, v, a, z, system.parameters.symbols], outputs)
