@@ -128,7 +128,7 @@ def _predicted(run: Run, progress: Progress, seed: int | None) -> Recording | st
     step = build_step(run)
     first = replace(run, recordings=replace(run.recordings, estimate=run.recordings.estimate[:1]))
     recordings = read_recordings(first, "estimate")
-    options = replace(problem_options(run, step.system.parameters, recordings), local=(), priors={})
+    options = replace(problem_options(run, step.system, recordings), local=(), priors={})
     problem = EstimationProblem(step, recordings, (), options)
     episode = problem.episodes[0]
     progress.stage(f"rolling out {episode.grid.steps} steps")
