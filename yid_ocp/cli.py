@@ -72,6 +72,12 @@ def _doubting_or_embedded(parser: argparse.ArgumentParser) -> None:
     _doubting(parser, optional=True)
 
 
+def _diagnose(parser: argparse.ArgumentParser) -> None:
+    _doubting(parser, optional=True)
+    text = "run folder of an earlier solve or diagnose of the same model: ask what differs since; may be repeated"
+    parser.add_argument("--baseline", metavar="RUN", action="append", default=[], help=text)
+
+
 def _identifiability(parser: argparse.ArgumentParser) -> None:
     _doubting(parser)
     parser.add_argument("--what-if", action="store_true", help="rank changes of the experiment; takes a few minutes")
@@ -135,7 +141,7 @@ COMMANDS: tuple[Command, ...] = (
         "diagnose",
         "find the gap between model and recordings, and what makes it",
         "diagnose",
-        _doubting_or_embedded,
+        _diagnose,
     ),
     Command(
         "blind",

@@ -194,7 +194,9 @@ class ModelSettings:
     arms: Annotated[ArmSettings, About("the robot's joints")] = field(default_factory=ArmSettings)
     frames: Annotated[
         Mapping[str, FrameSettings],
-        About("more frames, by name, on robot, object or world: a tool's tip, the middle of what a gripper holds, a marker"),
+        About(
+            "more frames, by name, on robot, object or world: a tool's tip, the middle of what a hand holds, a marker"
+        ),
     ] = field(default_factory=dict)
     object: Annotated[YObject | SegmentedObject | CableObject | None, About("the flexible object")] = None
     grasp: Annotated[Mapping[str, GraspSettings], About("by name: left, right, gripper")] = field(default_factory=dict)
@@ -220,6 +222,10 @@ class RecordingSettings:
 
     estimate: Annotated[tuple[RecordingPath, ...], About("to estimate on")] = ()
     held_out: Annotated[tuple[RecordingPath, ...], About("only predicted, never touched by the fit")] = ()
+    without: Annotated[
+        tuple[RecordingPath, ...],
+        About("made without what a diagnosis finds, which it then predicts; those of its baseline when absent"),
+    ] = ()
     strict: Annotated[
         bool, About("whether any doubt about a recording stops the run; --strict on the command line")
     ] = False
@@ -261,6 +267,11 @@ class DiagnosisSettings(Thresholds):
         Le(1),
         About("part of all stated std, torques' included, that is noise, where the rest stands for the model's error"),
     ] = 1.0
+
+    baseline: Annotated[
+        tuple[FilePath, ...],
+        About("run folders of `solve` or `diagnose`, of the same model: what differs since is asked"),
+    ] = ()
 
     @property
     def of_a_fit(self) -> GapLimits:

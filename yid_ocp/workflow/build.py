@@ -103,7 +103,7 @@ def build_system(run: Run, finer: int = 1) -> System:
     with located(run, "model"):
         system = System.build(
             carrier,
-            objects=[(item, *place) for item, (_, *place) in zip(items, objects, strict=True)],
+            objects=[(item, frame, place) for item, (_, frame, place) in zip(items, objects, strict=True)],
             grasps=grasps,
             driven=moved if mode == "driven" else (),
             prescribed=held.joint_names if held is not None else moved if mode == "prescribed" else (),
@@ -444,7 +444,7 @@ def problem_options(run: Run, system: System, recordings: Sequence[Recording] = 
     )
 
 
-def build_problem(run: Run, step: Step | None = None) -> EstimationProblem:
+def build_problem(run: Run, step: Step | None = None, without: Sequence[Recording] = ()) -> EstimationProblem:
     """The estimation problem of a run.
 
     Parameters
@@ -452,6 +452,8 @@ def build_problem(run: Run, step: Step | None = None) -> EstimationProblem:
     run : Run
     step : Step, optional
         Compiled before; built when absent.
+    without : sequence of Recording
+        That will be predicted only; the options say where markers sit in them.
 
     Returns
     -------
@@ -483,7 +485,7 @@ def build_problem(run: Run, step: Step | None = None) -> EstimationProblem:
         )
     _check_sensors(run, [*estimate, *held_out])
     seen = examined(run, system, build_cable(run), estimate, held_out)
-    options = problem_options(run, system, [*seen.estimate, *seen.held_out])
+    options = problem_options(run, system, [*seen.estimate, *seen.held_out, *without])
     step = build_step(run, system) if step is None else step
     said = replace(options, doubts=seen.doubts)
     problem = EstimationProblem(step, seen.estimate, free, said, None, seen.held_out)

@@ -46,7 +46,7 @@ def clamps(run: Run) -> Mechanism | None:
                 "clamps hold an object without a robot, and the model has one",
                 "model",
                 "clamps",
-                hint="remove model.clamps, or set model.robot: null; a robot holds the object by model.grasp or its mount",
+                hint="remove model.clamps, or set model.robot: null; a robot holds by model.grasp or by the mount",
             )
         return None
     said = model.arms
@@ -57,8 +57,7 @@ def clamps(run: Run) -> Mechanism | None:
                 "model",
                 "arms",
                 key,
-                hint="set model.robot to its URDF file, or remove model.arms; an object alone stands in the world or in "
-                "model.clamps",
+                hint="set model.robot to its URDF file, or remove model.arms; the world or model.clamps hold an object",
             )
     found: Mechanism | None = None
     for name, clamp in model.clamps.items():

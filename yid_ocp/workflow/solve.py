@@ -8,6 +8,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from yid_ocp.analysis.profile import with_intervals
 from yid_ocp.analysis.start_in_motion import safe_start
 from yid_ocp.config.reader import load_config
@@ -21,6 +23,7 @@ from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import Findings
 from yid_ocp.report.terminal import solve_summary
 from yid_ocp.solvers import Iterate, Solution, Status, solve
+from yid_ocp.solvers.judgement import known_covariance
 from yid_ocp.workflow.build import build_cable, build_problem
 from yid_ocp.workflow.command import DONE, FAILED, carry_out
 from yid_ocp.workflow.doubts import doubts_result
@@ -126,6 +129,17 @@ def run_solve(run: Run, out: str | Path | None = None, progress: Progress = SILE
     return SolveOutcome(folder.path, written, solution, problem)
 
 
+def _covariance(solution: Solution) -> dict[str, Any]:
+    """What is known of the shared free parameters together, with the ± that is reported."""
+    names = [name for name, entry in solution.parameters.items() if entry.free and name in solution.names]
+    at = [solution.names.index(name) for name in names]
+    if not solution.covariance.size:
+        return {"names": [], "matrix": []}
+    return known_covariance(
+        names, solution.covariance[np.ix_(at, at)], [solution.parameters[name].std for name in names]
+    )
+
+
 def solve_result(
     problem: EstimationProblem,
     solution: Solution,
@@ -147,6 +161,7 @@ def solve_result(
         "status": solution.status.value,
         "message": solution.message,
         "parameters": {name: asdict(entry) for name, entry in solution.parameters.items()},
+        "covariance": _covariance(solution),
         "cost": solution.cost,
         "iterations": solution.iterations,
         "evaluations": solution.evaluations,
