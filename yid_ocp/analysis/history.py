@@ -1,7 +1,7 @@
-"""Estimates of one model from several days: what they say together, what differs between them, and which to distrust.
+"""Estimates of one model from several days: what they say together, what differs, and which of them to distrust.
 
-For estimates x_i with covariances C_i of the same parameters, their mean is x = (sum C_i^-1)^-1 sum C_i^-1 x_i, and where
-nothing changed chi2 = sum (x_i - x)' C_i^-1 (x_i - x) has (k - 1) n degrees of freedom. Where it is larger, the
+For estimates x_i with covariances C_i of the same parameters, their mean is x = (sum C_i^-1)^-1 sum C_i^-1 x_i. Where
+nothing changed, chi2 = sum (x_i - x)' C_i^-1 (x_i - x) has (k - 1) n degrees of freedom. Where it is larger, the
 standard deviations of the mean are widened by sqrt(chi2/dof), Birge's ratio.
 
 References

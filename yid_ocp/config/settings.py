@@ -53,8 +53,8 @@ class FrameSettings(MountSettings):
     straight: Annotated[
         bool,
         About(
-            "whether xyz is where each recording's group `straight` has the point of this name, for markers on an object "
-            "that stands in the world; xyz then says nothing"
+            "whether each recording's `straight` says where the point of this name sits, in place of xyz, for markers "
+            "on an object that stands in the world"
         ),
     ] = False
 

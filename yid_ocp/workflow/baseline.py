@@ -15,7 +15,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import CableObject, EffectSettings, ParameterSettings, Run
 from yid_ocp.data.hdf5 import read_recording
 from yid_ocp.data.recording import Recording
-from yid_ocp.errors import DataError, YidError
+from yid_ocp.errors import ConfigError, DataError, YidError
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.workflow.build import recording_file
 
@@ -113,27 +113,47 @@ def earlier_runs(run: Run) -> tuple[Estimates, ...]:
         if any(Path(folder).resolve() == Path(other.run).resolve() for other in found):
             raise run.refuse(f"{folder} is given twice, and would count twice", *where, hint="list every run once")
         there = _settings(folder)
-        differing = [key for key in ALIKE if there is not None and _different(run, there, key)]
+        differing = "" if there is None else _different(run, there)
         if differing:
             raise run.refuse(
-                f"{folder} is a run of another model: model.{differing[0]} differs",
+                f"{folder} is a run of another model: model.{differing} differs",
                 *where,
                 allowed=f"the same {', '.join(ALIKE)} under `model`",
-                hint=f"compare model.{differing[0]} with {Path(folder) / 'config.yaml'}",
+                hint=f"compare model.{differing} with {Path(folder) / 'config.yaml'}",
             )
         found.append(own)
     return tuple(found)
 
 
-def _different(run: Run, there: Run, key: str) -> bool:
-    here, other = getattr(run.model, key), getattr(there.model, key)
-    if key == "robot" and here is not None and other is not None:
-        return Path(here).name != Path(other).name  # a folder may have moved
-    if isinstance(here, CableObject) and isinstance(other, CableObject):
-        return replace(here, undeformed=Path(here.undeformed).name) != replace(
-            other, undeformed=Path(other.undeformed).name
-        )
-    return bool(here != other)
+def refuse_another_model(folders: Sequence[Path]) -> None:
+    """Refuse run folders whose models are not one and the same.
+
+    Raises
+    ------
+    ConfigError
+    """
+    known = [(folder, settings) for folder in folders if (settings := _settings(folder)) is not None]
+    for folder, settings in known[1:]:
+        differing = _different(known[0][1], settings)
+        if differing:
+            raise ConfigError(
+                f"the runs are of different models: model.{differing} differs",
+                where=str(folder / "config.yaml"),
+                allowed=f"the same {', '.join(ALIKE)} under `model` as in {known[0][0]}",
+            )
+
+
+def _different(run: Run, there: Run) -> str:
+    """The first section of the model in which two runs differ, empty where none does."""
+    for key in ALIKE:
+        here, other = getattr(run.model, key), getattr(there.model, key)
+        if key == "robot" and here is not None and other is not None:
+            here, other = Path(here).name, Path(other).name  # a folder may have moved
+        if isinstance(here, CableObject) and isinstance(other, CableObject):
+            here, other = (replace(item, undeformed=Path(item.undeformed).name) for item in (here, other))
+        if here != other:
+            return key
+    return ""
 
 
 def _settings(folder: str | Path) -> Run | None:

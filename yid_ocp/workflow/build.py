@@ -112,6 +112,11 @@ def build_system(run: Run, finer: int = 1) -> System:
             points=model.points,
             springs={name: Spring(s.stiffness, s.rest) for name, s in model.springs.items()},
         )
+    if any(said.straight for said in model.frames.values()) and run.recordings.estimate:
+        # where markers sit when nobody says which recording is meant
+        first = replace(run, recordings=replace(run.recordings, estimate=run.recordings.estimate[:1]))
+        [places] = straight_values(run, system, read_recordings(first, "estimate")).values()
+        system = replace(system, parameters=system.parameters.with_values(places))
     return _completed(run, system, finer)
 
 

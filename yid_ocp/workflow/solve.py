@@ -116,6 +116,7 @@ def run_solve(run: Run, out: str | Path | None = None, progress: Progress = SILE
         more = {
             "doubts": doubts_result(problem.options.doubts),
             "safeguard": safe.message,
+            "covariance": covariance_result(solution, data_std),
             "discretisation": finer.result(data_std),
             "discretisation_notes": list(finer.notes),
             "stability": stability,
@@ -129,15 +130,16 @@ def run_solve(run: Run, out: str | Path | None = None, progress: Progress = SILE
     return SolveOutcome(folder.path, written, solution, problem)
 
 
-def _covariance(solution: Solution) -> dict[str, Any]:
-    """What is known of the shared free parameters together, with the ± that is reported."""
-    names = [name for name, entry in solution.parameters.items() if entry.free and name in solution.names]
+def covariance_result(solution: Solution, data_std: Mapping[str, float]) -> dict[str, Any]:
+    """What the data say of the shared free parameters together.
+
+    How far a finer model is counts in the reported ±, not here: another run of this model is as far from it.
+    """
+    names = [name for name in data_std if name in solution.names]
     at = [solution.names.index(name) for name in names]
     if not solution.covariance.size:
         return {"names": [], "matrix": []}
-    return known_covariance(
-        names, solution.covariance[np.ix_(at, at)], [solution.parameters[name].std for name in names]
-    )
+    return known_covariance(names, solution.covariance[np.ix_(at, at)], [data_std[name] for name in names])
 
 
 def solve_result(
@@ -161,7 +163,6 @@ def solve_result(
         "status": solution.status.value,
         "message": solution.message,
         "parameters": {name: asdict(entry) for name, entry in solution.parameters.items()},
-        "covariance": _covariance(solution),
         "cost": solution.cost,
         "iterations": solution.iterations,
         "evaluations": solution.evaluations,
