@@ -167,15 +167,18 @@ class Finding:
             ],
             "unseen": [v.effect.label for v in self.visibility if not v.visible],
             "noise": {f.channel: {"std": f.std, "unit": f.unit, "samples": f.samples} for f in self.floor},
-            "parameters": parameters(self),
-            "covariance": covariance(self.last),
             "baseline": None if self.since is None else _since(self.since),
             "counterfactual": None if self.counterfactual is None else self.counterfactual.to_dict(),
             "seconds": dict(self.seconds),
         }
 
 
-def parameters(finding: Finding) -> dict[str, dict[str, Any]]:
+def model_result(finding: Finding) -> dict[str, Any]:
+    """`model` of result.json: parameters and covariance of the model that a diagnosis ended with."""
+    return {"parameters": _parameters(finding), "covariance": _covariance(finding.last)}
+
+
+def _parameters(finding: Finding) -> dict[str, dict[str, Any]]:
     """Every parameter of the last model, of tried effects only those that it has: value, std, unit, whether free."""
     fit = finding.last
     problem = fit.problem
@@ -191,7 +194,7 @@ def parameters(finding: Finding) -> dict[str, dict[str, Any]]:
     return found
 
 
-def covariance(fit: Fit) -> dict[str, Any]:
+def _covariance(fit: Fit) -> dict[str, Any]:
     """Names and matrix of what is known of the shared free parameters together; those not known at all left out."""
     problem, shared = fit.problem, fit.problem.shared
     finish = fit.evaluation

@@ -54,7 +54,8 @@ def read_estimates(folder: str | Path) -> Estimates:
     if result.get("status") == "failed":
         raise DataError(f"the run failed: {result.get('message')}", where=str(file), hint="give one that converged")
     try:
-        known, parameters = result["covariance"], result["parameters"]
+        said = result.get("model", result)  # of a diagnosis, the model that it ended with
+        known, parameters = said["covariance"], said["parameters"]
         names = tuple(str(name) for name in known["names"])
         values = np.array([float(parameters[name]["value"]) for name in names])
         matrix = np.array(known["matrix"], float).reshape(len(names), len(names))

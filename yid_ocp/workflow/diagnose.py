@@ -19,6 +19,7 @@ from yid_ocp.config.settings import Run, dump_config
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis import Finding, diagnose
 from yid_ocp.diagnosis.baseline import with_baseline
+from yid_ocp.diagnosis.finding import model_result
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import Findings
@@ -117,6 +118,7 @@ def run_diagnose(run: Run, out: str | Path | None = None, progress: Progress = S
         told = finding.to_dict()
         moving = not last.problem.options.clamps and bool(last.problem.system.driven or last.problem.system.prescribed)
         own = {
+            "model": model_result(finding),
             "doubts": doubts_result(problem.options.doubts),
             "torque_offsets": offsets,
             "command": reproducing(run, folder.target),

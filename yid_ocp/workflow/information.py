@@ -95,7 +95,7 @@ def refuse_other_effects(run: Run, found: Iterable[str], own: Collection[str]) -
 
 def found_values(result: Mapping[str, Any]) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
     """Parameters of a `yid-solve/1` or `yid-diagnosis/1`, and in the latter sizes of effects, as people read them."""
-    if "absorption" not in result:
+    if "parameters" in result:
         return {name: entry["value"] for name, entry in result["parameters"].items()}, {}
     sizes = {
         f"{entry['kind']}@{entry['location']}": {
