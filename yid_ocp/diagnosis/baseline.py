@@ -153,7 +153,9 @@ def since(
         if name not in names:
             continue
         before, std, now = float(baseline.values[i]), float(baseline.std[i]), fit.values[name]
-        c0, c = float(prior[name]), plain[name]
+        # in units of noise alone a problem's variances are smaller, all by one factor
+        c0 = std**2
+        c = plain[name] * c0 / float(prior[name])
         counted = max(1.0, fit.std[name] ** 2 / c) if c > 0 and math.isfinite(fit.std[name]) else 1.0
         weight = 1 - c / c0
         score, p = None, 1.0
