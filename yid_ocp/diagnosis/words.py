@@ -200,7 +200,9 @@ def _counterfactual(found: Counterfactual) -> list[str]:
         if part.message:
             text.append(f"What was {made} could not be predicted ({part.message}).")
             continue
-        names = " and ".join(part.recordings[:2]) + (" and others" if len(part.recordings) > 2 else "")
+        names = " and ".join(name.removesuffix(" (without)") for name in part.recordings[:2]) + (
+            " and others" if len(part.recordings) > 2 else ""
+        )
         errors = ", ".join(f"{after:.2g} {unit}" for unit, (_, after) in part.means.items())
         plain = ", ".join(f"{before:.2g} {unit}" for unit, (before, _) in part.means.items())
         text.append(f"{begin} {names}, {made}, to {errors} (rms), where the model {rival} has {plain}.")
