@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from yid_ocp.solvers import solve as solve
     from yid_ocp.solvers.program import NonlinearProgram as NonlinearProgram
     from yid_ocp.solvers.symbolic import transcribe as transcribe
+    from yid_ocp.workflow.baseline import read_estimates as read_estimates
     from yid_ocp.workflow.build import load_problem as load_problem
     from yid_ocp.workflow.build import load_system as load_system
 
@@ -62,6 +63,7 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "problem": ("EstimationProblem", "ProblemOptions", "SensorOptions"),
     "solvers.program": ("NonlinearProgram",),
     "solvers.symbolic": ("transcribe",),
+    "workflow.baseline": ("read_estimates",),
     "workflow.build": ("load_problem", "load_system"),
     "solvers": (
         "GaussNewton",
@@ -106,6 +108,7 @@ __all__ = [
     "load_problem",
     "load_system",
     "read_any",
+    "read_estimates",
     "read_recording",
     "simulate",
     "solve",

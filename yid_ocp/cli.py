@@ -72,6 +72,12 @@ def _doubting_or_embedded(parser: argparse.ArgumentParser) -> None:
     _doubting(parser, optional=True)
 
 
+def _diagnose(parser: argparse.ArgumentParser) -> None:
+    _doubting(parser, optional=True)
+    text = "run folder of an earlier solve or diagnose of the same model: ask what differs since; may be repeated"
+    parser.add_argument("--baseline", metavar="RUN", action="append", default=[], help=text)
+
+
 def _identifiability(parser: argparse.ArgumentParser) -> None:
     _doubting(parser)
     parser.add_argument("--what-if", action="store_true", help="rank changes of the experiment; takes a few minutes")
@@ -118,6 +124,12 @@ def _export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quiet", action="store_true", help="print nothing but the files' paths")
 
 
+def _report(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("runs", metavar="RUN", nargs="+", help="run folders of solve or diagnose, in the order of time")
+    parser.add_argument("--out", metavar="DIR", help="folder to make (default: runs/history-report-DATE-TIME)")
+    parser.add_argument("--quiet", action="store_true", help="print nothing but the folder's path")
+
+
 def _schema(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="FILE", help="file to write; printed when absent")
 
@@ -135,7 +147,7 @@ COMMANDS: tuple[Command, ...] = (
         "diagnose",
         "find the gap between model and recordings, and what makes it",
         "diagnose",
-        _doubting_or_embedded,
+        _diagnose,
     ),
     Command(
         "blind",
@@ -143,6 +155,7 @@ COMMANDS: tuple[Command, ...] = (
         "blind",
         _blind,
     ),
+    Command("report", "compare runs of one model: what drifted, which run to distrust", "report", _report),
     Command("plan", "plan a motion of the arms with the identified model", "plan", _configured),
     Command("simulate", "write what the model says would be recorded", "simulate", _simulate),
     Command("check", "validate a configuration, its recordings and the model before a long run", "check", _doubting),

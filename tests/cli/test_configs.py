@@ -28,6 +28,15 @@ QUICK = {
     "baxter_arm": ("problem.duration=2.0",),
     "panda_beam": ("problem.duration=1.5", "model.object.segments.beam.links=2", "solver.iterations=3"),
     **dict.fromkeys(("springs_series_ends", "springs_series_joint", "springs_torsion"), ()),
+    "soft_beam": (
+        "problem.duration=0.3",
+        "model.object.segments.beam.links=2",
+        "solver.iterations=2",
+        "problem.compiler=false",
+        "model.effects=[]",
+        "parameters={beam.bend: {free: true, initial: 0.018}, beam.damping: {free: true, initial: 4.0e-5}}",
+        *UNREFINED,
+    ),
     "deft_bdlo1": (
         "problem.duration=0.1",
         "solver.iterations=2",

@@ -47,7 +47,7 @@ def test_parameters_of_a_run(written):
     assert [system.parameters[f"T{i}.bend"].value for i in (1, 2, 3)] == [5, 7, 5]
     assert system.parameters["T3.bend"].upper == 50
     assert system.parameters["T1.mass"].value == 0.07
-    options = problem_options(run, system.parameters)
+    options = problem_options(run, system)
     assert options.priors == {"T2.bend": 2.0}
 
 
@@ -241,13 +241,13 @@ def test_a_problem_has_the_options_of_its_section(written):
             "parameters: {T1.bend: {prior: 2, local: true}}\n"
         )
     )
-    options = problem_options(run, build_system(run).parameters)
+    options = problem_options(run, build_system(run))
     assert (options.weighting, options.huber_threshold, options.duration) == ("paper", 3.0, 2.0)
     assert (options.start_parameters, options.local, options.priors) == (("T1.mass",), ("T1.bend",), {"T1.bend": 2.0})
     assert options.sensors["points"].std == 0.1
     wrong = load_config(written("model: {object: {kind: y}}\nproblem: {start_parameters: [T1.mas]}\n"))
     with pytest.raises(ConfigError, match=r"there is no parameter 'T1.mas'") as caught:
-        problem_options(wrong, build_system(wrong).parameters)
+        problem_options(wrong, build_system(wrong))
     assert "line 2: problem.start_parameters" in caught.value.where
 
 
@@ -272,6 +272,6 @@ def test_prescribed_arms_that_hold_an_object_are_states(repository, file, overri
 def test_their_encoders_are_measurements_and_the_points_of_the_arm_are_not(repository):
     file = repository / "configs" / "dual_arm_vision.yaml"
     run = load_config(file, ["model.arms.mode=prescribed", "recordings.held_out=[]", "problem.compiler=false"])
-    options = problem_options(run, build_system(run).parameters, read_recordings(run, "estimate"))
+    options = problem_options(run, build_system(run), read_recordings(run, "estimate"))
     used = {group: said.use for group, said in options.sensors.items()}
     assert used == {"joints.position": True, "points_arm": False}

@@ -39,11 +39,36 @@ GraspName = Literal["point", "axis", "weld"]
 
 @dataclass(frozen=True, kw_only=True)
 class MountSettings:
-    """Where the root of an object sits, or a frame that the robot's file does not have."""
+    """Where the root of an object sits."""
 
-    frame: Annotated[str | None, About("frame of the robot that carries it; the world when absent")] = None
+    frame: Annotated[str | None, About("frame or clamp that carries it; the world when absent")] = None
     xyz: Annotated[Triple, About("position in that frame", "m")] = (0.0, 0.0, 0.0)
     rpy: Annotated[Triple, About("roll, pitch, yaw in that frame", "rad")] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameSettings(MountSettings):
+    """A named frame beside those that robot and object have: a tool's tip, a marker."""
+
+    straight: Annotated[
+        bool,
+        About(
+            "whether each recording's `straight` says where the point of this name sits, in place of xyz, for markers "
+            "on an object that stands in the world"
+        ),
+    ] = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClampSettings:
+    """A clamp that somebody or something moves as measured: a massless frame that follows two recorded points."""
+
+    origin: Annotated[str, About("point at which the clamp's origin sits")]
+    towards: Annotated[str, About("point to which its z axis looks, never along the world's x axis")]
+    roll: Annotated[
+        Literal["level", "transported"],
+        About("what two points do not tell: x axis across the world's y, or no turn about z from the start on"),
+    ] = "level"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,7 +134,7 @@ class CableObject(CableOptions):
 class GraspSettings:
     """A frame of the robot that holds a frame of the object."""
 
-    holder: Annotated[str, About("frame of the robot")]
+    holder: Annotated[str, About("frame of the robot, or a clamp")]
     held: Annotated[str, About("frame of the object, or a point along a segment such as T1:40%")]
     kind: Annotated[GraspName, About("3, 5 or 6 equations")] = "point"
     rpy: Annotated[Triple, About("orientation of held in holder, for axis and weld", "rad")] = (0.0, 0.0, 0.0)
@@ -158,10 +183,20 @@ class ArmSettings:
 class ModelSettings:
     """What the world is made of."""
 
-    robot: Annotated[FilePath | None, About("URDF file, or package:NAME of example-robot-data")] = None
+    robot: Annotated[
+        FilePath | None,
+        About("URDF file, or package:NAME of example-robot-data; null for an object held by the world or by clamps"),
+    ] = None
+    clamps: Annotated[
+        Mapping[str, ClampSettings],
+        About("what moves an object without a robot, by name; a cable has its own at both ends"),
+    ] = field(default_factory=dict)
     arms: Annotated[ArmSettings, About("the robot's joints")] = field(default_factory=ArmSettings)
     frames: Annotated[
-        Mapping[str, MountSettings], About("more frames, by name: a tool's tip, the middle of what a gripper holds")
+        Mapping[str, FrameSettings],
+        About(
+            "more frames, by name, on robot, object or world: a tool's tip, the middle of what a hand holds, a marker"
+        ),
     ] = field(default_factory=dict)
     object: Annotated[YObject | SegmentedObject | CableObject | None, About("the flexible object")] = None
     grasp: Annotated[Mapping[str, GraspSettings], About("by name: left, right, gripper")] = field(default_factory=dict)
@@ -187,6 +222,10 @@ class RecordingSettings:
 
     estimate: Annotated[tuple[RecordingPath, ...], About("to estimate on")] = ()
     held_out: Annotated[tuple[RecordingPath, ...], About("only predicted, never touched by the fit")] = ()
+    without: Annotated[
+        tuple[RecordingPath, ...],
+        About("made without what a diagnosis finds, which it then predicts; those of its baseline when absent"),
+    ] = ()
     strict: Annotated[
         bool, About("whether any doubt about a recording stops the run; --strict on the command line")
     ] = False
@@ -228,6 +267,11 @@ class DiagnosisSettings(Thresholds):
         Le(1),
         About("part of all stated std, torques' included, that is noise, where the rest stands for the model's error"),
     ] = 1.0
+
+    baseline: Annotated[
+        tuple[FilePath, ...],
+        About("run folders of `solve` or `diagnose`, of the same model: what differs since is asked"),
+    ] = ()
 
     @property
     def of_a_fit(self) -> GapLimits:

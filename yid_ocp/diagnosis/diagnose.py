@@ -10,8 +10,11 @@ from dataclasses import replace
 import numpy as np
 import threadpoolctl
 
+from yid_ocp.analysis.history import Estimates
 from yid_ocp.data.recording import Recording
+from yid_ocp.diagnosis.baseline import with_baseline
 from yid_ocp.diagnosis.carry_over import carried_over
+from yid_ocp.diagnosis.earlier import Earlier
 from yid_ocp.diagnosis.events import NOTHING, Events, find_events, without_events
 from yid_ocp.diagnosis.finding import Finding, absorption
 from yid_ocp.diagnosis.hypotheses import MARGINS, CandidateProblem, Choice, Cut, chosen_effects
@@ -44,6 +47,8 @@ def diagnose(
     solution: Solution | None = None,
     progress: Progress | None = None,
     store: Store | None = None,
+    baseline: Estimates | Sequence[Estimates] = (),
+    without: Sequence[Recording] = (),
 ) -> Finding:
     """Say whether there is a gap between model and recordings, where, which effect makes it, and how far it closes.
 
@@ -62,6 +67,11 @@ def diagnose(
         Told in words what is going on.
     store : Store, optional
         Of refits that an earlier run of the same diagnosis finished; told of every further one.
+    baseline : Estimates or sequence of Estimates, optional
+        What earlier runs of the same model say of its parameters (`read_estimates`): priors, so that the question is
+        what differs now. A problem that has them already (`with_baseline`) is taken as it is.
+    without : sequence of Recording, optional
+        Made without what is looked for: what the effects found are taken out for (`counterfactual`).
 
     Returns
     -------
@@ -79,12 +89,19 @@ def diagnose(
     # the matrices are small: threads of the linear algebra library cost more than they give
     with threadpoolctl.threadpool_limits(1):
         clock, told = _Clock(), progress or log.info
+        runs = (baseline,) if isinstance(baseline, Estimates) else tuple(baseline)
+        earlier = Earlier.of(runs, tuple(without))
+        if earlier.known is not None and not problem.options.joint_prior.names:
+            problem = with_baseline(problem, earlier.known)
         composed = _composed(problem, candidates, held_out, told)
         clock.lap("compose")
-        return _diagnosed(problem, Search(composed, thresholds or DEFAULTS, told, store), solution, clock)
+        search = Search(composed, thresholds or DEFAULTS, told, store)
+        return _diagnosed(problem, search, solution, clock, earlier)
 
 
-def _diagnosed(problem: EstimationProblem, search: Search, solution: Solution | None, clock: _Clock) -> Finding:
+def _diagnosed(
+    problem: EstimationProblem, search: Search, solution: Solution | None, clock: _Clock, earlier: Earlier
+) -> Finding:
     limits, progress = search.limits, search.progress
     progress("fitting the nominal model")
     nominal = nominal_fit(problem, search.problem, solution, search.store, limits)
@@ -104,7 +121,10 @@ def _diagnosed(problem: EstimationProblem, search: Search, solution: Solution | 
         search, nominal, cuts = _followed(search, other, cuts)
         search, before, held, screened = _tested(search, nominal)
         gap = has_gap(before, held, limits, screened.scores, offsets)
+    changed = earlier.changed(nominal, limits)
     clock.lap("other_starts")
+    moved = bool(changed) and not gap
+    gap = gap or moved
     if gap and enough:
         progress("locating the gap")
         smoothed = smooth_fit(nominal, limits)
@@ -122,6 +142,7 @@ def _diagnosed(problem: EstimationProblem, search: Search, solution: Solution | 
     clock.lap("carry_over")
     total = closure(nominal.loss, added[-1].fit.loss, limits=limits) if added else Closure(np.nan, np.nan, np.nan)
     explained = explained_part(nominal, added, trusted)
+    gap = gap and (bool(added) or not moved)  # what parameters explain by moving is no gap
     same = all(entry.agrees for entry in carried)
     verdict = decide(gap, screened.visible, added, total, limits, enough, explained, same)
     accepted = added if verdict in ("effect", "confusable") else ()
@@ -158,6 +179,8 @@ def _diagnosed(problem: EstimationProblem, search: Search, solution: Solution | 
         carried=carried,
         seconds=clock.laps,
         events=events,
+        since=earlier.since(accepted[-1].fit if accepted else nominal, limits),
+        counterfactual=earlier.counterfactual(nominal, accepted, progress),
     )
     return replace(finding, summary=sentences(finding))
 

@@ -7,7 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from yid_ocp.diagnosis.baseline import Since
 from yid_ocp.diagnosis.carry_over import Carried
+from yid_ocp.diagnosis.counterfactual import Counterfactual
 from yid_ocp.diagnosis.events import NOTHING, Events
 from yid_ocp.diagnosis.hypotheses import Cut
 from yid_ocp.diagnosis.localise import Place
@@ -19,6 +21,7 @@ from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import Reason
 from yid_ocp.effects import EffectBase
 from yid_ocp.problem.null_test import Floor, NullTest
+from yid_ocp.solvers.judgement import known_covariance, uncertainty
 
 FORMAT = "yid-diagnosis/1"
 
@@ -80,6 +83,10 @@ class Finding:
     limits : Thresholds
         By which all this was decided.
     seconds : dict of stage to float
+    since : Since or None
+        What has moved since the baseline; None without one.
+    counterfactual : Counterfactual or None
+        The world without the effects found; None where nothing of it was recorded, or nothing was found.
     summary : str
         The report in words; see `words.sentences`.
     cuts : tuple of Cut
@@ -116,6 +123,8 @@ class Finding:
     message: str
     limits: Thresholds
     seconds: Mapping[str, float]
+    since: Since | None = None
+    counterfactual: Counterfactual | None = None
     summary: str = ""
     cuts: tuple[Cut, ...] = ()
     reason: Reason = ""
@@ -198,8 +207,66 @@ class Finding:
             ],
             "unseen": [v.effect.label for v in self.visibility if not v.visible],
             "noise": {f.channel: {"std": f.std, "unit": f.unit, "samples": f.samples} for f in self.floor},
+            "baseline": None if self.since is None else _since(self.since),
+            "counterfactual": None if self.counterfactual is None else self.counterfactual.to_dict(),
             "seconds": dict(self.seconds),
         }
+
+
+def model_result(finding: Finding) -> dict[str, Any]:
+    """`model` of result.json: parameters and covariance of the model that a diagnosis ended with."""
+    return {"parameters": _parameters(finding), "covariance": _covariance(finding.last)}
+
+
+def _parameters(finding: Finding) -> dict[str, dict[str, Any]]:
+    """Every parameter of the last model, of tried effects only those that it has: value, std, unit, whether free."""
+    fit = finding.last
+    problem = fit.problem
+    idle = {entry.effect.label for entry in finding.visibility} - {effect.label for effect in fit.effects}
+    theta, _ = problem.split(problem.vector(fit.values), 0)
+    found = {}
+    for entry, value in zip(problem.system.parameters, theta, strict=True):
+        if entry.name in problem.local or entry.name.rpartition(".")[0] in idle:
+            continue
+        free = entry.name in problem.shared
+        std = _number(fit.std[entry.name]) if free else 0.0
+        found[entry.name] = {"value": float(value), "std": std, "unit": entry.unit, "free": free}
+    return found
+
+
+def _covariance(fit: Fit) -> dict[str, Any]:
+    """Names and matrix of what is known of the shared free parameters together; those not known at all left out."""
+    problem, shared = fit.problem, fit.problem.shared
+    finish = fit.evaluation
+    if finish.jacobian is None:
+        finish = problem.evaluate(problem.vector(fit.values), warm=finish.warm)
+    matrix, _ = uncertainty(problem, finish)
+    std = [fit.std[name] for name in shared]
+    return known_covariance(shared, matrix[: len(shared), : len(shared)], std)
+
+
+def _since(found: Since) -> dict[str, Any]:
+    return {
+        "runs": list(found.runs),
+        "explains": found.explains,
+        "effects": list(found.effects),
+        "chi2": found.chi2,
+        "p_value": found.p_value,
+        "parameters": {
+            entry.name: {
+                "before": entry.before,
+                "before_std": entry.before_std,
+                "now": entry.now,
+                "now_std": _number(entry.now_std),
+                "unit": entry.unit,
+                "score": entry.score,
+                "p_value": entry.p_value,
+                "changed": entry.changed,
+            }
+            for entry in found.parameters
+        },
+        "changed": [entry.name for entry in found.changed],
+    }
 
 
 def _state(fit: Fit, test: NullTest) -> dict[str, Any]:

@@ -44,16 +44,19 @@ class Loss:
         Sum of whitened squares and number of samples of every block; infinite where a rollout failed.
     channels : dict of channel to (float, str)
         Root mean square error and its unit.
+    known : float
+        Squares by which the parameters contradict a baseline; other recordings say that, whatever blocks are drawn.
     """
 
     squares: Array
     counts: Array
     channels: dict[str, tuple[float, str]]
+    known: float = 0.0
 
     @property
     def mean(self) -> float:
-        """chi2/n."""
-        return float(self.squares.sum() / max(self.counts.sum(), 1.0))
+        """chi2/n, the contradiction to a baseline counted in."""
+        return float((self.squares.sum() + self.known) / max(self.counts.sum(), 1.0))
 
     @property
     def gap(self) -> float:
@@ -340,4 +343,12 @@ def held_out_loss(problem: EstimationProblem, x: Array) -> Loss:
     predicted = [(result, episode) for episode, result in found if not isinstance(result, str)]
     errors = channel_errors(*map(list, zip(*predicted, strict=True))) if predicted else {}
     channels = {name: (float(entry["rmse"]), str(entry["unit"])) for name, entry in errors.items()}
-    return Loss(np.concatenate(squares), np.concatenate(counts), channels)
+    return Loss(np.concatenate(squares), np.concatenate(counts), channels, _contradiction(problem, x))
+
+
+def _contradiction(problem: EstimationProblem, x: Array) -> float:
+    """Squares of the joint prior's rows."""
+    joint = problem.options.joint_prior.of(problem.shared)
+    at = [problem.names.index(name) for name in joint.names]
+    apart = (x - problem.start)[at]
+    return float(apart @ np.linalg.solve(joint.covariance, apart)) if at else 0.0

@@ -63,8 +63,8 @@ def closure(before: Loss, after: Loss, seed: int = 0, limits: Thresholds = DEFAU
     rng = np.random.default_rng(seed)
     draws = rng.integers(0, len(before.counts), (RESAMPLES, len(before.counts)))
     n = before.counts[draws].sum(axis=1)
-    g0 = np.maximum(before.squares[draws].sum(axis=1) / n - 1.0, 0.0)
-    g1 = np.maximum(after.squares[draws].sum(axis=1) / n - 1.0, 0.0)
+    g0 = np.maximum((before.squares[draws].sum(axis=1) + before.known) / n - 1.0, 0.0)
+    g1 = np.maximum((after.squares[draws].sum(axis=1) + after.known) / n - 1.0, 0.0)
     ratio = 1 - g1[g0 > 0] / g0[g0 > 0]
     low, high = np.quantile(ratio, [0.025, 0.975]) if len(ratio) else (float("nan"), float("nan"))
     return Closure(1 - after.gap / before.gap, float(low), float(high), sure)
@@ -79,7 +79,8 @@ def far_likelier(before: Loss, after: Loss, limits: Thresholds = DEFAULTS) -> bo
     """
     if not max(before.mean, after.mean) < 1 + limits.smallest_gap:
         return False
-    return float(np.sum(before.squares) - np.sum(after.squares)) > 2 * limits.worth
+    fall = np.sum(before.squares) + before.known - np.sum(after.squares) - after.known
+    return float(fall) > 2 * limits.worth
 
 
 def gain(before: Loss, after: Loss) -> tuple[float, float]:
@@ -90,7 +91,7 @@ def gain(before: Loss, after: Loss) -> tuple[float, float]:
         return (-np.inf if np.isfinite(before.mean) else np.inf), 0.0
     count = len(difference)
     error = np.sqrt(count) * float(np.std(difference, ddof=1)) if count > 1 else np.inf
-    return float(difference.sum()) / total, float(error) / total
+    return float(difference.sum() + before.known - after.known) / total, float(error) / total
 
 
 def within_reach(fits: Sequence[Fit], limits: Thresholds = DEFAULTS) -> list[Fit]:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from yid_ocp.diagnosis.baseline import Since
 from yid_ocp.diagnosis.carry_over import disagreeing
+from yid_ocp.diagnosis.counterfactual import Counterfactual
 from yid_ocp.diagnosis.events import event_sentences
 from yid_ocp.diagnosis.finding import Finding
 from yid_ocp.diagnosis.hypotheses import Cut
@@ -28,6 +30,8 @@ SIDES = {
     "sensor": ", in what sensors read",
     "either": ", in the mechanics or in what the effort sensor reads, which efforts alone do not tell apart",
 }
+DIFFER = 0.01
+"""Significance below which several runs of a baseline differ."""
 NEXT = {
     "insufficient_data": "Record longer and larger motions; more of the object has to be seen.",
     "separate": "Vary {aspects} independently of each other, over a wide range, in one recording.",
@@ -121,6 +125,10 @@ def sentences(finding: Finding) -> str:
     elif finding.verdict == "unknown":
         text.append(_nameless(finding))
     text += [cut_short(cut) for cut in finding.cuts]
+    if finding.since is not None:
+        text.append(_since(finding.since, bool(finding.effects)))
+    if finding.counterfactual is not None:
+        text += _counterfactual(finding.counterfactual)
     if finding.in_blocks:
         why = "No held-out recording is left" if finding.cuts else "Only one set of recordings was given"
         text.append(f"{why}: alternate blocks of what is estimated on were held out.")
@@ -206,6 +214,52 @@ def _effects(finding: Finding) -> list[str]:
     if moved:
         steps = (f"{a.name} goes from {a.before:.3g} to {a.after:.3g}" for a in moved[:6])
         text.append(f"With it {', '.join(steps)}.")
+    return text
+
+
+def _since(found: Since, effects: bool) -> str:
+    """What has moved since the baseline, and what a baseline that explained little is worth."""
+    several = len(found.runs) > 1
+    said = "Against the baseline" + (f" of {len(found.runs)} runs" if several else "")
+    if found.changed:
+        moved = (
+            f"{e.name} is {e.now:.3g} ± {e.now_std:.2g} {e.unit} where it was {e.before:.3g} ± {e.before_std:.2g}"
+            for e in found.changed[:4]
+        )
+        text = f"{said}, {'even with that ' if effects else ''}{', '.join(moved)}."
+    else:
+        seen = [entry for entry in found.parameters if entry.score is not None]
+        text = f"{said}, " + (
+            "no parameter has changed." if seen else "these recordings say nothing of the parameters."
+        )
+    if several and found.p_value < DIFFER:
+        text += f" The runs of the baseline differ among themselves (p = {found.p_value:.2g}); their ± is wider for it."
+    if not found.explains:
+        text += (
+            " The model did not explain the baseline's recordings, so its ± counts that misfit and may be too small."
+        )
+    return text
+
+
+def _counterfactual(found: Counterfactual) -> list[str]:
+    """Whether taking the effects away predicts the world without them, and adding them the world with them."""
+    text = []
+    parts = (
+        ("Taken away again, it predicts", found.removed, "made without it", "as it was fitted without a diagnosis"),
+        ("Added to what was known without it, it predicts", found.added, "made with it", "without it"),
+    )
+    for begin, part, made, rival in parts:
+        if part.message:
+            text.append(f"What was {made} could not be predicted ({part.message}).")
+            continue
+        names = " and ".join(name.removesuffix(" (without)") for name in part.recordings[:2]) + (
+            " and others" if len(part.recordings) > 2 else ""
+        )
+        errors = ", ".join(f"{after:.2g} {unit}" for unit, (_, after) in part.means.items())
+        plain = ", ".join(f"{before:.2g} {unit}" for unit, (before, _) in part.means.items())
+        text.append(f"{begin} {names}, {made}, to {errors} (rms), where the model {rival} has {plain}.")
+        if not part.better:
+            text.append("That is no better, so it may stand in for something else.")
     return text
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
+import numpy as np
 from annotated_types import Ge, Gt, Len
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.data.doubt import Doubt
 from yid_ocp.model.cable import ClampPath
@@ -49,6 +50,31 @@ class SensorOptions:
 
 
 @dataclass(frozen=True)
+class JointPrior:
+    """A Gaussian prior of several shared parameters together, about their initial values: an earlier estimate.
+
+    Attributes
+    ----------
+    names : tuple of str, length n
+    covariance : ndarray, shape (n, n)
+        Positive definite, in the parameters' units.
+    """
+
+    names: tuple[str, ...] = ()
+    covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)), compare=False)
+
+    def scaled(self, factors: Mapping[str, float]) -> JointPrior:
+        """The prior of parameters that are so many times these; those that are not named stay."""
+        by = np.array([factors.get(name, 1.0) for name in self.names])
+        return JointPrior(self.names, self.covariance * np.outer(by, by))
+
+    def of(self, names: Sequence[str]) -> JointPrior:
+        """The prior of those of its parameters that are named, in that order, whatever the others are."""
+        at = [self.names.index(name) for name in names if name in self.names]
+        return JointPrior(tuple(self.names[i] for i in at), self.covariance[np.ix_(at, at)])
+
+
+@dataclass(frozen=True)
 class ProblemOptions:
     """Everything about an estimation problem that is neither the model nor the data.
 
@@ -60,6 +86,8 @@ class ProblemOptions:
         Free parameters with a value of their own in every recording.
     priors : mapping of parameter to standard deviation
         Gaussian priors about the initial value, in the parameter's unit.
+    joint_prior : JointPrior
+        What is known of several parameters together, in place of entries of `priors`.
     recording_values : mapping of recording to mapping of parameter to value
         Known values of parameters that differ from recording to recording, such as where markers sit.
     known_start : mapping of recording to array_like, shape (nx,)
@@ -92,6 +120,7 @@ class ProblemOptions:
     clamps: tuple[ClampPath, ...] = ()
     local: tuple[str, ...] = ()
     priors: Mapping[str, float] = field(default_factory=dict)
+    joint_prior: JointPrior = field(default_factory=JointPrior)
     weak_prior_factor: Annotated[
         float,
         Ge(0),

@@ -30,6 +30,7 @@ from yid_ocp.problem.unknowns import (
     soft_logarithm,
     start_limits,
     start_names,
+    stated_rows,
     stated_std,
 )
 
@@ -151,7 +152,8 @@ class EstimationProblem:
         bare = options.weighting == "paper" or options.weak_prior_factor <= 1
         weak = np.zeros(len(self.names), bool) if bare else self.positive & ~np.isfinite(self._prior_std)
         self._weak: NDArray[np.int64] = np.flatnonzero(weak)
-        self.rows = ResidualRows.of(episodes, int(np.isfinite(self._prior_std).sum()), len(self._weak))
+        self._stated = stated_rows(self.unknowns, options, self._prior_std)
+        self.rows = ResidualRows.of(episodes, len(self._stated), len(self._weak))
 
     def _changed(self, **changes: Any) -> EstimationProblem:
         """Another problem that shares what is compiled and placed; nothing is prepared anew."""
@@ -367,15 +369,12 @@ class EstimationProblem:
 
     def prior(self, x: Array) -> tuple[Array, Array]:
         """Rows of the stated and of the weak priors, and their derivative by the unknowns."""
-        stated, weak = np.flatnonzero(np.isfinite(self._prior_std)), self._weak
-        rows = np.zeros((len(stated) + len(weak), len(x)))
-        weight = 1.0 / self._prior_std[stated]
-        rows[np.arange(len(stated)), stated] = weight
-        start = self.start
+        stated, weak, start = self._stated, self._weak, self.start
+        rows = np.vstack([stated, np.zeros((len(weak), len(x)))])
         spread = np.log(max(self.options.weak_prior_factor, 1.0 + 1e-9))
         value, slope = soft_logarithm(x[weak] / start[weak])
         rows[len(stated) + np.arange(len(weak)), weak] = slope / (spread * start[weak])
-        return np.concatenate([weight * (x - start)[stated], value / spread]), rows
+        return np.concatenate([stated @ (x - start), value / spread]), rows
 
     def informing(self, evaluation: Evaluation) -> tuple[Array, Array]:
         """What data and stated priors say, in units of their noise: residual (r,) and Jacobian (r, nx).
@@ -584,6 +583,7 @@ class EstimationProblem:
             self.options,
             local=tuple(name for name in self.options.local if name in keep),
             priors={name: std for name, std in self.options.priors.items() if name in keep},
+            joint_prior=self.options.joint_prior.of(free),
         )
         nominal = dict(zip(self.system.parameters.names, self.theta, strict=True))
         return self._prepared(free=free, options=options, values=nominal | dict(values or {}))

@@ -92,6 +92,8 @@ def stated_std(
     """
     limits = hidden_starts(system)
     stds = []
+    joint = options.joint_prior.of(unknowns.shared)
+    known = dict(zip(joint.names, np.sqrt(np.diag(joint.covariance)).tolist(), strict=True))
     for name in unknowns.names:
         base = name.split("[")[0]
         if base.startswith(f"{START}q."):
@@ -102,8 +104,29 @@ def stated_std(
         elif base.startswith(f"{START}z."):
             stds.append(limits[base.removeprefix(f"{START}z.")] / math.sqrt(3))
         else:
-            stds.append(float(options.priors.get(base, np.inf)))
+            stds.append(known.get(name, float(options.priors.get(base, np.inf))))
     return np.array(stds)
+
+
+def stated_rows(unknowns: Unknowns, options: ProblemOptions, std: Array) -> Array:
+    """Rows of the stated priors, (k, nx): times (x - start) they are in units of what is known, and independent.
+
+    Parameters
+    ----------
+    unknowns : Unknowns
+    options : ProblemOptions
+    std : ndarray, shape (nx,)
+        From `stated_std`.
+    """
+    joint = options.joint_prior.of(unknowns.shared)
+    at = [unknowns.names.index(name) for name in joint.names]
+    alone = [i for i in np.flatnonzero(np.isfinite(std)) if i not in at]
+    rows = np.zeros((len(alone) + len(at), len(std)))
+    rows[np.arange(len(alone)), alone] = 1.0 / std[alone]
+    if at:
+        # C = L L', so that L^-1 d has unit covariance
+        rows[len(alone) :, at] = np.linalg.inv(np.linalg.cholesky(joint.covariance))
+    return rows
 
 
 def start_names(system: System, options: ProblemOptions, free: Sequence[str], theta: Array) -> tuple[str, ...]:
@@ -141,7 +164,7 @@ def start_limits(system: System, names: Sequence[str]) -> Array:
 
 def check_free(system: System, free: Sequence[str], options: ProblemOptions) -> None:
     """Refuse parameters that are unknown, named twice, or local or with a prior without being free."""
-    for name in [*free, *options.local, *options.priors]:
+    for name in [*free, *options.local, *options.priors, *options.joint_prior.names]:
         system.parameters.index(name)
     if len(set(free)) != len(free):
         raise ConfigError("a free parameter is named twice", where=", ".join(free))

@@ -9,6 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from yid_ocp.data import Recording
+from yid_ocp.report.earlier import (
+    baseline_rows,
+    counterfactual_rows,
+    history_rows,
+    history_sentences,
+    run_rows,
+)
 from yid_ocp.report.tables import (
     blind_table,
     distance_rows,
@@ -276,11 +283,19 @@ def diagnose_summary(result: Mapping[str, Any]) -> list[str]:
         p = f"{entry['p_value']:.2g}" if entry["p_value"] > 1e-12 else "< 1e-12"
         rows.append((label, values, closed, f"{entry['score']:.3g}", p))
     lines += [*table(rows), ""] if len(rows) > 1 else []
+    for shown in (baseline_rows(result), counterfactual_rows(result)):
+        lines += [*table(shown), ""] if len(shown) > 1 else []
     lines += _offset_lines(result)
     lines += ["what is in doubt about the recordings may be what the verdict is about"] if result.get("doubts") else []
     if result["next_plan"] is not None:
         lines += ["to separate what looks alike, plan a motion:", planning_command(result["next_plan"]), ""]
     return [*lines, f"verdict: {result['verdict']} ({sum(result['seconds'].values()):.1f} s)"]
+
+
+def history_summary(result: Mapping[str, Any]) -> list[str]:
+    """Lines that tell a person what a `yid-history/1` result says."""
+    said = [line for text in history_sentences(result) for line in textwrap.wrap(text, 100)]
+    return [*table(history_rows(result)), "", *table(run_rows(result)), "", *said]
 
 
 def planning_command(section: Mapping[str, Any]) -> str:

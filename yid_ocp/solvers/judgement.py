@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -261,6 +262,22 @@ def plain_std(covariance: Array, x: Array) -> Array:
     return np.where(np.isnan(diagonal), np.inf, np.sqrt(np.maximum(diagonal, 0.0)))
 
 
+def known_covariance(names: Sequence[str], matrix: Array, std: Sequence[float]) -> dict[str, Any]:
+    """For result.json: names and covariance of parameters, correlated as in a matrix, with the ± that is stated.
+
+    Parameters
+    ----------
+    names : sequence of str, length n
+    matrix : ndarray, shape (n, n)
+    std : sequence of float, length n
+        Those that are not finite and positive are left out: nothing is known of their parameters.
+    """
+    at = [i for i, value in enumerate(std) if math.isfinite(value) and value > 0 and matrix[i, i] > 0]
+    factor = np.array([std[i] for i in at]) / np.sqrt(np.array([matrix[i, i] for i in at]))
+    kept = matrix[np.ix_(at, at)] * np.outer(factor, factor)
+    return {"names": [names[i] for i in at], "matrix": kept.tolist()}
+
+
 def _informed_cost(problem: EstimationProblem, evaluation: Evaluation) -> float:
     """Cost in units of the noise without the weak priors."""
     weak, stated = (
@@ -363,6 +380,8 @@ def typical_sizes(problem: EstimationProblem, x: Array) -> Mapping[str, float]:
     entries = list(problem.system.parameters)
     scales = {name.split("[")[0]: float(scale) for name, scale in zip(problem.names, problem.scales, strict=True)}
     sizes = dict(zip((entry.name for entry in entries), np.abs(theta), strict=True))
+    joint = problem.options.joint_prior
+    known = {**problem.options.priors, **dict(zip(joint.names, np.sqrt(np.diag(joint.covariance)), strict=True))}
     found = {}
     for entry in entries:
         if entry.name not in (*problem.shared, *problem.local):
@@ -371,8 +390,8 @@ def typical_sizes(problem: EstimationProblem, x: Array) -> Mapping[str, float]:
         alike = [o for o in entries if o.name != entry.name and o.unit == entry.unit and "@" not in o.name]
         own = [o for o in alike if _kind(o.name) == _kind(entry.name)]
         others = [float(sizes[o.name]) for o in own or alike if sizes[o.name] > 0]
-        if entry.name in problem.options.priors:
-            found[entry.name] = float(problem.options.priors[entry.name])
+        if entry.name in known:
+            found[entry.name] = float(known[entry.name])
         elif math.isfinite(width):
             found[entry.name] = width / 2
         else:

@@ -467,20 +467,25 @@ class _Maker:
         found = []
         kinds = (("prior", slice(0, stated), v - about), ("weak_prior", slice(stated, None), soft))
         for name, part, value in kinds:
-            row, unknown = np.nonzero(slopes[part])
-            kept = np.isin(unknown, list(columns))
-            weight, unknown = slopes[part][row, unknown][kept], unknown[kept]
+            own = slopes[part]
+            unknown = np.array([k for k in np.flatnonzero(own.any(axis=0)) if int(k) in columns], int)
+            own = own[own[:, unknown].any(axis=1)][:, unknown]
             if not len(unknown):
                 continue
+            # rows of a joint prior mix their own unknown, the last one, with those before it
+            last = own.shape[1] - 1 - np.argmax(own[:, ::-1] != 0, axis=1)
+            weight = own[np.arange(len(own)), last]
+            mixed = ca.sparsify(ca.DM(own / weight[:, None]))
             if name == "weak_prior":
-                weight = weight * problem.start[unknown]
+                weight = weight * problem.start[unknown[last]]
             names = [problem.names[k] for k in unknown]
             start = self._p.add(f"{name}.start", problem.start[unknown], names)
-            weights = self._p.add(f"{name}.weight", weight, names)
+            rows = [names[k] for k in last]
+            weights = self._p.add(f"{name}.weight", weight, rows)
             local = Local(name, [v, about, ca.SX(0, 1)], value)
             at = np.array([[columns[int(k)]] for k in unknown])
             term = Term(name, (name,), local, at, start, np.zeros(0, np.int64))
-            found.append(Residual(term, ca.DM.eye(len(unknown)), weights[:, 0]))
+            found.append(Residual(term, mixed, weights[:, 0]))
         return found
 
 

@@ -32,6 +32,7 @@ from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.sensors.joints import POSITION, of_arm
 from yid_ocp.workflow.doubts import blaming, examined, object_doubts, stop_at
+from yid_ocp.workflow.held import clamp_paths, clamps, straight_values, with_frames
 
 GIVEN_FRAMES = 2  # of a cable's free points, from which every prediction starts
 LARGEST_GAP = 0.01  # what encoder noise and a slightly wrong length of the object can make of a grasp [m]
@@ -77,6 +78,7 @@ def build_system(run: Run, finer: int = 1) -> System:
         return _cable_model(run)
     robot = _robot(run)
     joints = () if robot is None else robot.joint_names
+    held = clamps(run)
     damping, of_object = _dampings(run, joints)
     for name, spring in model.springs.items():
         if name not in joints:
@@ -96,18 +98,25 @@ def build_system(run: Run, finer: int = 1) -> System:
     ]
     if robot is None and not objects:
         raise run.refuse("the model has neither a robot nor an object", "model", hint="set model.robot or model.object")
+    with located(run, "model", "frames"):
+        carrier, items = with_frames(run, robot if held is None else held, [item for item, _, _ in objects])
     with located(run, "model"):
         system = System.build(
-            robot,
-            objects=objects,
+            carrier,
+            objects=[(item, frame, place) for item, (_, frame, place) in zip(items, objects, strict=True)],
             grasps=grasps,
             driven=moved if mode == "driven" else (),
-            prescribed=moved if mode == "prescribed" else (),
+            prescribed=held.joint_names if held is not None else moved if mode == "prescribed" else (),
             damping=damping,
             gravity=model.gravity,
             points=model.points,
             springs={name: Spring(s.stiffness, s.rest) for name, s in model.springs.items()},
         )
+    if any(said.straight for said in model.frames.values()) and run.recordings.estimate:
+        # where markers sit when nobody says which recording is meant
+        first = replace(run, recordings=replace(run.recordings, estimate=run.recordings.estimate[:1]))
+        [places] = straight_values(run, system, read_recordings(first, "estimate")).values()
+        system = replace(system, parameters=system.parameters.with_values(places))
     return _completed(run, system, finer)
 
 
@@ -157,7 +166,7 @@ def _cable_model(run: Run) -> System:
     cable, item = build_cable(run), run.model.object
     assert cable is not None
     assert isinstance(item, CableObject)
-    for key in ("robot", "grasp", "springs"):
+    for key in ("robot", "grasp", "springs", "clamps", "frames"):
         if getattr(run.model, key):
             raise run.refuse(f"a cable takes no {key}: its clamps hold it", "model", key, hint=f"remove {key}")
     for name in item.branches:
@@ -191,11 +200,7 @@ def _robot(run: Run) -> Mechanism | None:
     input_files(run)
     with located(run, "model", "arms", "joints"):
         arms = model.arms
-        robot = read_urdf(model.robot, joints=arms.joints, locked=arms.locked, exclude_links=arms.exclude_links)
-    for name, at in model.frames.items():
-        with located(run, "model", "frames", name):
-            robot = robot.with_frame(name, at.frame, _placement(at))
-    return robot
+        return read_urdf(model.robot, joints=arms.joints, locked=arms.locked, exclude_links=arms.exclude_links)
 
 
 def input_files(run: Run) -> dict[str, Path]:
@@ -400,17 +405,17 @@ def build_step(run: Run, system: System | None = None) -> Step:
     return compile_step(system, said.time_step, said.force_split, said.constraint_force, use_compiler=said.compiler)
 
 
-def problem_options(run: Run, parameters: Parameters, recordings: Sequence[Recording] = ()) -> ProblemOptions:
+def problem_options(run: Run, system: System, recordings: Sequence[Recording] = ()) -> ProblemOptions:
     """What the settings say about the estimation problem.
 
     Parameters
     ----------
     run : Run
-    parameters : Parameters
-        Of the system.
+    system : System
     recordings : sequence of Recording
-        Where values differ from recording to recording (a cable's edges), those of these.
+        Where values differ from recording to recording (a cable's edges, places of markers), those of these.
     """
+    parameters = system.parameters
     chosen = parameter_settings(run, parameters)
     for name in run.problem.start_parameters:
         if name not in parameters:
@@ -424,7 +429,7 @@ def problem_options(run: Run, parameters: Parameters, recordings: Sequence[Recor
         for group in {group.name for recording in recordings for group in recording.points if of_arm(group)}:
             sensors[group] = replace(sensors.get(group, SensorOptions()), use=False)
     cable = build_cable(run)
-    own: dict[str, dict[str, float]] = {}
+    own = straight_values(run, system, recordings)
     if cable is not None and isinstance(run.model.object, CableObject):
         for group in {group.name for recording in recordings for group in recording.points}:
             said = sensors.get(group, SensorOptions())
@@ -437,14 +442,14 @@ def problem_options(run: Run, parameters: Parameters, recordings: Sequence[Recor
     return replace(
         run.problem,
         sensors=sensors,
-        clamps=() if cable is None else cable.clamps,
+        clamps=clamp_paths(run, cable),
         local=tuple(name for name, said in chosen.items() if said.local),
         priors={name: said.prior for name, said in chosen.items() if said.prior is not None},
         recording_values=own,
     )
 
 
-def build_problem(run: Run, step: Step | None = None) -> EstimationProblem:
+def build_problem(run: Run, step: Step | None = None, without: Sequence[Recording] = ()) -> EstimationProblem:
     """The estimation problem of a run.
 
     Parameters
@@ -452,6 +457,8 @@ def build_problem(run: Run, step: Step | None = None) -> EstimationProblem:
     run : Run
     step : Step, optional
         Compiled before; built when absent.
+    without : sequence of Recording
+        That will be predicted only; the options say where markers sit in them.
 
     Returns
     -------
@@ -483,7 +490,7 @@ def build_problem(run: Run, step: Step | None = None) -> EstimationProblem:
         )
     _check_sensors(run, [*estimate, *held_out])
     seen = examined(run, system, build_cable(run), free, estimate, held_out)
-    options = problem_options(run, system.parameters, [*seen.estimate, *seen.held_out])
+    options = problem_options(run, system, [*seen.estimate, *seen.held_out, *without])
     step = build_step(run, system) if step is None else step
     said = replace(options, doubts=seen.doubts)
     problem = EstimationProblem(step, seen.estimate, free, said, None, seen.held_out)

@@ -6,22 +6,27 @@ import argparse
 import logging
 import os
 import shlex
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from yid_ocp.analysis.history import Estimates, together
 from yid_ocp.config.reader import DIAGNOSIS_DEFAULT, load_config
 from yid_ocp.config.settings import Run, dump_config
+from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis import Finding, diagnose
+from yid_ocp.diagnosis.baseline import with_baseline
+from yid_ocp.diagnosis.finding import model_result
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import Findings
 from yid_ocp.report.terminal import diagnose_summary
 from yid_ocp.sensors.joints import EFFORT, POSITION
 from yid_ocp.solvers import Solution, solve
+from yid_ocp.workflow.baseline import earlier_runs, recordings_without, refuse_same, with_effects_of
 from yid_ocp.workflow.build import build_problem
 from yid_ocp.workflow.command import DONE, carry_out
 from yid_ocp.workflow.doubts import doubts_result
@@ -56,6 +61,9 @@ class DiagnoseOutcome:
 def run(arguments: argparse.Namespace) -> int:
     """The command."""
     settings = load_config(arguments.config, arguments.overrides, DIAGNOSIS_DEFAULT)
+    if arguments.baseline:
+        said = tuple(str(Path(folder).expanduser().resolve()) for folder in arguments.baseline)
+        settings = replace(settings, diagnosis=replace(settings.diagnosis, baseline=said))
     carry_out(lambda shown: run_diagnose(settings, arguments.out, shown), diagnose_summary, arguments.quiet)
     return DONE
 
@@ -87,9 +95,17 @@ def run_diagnose(run: Run, out: str | Path | None = None, progress: Progress = S
             progress.stage(text)
 
         progress.stage("building the model and its compiled step")
-        problem = build_problem(run)
+        runs = earlier_runs(run)
+        without, said = recordings_without(run)
+        if said:
+            folder.log("message", level="WARNING", source="baseline", text=said)
+        run = with_effects_of(run, runs)
+        problem = build_problem(run, without=without)
+        refuse_same(run, problem, runs, without)
+        if runs:
+            problem = with_baseline(problem, together(runs)[0])
         try:
-            finding = _found(run, problem, refits, stage)
+            finding = _found(run, problem, refits, stage, runs, without)
         except KeyboardInterrupt:
             if len(refits):
                 log.warning("%d finished refits are in %s; the same command resumes them", len(refits), refits.file)
@@ -102,6 +118,7 @@ def run_diagnose(run: Run, out: str | Path | None = None, progress: Progress = S
         told = finding.to_dict()
         moving = not last.problem.options.clamps and bool(last.problem.system.driven or last.problem.system.prescribed)
         own = {
+            "model": model_result(finding),
             "doubts": doubts_result(problem.options.doubts),
             "torque_offsets": offsets,
             "command": reproducing(run, folder.target),
@@ -116,7 +133,14 @@ def run_diagnose(run: Run, out: str | Path | None = None, progress: Progress = S
     return DiagnoseOutcome(folder.path, written, finding)
 
 
-def _found(run: Run, problem: EstimationProblem, refits: Refits, stage: Callable[[str], None]) -> Finding:
+def _found(
+    run: Run,
+    problem: EstimationProblem,
+    refits: Refits,
+    stage: Callable[[str], None],
+    runs: Sequence[Estimates],
+    without: Sequence[Recording],
+) -> Finding:
     said = run.diagnosis
     nominal: Solution | None = None
     if said.noise_fraction < 1 and problem.held_out:
@@ -130,6 +154,8 @@ def _found(run: Run, problem: EstimationProblem, refits: Refits, stage: Callable
         solution=nominal,
         progress=stage,
         store=refits,
+        baseline=runs,
+        without=without,
     )
 
 
@@ -141,9 +167,12 @@ def reproducing(run: Run, folder: Path) -> str:
         return shlex.join(
             ["yid-ocp", "diagnose", str((folder if near.startswith("..") else Path(near)) / "config.yaml")]
         )
+    said = [part for folder in run.diagnosis.baseline for part in ("--baseline", folder)]
+    if any(key[:2] == ("diagnosis", "baseline") for key in run.places):
+        said = []  # the configuration says it
     if any(origin.startswith("embedded default") for origin in origins):
-        return "yid-ocp diagnose"
-    return shlex.join(["yid-ocp", "diagnose", run.file])
+        return shlex.join(["yid-ocp", "diagnose", *said])
+    return shlex.join(["yid-ocp", "diagnose", run.file, *said])
 
 
 def in_units_of_noise(problem: EstimationProblem, run: Run) -> EstimationProblem:
@@ -177,6 +206,7 @@ def in_units_of_noise(problem: EstimationProblem, run: Run) -> EstimationProblem
             options,
             sensors=sensors,
             priors={name: share * std for name, std in options.priors.items()},
+            joint_prior=options.joint_prior.scaled(dict.fromkeys(options.joint_prior.names, share)),
             huber_threshold=options.huber_threshold / share,
             weak_prior_factor=options.weak_prior_factor**share if options.weak_prior_factor > 0 else 0.0,
             configuration_std=share * options.configuration_std,

@@ -123,7 +123,8 @@ def _with_twice_the_links(run: Run, problem: EstimationProblem) -> Refined:
     factors = {name: float(finer_factor(run, name, 2)) for name in system.parameters.names}
     priors = {name: std * factors.get(name, 1.0) for name, std in options.priors.items()}
     recordings = [episode.recording for episode in problem.episodes]
-    made = EstimationProblem(step, recordings, problem.free, replace(options, priors=priors))
+    options = replace(options, priors=priors, joint_prior=options.joint_prior.scaled(factors))
+    made = EstimationProblem(step, recordings, problem.free, options)
     return Refined(made, factors, divided_joints(problem.system, system))
 
 

@@ -23,6 +23,7 @@ from yid_ocp.sensors.joints import EFFORT, POSITION, angle_std, by_joint, torque
 from yid_ocp.workflow.build import build_step, build_system, problem_options, read_recordings
 from yid_ocp.workflow.command import DONE, FAILED, carry_out
 from yid_ocp.workflow.folder import new_run_folder
+from yid_ocp.workflow.held import clamped_points
 from yid_ocp.workflow.progress import SILENT, Progress
 
 FORMAT = "yid-simulate/1"
@@ -115,6 +116,14 @@ def _virtual(run: Run, progress: Progress, seed: int) -> Recording:
     from yid_ocp.virtual.experiment import VirtualExperiment, virtual_experiment
 
     system = build_system(run)
+    if run.model.robot is None:
+        raise run.refuse(
+            "nothing moves an object without a robot by itself",
+            "recordings",
+            "estimate",
+            allowed="a recording whose start, clamps and times are taken over",
+            hint="list one, or set model.robot for a virtual experiment",
+        )
     progress.stage("simulating a virtual experiment in MuJoCo")
     duration = run.problem.duration or DURATION
     experiment = VirtualExperiment(
@@ -128,7 +137,7 @@ def _predicted(run: Run, progress: Progress, seed: int | None) -> Recording | st
     step = build_step(run)
     first = replace(run, recordings=replace(run.recordings, estimate=run.recordings.estimate[:1]))
     recordings = read_recordings(first, "estimate")
-    options = replace(problem_options(run, step.system.parameters, recordings), local=(), priors={})
+    options = replace(problem_options(run, step.system, recordings), local=(), priors={})
     problem = EstimationProblem(step, recordings, (), options)
     episode = problem.episodes[0]
     progress.stage(f"rolling out {episode.grid.steps} steps")
@@ -169,11 +178,35 @@ def as_recording(
                     original.sensor, original.frame, original.pose,
                 )
             )  # fmt: skip
+    groups = [_with_clamps(group, problem, source) for group in groups]
     theta = problem.predictor.own_theta(episode, problem.theta)
     truth = dict(zip(system.parameters.names, map(float, theta), strict=True))
     text = f"{run.description} Simulated with the inputs of {episode.name}.".strip()
     joints = _joints(problem, episode, outcome, rng)
-    return Recording(joints, tuple(groups), text, "yid_ocp simulate", "recording", truth=truth)
+    made = Recording(joints, tuple(groups), text, "yid_ocp simulate", "recording", truth=truth)
+    return replace(made, straight=_straight(made, source))
+
+
+def _with_clamps(group: PointGroup, problem: EstimationProblem, source: Recording) -> PointGroup:
+    """A group with the points that clamps follow, as they were recorded: what moves the object, not what it does."""
+    original = next(entry for entry in source.points if entry.name == group.name)
+    followed = clamped_points(problem.options.clamps)
+    names = tuple(name for name in followed if name in original.names and name not in group.names)
+    if not names:
+        return group
+    at = [original.names.index(name) for name in names]
+    near = np.searchsorted(original.t, group.t - 1e-9).clip(0, len(original.t) - 1)
+    position = np.concatenate([group.position, original.position[near][:, at]], axis=1)
+    assert group.std is not None
+    std = np.concatenate([group.std, np.full((len(group.t), len(at), 3), np.median(group.std))], axis=1)
+    return replace(group, names=(*group.names, *names), position=position, std=std)
+
+
+def _straight(made: Recording, source: Recording) -> Array | None:
+    """Where the points of the first group were while the object was held straight, where the source says it."""
+    if source.straight is None or not made.points or made.points[0].name != source.points[0].name:
+        return None
+    return source.straight[[source.points[0].names.index(name) for name in made.points[0].names]]
 
 
 def _joints(

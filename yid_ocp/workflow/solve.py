@@ -8,6 +8,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from yid_ocp.analysis.plausibility import check_fit
 from yid_ocp.analysis.profile import with_intervals
 from yid_ocp.analysis.start_in_motion import safe_start
@@ -23,7 +25,7 @@ from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import Findings
 from yid_ocp.report.terminal import solve_summary
 from yid_ocp.solvers import Iterate, Solution, Status, solve
-from yid_ocp.solvers.judgement import distrusted
+from yid_ocp.solvers.judgement import distrusted, known_covariance
 from yid_ocp.workflow.build import build_cable, build_problem
 from yid_ocp.workflow.command import DONE, FAILED, carry_out
 from yid_ocp.workflow.doubts import doubts_result
@@ -118,6 +120,7 @@ def run_solve(run: Run, out: str | Path | None = None, progress: Progress = SILE
         more = {
             "doubts": doubts_result(doubts),
             "safeguard": safe.message,
+            "covariance": covariance_result(solution, data_std),
             "discretisation": finer.result(data_std),
             "discretisation_notes": list(finer.notes),
             "stability": stability,
@@ -158,6 +161,18 @@ def doubted(
     believed = replace(solution.fit, believed=False)
     solution = replace(solution, fit=believed, parameters=distrusted(solution.parameters))
     return solution, (*problem.options.doubts, *found)
+
+
+def covariance_result(solution: Solution, data_std: Mapping[str, float]) -> dict[str, Any]:
+    """What the data say of the shared free parameters together.
+
+    How far a finer model is counts in the reported ±, not here: another run of this model is as far from it.
+    """
+    names = [name for name in data_std if name in solution.names]
+    at = [solution.names.index(name) for name in names]
+    if not solution.covariance.size:
+        return {"names": [], "matrix": []}
+    return known_covariance(names, solution.covariance[np.ix_(at, at)], [data_std[name] for name in names])
 
 
 def solve_result(

@@ -1,0 +1,59 @@
+"""The real soft beam: stiffness from the bare run, the load from what differs, the bare run from the loaded one.
+
+Minutes long: `python -m pytest -m slow tests/diagnosis/test_soft_beam.py`. Other recordings of the beam with a load can
+be named in the environment, with their masses, as `YID_OCP_LOADS=FILE:KG,FILE:KG`.
+"""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+from yid_ocp.config.reader import load_config
+from yid_ocp.workflow.diagnose import run_diagnose
+from yid_ocp.workflow.solve import run_solve
+
+pytestmark = pytest.mark.slow
+SECOND_MOMENT = 0.03**4 / 12  # of the section [m^4]
+QUIET = ("output.report=false", "output.discretisation=none")
+
+
+@pytest.fixture(scope="module")
+def folder(shared):
+    found = shared / "recordings" / "soft_beam"
+    if not found.is_dir():
+        pytest.skip("the real recordings are not here (shared/recordings beside the project)")
+    return found
+
+
+@pytest.fixture(scope="module")
+def bare(repository, folder, tmp_path_factory):
+    run = load_config(repository / "configs" / "soft_beam.yaml", QUIET)
+    return run_solve(run, tmp_path_factory.mktemp("beam") / "bare")
+
+
+def loads(folder):
+    said = [entry.rpartition(":") for entry in os.environ.get("YID_OCP_LOADS", "").split(",") if entry]
+    return [(str(folder / "beam_load52_a.h5"), 0.052), *((file, float(mass)) for file, _, mass in said)]
+
+
+def test_the_bare_run_gives_the_modulus_that_others_found(bare):
+    entry = bare.solution.parameters["beam.bend"]
+    assert entry.value / SECOND_MOMENT == pytest.approx(264e3, rel=0.08)
+    assert bare.solution.fit.explains
+    assert max(channel["rmse"] for channel in bare.result["residuals"].values()) < 3e-4
+
+
+def test_the_load_is_named_and_taking_it_away_predicts_the_bare_run(repository, folder, bare, tmp_path):
+    for i, (recording, mass) in enumerate(loads(folder)):
+        said = (f"recordings.estimate=[{recording}]", f"diagnosis.baseline=[{bare.folder}]")
+        run = load_config(repository / "configs" / "soft_beam.yaml", (*QUIET, *said))
+        finding = run_diagnose(run, tmp_path / f"load{i}").finding
+        assert finding.effects[0].label == "point_mass@w_beam"
+        found = finding.last.values["point_mass@w_beam.mass"]
+        assert found == pytest.approx(mass, rel=0.1)
+        assert finding.counterfactual is not None
+        [(plain, without)] = finding.counterfactual.removed.means.values()
+        assert without < 0.2 * plain
+        assert finding.counterfactual.added.better

@@ -1,0 +1,207 @@
+"""Objects without a robot, and what an earlier run says: markers, clamps, baseline, counterfactual, history."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from yid_ocp.analysis.history import Estimates
+from yid_ocp.config.reader import load_config
+from yid_ocp.data.hdf5 import write_recording
+from yid_ocp.data.recording import PointGroup, Recording
+from yid_ocp.diagnosis.baseline import with_baseline
+from yid_ocp.errors import ConfigError, DataError
+from yid_ocp.workflow.baseline import earlier_runs, read_estimates, recordings_without, with_effects_of
+from yid_ocp.workflow.build import build_problem, build_system, read_recordings
+from yid_ocp.workflow.report import run_report
+from yid_ocp.workflow.simulate import run_simulate
+
+BEAM = """
+model:
+  object:
+    kind: segments
+    mount: {xyz: [0.1, 0.2, 0.3], rpy: [0.0, 1.5707963267948966, 0.0]}
+    segments:
+      beam: {length: 0.1, mass: 0.1, section: [0.03, 0.03], links: 2, rigidity: true, clamped: true, joint_order: y}
+  frames:
+    mark: {frame: w_beam, straight: true}
+recordings: {estimate: [beam.h5]}
+sensors: {points: {std: 1.0e-4}}
+parameters:
+  beam.bend: {free: true, initial: 0.02}
+  beam.damping: {free: true, initial: 5.0e-5}
+problem: {time_step: 0.01, compiler: false, initial_state: estimated, duration: 0.4}
+output: {report: false, discretisation: none}
+"""
+STRAIGHT = np.array([0.2, 0.2, 0.32])  # the tip's face is at 0.2, 0.2, 0.3
+
+
+def blank(straight=STRAIGHT, name="mark"):
+    t = np.arange(41) * 0.01
+    position = np.broadcast_to(STRAIGHT - np.array([0.0, 0.0, 0.004]), (41, 1, 3))
+    points = (PointGroup("points", (name,), t, position, 1e-4),)
+    return Recording(None, points, straight=None if straight is None else straight[None, :])
+
+
+def settings(folder, recording=None, overrides=()):
+    write_recording(blank() if recording is None else recording, folder / "beam.h5")
+    (folder / "beam.yaml").write_text(BEAM, encoding="utf-8")
+    return load_config(folder / "beam.yaml", overrides)
+
+
+def test_a_marker_sits_where_straight_says_in_the_frame_that_carries_it(tmp_path):
+    run = settings(tmp_path)
+    system = build_system(run)
+    found = [system.parameters[f"mark.{axis}"].value for axis in "xyz"]
+    # the link's z axis is the world's x, its x axis looks down
+    assert found == pytest.approx([-0.02, 0.0, 0.0], abs=1e-9)
+
+
+def test_every_recording_has_its_own_places_of_markers(tmp_path):
+    run = settings(tmp_path)
+    other = replace(blank(STRAIGHT + np.array([0.0, 0.005, 0.0])), name="other")
+    problem = build_problem(run, without=[other])
+    assert problem.options.recording_values["beam"]["mark.y"] == pytest.approx(0.0, abs=1e-9)
+    assert problem.options.recording_values["other"]["mark.y"] == pytest.approx(0.005, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "recording", "kind", "words"),
+    [
+        ((), blank(None), DataError, "where its markers were"),
+        ((), blank(name="elsewhere"), ConfigError, "'mark' is no point"),
+        (("model.frames.mark.frame=w_bean",), None, ConfigError, "sits on nothing of the object"),
+        (("model.arms.joints=[elbow]",), None, ConfigError, "the model has no robot"),
+        (("model.clamps={jaw: {origin: mark, towards: mark}}",), None, ConfigError, "one point for both ends"),
+        (("model.clamps={jaw: {origin: a, towards: b}}", "model.object.mount.frame=jaw"), None, ConfigError, "moves"),
+    ],
+)
+def test_what_an_object_without_a_robot_cannot_have_is_refused_in_words(tmp_path, overrides, recording, kind, words):
+    run = settings(tmp_path, recording, overrides)
+    with pytest.raises(kind, match=words):
+        build_problem(run)
+
+
+def test_a_moved_clamp_carries_the_object_and_stands_in_what_is_simulated(tmp_path):
+    t = np.arange(41) * 0.01
+    rise = np.zeros((41, 3))
+    rise[:, 2] = 0.01 * np.sin(2 * np.pi * t)
+    base, ahead, tip = np.array([0.1, 0.2, 0.3]), np.array([0.1, 0.2, 0.25]), np.array([0.1, 0.2, 0.2])
+    position = np.stack([base + rise, ahead + rise, tip + rise], axis=1)
+    recording = Recording(None, (PointGroup("points", ("a", "b", "w_beam"), t, position, 1e-4),))
+    clamp = "model.clamps={jaw: {origin: a, towards: b}}"
+    run = settings(
+        tmp_path,
+        recording,
+        (clamp, "model.frames={}", "model.object.mount={frame: jaw}", "problem.initial_state=equilibrium"),
+    )
+    problem = build_problem(run)
+    assert problem.system.prescribed == tuple(f"jaw_{part}" for part in ("x", "y", "z", "rx", "ry", "rz"))
+    made = run_simulate(run, tmp_path / "made").recording
+    assert made is not None
+    group = made.points[0]
+    assert set(group.names) == {"a", "b", "w_beam"}
+    assert group.position[:, group.names.index("a")] == pytest.approx(base + rise, abs=1e-12)
+    # hanging straight down and moved along itself, the beam stays straight
+    assert group.position[:, group.names.index("w_beam")] == pytest.approx(tip + rise, abs=2e-4)
+
+
+def test_without_a_recording_nothing_moves_an_object_alone(tmp_path):
+    run = settings(tmp_path, None, ("recordings.estimate=[]", "model.frames={}"))
+    with pytest.raises(ConfigError, match="nothing moves an object without a robot"):
+        run_simulate(run, tmp_path / "made")
+
+
+# -- earlier runs -----------------------------------------------------------------------------------------------------
+
+
+def folder_of(path, values=(0.02, 5e-5), std=(2e-4, 1e-6), correlation=0.5, **more):
+    """A run folder of `solve` as far as a baseline reads it."""
+    path.mkdir()
+    c = correlation * std[0] * std[1]
+    result = {
+        "format": "yid-solve/1",
+        "status": "converged",
+        "fit": {"explains": True},
+        "parameters": {
+            name: {"value": v, "std": s, "unit": "", "free": True}
+            for name, v, s in zip(("beam.bend", "beam.damping"), values, std, strict=True)
+        },
+        "covariance": {"names": ["beam.bend", "beam.damping"], "matrix": [[std[0] ** 2, c], [c, std[1] ** 2]]},
+    }
+    (path / "result.json").write_text(json.dumps(result | more), encoding="utf-8")
+    return path
+
+
+def test_a_baseline_is_a_joint_prior_about_its_values(tmp_path):
+    run = settings(tmp_path)
+    known = read_estimates(folder_of(tmp_path / "old", values=(0.018, 4e-5)))
+    problem = with_baseline(build_problem(run), known)
+    at = [problem.names.index(name) for name in ("beam.bend", "beam.damping")]
+    assert problem.start[at] == pytest.approx([0.018, 4e-5])
+    moved = problem.start.copy()
+    moved[at] += [3e-4, -1e-6]
+    residual, rows = problem.prior(moved)
+    apart = moved[at] - problem.start[at]
+    expected = apart @ np.linalg.solve(known.covariance, apart)
+    assert residual @ residual == pytest.approx(expected, rel=1e-9)
+    assert rows @ (moved - problem.start) == pytest.approx(residual, rel=1e-9)
+
+
+def test_the_baselines_effects_stay_in_the_model(tmp_path):
+    run = settings(tmp_path)
+    known = Estimates(
+        "old", ("kelvin_voigt@beam.tau",), np.array([0.01]), np.array([[1e-6]]),
+        effects={"kelvin_voigt@beam": {"tau": 0.01}},
+    )  # fmt: skip
+    with pytest.raises(ConfigError, match="the effect kelvin_voigt@beam"):
+        with_baseline(build_problem(run), known)
+    problem = with_baseline(build_problem(with_effects_of(run, (known,))), known)
+    assert "kelvin_voigt@beam.tau" in problem.free
+    assert problem.named(problem.start)["kelvin_voigt@beam.tau"] == pytest.approx(0.01)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"format": "yid-plan/1"}, "another command"),
+        ({"status": "failed", "message": "no"}, "the run failed"),
+        ({"covariance": {}}, "how sure its parameters are"),
+        ({"covariance": {"names": [], "matrix": []}}, "found no parameter"),
+    ],
+)
+def test_a_folder_that_says_nothing_of_parameters_is_refused(tmp_path, change, words):
+    with pytest.raises(DataError, match=words):
+        read_estimates(folder_of(tmp_path / "old", **change))
+
+
+def test_a_baseline_of_another_model_is_refused_by_what_differs(tmp_path):
+    folder_of(tmp_path / "old")
+    (tmp_path / "old" / "config.yaml").write_text(BEAM.replace("links: 2", "links: 3"), encoding="utf-8")
+    run = settings(tmp_path, None, ("diagnosis.baseline=[old]",))
+    with pytest.raises(ConfigError, match=r"model\.object differs"):
+        earlier_runs(run)
+
+
+def test_recordings_of_the_baseline_are_those_without_what_is_looked_for(tmp_path):
+    folder = folder_of(tmp_path / "old")
+    (folder / "config.yaml").write_text(BEAM.replace("[beam.h5]", "[../beam.h5]"), encoding="utf-8")
+    run = settings(tmp_path, None, ("diagnosis.baseline=[old]",))
+    [found], message = recordings_without(run)
+    assert (found.name, message) == ("beam (without)", "")
+    assert found.sha256 == read_recordings(run, "estimate")[0].sha256
+
+
+def test_report_says_what_drifted_and_writes_the_history(tmp_path):
+    folders = [folder_of(tmp_path / f"day{i}", values=(0.02 if i < 3 else 0.025, 5e-5)) for i in range(4)]
+    outcome = run_report(folders, tmp_path / "history")
+    written = json.loads((tmp_path / "history" / "history.json").read_text(encoding="utf-8"))
+    assert written["format"] == "yid-history/1"
+    assert outcome.history.drifted == ("beam.bend",)
+    assert [entry["name"] for entry in written["runs"] if entry["distrusted"]] == [str(folders[3])]
+    assert "beam.bend is not the same in all runs" in (tmp_path / "history" / "report.html").read_text(encoding="utf-8")
+    with pytest.raises(ConfigError, match="one run has no history"):
+        run_report(folders[:1], tmp_path / "other")

@@ -1,0 +1,191 @@
+"""What holds an object without a robot, and frames that the settings add: clamps that follow points, markers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+
+from yid_ocp.config.settings import CableObject, Run
+from yid_ocp.data.recording import Recording
+from yid_ocp.errors import DataError, nearest
+from yid_ocp.model import FlexibleObject, Mechanism, Parameter, System, forward_kinematics
+from yid_ocp.model.cable import Cable, ClampPath
+from yid_ocp.model.mechanism import Frame, Placement
+from yid_ocp.model.system import floating_clamp, placement_matrix
+
+AXES = "xyz"
+
+
+def clamp_paths(run: Run, cable: Cable | None) -> tuple[ClampPath, ...]:
+    """Which clamps follow which measured points: those of the settings, or a cable's own."""
+    if cable is not None:
+        return cable.clamps
+    return tuple(ClampPath(name, s.origin, s.towards, s.roll) for name, s in run.model.clamps.items())
+
+
+def clamped_points(paths: Sequence[ClampPath]) -> tuple[str, ...]:
+    """The points that clamps follow."""
+    return tuple(dict.fromkeys(point for path in paths for point in (path.origin, path.towards)))
+
+
+def clamps(run: Run) -> Mechanism | None:
+    """The clamps that move an object without a robot, None where there are none.
+
+    Raises
+    ------
+    ConfigError
+        Clamps beside a robot, settings of a robot's joints without one.
+    """
+    model = run.model
+    if model.robot is not None:
+        if model.clamps:
+            raise run.refuse(
+                "clamps hold an object without a robot, and the model has one",
+                "model",
+                "clamps",
+                hint="remove model.clamps, or set model.robot: null; a robot holds by model.grasp or by the mount",
+            )
+        return None
+    said = model.arms
+    for key, given in (("joints", said.joints), ("passive", said.passive), ("locked", said.locked)):
+        if given:
+            raise run.refuse(
+                "the settings name joints, but the model has no robot",
+                "model",
+                "arms",
+                key,
+                hint="set model.robot to its URDF file, or remove model.arms; the world or model.clamps hold an object",
+            )
+    found: Mechanism | None = None
+    for name, clamp in model.clamps.items():
+        if clamp.origin == clamp.towards:
+            raise run.refuse(
+                f"clamp '{name}' has one point for both ends", "model", "clamps", name, allowed="two different points"
+            )
+        found = floating_clamp(name) if found is None else found.joined(floating_clamp(name))
+    return found
+
+
+def with_frames(
+    run: Run, carrier: Mechanism | None, items: Sequence[FlexibleObject]
+) -> tuple[Mechanism | None, list[FlexibleObject]]:
+    """Robot (or clamps) and objects with the frames that the settings add to them.
+
+    A frame whose place each recording's `straight` tells has the parameters NAME.x, .y, .z; see `straight_values`.
+
+    Raises
+    ------
+    ConfigError
+        What carries a frame does not exist.
+    ModelError
+        A name that is taken.
+    """
+    made = list(items)
+    for name, said in run.model.frames.items():
+        where = ("model", "frames", name)
+        owner = next((i for i, item in enumerate(made) if said.frame and item.mechanism.has_frame(said.frame)), None)
+        tree = carrier if owner is None else made[owner].mechanism
+        if owner is None:
+            if said.straight:
+                raise run.refuse(
+                    f"'{name}' is placed by `straight`, but sits on nothing of the object",
+                    *where,
+                    allowed="a frame of the object, such as w_SEGMENT, its end, or SEGMENT:40%",
+                    hint=f"set model.frames.{name}.frame",
+                )
+            tree = Mechanism("world", (), {}) if tree is None else tree
+            known = [*tree.frames, *(frame for item in made for frame in item.mechanism.frames)]
+            if said.frame is not None and not tree.has_frame(said.frame):
+                raise run.refuse(f"there is no frame '{said.frame}'", *where, "frame", hint=nearest(said.frame, known))
+        assert tree is not None
+        if said.straight:
+            tree = _marked(tree, name, str(said.frame))
+        else:
+            tree = tree.with_frame(name, said.frame, placement_matrix(said.xyz, said.rpy))
+        if owner is None:
+            carrier = tree
+        else:
+            made[owner] = replace(made[owner], mechanism=tree)
+    return carrier, made
+
+
+def _marked(tree: Mechanism, name: str, frame: str) -> Mechanism:
+    """The mechanism with a frame at a parameter's place in another one, turned like it."""
+    carrier = tree.with_frame(name, frame, np.eye(4)).frames[name]
+    entries = [Parameter(f"{name}.{axis}", 0.0, "m", description=f"{axis} of {name} in {frame}") for axis in AXES]
+    offset = Placement(ca.SX(ca.DM.eye(3)), ca.vertcat(*(entry.symbol for entry in entries)))
+    frames = {**tree.frames, name: Frame(carrier.joint, carrier.placement @ offset)}
+    return replace(tree, frames=frames, parameters=tree.parameters.joined(entries))
+
+
+def straight_values(run: Run, system: System, recordings: Sequence[Recording]) -> dict[str, dict[str, float]]:
+    """Where each recording's markers sit on the object, by their positions while it was held straight [m].
+
+    Parameters
+    ----------
+    run : Run
+    system : System
+        Whose object stands in the world; without its weight it is straight.
+    recordings : sequence of Recording
+
+    Returns
+    -------
+    dict of recording to dict of parameter to value
+        Empty where no frame is placed so.
+
+    Raises
+    ------
+    ConfigError
+        The object does not stand in the world, or a marker is no point of a recording.
+    DataError
+        A recording without `straight`.
+    """
+    names = [name for name, said in run.model.frames.items() if said.straight]
+    if not names:
+        return {}
+    _check_standing(run, names[0])
+    q = ca.SX.sym("q", system.size)
+    kinematics = forward_kinematics(system.mechanism, q)
+    poses = [kinematics.pose(name) for name in names]
+    outputs = [out for pose in poses for out in (pose.rotation, pose.translation)]
+    function = ca.Function("straight", [q, system.parameters.symbols], outputs)
+    theta = system.parameters.vector({f"{name}.{axis}": 0.0 for name in names for axis in AXES})
+    placed = [np.array(out) for out in function(np.zeros(system.size), theta)]
+    found: dict[str, dict[str, float]] = {}
+    for recording in recordings:
+        group = recording.points[0].names if recording.points else ()
+        if recording.straight is None:
+            raise DataError(
+                "the recording does not say where its markers were while the object was held straight",
+                where=f"{recording.name}: straight",
+                allowed="positions of the points of its first group, shape (np, 3) [m]",
+                hint=f"record them, or give model.frames.{names[0]}.xyz in place of straight: true",
+            )
+        values: dict[str, float] = {}
+        for i, name in enumerate(names):
+            if name not in group:
+                raise run.refuse(
+                    f"'{name}' is no point of {recording.name}", "model", "frames", name, hint=nearest(name, group)
+                )
+            rotation, origin = placed[2 * i], placed[2 * i + 1].ravel()
+            local = rotation.T @ (recording.straight[group.index(name)] - origin)
+            values |= {f"{name}.{axis}": float(x) for axis, x in zip(AXES, local, strict=True)}
+        found[recording.name] = values
+    return found
+
+
+def _check_standing(run: Run, name: str) -> None:
+    item = run.model.object
+    if isinstance(item, CableObject) or (item is not None and item.mount is not None and item.mount.frame):
+        raise run.refuse(
+            "the object moves with what carries it, so `straight` does not say where it was",
+            "model",
+            "frames",
+            name,
+            "straight",
+            allowed="an object whose mount stands in the world",
+            hint=f"give model.frames.{name}.xyz instead",
+        )
