@@ -17,7 +17,7 @@ from make_recordings import TRAVEL, TRUTH, compress
 import yid_ocp
 from yid_ocp.data.hdf5 import write_recording
 from yid_ocp.model import Grasp, System, flexible_object
-from yid_ocp.model.system import placement_matrix
+from yid_ocp.model.rotations import placement_matrix
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.model.y_object import y_segments
 from yid_ocp.virtual.engine import Simulation

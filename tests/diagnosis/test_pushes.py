@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import casadi as ca
@@ -11,8 +12,9 @@ from test_smoother import random_model
 
 from yid_ocp.diagnosis import smoother
 from yid_ocp.diagnosis.localise import localise
+from yid_ocp.diagnosis.pushes import PUSHED, forces_of_pushes, weights_of_segments
 from yid_ocp.diagnosis.smoother import _instead, _run
-from yid_ocp.diagnosis.smoother_model import PUSHED, Source, _forces_of_pushes, _weights_of
+from yid_ocp.diagnosis.smoother_model import Source
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.virtual.experiment import paper_system
@@ -22,32 +24,28 @@ THETA = np.array([parameter.value for parameter in SYSTEM.parameters])
 
 
 def test_a_push_is_what_virtual_work_says():
-    rng = np.random.default_rng(3)
-    q = 0.3 * rng.standard_normal((2, SYSTEM.size))
-    forced = np.array([i for i in range(SYSTEM.size) if i % 3 != 1])
-    forces = len(forced)
-    reference = rng.uniform(0.5, 2.0, forces + 2 + 6)
-    unknowns = SimpleNamespace(
-        forced=forced, pushed=("T1", "T3"), reference=reference, loading=forces + 2, driving=forces + 8
-    )
-    course = SimpleNamespace(system=SYSTEM, theta=THETA, rollout=SimpleNamespace(state=np.hstack([q, q, q])))
-    found = _forces_of_pushes(course, unknowns)
-    assert found.shape == (2, forces, 6)
+    q = 0.3 * np.random.default_rng(3).standard_normal((2, SYSTEM.size))
+    found = forces_of_pushes(SYSTEM, THETA, q, ("T1", "T3"))
+    assert found.shape == (2, SYSTEM.size, 6)
     symbol = ca.SX.sym("q", SYSTEM.size)
     at = ca.vertcat(*(forward_kinematics(SYSTEM.mechanism, symbol).position(f"{s}:{PUSHED}") for s in ("T1", "T3")))
     place = ca.Function("place", [symbol, SYSTEM.parameters.symbols], [at])
     for k, row in enumerate(q):
-        for i, index in enumerate(forced):
+        for i in range(SYSTEM.size):
             step = np.zeros(SYSTEM.size)
-            step[index] = 1e-6
+            step[i] = 1e-6
             moved = (np.array(place(row + step, THETA)) - np.array(place(row - step, THETA))).ravel() / 2e-6
-            expected = moved * reference[forces + 2 :] / reference[i]
-            assert found[k, i] == pytest.approx(expected, abs=1e-7)
+            assert found[k, i] == pytest.approx(moved, abs=1e-8)
 
 
 def test_pushes_are_measured_by_the_weight_of_their_segment():
-    found = _weights_of(SimpleNamespace(system=SYSTEM, theta=THETA))
+    found = weights_of_segments(SYSTEM, THETA)
     assert found == pytest.approx({"T1": 9.81 * 0.064, "T2": 9.81 * 0.015, "T3": 9.81 * 0.016})
+
+
+def test_what_cannot_be_pushed_is_not():
+    assert weights_of_segments(replace(SYSTEM, segments=()), THETA) == {}
+    assert forces_of_pushes(SYSTEM, THETA, np.zeros((4, SYSTEM.size)), ()).shape == (4, SYSTEM.size, 0)
 
 
 # -- places that do as well -------------------------------------------------------------------------------------------

@@ -28,6 +28,7 @@ from factories import (
 from made_series import series
 
 from yid_ocp.diagnosis.events import NOTHING, Event, Events
+from yid_ocp.diagnosis.earlier import Earlier
 from yid_ocp.diagnosis.hypotheses import CandidateProblem
 from yid_ocp.diagnosis.refit import Search
 from yid_ocp.diagnosis.screening import Screened
@@ -285,7 +286,7 @@ class Steps:
         self.nominal.problem.held_out = held
         self.composed = CandidateProblem("problem", tuple(self.effects), self.given["blocks"])
         search = Search(self.composed, Thresholds(**limits), self.said.append, "store")
-        return module._diagnosed("problem", search, "solution", module._Clock())
+        return module._diagnosed("problem", search, "solution", module._Clock(), Earlier.of((), ()))
 
 
 class Remembering:

@@ -8,8 +8,7 @@ import pytest
 
 from yid_ocp.errors import ModelError
 from yid_ocp.model.mechanism import Inertia, merged
-from yid_ocp.model.rotations import transform
-from yid_ocp.model.system import placement_matrix
+from yid_ocp.model.rotations import placement_matrix, transform
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.model.y_object import y_object
 

@@ -23,11 +23,11 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
+from yid_ocp.diagnosis.pushes import forces_of_pushes, weights_of_segments
 from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
 from yid_ocp.effects.base import grasp_names, robot_joints
 from yid_ocp.integrator.linear import Loads, linear_steps, live_states
 from yid_ocp.integrator.step_model import Rollout
-from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, apparent_inertia
@@ -42,8 +42,6 @@ MEMORY = 0.5
 """Time in which an unknown forgets its value [s]."""
 INTERVAL = 0.1
 """Shortest time over which unknowns are constant [s]."""
-PUSHED = "75%"
-"""Where a segment is pushed, by arc length: what acts on its tip and what acts all along it are both near that."""
 INTERVALS = 150
 """Number of intervals of a long recording, beyond which they become longer."""
 
@@ -255,7 +253,7 @@ def _unknowns(course: _Course, limits: Thresholds) -> _Unknowns:
         reference += [limits.offset] * 3
         row += grasp.equations
     pushed = []
-    for segment, weight in _weights_of(course).items():
+    for segment, weight in weights_of_segments(course.system, course.theta).items():
         pushed.append(segment)
         names += [f"{segment}.push_{axis}" for axis in "xyz"]
         sources += [Source(segment, "push")] * 3
@@ -276,39 +274,6 @@ def _unknowns(course: _Course, limits: Thresholds) -> _Unknowns:
             reference.append(limits.bias * float(np.nanmedian(samples.std[:, column])))
     held = np.array(grasped, int)
     return _Unknowns(tuple(names), tuple(sources), np.array(reference), forced, held, tuple(pushed), tuple(biased))
-
-
-def _weights_of(course: _Course) -> dict[str, float]:
-    """Weight of every segment of the object that can be pushed [N]; those without mass are left out."""
-    system, tree = course.system, course.system.mechanism
-    masses = {}
-    for segment in system.segments:
-        joints = [tree.joints[tree.joint_index(name)] for link in segment.links for name in link]
-        if tree.has_frame(f"{segment.name}:{PUSHED}"):
-            masses[segment.name] = sum((body.mass for joint in joints for body in joint.bodies), ca.SX(0))
-    gravity = ca.norm_2(ca.SX(system.gravity))
-    if not masses:
-        return {}
-    value = ca.Function("weights", [system.parameters.symbols], [gravity * ca.vertcat(*masses.values())])
-    found = np.array(value(course.theta)).ravel()
-    return {name: float(weight) for name, weight in zip(masses, found, strict=True) if weight > 0}
-
-
-def _forces_of_pushes(course: _Course, unknowns: _Unknowns) -> Array:
-    """Unknown forces that pushes of their reference size amount to at every node, shape (N + 1, forces, pushes)."""
-    system, forces = course.system, len(unknowns.forced)
-    state = course.rollout.state[:, : system.size]
-    if not unknowns.pushed:
-        return np.zeros((len(state), forces, 0))
-    q = ca.SX.sym("q", system.size)
-    moved = forward_kinematics(system.mechanism, q)
-    jacobian = ca.vertcat(*(moved.point_jacobian(f"{segment}:{PUSHED}") for segment in unknowns.pushed))
-    function = ca.Function("pushed", [q, system.parameters.symbols], [jacobian.T])
-    rows = 3 * len(unknowns.pushed)
-    found = np.array(function.map(len(state))(state.T, np.tile(course.theta[:, None], len(state))))
-    by_push = found.reshape(system.size, len(state), rows).transpose(1, 0, 2)[:, unknowns.forced]
-    size = unknowns.reference[unknowns.loading : unknowns.driving]
-    return np.asarray(by_push * size / unknowns.reference[:forces, None])
 
 
 def _unknown_forces(course: _Course, part: float) -> tuple[list[str], list[Source], list[float], NDArray[np.int64]]:
@@ -408,7 +373,10 @@ def _recording(course: _Course, observed: Array, limits: Thresholds, shortest: f
     length = int(max(round(shortest / h), math.ceil(steps * INTERVAL / (INTERVALS * shortest)), 1))
     edges = np.unique(np.append(np.arange(0, steps, length), steps))
     unknowns = _unknowns(course, limits)
-    loads, pushes = _loads_of(course, unknowns), _forces_of_pushes(course, unknowns)
+    loads, forces = _loads_of(course, unknowns), len(unknowns.forced)
+    nodes = course.rollout.state[:, : course.system.size]
+    pushes = forces_of_pushes(course.system, course.theta, nodes, unknowns.pushed)[:, unknowns.forced]
+    pushes *= unknowns.reference[unknowns.loading : unknowns.driving] / unknowns.reference[:forces, None]
     linear = partial(linear_steps, course.problem.step, course.theta, course.rollout, loads)
     ends = [*linear(slice(0, 1)), *linear(slice(steps - 1, steps))]
     moving = np.flatnonzero(live_states(course.problem.step, ends))

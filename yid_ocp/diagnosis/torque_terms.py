@@ -57,7 +57,7 @@ def torque_terms(
     q, z = rollout.state[:, :n], rollout.state[:, 2 * n :]
     v = np.gradient(q, time_step, axis=0)
     a = np.gradient(v, time_step, axis=0)
-    function = _function(system).map(len(nodes))
+    function = _function(system, time_step).map(len(nodes))
     squares, needed, held = (np.array(part).T for part in function(*(x[nodes].T for x in (q, v, a, z)), theta))
     applied = np.zeros((len(nodes), n))
     for indices, effort in ((system.driven_indices, rollout.torque), (system.prescribed_indices, rollout.effort)):
@@ -67,7 +67,7 @@ def torque_terms(
     return TorqueTerms(np.sqrt(squares + applied**2), np.asarray(rate), np.abs(held))
 
 
-def _function(system: System) -> ca.Function:
+def _function(system: System, time_step: float) -> ca.Function:
     """(q, v, a, z, theta) to the sum of squares of all terms, the torque needed, and what friction may hold."""
     n, names = system.size, tuple(system.internal)
     q, v, a, z = (ca.SX.sym(name, size) for name, size in (("q", n), ("v", n), ("a", n), ("z", len(names))))
@@ -77,7 +77,7 @@ def _function(system: System) -> ca.Function:
     rest, u = ca.SX.zeros(len(names)), ca.SX.zeros(len(system.driven))
     pulls = ca.SX.zeros(system.constraint_count)
     rows = {name: i for i, name in enumerate(names)}
-    state = MidpointState(system, kinematics, q, v, z, rest, u, pulls, rows)
+    state = MidpointState(system, kinematics, q, v, z, rest, u, pulls, rows, ca.SX(time_step))
     energy, viscous, others = -system.elastic_energy(q), system.viscous_force(v), ca.SX.zeros(n)
     for effect in system.effects:
         terms = effect.terms(state)

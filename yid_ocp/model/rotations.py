@@ -85,3 +85,9 @@ def _cs(angle: float) -> tuple[float, float]:
 
 def _skew(u: Matrix) -> Matrix:
     return np.array([[0, -u[2], u[1]], [u[2], 0, -u[0]], [-u[1], u[0], 0]])
+
+
+def placement_matrix(xyz: ArrayLike = (0.0, 0.0, 0.0), rpy: ArrayLike = (0.0, 0.0, 0.0)) -> Matrix:
+    """4x4 placement from a translation [m] and roll, pitch, yaw [rad]."""
+    angles = np.asarray(rpy, float)
+    return transform(roll_pitch_yaw(*angles), xyz)

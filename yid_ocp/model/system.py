@@ -16,7 +16,6 @@ from yid_ocp.model.flexible import AXES, ElasticJoint, FlexibleObject, SegmentLa
 from yid_ocp.model.kinematics import Kinematics
 from yid_ocp.model.mechanism import Frame, Joint, Mechanism, Placement
 from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.model.rotations import roll_pitch_yaw, transform
 
 GraspKind = Literal["point", "axis", "weld"]
 EQUATIONS: dict[str, tuple[str, ...]] = {
@@ -573,8 +572,7 @@ def _check_names(
         repeated = sorted({name for name in names if names.count(name) > 1})
         if repeated:
             raise ModelError(f"'{repeated[0]}' is named twice among the {kind}", allowed="each name once")
-    both = sorted(set(driven) & set(prescribed))
-    if both:
+    if both := sorted(set(driven) & set(prescribed)):
         raise ModelError(f"joint '{both[0]}' is both driven and prescribed", allowed="one of the two")
     for grasp in grasps:
         tree.frame(grasp.holder)
@@ -600,9 +598,3 @@ def floating_clamp(name: str, frame: str | None = None) -> Mechanism:
         for a, (letter, axis) in enumerate(AXES.items())
     )
     return Mechanism(name, joints, {frame or name: Frame(5, Placement.identity())})
-
-
-def placement_matrix(xyz: ArrayLike = (0.0, 0.0, 0.0), rpy: ArrayLike = (0.0, 0.0, 0.0)) -> np.ndarray:
-    """4x4 placement from a translation [m] and roll, pitch, yaw [rad]."""
-    angles = np.asarray(rpy, float)
-    return transform(roll_pitch_yaw(*angles), xyz)

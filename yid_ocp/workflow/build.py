@@ -24,8 +24,8 @@ from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model import FlexibleObject, Grasp, Mechanism, Segment, System, flexible_object
 from yid_ocp.model.cable import Cable, cable_system, length_values, read_vertices
 from yid_ocp.model.parameters import Parameters
-from yid_ocp.model.rotations import roll_pitch_yaw
-from yid_ocp.model.system import Spring, placement_matrix
+from yid_ocp.model.rotations import placement_matrix, roll_pitch_yaw
+from yid_ocp.model.system import Spring
 from yid_ocp.model.urdf import read_urdf, robot_description_file
 from yid_ocp.model.y_object import Y_FOOT, y_segments
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions

@@ -14,7 +14,8 @@ from yid_ocp.errors import DataError, nearest
 from yid_ocp.model import FlexibleObject, Mechanism, Parameter, System, forward_kinematics
 from yid_ocp.model.cable import Cable, ClampPath
 from yid_ocp.model.mechanism import Frame, Placement
-from yid_ocp.model.system import floating_clamp, placement_matrix
+from yid_ocp.model.rotations import placement_matrix
+from yid_ocp.model.system import floating_clamp
 
 AXES = "xyz"
 
