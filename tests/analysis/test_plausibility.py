@@ -258,7 +258,7 @@ def test_at_rest_nothing_tells_of_clocks(arms, runs):
 
 def test_the_error_of_a_clock_and_its_standard_deviation():
     """Of a sine with white noise, beside a constant that is not known."""
-    t, noise, rng = np.linspace(0, 10, 400), 0.05, np.random.default_rng(1)
+    t, noise, rng = np.linspace(0, 10, 400), 0.02, np.random.default_rng(1)
     found = []
     for _ in range(60):
         true = np.sin(2 * (t - 0.01 - 0.002 * (t - 5)))

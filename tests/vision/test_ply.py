@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+
 import numpy as np
 import pytest
 
@@ -36,6 +38,7 @@ SOUND = {
     "windows": (head("ascii") + TEXT).replace(b"\n", b"\r\n"),
     "another element before": head("binary_little_endian", before=CAMERA) + b"\x01\x00\x02\x00" + body("<"),
     "the same as text": head("ascii", before=CAMERA) + b"1\n2\n" + TEXT,
+    "a comment longer than any buffer": (head("ascii") + TEXT).replace(b"made", b"made" + b"9" * 5000),
     "faces after": head("ascii").replace(b"end_header", FACES + b"end_header") + TEXT + b"3 0 1 2\n",
 }
 
@@ -80,7 +83,5 @@ def test_whatever_is_damaged_is_read_or_refused(tmp_path):
             for at in rng.integers(len(made), size=3):
                 made[at] = int(rng.integers(256))
             path.write_bytes(bytes(made))
-            try:
+            with contextlib.suppress(DataError):
                 assert read_ply(path).shape[1] == 3
-            except DataError as error:
-                assert error.what
