@@ -43,8 +43,12 @@ Run = tuple[Episode, EpisodeResult, Array]
 
 INTERVAL = 0.05
 """Time over which an unknown force is constant where events are sought [s]."""
+POINTS = 250
+"""Points of a history that are looked at together."""
 LONGEST_RUN = 3
 """Wrong samples in a row; more of them are a gap or a stuck channel."""
+STENCILS = (4, 7, 10)
+"""Distances of the samples through which a smooth course is laid beside a wrong one."""
 NEIGHBOURS = 20
 """Samples on either side with which one is compared."""
 ALONE = 3.0
@@ -251,14 +255,7 @@ def _before_fall(history: History, falls: Sequence[Fall], limits: Thresholds) ->
     keep = np.flatnonzero(history.t <= until - (smear if math.isfinite(until) else 0.0))
     if len(keep) < 10:
         return None
-    return replace(
-        history,
-        t=history.t[keep],
-        score=history.score[keep],
-        information=history.information[np.ix_(keep, keep)],
-        error=history.error[keep],
-        held=history.held[keep],
-    )
+    return history.at(keep)
 
 
 def _allowed(problem: EstimationProblem, run: Run, nodes: NDArray[np.int64], limits: Thresholds) -> tuple[Array, Array]:
@@ -281,21 +278,37 @@ def _read_forces(problem: EstimationProblem, run: Run, limits: Thresholds) -> It
         error, held = _allowed(problem, run, samples.node, limits)
         weight = np.where(samples.seen, samples.weight, 0.0)
         value = np.where(samples.seen, predicted - samples.value, 0.0)
+        times = sample_times(episode, samples)
+        # what lies closer together than an interval counts together
+        bins = np.unique(np.floor((times - times[0]) / INTERVAL + 1e-6), return_inverse=True)[1]
+        together = np.zeros((int(bins.max()) + 1, len(times)))
+        together[bins, np.arange(len(times))] = 1.0
+        mean = together / together.sum(axis=1, keepdims=True)
         for column, joint in enumerate(samples.sensor.efforts):
             at, square = tree.joint_index(joint), weight[:, column] ** 2
             unit = "N" if tree.joints[at].kind == "prismatic" else "N m"
-            yield History(
+            whole = History(
                 episode.name,
                 joint,
                 joint,
                 unit,
-                sample_times(episode, samples),
-                square * value[:, column],
-                np.diag(square),
-                error[:, at],
-                held[:, at],
+                mean @ times,
+                together @ (square * value[:, column]),
+                np.diag(together @ square),
+                mean @ error[:, at],
+                mean @ held[:, at],
                 problem.options.path_cutoff,
             )
+            yield from _spans(whole, limits)
+
+
+def _spans(whole: History, limits: Thresholds) -> Iterator[History]:
+    """A long history in parts that overlap by twice the longest pulse: the work grows with the cube of their points."""
+    overlap = math.ceil(2 * limits.pulse / whole.spacing)
+    length = max(POINTS, 3 * overlap)
+    for begin in range(0, max(len(whole.t) - overlap, 1), length - overlap):
+        keep = np.arange(begin, min(begin + length, len(whole.t)))
+        yield whole.at(keep)
 
 
 def _driving_forces(
@@ -439,12 +452,11 @@ def _floor(problem: EstimationProblem, episode: Episode, joint: str, quantity: s
 
 
 def _alone(t: Array, values: Array, noise: Array, about: tuple[str, str, str, str]) -> Iterator[Event]:
-    """Runs of at most `LONGEST_RUN` samples far from the median of what is around them, as none of these is."""
-    count, half = len(values), 2 * LONGEST_RUN
+    """Runs of at most `LONGEST_RUN` samples far from where what is around them leads, as none of these is."""
+    count = len(values)
     if count < 2 * NEIGHBOURS:
         return
-    around = np.lib.stride_tricks.sliding_window_view(np.pad(values, half, mode="reflect"), 2 * half + 1)
-    off = values - np.median(around, axis=1)
+    off = _beside_neighbours(t, values)
     size = np.abs(off)
     wide = np.lib.stride_tricks.sliding_window_view(np.pad(size, NEIGHBOURS, mode="reflect"), 2 * NEIGHBOURS + 1)
     spread = 1.4826 * np.median(wide, axis=1)
@@ -453,7 +465,7 @@ def _alone(t: Array, values: Array, noise: Array, about: tuple[str, str, str, st
         end = begin
         while end + 1 < count and odd[end + 1]:
             end += 1
-        if end - begin >= LONGEST_RUN or begin < LONGEST_RUN or end >= count - LONGEST_RUN:
+        if end - begin >= LONGEST_RUN:
             continue
         near = np.r_[max(begin - NEIGHBOURS, 0) : begin, end + 1 : min(end + 1 + NEIGHBOURS, count)]
         if size[begin : end + 1].min() < ALONE * size[near].max(initial=0.0):
@@ -474,6 +486,26 @@ def _alone(t: Array, values: Array, noise: Array, about: tuple[str, str, str, st
             spread_here * period * math.sqrt(end - begin + 1),
             unit,
         )
+
+
+def _beside_neighbours(t: Array, values: Array) -> Array:
+    """Value less the cubic through four samples about it, the smallest of three such differences, shape (M,).
+
+    No two of the stencils share a sample within a run, so that a wrong sample spoils at most one of its neighbours'
+    three; where they differ in sign, and at both ends, nothing is said.
+    """
+    found = np.zeros((len(STENCILS), len(values)))
+    for one, step in zip(found, STENCILS, strict=True):
+        middle = np.arange(2 * step, len(values) - 2 * step)
+        at = [middle + shift * step for shift in (-2, -1, 1, 2)]
+        cubic = np.zeros(len(middle))
+        for own in at:
+            weights = [(t[middle] - t[other]) / (t[own] - t[other]) for other in at if other is not own]
+            cubic += np.prod(weights, axis=0) * values[own]
+        one[middle] = values[middle] - cubic
+    smallest = found[np.argmin(np.abs(found), axis=0), np.arange(len(values))]
+    smallest[np.any(found > 0, axis=0) & np.any(found < 0, axis=0)] = 0.0
+    return smallest
 
 
 # -- the recordings without them --------------------------------------------------------------------------------------
@@ -497,7 +529,7 @@ def without_events(problem: EstimationProblem, events: Events) -> EstimationProb
         for event in own:
             if event.pulse is not None and event.channel in problem.system.driven:
                 torque[:, problem.system.driven.index(event.channel)] += event.pulse.values(times)
-        smear = 1 / (2 * problem.options.path_cutoff)
+        smear = 1 / problem.options.path_cutoff
         parts = [_counting(episode, samples, own, fall, smear) for samples in episode.samples]
         return replace(episode, torque=torque, samples=tuple(parts))
 
@@ -510,7 +542,7 @@ def _counting(episode: Episode, samples: Measurements, own: Sequence[Event], fal
     t = sample_times(episode, samples)
     t = t if t.ndim > 1 else np.broadcast_to(t[:, None], hidden.shape)
     if math.isfinite(fall) and samples.sensor.efforts:
-        hidden |= t > fall - LowPass(1 / (2 * smear)).settling if smear > 0 else t > fall
+        hidden |= t > fall - LowPass(1 / smear).settling if smear > 0 else t > fall
     for event in own:
         for column, channel in enumerate(samples.channel_of_column):
             if samples.sensor.efforts:

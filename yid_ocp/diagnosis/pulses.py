@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -44,10 +44,11 @@ MOST = 12
 """Pulses and what is like them in one history."""
 RARE = 1 / 3
 """Part of the time from which forces in short windows are none of events: the model errs everywhere."""
-MARGIN = 0.5
-"""Lengths of a pulse for which the history must go on before and after it."""
-PROMINENT = 2.0
-"""Times the median size of a pulse of the same length anywhere in the history that one must have."""
+PROMINENT = 1.5
+"""Times the median size of a pulse of the same length anywhere in the history that one must have: more than the
+largest value of a sine over its median."""
+SEEN = 1.5
+"""Times the range of the history about it that a pulse may have at most: a larger one is made up by the rest."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +88,12 @@ class History:
     def spacing(self) -> float:
         """From point to point [s]."""
         return float(np.median(np.diff(self.t)))
+
+    def at(self, keep: NDArray[np.int64]) -> History:
+        """The same at some points alone; what connects them with the others is left out."""
+        information = self.information[np.ix_(keep, keep)]
+        parts = {name: getattr(self, name)[keep] for name in ("t", "score", "error", "held")}
+        return replace(self, information=information, **parts)
 
     @property
     def values(self) -> Array:
@@ -256,8 +263,8 @@ def pulses(history: History, limits: Thresholds = DEFAULTS) -> tuple[list[Pulse]
         beside = [rest.beside(taken) for rest in rests]
         gains = [free * rest.gains(profiles) for rest in beside]
         totals = [rest.evidence + float(gain.max()) for rest, gain in zip(beside, gains, strict=True)]
-        likeliest = int(np.argmax(totals))
-        rest, gain = beside[likeliest], gains[likeliest]
+        best = int(np.argmax(totals))
+        rest, gain = beside[best], gains[best]
         rise = max(totals) - max(rest.evidence for rest in beside)
         if rise < limits.worth:
             break
@@ -265,7 +272,7 @@ def pulses(history: History, limits: Thresholds = DEFAULTS) -> tuple[list[Pulse]
         own = seen(window, history.t)
         rise += float(rest.gains(own)[0] - gain.max())
         other = _other(history, rest, window, seen)
-        if other is None and not _stands_out(history, rests[likeliest], rest, window, seen, limits):
+        if other is None and not _stands_out(history, rests[best], rest, window, seen, limits.pulse):
             other = own
         taken = np.column_stack([taken, own if other is None else other])
         if other is None:
@@ -305,7 +312,7 @@ def _windows(history: History, limits: Thresholds) -> tuple[_Windows, float]:
     lengths = [FEWEST * spacing]
     while lengths[-1] * GROWTH <= limits.pulse:
         lengths.append(lengths[-1] * GROWTH)
-    begins = [np.arange(first + MARGIN * length, last - (1 + MARGIN) * length + 1e-9, spacing) for length in lengths]
+    begins = [np.arange(first + spacing, last - spacing - length + 1e-9, spacing) for length in lengths]
     begin = np.concatenate(begins)
     end = begin + np.repeat(lengths, [len(b) for b in begins])
     flat = np.repeat([False, True], len(begin))
@@ -334,7 +341,7 @@ def _refined(
         while True:
             ends = np.array([begin, end]) + moves
             length = ends[:, 1] - ends[:, 0]
-            inside = (ends[:, 0] >= first + MARGIN * length) & (ends[:, 1] <= last - MARGIN * length)
+            inside = (ends[:, 0] >= first + history.spacing) & (ends[:, 1] <= last - history.spacing)
             ends = ends[inside & (length >= shortest) & (length <= limits.pulse)]
             both = np.tile(ends, (2, 1))
             tried = _Windows(both[:, 0], both[:, 1], np.repeat([False, True], len(ends)))
@@ -369,20 +376,22 @@ def _other(history: History, rest: _Rest, window: _Windows, seen: _Filter) -> Ar
     return profiles[:, best] if gains[best] >= gain else None
 
 
-def _stands_out(
-    history: History, bare: _Rest, rest: _Rest, window: _Windows, seen: _Filter, limits: Thresholds
-) -> bool:
-    """Whether a pulse is shorter than the longest, and larger than what the history holds everywhere.
+def _stands_out(history: History, bare: _Rest, rest: _Rest, window: _Windows, seen: _Filter, longest: float) -> bool:
+    """Whether a pulse is shorter than the longest, larger than what the history holds everywhere, and there to be seen.
 
     `bare` is the rest with nothing taken in, `rest` that beside what was.
     """
-    length = float(window.end[0] - window.begin[0])
-    if length > 0.98 * limits.pulse:
+    begin, end = float(window.begin[0]), float(window.end[0])
+    length, own = end - begin, seen(window, history.t)
+    if length > 0.98 * longest:
         return False
-    begin = np.arange(float(history.t[0]), float(history.t[-1]) - length, history.spacing)
-    everywhere = _Windows(begin, begin + length, np.repeat(window.flat, len(begin)))
-    usual = float(np.median(np.abs(bare.sizes(seen(everywhere, history.t)))))
-    return abs(float(rest.sizes(seen(window, history.t))[0])) > PROMINENT * usual
+    size = abs(float(rest.sizes(own)[0]))
+    near = history.values[(history.t > begin - length) & (history.t < end + length)]
+    if size * float(np.abs(own).max()) > SEEN * float(np.ptp(near)):
+        return False
+    begins = np.arange(float(history.t[0]), float(history.t[-1]) - length, history.spacing)
+    everywhere = _Windows(begins, begins + length, np.repeat(window.flat, len(begins)))
+    return size > PROMINENT * float(np.median(np.abs(bare.sizes(seen(everywhere, history.t)))))
 
 
 def _sized(

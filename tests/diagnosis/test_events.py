@@ -1,0 +1,175 @@
+"""Events of a two-joint arm that MuJoCo plays: pushes, a snag, a wrong encoder sample, and nothing at all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from yid_ocp.data.recording import Recording
+from yid_ocp.diagnosis import diagnose
+from yid_ocp.diagnosis.events import Event, Events, Fall, event_sentences, find_events, without_events
+from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.integrator.step import compile_step
+from yid_ocp.model import System
+from yid_ocp.model.urdf import read_urdf
+from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
+from yid_ocp.problem.null_test import sample_times
+from yid_ocp.solvers import GaussNewton, solve
+from yid_ocp.virtual.engine import Simulation
+from yid_ocp.virtual.experiment import ArmNoise, VirtualExperiment, virtual_experiment
+from yid_ocp.virtual.interruptions import Interruptions, Push, Snag
+from yid_ocp.virtual.motion import Motion
+
+pytest.importorskip("mujoco", reason="twins are made in MuJoCo: pip install 'yid-ocp[blind]'")
+
+JOINTS = ("shoulder", "elbow")
+DAMPING = {"shoulder": 0.1, "elbow": 0.05}
+PUSHES = (Push("shoulder", 1.5, 2.0, 1.5), Push("elbow", 3.0, 3.4, -0.8))
+
+
+@dataclass(frozen=True)
+class Twin:
+    """An arm that MuJoCo drives, and the problem of its motion as measured."""
+
+    driven: System
+    prescribed: System
+
+    def recording(self, interruptions: Interruptions | None = None, seed: int = 0) -> Recording:
+        frequency = np.array([[0.5, 0.9, 1.3], [0.6, 1.0, 1.5]])
+        phase = np.random.default_rng(seed).uniform(0, 2 * np.pi, (2, 3))
+        motion = Motion(JOINTS, 0.25 / frequency, frequency, phase)
+        noise = ArmNoise(position=5e-5, effort=0.02)
+        how = VirtualExperiment(
+            motion,
+            dict.fromkeys(JOINTS, 0.3),
+            Simulation(5.0, 200.0, 1e-3, effort_kind="mean"),
+            noise,
+            None,
+            interruptions,
+            seed,
+            f"run_{seed}",
+        )
+        return virtual_experiment(self.driven, None, how)
+
+    def problem(self, *recordings: Recording) -> EstimationProblem:
+        sensors = {"joints.effort": SensorOptions(std=0.02), "joints.position": SensorOptions(std=5e-5)}
+        step = compile_step(self.prescribed, 0.01)
+        free = [f"{joint}.damping" for joint in JOINTS]
+        return EstimationProblem(step, recordings, free, ProblemOptions(sensors=sensors, path_cutoff=8.0))
+
+    def events(self, *recordings: Recording) -> Events:
+        problem = self.problem(*recordings)
+        x = solve(problem, GaussNewton()).x
+        return find_events(problem, x, problem.evaluate(x), None)
+
+
+@pytest.fixture(scope="module")
+def twin(urdf_folder) -> Twin:
+    tree = read_urdf(str(urdf_folder / "double_pendulum.urdf"))
+    return Twin(
+        System.build(tree, driven=JOINTS, damping=DAMPING), System.build(tree, prescribed=JOINTS, damping=DAMPING)
+    )
+
+
+@pytest.fixture(scope="module")
+def pushed(twin) -> Recording:
+    return twin.recording(Interruptions(PUSHES))
+
+
+def test_pushes_are_found_at_their_joints_in_their_windows_with_their_impulses(twin, pushed):
+    found = twin.events(pushed).found
+    assert [(event.kind, event.location, event.unit) for event in found] == [
+        ("force", "shoulder", "N m"),
+        ("force", "elbow", "N m"),
+    ]
+    for event, push in zip(found, PUSHES, strict=True):
+        assert event.begin == pytest.approx(push.begin, abs=0.1)
+        assert event.end == pytest.approx(push.end, abs=0.1)
+        assert event.impulse == pytest.approx(push.impulse, rel=0.15)
+        assert abs(event.impulse - push.impulse) < 3 * event.std
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_nothing_happens_in_a_clean_run(twin, seed):
+    assert not twin.events(twin.recording(seed=seed))
+
+
+def test_a_snag_is_an_event_of_its_joint(twin):
+    found = twin.events(twin.recording(Interruptions((), (Snag("elbow", 2.0, 2.3, 30.0),)))).found
+    assert found
+    assert {event.location for event in found} == {"elbow"}
+    assert all(event.begin > 1.8 and event.end < 2.5 for event in found)
+
+
+def test_a_wrong_encoder_sample_is_named_as_such_and_makes_no_push(twin):
+    clean = twin.recording()
+    position = clean.joints.position.copy()
+    position[500:502, 1] += 0.01
+    wrong = replace(clean, joints=replace(clean.joints, position=position))
+    (event,) = twin.events(wrong).found
+    assert (event.kind, event.channel, event.unit) == ("sample", "joints.position.elbow", "rad")
+    assert event.peak == pytest.approx(0.01, abs=1e-3)
+    assert event.begin == pytest.approx(wrong.joints.t[500], abs=0.006)
+    assert event.end == pytest.approx(wrong.joints.t[501], abs=0.006)
+
+
+def test_a_gap_that_lives_in_events_alone_is_none_and_the_words_tell_of_them(bench):
+    def push(t):
+        part = np.clip((t - 1.5) / 0.4, 0, 1)
+        return -np.stack([0 * t, 0.5 * np.sin(np.pi * part) ** 2], axis=1)
+
+    problem = bench.problem([bench.recording({}, 1, torque=push)])
+    finding = diagnose(problem, ["joint_coulomb@elbow", "effort_offset@elbow"], [bench.recording({}, 2)])
+    assert finding.verdict == "no_gap"
+    (told,) = finding.to_dict()["events"]
+    assert list(told) == ["recording", "location", "channel", "kind", "from", "to", "impulse", "peak", "unit", "std"]
+    assert (told["location"], told["recording"]) == ("elbow", "run_1")
+    assert told["impulse"] == pytest.approx(0.1, rel=0.15)
+    assert finding.to_dict()["not_judged"] == []
+    assert "One event stands beside all this" in finding.summary
+
+
+def test_samples_of_an_events_joint_in_its_window_do_not_count(twin, pushed):
+    problem = twin.problem(pushed)
+    event = Event("run_0", "elbow", "elbow", "force", 3.0, 3.4, -0.8, -0.16, 0.01, "N m")
+    cleaned = without_events(problem, Events((event,)))
+    (before,), (after,) = problem.episodes[0].samples, cleaned.episodes[0].samples
+    t = sample_times(problem.episodes[0], before)
+    hidden = before.seen & ~after.seen
+    smear = 1 / problem.options.path_cutoff
+    assert not hidden[:, 0].any()
+    assert np.array_equal(hidden[:, 1], before.seen[:, 1] & (t > 3.0 - smear) & (t < 3.4 + smear))
+    assert without_events(problem, Events((replace(event, recording="another"),))).episodes[0].samples[0] is before
+
+
+def test_after_a_fall_nothing_counts(twin, pushed):
+    events = find_events(*fitted(twin.problem(pushed)), None, Thresholds(fall=1.0))
+    (fall,) = events.falls
+    assert fall.recording == "run_0"
+    assert fall.joint in JOINTS
+    assert all(event.end < fall.time for event in events.found)
+    cleaned = without_events(twin.problem(pushed), Events((), (Fall("run_0", "elbow", 3.0),)))
+    (samples,) = cleaned.episodes[0].samples
+    t = sample_times(cleaned.episodes[0], samples)
+    assert not samples.seen[t > 3.0].any()
+    assert samples.seen[(t > 1.0) & (t < 2.0)].all()
+    assert "From 3 s on nothing is judged in run_0" in event_sentences(Events((), (Fall("run_0", "elbow", 3.0),)))
+
+
+def fitted(problem: EstimationProblem):
+    x = solve(problem, GaussNewton()).x
+    return problem, x, problem.evaluate(x)
+
+
+def test_what_happened_is_told_one_by_one_up_to_eight():
+    event = Event("run", "elbow", "elbow", "force", 1.0, 1.5, 0.5, 0.12, 0.01, "N m")
+    odd = Event("run", "camera", "points.w_T1.x", "sample", 2.0, 2.01, 0.05, 5e-4, 1e-5, "m")
+    assert event_sentences(Events()) == ""
+    assert event_sentences(Events((event,))) == (
+        "One event stands beside all this, short and in one place: elbow is pushed by up to +0.5 N m from 1.00 to 1.50 "
+        "s in run (+0.12 ± 0.01 N m s)."
+    )
+    assert "points.w_T1.x is off by +0.05 m at 2.005 s in run" in event_sentences(Events((event, odd)))
+    assert event_sentences(Events((event,) * 10)).endswith("; and 2 more.")
