@@ -499,3 +499,12 @@ def test_of_two_effects_the_first_is_tried_without(monkeypatch):
     rounds = Rounds(monkeypatch, losses)
     assert rounds.compose(effects=2)[1] == ["a", "b"]
     assert [entry[:2] for entry in rounds.refits[2:]] == [("a@x and b@x without a@x", ["b"])]
+
+
+def test_what_contradicts_a_baseline_counts_whatever_blocks_are_drawn():
+    counts = np.full(8, 10.0)
+    before, after = Loss(2 * counts, counts, {}, 800.0), Loss(3 * counts, counts, {}, 0.0)
+    assert (before.mean, after.mean) == (12.0, 3.0)
+    assert gain(before, after) == (pytest.approx(9.0), 0.0)
+    found = closure(before, after)
+    assert (found.value, found.low, found.high) == pytest.approx((9 / 11, 9 / 11, 9 / 11))

@@ -1,7 +1,7 @@
-"""The real soft beam: its stiffness from the bare run, the load from what differs, and the bare run from the loaded one.
+"""The real soft beam: its stiffness from the bare run, the load from what differs, the bare run from the loaded one.
 
-Minutes long: `python -m pytest -m slow tests/diagnosis/test_soft_beam.py`. Other recordings of the beam with a load can be
-named in the environment, with their masses, as `YID_OCP_LOADS=FILE:KG,FILE:KG`.
+Minutes long: `python -m pytest -m slow tests/diagnosis/test_soft_beam.py`. Other recordings of the beam with a load can
+be named in the environment, with their masses, as `YID_OCP_LOADS=FILE:KG,FILE:KG`.
 """
 
 from __future__ import annotations
