@@ -27,8 +27,8 @@ from factories import (
 )
 from made_series import series
 
-from yid_ocp.diagnosis.events import NOTHING, Event, Events
 from yid_ocp.diagnosis.earlier import Earlier
+from yid_ocp.diagnosis.events import NOTHING, Event, Events
 from yid_ocp.diagnosis.hypotheses import CandidateProblem
 from yid_ocp.diagnosis.refit import Search
 from yid_ocp.diagnosis.screening import Screened

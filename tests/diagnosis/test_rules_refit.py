@@ -21,6 +21,7 @@ from yid_ocp.diagnosis.refit import (
     refit_all,
 )
 from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.solvers import Status
 
 # the package's own name `refit` is the function
@@ -321,7 +322,14 @@ def predicting(monkeypatch):
 
     return lambda *pairs: (
         SimpleNamespace(
-            held_out=[e for e, _ in pairs], validate=lambda x: list(pairs), held_out_rows=rows, disturbed=False
+            held_out=[e for e, _ in pairs],
+            validate=lambda x: list(pairs),
+            held_out_rows=rows,
+            disturbed=False,
+            options=ProblemOptions(),
+            shared=(),
+            names=(),
+            start=np.zeros(0),
         ),
         told,
     )

@@ -576,3 +576,12 @@ def test_an_effect_that_is_not_there_is_not_added(monkeypatch):
 )
 def test_an_effect_counts_by_what_it_takes_away_of_an_error(before, after, counts):
     assert relevant(before, after) is counts
+
+
+def test_what_contradicts_a_baseline_counts_whatever_blocks_are_drawn():
+    counts = np.full(8, 10.0)
+    before, after = Loss(2 * counts, counts, {}, 800.0), Loss(3 * counts, counts, {}, 0.0)
+    assert (before.mean, after.mean) == (12.0, 3.0)
+    assert gain(before, after) == (pytest.approx(9.0), 0.0)
+    found = closure(before, after)
+    assert (found.value, found.low, found.high) == pytest.approx((9 / 11, 9 / 11, 9 / 11))

@@ -1,0 +1,125 @@
+"""What differs from an earlier run, on a small beam that carries a load on the second day."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from yid_ocp.analysis.history import Estimates
+from yid_ocp.config.reader import load_config
+from yid_ocp.data.hdf5 import write_recording
+from yid_ocp.data.recording import PointGroup, Recording
+from yid_ocp.diagnosis.baseline import since, with_baseline
+from yid_ocp.diagnosis.hypotheses import CandidateProblem
+from yid_ocp.diagnosis.refit import refit
+from yid_ocp.errors import ConfigError
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.workflow.build import build_problem
+from yid_ocp.workflow.diagnose import run_diagnose
+from yid_ocp.workflow.simulate import as_recording
+from yid_ocp.workflow.solve import run_solve
+
+BEAM = """
+model:
+  object:
+    kind: segments
+    mount: {rpy: [0.0, 1.5707963267948966, 0.0]}
+    segments:
+      beam: {length: 0.1, mass: 0.1, section: [0.03, 0.03], links: 2, rigidity: true, clamped: true, joint_order: y}
+recordings: {estimate: [bare.h5]}
+parameters:
+  beam.bend: {free: true, initial: 0.015}
+  beam.damping: {free: true, initial: 8.0e-5}
+problem: {time_step: 0.01, compiler: false, initial_state: estimated, configuration_std: 0.2, velocity_std: 3.0}
+diagnosis: {candidates: [point_mass@w_beam, kelvin_voigt@beam]}
+output: {report: false, discretisation: none}
+"""
+NOISE, LOAD = 1e-4, 0.05
+TRUTH = {"beam.bend": 0.02, "beam.damping": 5e-5}
+
+
+def swing(folder, name, seed, effects="[]"):
+    """A recording of 2.2 s of the beam let go from 0.1 rad a joint, and its file."""
+    t = np.arange(221) * 0.01
+    empty = Recording(None, (PointGroup("points", ("w_beam",), t, np.zeros((221, 1, 3)), NOISE),))
+    write_recording(empty, folder / "bare.h5")
+    (folder / "beam.yaml").write_text(BEAM, encoding="utf-8")
+    run = load_config(folder / "beam.yaml", (f"model.effects={effects}",))
+    problem = build_problem(run)
+    start = {f"start.q.{joint}[bare]": 0.1 for joint in problem.system.mechanism.joint_names}
+    values = problem.named(problem.vector({**TRUTH, **start}))
+    theta, offset = problem.split(problem.vector(values), 0)
+    outcome = problem.predictor.run(problem.episodes[0], theta, offset, False)
+    assert not isinstance(outcome, str)
+    made = as_recording(run, problem, problem.episodes[0], outcome, seed)
+    write_recording(replace(made, truth={}), folder / f"{name}.h5")
+
+
+@pytest.fixture(scope="module")
+def beam(tmp_path_factory):
+    """Folder with a bare and a loaded swing, and a run of `solve` on the bare one."""
+    folder = tmp_path_factory.mktemp("beam")
+    swing(folder, "loaded", 2, f"[{{kind: point_mass, location: w_beam, values: {{mass: {LOAD}}}}}]")
+    swing(folder, "again", 3)
+    swing(folder, "bare", 1)
+    run_solve(load_config(folder / "beam.yaml"), folder / "old")
+    return folder
+
+
+def diagnosed(beam, recording, out):
+    said = (f"recordings.estimate=[{recording}.h5]", "diagnosis.baseline=[old]")
+    return run_diagnose(load_config(beam / "beam.yaml", said), out)
+
+
+def test_a_load_is_what_differs_and_taking_it_away_predicts_the_first_day(beam, tmp_path):
+    outcome = diagnosed(beam, "loaded", tmp_path / "new")
+    finding, result = outcome.finding, outcome.result
+    assert [effect.label for effect in finding.effects] == ["point_mass@w_beam"]
+    mass = finding.last.values["point_mass@w_beam.mass"]
+    assert abs(mass - LOAD) < 4 * finding.last.std["point_mass@w_beam.mass"]
+    assert result["baseline"]["changed"] == []
+    for part in ("removed", "added"):
+        errors = result["counterfactual"][part]["rmse"]["points.w_beam"]
+        # no more than noise in three coordinates is left
+        assert errors["counterfactual"] < 1.5 * np.sqrt(3) * NOISE < errors["without_diagnosis"]
+    assert "Taken away again, it predicts bare, made without it" in result["summary"]
+    assert set(result["model"]["covariance"]["names"]) == {*TRUTH, "point_mass@w_beam.mass"}
+
+
+def test_nothing_differs_where_nothing_changed(beam, tmp_path):
+    outcome = diagnosed(beam, "again", tmp_path / "new")
+    assert outcome.result["verdict"] == "no_gap"
+    assert outcome.result["baseline"]["changed"] == []
+    assert outcome.result["counterfactual"] is None
+    assert "no parameter has changed" in outcome.result["summary"]
+
+
+def test_a_recording_of_the_baseline_is_refused(beam, tmp_path):
+    with pytest.raises(ConfigError, match="would count twice"):
+        diagnosed(beam, "bare", tmp_path / "new")
+
+
+@pytest.mark.parametrize("times", [0.1, 1.0, 10.0])
+def test_a_move_counts_as_the_difference_of_two_independent_estimates(beam, times):
+    """Of one parameter it is (data alone - baseline) over the root of both variances, however tight the baseline is."""
+    run = load_config(
+        beam / "beam.yaml",
+        ("recordings.estimate=[again.h5]", "recordings.held_out=[bare.h5]", "parameters.beam.damping.free=false"),
+    )
+    problem = build_problem(run)
+    alone = refit(CandidateProblem(problem.at(TRUTH), (), False), (), {})
+    assert alone is not None
+    std = alone.std["beam.bend"] * times
+    before = alone.values["beam.bend"] + 3 * std
+    known = Estimates("old", ("beam.bend",), np.array([before]), np.array([[std**2]]))
+    both = refit(CandidateProblem(with_baseline(problem.at(TRUTH), known), (), False), (), {})
+    assert both is not None
+    [shift] = since(both, known, 0.01).parameters
+    apart = (alone.values["beam.bend"] - before) / np.hypot(std, alone.std["beam.bend"])
+    if times < 0.2:
+        assert shift.score is None  # the recording says nothing beside such a baseline
+    else:
+        assert shift.score == pytest.approx(apart, rel=0.1)
+        assert isinstance(both.problem, EstimationProblem)
