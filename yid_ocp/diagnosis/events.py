@@ -468,7 +468,9 @@ def _alone(t: Array, values: Array, noise: Array, about: tuple[str, str, str, st
         if end - begin >= LONGEST_RUN:
             continue
         near = np.r_[max(begin - NEIGHBOURS, 0) : begin, end + 1 : min(end + 1 + NEIGHBOURS, count)]
-        if size[begin : end + 1].min() < ALONE * size[near].max(initial=0.0):
+        # a stamp that is late by an interval moves a value by what changes from sample to sample
+        steps = np.abs(np.diff(values))[[k for k in near[:-1] if k + 1 != begin and k < count - 1]]
+        if size[begin : end + 1].min() < ALONE * max(size[near].max(initial=0.0), steps.max(initial=0.0)):
             continue
         period = float(np.median(np.diff(t[max(begin - NEIGHBOURS, 0) : end + NEIGHBOURS])))
         peak = float(off[begin + int(size[begin : end + 1].argmax())])
