@@ -197,7 +197,8 @@ def refit(
         }
         again = _attempt(own, effects, fresh) if len(fresh) < len(start) else None
         best = again if again is not None and again[1].cost < best[1].cost else best
-    for effect in effects:
+    # those before it were found from both already
+    for effect in effects[-1:]:
         moved = effect.elsewhere(start)
         if moved is None:
             continue
