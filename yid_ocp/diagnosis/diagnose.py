@@ -13,7 +13,7 @@ import threadpoolctl
 from yid_ocp.analysis.history import Estimates
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.baseline import with_baseline
-from yid_ocp.diagnosis.earlier import Earlier
+from yid_ocp.diagnosis.earlier import NOTHING, Earlier
 from yid_ocp.diagnosis.finding import Finding, absorption
 from yid_ocp.diagnosis.hypotheses import CandidateProblem, Choice, chosen_effects
 from yid_ocp.diagnosis.localise import Place, attributed, localise, merged
@@ -95,7 +95,7 @@ def diagnose(
 
 
 def _diagnosed(
-    problem: EstimationProblem, search: Search, solution: Solution | None, clock: _Clock, earlier: Earlier
+    problem: EstimationProblem, search: Search, solution: Solution | None, clock: _Clock, earlier: Earlier = NOTHING
 ) -> Finding:
     limits, progress = search.limits, search.progress
     progress("fitting the nominal model")
