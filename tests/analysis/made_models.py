@@ -11,6 +11,7 @@ from made_series import samples
 
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.problem.evaluation import Evaluation, ResidualRows
+from yid_ocp.problem.options import JointPrior
 from yid_ocp.solvers.base import Solution, Status
 from yid_ocp.solvers.judgement import Estimate, Fit
 
@@ -65,6 +66,7 @@ class Formula:
             known_start={},
             recording_values={},
             priors={},
+            joint_prior=JointPrior(),
             path_cutoff=np.inf,
         )
         everything = samples(

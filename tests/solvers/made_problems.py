@@ -10,6 +10,7 @@ from made_series import samples
 
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.problem.evaluation import Evaluation, ResidualRows
+from yid_ocp.problem.options import JointPrior
 from yid_ocp.solvers.base import Iterate, Outcome, Status
 
 
@@ -61,7 +62,7 @@ class MadeUp:
         self.bounds = np.full(size, lower), np.full(size, upper)
         self.scales = np.abs(self.start) if scales is None else np.array(scales, float)
         self.options = SimpleNamespace(
-            believed=True, weighting=weighting, priors=dict(priors or {}), path_cutoff=np.inf
+            believed=True, weighting=weighting, priors=dict(priors or {}), path_cutoff=np.inf, joint_prior=JointPrior()
         )
         self.disturbed = False
         values = [*self.start, *fixed]

@@ -14,6 +14,7 @@ from yid_ocp.data.hdf5 import write_recording
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.diagnosis.baseline import with_baseline
 from yid_ocp.errors import ConfigError, DataError
+from yid_ocp.solvers import GaussNewton, MultipleShooting, solve
 from yid_ocp.workflow.baseline import earlier_runs, read_estimates, recordings_without, with_effects_of
 from yid_ocp.workflow.build import build_problem, build_system, read_recordings
 from yid_ocp.workflow.report import run_report
@@ -203,5 +204,19 @@ def test_report_says_what_drifted_and_writes_the_history(tmp_path):
     assert outcome.history.drifted == ("beam.bend",)
     assert [entry["name"] for entry in written["runs"] if entry["distrusted"]] == [str(folders[3])]
     assert "beam.bend is not the same in all runs" in (tmp_path / "history" / "report.html").read_text(encoding="utf-8")
+    later = folder_of(tmp_path / "later", baseline={"runs": [str(folders[0])]})
+    with pytest.raises(ConfigError, match="would count twice"):
+        run_report([folders[0], later], tmp_path / "other")
     with pytest.raises(ConfigError, match="one run has no history"):
         run_report(folders[:1], tmp_path / "other")
+
+
+@pytest.mark.slow
+def test_a_program_with_node_states_has_the_same_joint_prior(tmp_path):
+    """`python -m pytest -m slow tests/workflow/test_held.py`: some seconds in IPOPT."""
+    run = settings(tmp_path, None, ("problem.initial_state=equilibrium",))
+    known = read_estimates(folder_of(tmp_path / "old", values=(0.018, 4e-5)))
+    problem = with_baseline(build_problem(run), known)
+    rolled, program = (solve(problem, method) for method in (GaussNewton(), MultipleShooting()))
+    assert program.cost == pytest.approx(rolled.cost, rel=1e-6)
+    assert program.x == pytest.approx(rolled.x, rel=1e-3)

@@ -14,7 +14,7 @@ from yid_ocp.analysis.history import Estimates
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.baseline import with_baseline
 from yid_ocp.diagnosis.carry_over import carried_over
-from yid_ocp.diagnosis.earlier import Earlier
+from yid_ocp.diagnosis.earlier import UNTOLD, Earlier
 from yid_ocp.diagnosis.events import NOTHING, Events, find_events, without_events
 from yid_ocp.diagnosis.finding import Finding, absorption
 from yid_ocp.diagnosis.hypotheses import MARGINS, CandidateProblem, Choice, Cut, chosen_effects
@@ -100,7 +100,7 @@ def diagnose(
 
 
 def _diagnosed(
-    problem: EstimationProblem, search: Search, solution: Solution | None, clock: _Clock, earlier: Earlier
+    problem: EstimationProblem, search: Search, solution: Solution | None, clock: _Clock, earlier: Earlier = UNTOLD
 ) -> Finding:
     limits, progress = search.limits, search.progress
     progress("fitting the nominal model")

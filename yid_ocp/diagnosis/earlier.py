@@ -64,3 +64,7 @@ class Earlier:
             return None
         progress("predicting the world without the effects")
         return counterfactual(nominal, added[-1].fit, self.without, self.known)
+
+
+UNTOLD = Earlier(None, (), 0.0, 1.0, ())
+"""Of a diagnosis that stands for itself."""

@@ -123,16 +123,33 @@ def earlier_runs(run: Run) -> tuple[Estimates, ...]:
                 hint=f"compare model.{differing} with {Path(folder) / 'config.yaml'}",
             )
         found.append(own)
+    dependent = _dependent(run.diagnosis.baseline)
+    if dependent:
+        raise run.refuse(dependent, "diagnosis", "baseline", hint="give the later one alone")
     return tuple(found)
 
 
-def refuse_another_model(folders: Sequence[Path]) -> None:
-    """Refuse run folders whose models are not one and the same.
+def _dependent(folders: Sequence[str | Path]) -> str:
+    """Says which run has another one of them as its baseline, so that one would count twice; empty where none has."""
+    known = [Path(folder).resolve() for folder in folders]
+    for folder in known:
+        said = _result(folder / "result.json").get("baseline") or {}
+        twice = [own for own in said.get("runs", ()) if Path(own).resolve() in known]
+        if twice:
+            return f"{folder} has {twice[0]} as its baseline already, which would count twice"
+    return ""
+
+
+def refuse_unlike(folders: Sequence[Path]) -> None:
+    """Refuse run folders whose models are not one and the same, or one of which has another as its baseline.
 
     Raises
     ------
     ConfigError
     """
+    dependent = _dependent(folders)
+    if dependent:
+        raise ConfigError(dependent, where="report", hint="diagnose without --baseline for a history, or leave one out")
     known = [(folder, settings) for folder in folders if (settings := _settings(folder)) is not None]
     for folder, settings in known[1:]:
         differing = _different(known[0][1], settings)

@@ -15,7 +15,7 @@ from yid_ocp.files import file_sha256
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import Findings
 from yid_ocp.report.terminal import history_summary
-from yid_ocp.workflow.baseline import read_estimates, refuse_another_model
+from yid_ocp.workflow.baseline import read_estimates, refuse_unlike
 from yid_ocp.workflow.command import DONE, carry_out
 from yid_ocp.workflow.folder import new_run_folder, versions
 from yid_ocp.workflow.progress import SILENT, Progress
@@ -72,7 +72,7 @@ def run_report(
     if twice:
         raise ConfigError("a run is given twice, and would count twice", where=twice[0], hint="list every run once")
     estimates = [read_estimates(path) for path in paths]
-    refuse_another_model(paths)
+    refuse_unlike(paths)
     progress.stage(f"comparing {len(paths)} runs")
     found = history(estimates)
     with new_run_folder(Run(name="history"), out, "report") as folder:
