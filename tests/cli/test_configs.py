@@ -26,6 +26,7 @@ QUICK = {
     **dict.fromkeys(PAPER, (*COARSE, *UNREFINED)),
     "single_arm_vision": COARSE,
     "baxter_arm": ("problem.duration=2.0",),
+    "double_pendulum": ("problem.duration=3.0",),
     "panda_beam": ("problem.duration=1.5", "model.object.segments.beam.links=2", "solver.iterations=3"),
     **dict.fromkeys(("springs_series_ends", "springs_series_joint", "springs_torsion"), ()),
     "soft_beam": (

@@ -11,7 +11,7 @@ import pytest
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.diagnosis import smoother_model
 from yid_ocp.diagnosis.localise import Place, attributed, informed_map, localise, merged
-from yid_ocp.diagnosis.smoother import _filter, _run, _scores, smooth
+from yid_ocp.diagnosis.smoother import _filter, _run, _scores, history_of_force, smooth
 from yid_ocp.diagnosis.smoother_model import Interval, Linear, Source, linear_model
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.step import compile_step
@@ -91,6 +91,28 @@ def test_the_filter_gives_the_evidence_and_the_posterior_of_dense_algebra(seed):
     assert done.covariance == pytest.approx(expected, rel=1e-8, abs=1e-10)
     left = np.linalg.solve(total, observed)
     assert np.vstack(done.left) == pytest.approx(left, rel=1e-8, abs=1e-10)
+
+
+@pytest.mark.parametrize("unknown", [0, 1])
+def test_what_is_said_of_one_unknowns_history_is_that_of_dense_algebra(unknown):
+    model = random_model(5)
+    variance = {FORCE: 0.8, BIAS: 2.5}
+    design, prior, _ = dense(model, np.array([variance[source] for source in model.sources]))
+    observed = np.vstack([i.observed for i in model.intervals])
+    # parameters have a prior of three of their sizes
+    total = design @ np.diag(prior) @ design.T + np.eye(len(design)) + 9 * observed[:, 1:] @ observed[:, 1:].T
+    columns = []
+    for at in range(len(model.intervals)):
+        state, rows = np.zeros(len(model.loose)), []
+        for j, interval in enumerate(model.intervals):
+            value = float(j == at)
+            rows.append(interval.by_state @ state + interval.by_unknown[:, unknown] * value)
+            state = interval.transition @ state + interval.drive[:, unknown] * value
+        columns.append(np.concatenate(rows))
+    response = np.stack(columns, axis=1)
+    score, information = history_of_force(model, variance, unknown)
+    assert score == pytest.approx(response.T @ np.linalg.solve(total, observed[:, 0]), rel=1e-7, abs=1e-9)
+    assert information == pytest.approx(response.T @ np.linalg.solve(total, response), rel=1e-7, abs=1e-9)
 
 
 def test_the_scores_are_the_slope_of_the_evidence():

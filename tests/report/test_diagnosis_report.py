@@ -11,6 +11,8 @@ import pytest
 
 from yid_ocp.data import JointGroup, Recording, write_recording
 from yid_ocp.diagnosis import Thresholds, diagnose
+from yid_ocp.diagnosis.events import Event, Events, Fall, Force
+from yid_ocp.diagnosis.pulses import Pulse
 from yid_ocp.report import figures
 from yid_ocp.report.figures import Change, Curve, Ranked, Row
 from yid_ocp.report.html import write_report
@@ -169,3 +171,25 @@ def test_a_band_is_shaded_about_the_noise():
     t = np.linspace(0.0, 1.0, 5)
     figure = figures.over_time([Curve("error", t[:0], t[:0], {"line": (t, t)}, 0.2)], "red", {"line": "blue"})
     assert (figure.layout.shapes[0].y0, figure.layout.shapes[0].y1) == (-0.2, 0.2)
+
+
+def test_events_are_marked_on_the_time_axis_told_and_listed(found, tmp_path):
+    t = np.linspace(0, 2, 21)
+    pulse = Pulse(0.5, 1.0, 0.7, False, 0.05, 1e-9)
+    event = Event("run", "elbow", "elbow", "force", 0.5, 1.0, 0.7, pulse.impulse, 0.0125, "N m", pulse)
+    events = Events(
+        (event,), (Fall("run", "elbow", 1.5),), (Force("run", "elbow", "N m", t, pulse.values(t), 0.1 + 0 * t),)
+    )
+    page = page_of(replace(found["no_gap"], events=events), tmp_path / "report.html")
+    assert 'id="events"' in page
+    text = text_of(page)
+    assert "elbow is pushed by up to +0.7 N m from 0.50 to 1.00 s in run" in text
+    assert "From 1.5 s on nothing is judged in run" in text
+    assert 'id="events"' not in page_of(found["no_gap"], tmp_path / "plain.html")
+
+
+def test_spans_are_shaded():
+    t = np.linspace(0, 3, 31)
+    figure = figures.over_time([Curve("a", t, t, {}, spans=[(1.0, 2.0)])], "#000000", {})
+    (shape,) = figure.layout.shapes
+    assert (shape.x0, shape.x1) == (1.0, 2.0)

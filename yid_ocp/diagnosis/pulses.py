@@ -248,7 +248,7 @@ def pulses(history: History, limits: Thresholds = DEFAULTS) -> tuple[list[Pulse]
     list of Pulse
         With p-values of single windows; see `discoveries`.
     float
-        Windows that do not overlap, of all lengths together.
+        Windows that do not overlap, of lengths a factor of two apart.
     """
     windows, tries = _windows(history, limits)
     if not len(windows.begin):
@@ -316,7 +316,8 @@ def _windows(history: History, limits: Thresholds) -> tuple[_Windows, float]:
     begin = np.concatenate(begins)
     end = begin + np.repeat(lengths, [len(b) for b in begins])
     flat = np.repeat([False, True], len(begin))
-    tries = sum((last - first) / length for length in lengths if length <= last - first)
+    # windows of nearly the same length tell the same: those within a factor of two count as one
+    tries = math.log2(GROWTH) * sum((last - first) / length for length in lengths if length <= last - first)
     return _Windows(np.tile(begin, 2), np.tile(end, 2), flat), tries
 
 
