@@ -49,12 +49,12 @@ SILENT = smoothed({FORCE: 0.0})
 @pytest.fixture
 def nominal(monkeypatch):
     """What fits the nominal model is asked; nominal.outcome: what the refit gives."""
-    made = SimpleNamespace(outcome=fit(), known=None, starts=[], solved=[], found=None)
+    made = SimpleNamespace(outcome=fit(), outcomes=[], known=None, starts=[], solved=[], found=None)
 
     def refit(problem, effects, start, store, name, limits):
-        assert name == ""
+        assert name == ("" if not made.starts else "the nominal model from its start")
         made.starts.append((problem, tuple(effects), dict(start), store, limits))
-        return made.outcome
+        return made.outcomes.pop(0) if made.outcomes else made.outcome
 
     def solve(problem, solver):
         made.solved.append((problem, solver))
@@ -92,6 +92,13 @@ def test_the_nominal_fit_begins_at_the_solution_of_all_data(nominal, blocks, giv
     assert module.nominal_fit("problem", composed, given, "store", limits) is nominal.outcome
     assert nominal.starts == [(composed, (), start, "store", limits)]
     assert nominal.solved == [("problem", GaussNewton(iterations=30))][:solved]
+
+
+def test_where_the_solution_cannot_be_rolled_out_again_the_fit_begins_at_the_start(nominal):
+    nominal.outcomes = [None]
+    composed = SimpleNamespace(blocks=False, problem=CALM)
+    assert module.nominal_fit("problem", composed, solution()) is nominal.outcome
+    assert [start for _, _, start, _, _ in nominal.starts] == [{"k": 2.0}, {}]
 
 
 def test_a_nominal_fit_that_is_known_is_not_repeated(nominal):

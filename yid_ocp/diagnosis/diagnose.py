@@ -373,7 +373,11 @@ def nominal_fit(
         known = recalled(composed.weighted_at(known.values), (), store)
     if known is not None:
         return known
-    fit = _settled(composed, _nominal_start(problem, composed, solution), store, "", limits)
+    start = _nominal_start(problem, composed, solution)
+    fit = _settled(composed, start, store, "", limits)
+    if fit is None and start:
+        # a gap may drive parameters so far that the equilibrium which the solver followed is not found again from there
+        fit = _settled(composed, {}, store, "the nominal model from its start", limits)
     if fit is None:
         raise SolverError("the nominal model cannot be rolled out at its fit", where="diagnosis")
     return fit
