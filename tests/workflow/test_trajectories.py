@@ -8,6 +8,7 @@ import h5py
 import numpy as np
 import pytest
 
+from yid_ocp.diagnosis.events import NOTHING
 from yid_ocp.errors import OutputError
 from yid_ocp.solvers import GaussNewton, solve
 from yid_ocp.workflow.build import load_problem
@@ -55,7 +56,8 @@ def test_a_solution_with_its_predictions(solved, tmp_path):
 def test_a_diagnosis_without_a_gap_has_predictions_alone(solved, tmp_path):
     ((episode, outcome),) = solved[2]
     other = SimpleNamespace(predicted=[2 * array for array in outcome.predicted])
-    write_diagnosis_trajectories(tmp_path / "t.h5", SimpleNamespace(smoothed=None), [(episode, outcome, other)])
+    finding = SimpleNamespace(smoothed=None, events=NOTHING)
+    write_diagnosis_trajectories(tmp_path / "t.h5", finding, [(episode, outcome, other)])
     with h5py.File(tmp_path / "t.h5") as file:
         assert file.attrs["format"] == "yid-diagnosis-trajectories/1"
         assert list(file) == ["held_out"]
