@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -202,6 +203,10 @@ DOUBTFUL, COLLAPSED = 0.1, 0.02
 # An arm that folds the object for a moment parts valleys that lie near each other: where the model does not explain the
 # recording, starts these factors off the best fit are tried, stiffer ones, with which less folds.
 NEARBY = (1.25, 1.6)
+# A branch that is seen a few times a second has the phase of several frequencies: what is known worse than this part of
+# its value may have other valleys. It is moved by these factors, the others as the fit's covariance says, and where the
+# cost then rises by less than this part of what the fit predicts, the search goes on from there.
+LOOSE, APART, SHALLOW, OTHERS = 0.03, (1 / 2.5, 1 / 1.6, 1.6, 2.5), 0.2, 2
 # Noise that drives the motion is linearised where a pass begins; passes end when one changes nothing.
 PASSES = 6
 REMEDY = "start nearer, widen the bounds, or use gauss_newton"
@@ -288,6 +293,8 @@ def _solved(
             break
         near = np.where(problem.positive, np.clip(outcome.x * factor, lower, upper), outcome.x)
         try_from(near, f"best fit x {factor:g}")
+    for near in _other_valleys(best[2], best[1], best[0].x) if restarts and carries_covariance(solver) else ():
+        try_from(near, "another valley")
     outcome, finish, weighted = best
     if problem.disturbed and not carries_noise(solver):
         remark = "; weighted by the sensors' noise alone, without the noise that drives the motion"
@@ -367,6 +374,29 @@ def _doubtful(problem: EstimationProblem, finish: Evaluation, x: Array, first: A
     std = np.sqrt(np.maximum(np.diag(uncertainty(problem, finish)[0]), 0.0))
     loose = (std > DOUBTFUL * np.abs(x)) & (std < 100 * np.abs(first))
     return problem.positive & (loose | (x < COLLAPSED * first))
+
+
+def _other_valleys(problem: EstimationProblem, finish: Evaluation, x: Array) -> list[Array]:
+    """Starts from which a loosely known unknown may go to another value than the one found, the likeliest first."""
+    if not finish.ok or finish.jacobian is None or not problem.disturbed:
+        return []
+    covariance, _ = uncertainty(problem, finish)
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    found: list[tuple[float, Array]] = []
+    # what is hardly known stays where it is
+    known = std < np.abs(x)
+    for i in np.flatnonzero(problem.positive & known & (std > LOOSE * np.abs(x))):
+        for factor in APART:
+            along = np.where(known, covariance[:, i] / covariance[i, i], 0.0)
+            moved = np.clip(x + along * (factor - 1.0) * x[i], *problem.bounds)
+            # a stiffness counts by its logarithm where that says less: a slope that fades is no valley
+            expected = 0.5 * (min(abs(factor - 1.0), abs(math.log(factor))) * x[i] / std[i]) ** 2
+            there = problem.evaluate(moved, derivatives=False, warm=finish.warm)
+            rise = there.cost - finish.cost
+            if there.ok and expected > 2.0 and rise < SHALLOW * expected:
+                found.append((rise, moved))
+    found.sort(key=lambda entry: entry[0])
+    return [moved for _, moved in found[:OTHERS]]
 
 
 def carries_covariance(solver: Solver) -> bool:
