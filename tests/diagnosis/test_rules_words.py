@@ -30,7 +30,7 @@ from factories import (
 from yid_ocp.diagnosis.finding import which
 from yid_ocp.diagnosis.hypotheses import Cut
 from yid_ocp.diagnosis.verdict import Reason
-from yid_ocp.diagnosis.words import NAMELESS, sentences
+from yid_ocp.diagnosis.words import NAMELESS, next_experiment, sentences
 
 FRICTION, OFFSET = effect("friction@elbow"), effect("offset@wrist", amplitude(lower=-9.0))
 NO_EFFECT = {"added": (), "fits": ()}
@@ -398,3 +398,26 @@ def test_a_recording_that_cannot_be_followed_is_named(kept, said):
 def test_blocks_for_want_of_a_recording_that_can_be_followed_are_said():
     text = sentences(finding(cuts=(Cut("other", 0.0, 5.0),), in_blocks=True))
     assert "No held-out recording is left: alternate blocks" in text
+
+
+# -- sentences that numbers would contradict --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("share", [0.0, 0.004])
+def test_a_place_without_a_share_is_no_place(share):
+    text = sentences(finding("unknown", where=(place("spring_1", share),)))
+    assert "spring_1" not in text.replace("Move spring_1", "")
+    assert "These data do not tell where it lies." in text
+
+
+@pytest.mark.parametrize(
+    ("at", "share", "said"),
+    [
+        ("T1", 0.8, "Move T1 alone, slowly and fast, and hold it still in several postures."),
+        ("world", 0.8, "Record other motions, faster and larger."),
+        ("camera", 0.8, "Record other motions, faster and larger."),
+        ("spring_1", 0.0, "Record other motions, faster and larger."),
+    ],
+)
+def test_nobody_is_asked_to_move_what_does_not_move(at, share, said):
+    assert next_experiment("unknown", (), (place(at, share),), ()) == said

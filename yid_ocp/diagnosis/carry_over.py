@@ -78,7 +78,9 @@ def compared(effect: EffectBase, first: Fit, second: Fit, limits: Thresholds = D
     for name in effect.amplitudes:
         apart = abs(first.values[name] - second.values[name])
         spread = math.hypot(first.std[name], second.std[name])
-        agrees = apart <= limits.carried_stds * spread or apart <= limits.carried * size * width[name]
+        # what has no standard deviation says nothing against it
+        sure = math.isfinite(spread) and apart > limits.carried_stds * spread
+        agrees = not sure or apart <= limits.carried * size * width[name]
         parameter = effect.parameters[name]
         own = (first.values[name], first.std[name], second.values[name], second.std[name])
         found.append(Carried(effect.label, name.removeprefix(f"{effect.label}."), parameter.unit, *own, agrees))

@@ -32,6 +32,8 @@ SIDES = {
 }
 DIFFER = 0.01
 """Significance below which several runs of a baseline differ."""
+NOWHERE = ("world", "clock", "camera", "object", "base")
+"""Places that nobody can move alone."""
 NEXT = {
     "insufficient_data": "Record longer and larger motions; more of the object has to be seen.",
     "separate": "Vary {aspects} independently of each other, over a wide range, in one recording.",
@@ -77,8 +79,10 @@ def next_experiment(verdict: str, added: Sequence[Added], where: Sequence[Place]
     rivals = next((entry.rivals for entry in added if len(entry.rivals) > 1), ())
     if rivals:
         return separating(rivals)
-    if verdict == "unknown" and where:
+    if verdict == "unknown" and where and where[0].share > 0 and where[0].location not in NOWHERE:
         return NEXT["unknown"].format(place=where[0].location)
+    if verdict == "unknown":
+        return NEXT["other"]
     if verdict == "no_gap" and unseen:
         return NEXT["unseen"].format(unseen=", ".join(unseen[:4]) + (", ..." if len(unseen) > 4 else ""))
     return NEXT["no_gap"] if verdict == "no_gap" else NEXT["effect"]
@@ -158,9 +162,12 @@ def _gap(finding: Finding) -> str:
 
 def _places(finding: Finding) -> str:
     """Where it lies; empty where nothing says so."""
-    named = " and ".join(f"{_one_of(p)} ({100 * p.share:.0f} %)" for p in main_places(finding.where))
+    shares = [(_one_of(p), round(100 * p.share)) for p in main_places(finding.where)]
+    named = " and ".join(f"{place} ({percent} %)" for place, percent in shares if percent)
     side = "" if finding.smoothed is None else SIDES.get(finding.smoothed.side, "")
-    return f"It lies in {named}{side}." if named else ""
+    if named:
+        return f"It lies in {named}{side}."
+    return "These data do not tell where it lies." if shares else ""
 
 
 def _nameless(finding: Finding) -> str:
