@@ -288,6 +288,13 @@ def test_a_late_sample_changes_by_the_slope_on_its_node_by_the_mean_of_two(node,
     np.testing.assert_allclose(all_late.slope(at_nodes, several, np.array([steps]))[1], [rate])
 
 
+def test_late_samples_of_which_a_short_piece_holds_none_change_by_nothing():
+    none = measured(efforts("a"), np.zeros(0, int), np.zeros(0), np.zeros((0, 1)), span=(2, 8))
+    late = none.late(np.array([0.5]))
+    assert late.slope(np.zeros((0, 1)), none, np.array([0.5])).shape == (0, 1)
+    assert late.interpolate(np.zeros((0, 1, 3))).shape == (0, 1, 3)
+
+
 @pytest.mark.parametrize(("t", "time_step"), [(np.linspace(0.0, 3e3, 400), 0.01), (np.arange(0.0, 3e3, 10.0), 0.01)])
 def test_a_clock_in_other_units_does_not_make_an_endless_rollout(t, time_step):
     made = recording(joints(["a"], t, np.zeros((len(t), 1))))

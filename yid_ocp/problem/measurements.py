@@ -139,6 +139,8 @@ class Measurements:
         steps : ndarray, shape (k,)
         """
         nodes, column = self.nodes, np.arange(at_nodes.shape[1])
+        if not len(nodes):  # a short piece may hold no sample of a slow sensor
+            return np.zeros((0, at_nodes.shape[1]))
         place = self.node - nodes[0]
 
         def at(index: NDArray[np.int64]) -> Array:
