@@ -384,7 +384,8 @@ def _stands_out(history: History, bare: _Rest, rest: _Rest, window: _Windows, se
     """
     begin, end = float(window.begin[0]), float(window.end[0])
     length, own = end - begin, seen(window, history.t)
-    if length > 0.98 * longest:
+    # at either bound its length is not found but cut off: jumps of friction are shorter, errors of the model longer
+    if not 1.02 * FEWEST * history.spacing < length < 0.98 * longest:
         return False
     size = abs(float(rest.sizes(own)[0]))
     near = history.values[(history.t > begin - length) & (history.t < end + length)]
