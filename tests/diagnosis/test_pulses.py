@@ -8,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.diagnosis.pulses import History, Pulse, discoveries, pulses
+from yid_ocp.diagnosis.pulses import History, Pulse, pulses
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.problem.low_pass import LowPass
+from yid_ocp.problem.null_test import discoveries
 
 T = 0.1 * np.arange(80)
 NOISE = 0.02

@@ -203,10 +203,10 @@ def _happened(whole: EstimationProblem, fit: Fit, limits: Thresholds) -> Events:
             return NOTHING
         test = null_test(residual_series(judged), residual.residual, len(fit.values), limits.level, limits.window)
         if any(window.flagged for window in test.windows):
-            smoothed = smooth_fit(
-                replace(fit, problem=own, evaluation=own.evaluate(x, warm=fit.evaluation.warm)), limits
-            )
-    evaluation = own.evaluate(x, smoothed is not None, fit.evaluation.warm)
+            evaluation = own.evaluate(x, warm=fit.evaluation.warm)
+            smoothed = smooth_fit(replace(fit, problem=own, evaluation=evaluation), limits)
+    if smoothed is None:
+        evaluation = own.evaluate(x, False, fit.evaluation.warm)
     return find_events(own, x, evaluation, smoothed, limits) if evaluation.ok else NOTHING
 
 

@@ -21,7 +21,7 @@ import threadpoolctl
 from numpy.typing import NDArray
 
 from yid_ocp.data.channels import quantum
-from yid_ocp.diagnosis.pulses import RARE, History, Pulse, discoveries, pulses
+from yid_ocp.diagnosis.pulses import RARE, History, Pulse, pulses
 from yid_ocp.diagnosis.smoother import Smoothed, history_of_force
 from yid_ocp.diagnosis.smoother_model import Linear, linear_model, seen_by
 from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
@@ -32,7 +32,7 @@ from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.low_pass import LowPass
 from yid_ocp.problem.measurements import Measurements
-from yid_ocp.problem.null_test import sample_times
+from yid_ocp.problem.null_test import discoveries, sample_times
 from yid_ocp.problem.options import SensorOptions
 from yid_ocp.problem.prediction import EpisodeResult
 from yid_ocp.sensors.joints import by_joint

@@ -246,7 +246,7 @@ def pulses(history: History, limits: Thresholds = DEFAULTS) -> tuple[list[Pulse]
     Returns
     -------
     list of Pulse
-        With p-values of single windows; see `discoveries`.
+        With p-values of single windows; see `null_test.discoveries`.
     float
         Windows that do not overlap, of lengths a factor of two apart.
     """
@@ -282,28 +282,6 @@ def pulses(history: History, limits: Thresholds = DEFAULTS) -> tuple[list[Pulse]
     if covered > RARE * float(history.t[-1] - history.t[0]):
         return [], tries
     return _sized(history, rests, found, taken, seen), tries
-
-
-def discoveries(p_values: Sequence[float], tries: float, level: float) -> list[bool]:
-    """Which of some pulses are more than chance among all windows that were looked at.
-
-    Benjamini and Hochberg (1995), doi:10.1111/j.2517-6161.1995.tb02031.x.
-
-    Parameters
-    ----------
-    p_values : sequence of float
-        Of the pulses that were found.
-    tries : float
-        Number of windows.
-    level : float
-        False-discovery rate.
-    """
-    order = np.argsort(p_values)
-    passed = np.flatnonzero(np.sort(p_values) <= level * np.arange(1, len(order) + 1) / max(tries, 1.0))
-    real = np.zeros(len(order), bool)
-    if len(passed):
-        real[order[: passed[-1] + 1]] = True
-    return [bool(r) for r in real]
 
 
 def _windows(history: History, limits: Thresholds) -> tuple[_Windows, float]:
@@ -402,8 +380,7 @@ def _sized(
     """The pulses with their sizes, all together, beside the rest of the largest evidence."""
     if not found:
         return []
-    rest = max((rest.beside(taken) for rest in rests), key=lambda one: one.evidence)
-    rest = rests[[r.beside(taken).evidence for r in rests].index(rest.evidence)]
+    rest = max(rests, key=lambda one: one.beside(taken).evidence)
     spread = np.linalg.pinv(taken.T @ rest.precision @ taken, hermitian=True)
     size = spread @ (taken.T @ rest.scored)
     result = []

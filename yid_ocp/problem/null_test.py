@@ -241,14 +241,30 @@ def _windows(series: Sequence[Series], residual: Array, level: float, length: fl
                 p = float(scipy.stats.chi2.sf(total / count * degrees, degrees))
                 z = (total / count - 1) * np.sqrt(degrees / 2)
                 raw.append((recording, channel, begin, min(begin + length, last), float(z), p))
-    p_values = np.array([entry[5] for entry in raw])
+    flagged = discoveries([entry[5] for entry in raw], len(raw), level)
+    return tuple(Window(*entry[:5], flag) for entry, flag in zip(raw, flagged, strict=True))
+
+
+def discoveries(p_values: Sequence[float], tries: float, level: float) -> list[bool]:
+    """Which of some findings are more than chance among all places that were looked at.
+
+    Benjamini and Hochberg (1995), doi:10.1111/j.2517-6161.1995.tb02031.x.
+
+    Parameters
+    ----------
+    p_values : sequence of float
+        Of what was found.
+    tries : float
+        Number of places.
+    level : float
+        False-discovery rate.
+    """
     order = np.argsort(p_values)
-    # Benjamini and Hochberg (1995), doi:10.1111/j.2517-6161.1995.tb02031.x
-    passed = np.flatnonzero(p_values[order] <= level * np.arange(1, len(raw) + 1) / max(len(raw), 1))
-    flagged = np.zeros(len(raw), bool)
+    passed = np.flatnonzero(np.sort(p_values) <= level * np.arange(1, len(order) + 1) / max(tries, 1.0))
+    real = np.zeros(len(order), bool)
     if len(passed):
-        flagged[order[: passed[-1] + 1]] = True
-    return tuple(Window(*entry[:5], bool(flag)) for entry, flag in zip(raw, flagged, strict=True))
+        real[order[: passed[-1] + 1]] = True
+    return [bool(r) for r in real]
 
 
 def sample_times(episode: Episode, samples: Measurements) -> Array:
