@@ -14,7 +14,7 @@ from yid_ocp.data.doubt import Doubt
 from yid_ocp.errors import DataError
 from yid_ocp.solvers import solve
 from yid_ocp.workflow.build import build_problem, build_system
-from yid_ocp.workflow.doubts import of_one
+from yid_ocp.workflow.doubts import is_modelled, of_one
 
 
 @pytest.fixture
@@ -180,3 +180,13 @@ def test_what_the_model_has_as_an_effect_is_no_doubt(repository, clean, tmp_path
     assert doubt.setting == "model.effects: [{kind: encoder_offset, location: left_e1, values: {offset: 0.05}}]"
     answered = load_config(file, [*settings, doubt.setting.replace(": ", "=", 1)])
     assert of_one(answered, build_system(answered), moved) == []
+
+
+@pytest.mark.parametrize("effect", ["effort_delay, location: left", "effort_lag, location: left_e1"])
+def test_a_delay_and_a_lag_both_answer_late_efforts(repository, effect):
+    file = repository / "configs" / "single_arm_no_vision.yaml"
+    late = Doubt("effort_lag", "efforts are late", "not_trusted", 3.0, "shift their times", "", "joints", "effort")
+    plain = load_config(file)
+    assert not is_modelled(build_system(plain), late)
+    answered = load_config(file, [f"model.effects=[{{kind: {effect}}}]"])
+    assert is_modelled(build_system(answered), late)

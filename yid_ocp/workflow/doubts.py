@@ -37,12 +37,12 @@ from yid_ocp.problem.prediction import EpisodeResult
 from yid_ocp.sensors.joints import EFFORT, POSITION
 
 MODELLED = {
-    "encoder_offset": "encoder_offset",
-    "effort_gain": "effort_gain",
-    "effort_sign": "effort_gain",
-    "effort_offset": "effort_offset",
-    "effort_lag": "effort_delay",
-    "clock_offset": "camera_latency",
+    "encoder_offset": ("encoder_offset",),
+    "effort_gain": ("effort_gain",),
+    "effort_sign": ("effort_gain",),
+    "effort_offset": ("effort_offset",),
+    "effort_lag": ("effort_delay", "effort_lag"),
+    "clock_offset": ("camera_latency",),
 }
 """Effects by which a model takes such an error into account."""
 MOVING = ("damping", "viscous", "coulomb", "stribeck", "inertia", "tau")
@@ -171,7 +171,7 @@ def _beside_the_model(
         if any(doubt.weight == "refused" for doubt in found):
             return found
         told = [*check_efforts(arm, recording), *check_held_points(arm, recording, _choice(run))]
-        found += [doubt for doubt in told if not _modelled(system, doubt)]
+        found += [doubt for doubt in told if not is_modelled(system, doubt)]
     return found + list(check_reach(arm, system, theta, recording, _choice(run)))
 
 
@@ -191,11 +191,11 @@ def _excitation(run: Run, arm: Arm, free: Sequence[str], recordings: Sequence[Re
     return found
 
 
-def _modelled(system: System, doubt: Doubt) -> bool:
+def is_modelled(system: System, doubt: Doubt) -> bool:
     """Whether the model has as an effect what the doubt is about."""
-    kind = MODELLED.get(doubt.cause, "")
-    places = {effect.location for effect in system.effects if effect.kind == kind}
-    if kind == "camera_latency" and kind not in doubt.setting:  # no camera's clock
+    kinds = MODELLED.get(doubt.cause, ())
+    places = {effect.location for effect in system.effects if effect.kind in kinds}
+    if "camera_latency" in kinds and "camera_latency" not in doubt.setting:  # no camera's clock
         return False
     joint = doubt.channel.partition(".")[2]
     return bool(places) and (not joint or joint in places)
