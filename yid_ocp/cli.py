@@ -238,22 +238,28 @@ def _carried_out(arguments: argparse.Namespace) -> int:
         code = int(import_module(f"yid_ocp.workflow.{arguments.module}").run(arguments))
         sys.stdout.flush()
         return code
-    except YidError as error:
+    except Exception as error:
+        number = interruption.asked()
+        if number is not None:  # what a library makes of being interrupted is no cause
+            raise interruption.Interrupted(number) from error
+        return _failed(error)
+
+
+def _failed(error: Exception) -> int:
+    """Say why a command failed; its exit code."""
+    if isinstance(error, YidError):
         return _wrong(error)
-    except BrokenPipeError:
+    if isinstance(error, BrokenPipeError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python fails again when it ends
         return _wrong(OutputError("standard output was closed before all was printed", hint="read it to its end"))
-    except OSError as error:
+    if isinstance(error, OSError):
         what = f"the system refused: {error.strerror or error}"
         return _wrong(OutputError(what, where=str(error.filename or ""), hint="see whether disk and rights allow it"))
-    except MemoryError as error:
+    if isinstance(error, MemoryError):
         what = f"there is not enough memory: {error}"
         return _wrong(ResourceError(what, hint="shorten the run, or take fewer links"))
-    except Exception as error:  # whatever else comes up here is a mistake of ours
-        number = interruption.asked()
-        if number is not None:  # or the words of a library that was interrupted
-            raise interruption.Interrupted(number) from error
-        with tempfile.NamedTemporaryFile("w", prefix="yid-ocp-", suffix=".log", delete=False, encoding="utf-8") as file:
-            traceback.print_exc(file=file)
-        print(f"bug: {type(error).__name__}: {error}\n  please report it with {file.name}", file=sys.stderr)
-        return BUG
+    # whatever else comes up here is a mistake of ours
+    with tempfile.NamedTemporaryFile("w", prefix="yid-ocp-", suffix=".log", delete=False, encoding="utf-8") as file:
+        traceback.print_exception(error, file=file)
+    print(f"bug: {type(error).__name__}: {error}\n  please report it with {file.name}", file=sys.stderr)
+    return BUG

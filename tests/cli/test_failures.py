@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from yid_ocp.errors import DataError
 from yid_ocp.problem.prediction import Predictor
 from yid_ocp.workflow import solve as solve_module
 
@@ -66,6 +68,24 @@ def test_an_interruption_leaves_nothing(cli, pendulum, left_nothing, monkeypatch
     done = cli("solve", pendulum)
     assert done.code == 130
     assert "interrupted" in done.err
+    left_nothing()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals as on POSIX")
+@pytest.mark.parametrize("made_of_it", [DataError("a library cannot be loaded"), OSError("cut off"), ValueError("no")])
+def test_an_interruption_is_one_whatever_a_library_makes_of_it(cli, pendulum, left_nothing, monkeypatch, made_of_it):
+    def swallowed(*arguments, **named):
+        with contextlib.suppress(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(10)
+        raise made_of_it
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    monkeypatch.setattr(solve_module, "solve", swallowed)
+    done = cli("solve", pendulum)
+    signal.signal(signal.SIGINT, before)
+    assert done.code == 130
+    assert done.err.rstrip().endswith("interrupted (SIGINT); nothing half-finished was left")
     left_nothing()
 
 
