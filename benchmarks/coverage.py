@@ -34,12 +34,12 @@ from make_recordings import OFFSETS, SNAP, TRUTH, within_limits
 import yid_ocp
 from yid_ocp.config.reader import load_config
 from yid_ocp.data.hdf5 import write_recording
-from yid_ocp.data.recording import EffortKind
 from yid_ocp.errors import ModelError
 from yid_ocp.files import content_hash, file_sha256, write_json
 from yid_ocp.model.system import System
 from yid_ocp.parallel import Task, TaskResult, process_pool, run_tasks
 from yid_ocp.report.terminal import solve_summary, table
+from yid_ocp.sensors.base import EffortKind
 from yid_ocp.virtual.engine import Simulation, simulate_in_mujoco
 from yid_ocp.virtual.experiment import ArmNoise, VirtualExperiment, paper_system, virtual_experiment
 from yid_ocp.virtual.motion import Excitation, Motion, multisine

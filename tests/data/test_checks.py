@@ -137,11 +137,12 @@ def test_a_fault_is_told_by_its_cause(fault):
     assert causes(recording) == expected
 
 
-def test_commands_that_end_at_a_bound_are_a_warning():
+def test_commands_may_end_at_a_bound():
     recording, _ = FAULTS["clipped efforts"]
-    for kind, weight in (("command", "warning"), ("sample", "not_trusted")):
-        found = check_recording(changed(recording, effort_kind=kind), lambda _: SensorOptions())
-        assert {(doubt.cause, doubt.weight) for doubt in found} == {("saturated", weight)}
+    assert causes(changed(recording, effort_kind="command")) == set()
+    assert causes(recording, joints_effort=SensorOptions(kind="command")) == set()
+    commands = changed(recording, effort_kind="command")
+    assert causes(commands, joints_effort=SensorOptions(kind="sample")) == {"saturated"}
 
 
 def test_noise_that_settings_state_counts_instead_of_the_recorded():

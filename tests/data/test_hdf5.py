@@ -74,7 +74,7 @@ def recordings(draw: st.DrawFn) -> Recording:
         shape = (len(t), len(joint_names))
         channels: dict[str, Any] = {"position": draw(hnp.arrays(float, shape, elements=finite(50.0)))}
         for channel in draw(st.sets(st.sampled_from(sorted(set(JOINT_CHANNELS) - {"position"})))):
-            bound = 50.0 if channel == "position_command" else 1e300
+            bound = {"rad": 50.0, "rad/s": 1e6, "N m": 1e9}[JOINT_CHANNELS[channel]]
             channels[channel] = draw(hnp.arrays(float, shape, elements=finite(bound)))
         std = st.none() | st.floats(0, 1e9) | hnp.arrays(float, shape[1], elements=st.floats(0, 1e9))
         kinds = st.sampled_from([None, "sample", "mean", "command"])

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from small_problems import PENDULUM, pendulum_step, taken
 
 from yid_ocp.data.recording import JointGroup
+from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.grid import Grid
 from yid_ocp.problem.inputs import held_torque, held_torque_slope
+from yid_ocp.sensors.joints import EFFORT
 
 H = 0.01
 
@@ -24,3 +27,17 @@ def test_torque_acts_late() -> None:
     slope = held_torque_slope(joints, ("a", "b"), grid, "made", np.array([0.0, 0.25 * H]))
     assert slope[:, 0] == pytest.approx(-np.array([0.5, 1.5, 3.0, 6.0, 12.0]) / H)
     assert slope[1:, 1] == pytest.approx(-np.diff(prompt[:, 1]) / H)
+
+
+@pytest.mark.parametrize("kind", ["sample", "mean", "command"])
+def test_settings_say_what_recorded_efforts_are(urdf_folder, kind):
+    step = pendulum_step(urdf_folder, driven=PENDULUM)
+    recorded = taken(step, 1)
+    stated = ProblemOptions(sensors={EFFORT: SensorOptions(kind=kind)})
+    (said,) = EstimationProblem(step, [recorded], ["shoulder.damping"], stated).episodes
+    (held,) = EstimationProblem(
+        step, [recorded.with_effort_kind(kind)], ["shoulder.damping"], ProblemOptions()
+    ).episodes
+    assert said.recording.joints.effort_kind == kind
+    np.testing.assert_array_equal(said.torque, held.torque)
+    assert (np.abs(said.torque - recorded.joints.effort[:-1]).max() < 1e-12) == (kind != "sample")

@@ -237,7 +237,8 @@ def _clock(recording: Recording, name: str) -> str:
 
 def saturated(recording: Recording) -> Iterator[Doubt]:
     """Efforts that meet their extreme again and again, to the last digit."""
-    commanded = recording.joints is not None and recording.joints.effort_taken_as == "command"
+    if recording.joints is not None and recording.joints.effort_taken_as == "command":
+        return  # what a controller asks for ends at its own bound
     for group, channel, t, values in _channels(recording, "effort"):
         for sign in (1.0, -1.0):
             levels, counts = np.unique(sign * values, return_counts=True)
@@ -252,10 +253,10 @@ def saturated(recording: Recording) -> Iterator[Doubt]:
                 yield Doubt(
                     "saturated",
                     f"{channel} is exactly {sign * levels[-1]:.4g} N m in {at.sum()} samples and never beyond",
-                    # what a controller asked for may end at its own bound
-                    "warning" if commanded else "not_trusted",
+                    "not_trusted",
                     at.sum() / LIMITS.clipped,
-                    "leave what is cut off out, or record within the sensor's range",
+                    "leave what is cut off out, or record within the sensor's range; where it is what a controller "
+                    "asked for, say sensors.joints.effort.kind: command",
                     "",
                     group,
                     channel,

@@ -46,6 +46,7 @@ def check_recording(recording: Recording, choice: Choices, driving: bool = True)
     -------
     list of Doubt
     """
+    recording = recording.with_effort_kind(choice("joints.effort").kind)
     units = [replace(doubt, recording=recording.name) for doubt in _units_of_time(recording)]
     if units:
         return units  # nothing else can be said in times that are not seconds

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import DataError, nearest
+from yid_ocp.sensors.base import EffortKind
 
 Array = NDArray[np.float64]
 Clock = Literal["recorded", "nominal"]
-EffortKind = Literal["sample", "mean", "command"]
 
 JOINT_CHANNELS: Mapping[str, str] = {
     "position": "rad",
@@ -32,7 +32,9 @@ JOINT_STD = ("position_std", "velocity_std", "effort_std", "effort_bias_std")
 POINT_GROUP_NAME = re.compile(r"points(_[^/]+)?")
 """What a group of points may be called."""
 
-_LARGEST_ANGLE = 50.0  # eight turns: no robot joint does that, whereas a posture in degrees nearly always does
+_LARGEST = {"rad": 50.0, "rad/s": 1e6, "N m": 1e9}
+"""What no joint does: eight turns, which a posture in degrees nearly always exceeds, or beyond any machine."""
+_LARGEST_SPREAD = 1e9  # its square is a number still
 _LARGEST_DISTANCE = 50.0  # beyond any motion capture volume, whereas an object in millimetres is always larger
 _TIME_TOLERANCE = 1e-9  # a nominal clock is a sum of rounded periods, so its end is seldom exactly the number asked for
 
@@ -225,6 +227,12 @@ class Recording:
         """Time from the first sample of any group to the last of any [s]."""
         return float(max(group.t[-1] for group in self.groups) - min(group.t[0] for group in self.groups))
 
+    def with_effort_kind(self, kind: EffortKind | None) -> Recording:
+        """The recording with its efforts taken as a kind that is stated elsewhere; itself where none is."""
+        if kind is None or self.joints is None:
+            return self
+        return replace(self, joints=replace(self.joints, effort_kind=kind))
+
     def slice(self, start: float, stop: float) -> Recording:
         """Cut out the samples with  start <= t <= stop.
 
@@ -308,8 +316,8 @@ def validate(recording: Recording, *, allow_nan_effort: bool = False, where: str
         If there is no group, or one is empty; names are repeated or do not match the arrays; a clock is not finite and
         strictly increasing; a joint channel has a value that is not finite; a point is infinite or seen in part; a
         standard deviation is negative; the kind of effort is none that is known; a pose is not a rigid transform; joint
-        positions exceed 50 rad or points 50 m, which are degrees or millimetres; `straight` does not match the first
-        group of points.
+        positions exceed 50 rad or points 50 m, which are degrees or millimetres; speeds or efforts are beyond any
+        machine; `straight` does not match the first group of points.
     """
     origin = where or f"recording '{recording.name}'"
     require(bool(recording.groups), "the recording has no group", origin, "joints, points, points_<name>")
@@ -390,21 +398,23 @@ def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> 
                 hint="cut the recording or leave the channel out"
                 + (", or read with allow_nan_effort=True" if is_effort else ""),
             )
-        largest = float(np.nanmax(np.abs(value))) if JOINT_CHANNELS[channel] == "rad" else 0.0
+        unit = JOINT_CHANNELS[channel]
+        largest = float(np.nanmax(np.abs(value), initial=0.0))
+        degrees = f"these look like degrees: convert them to radians, or read a CSV with units={{'{channel}': 'deg'}}"
         require(
-            largest <= _LARGEST_ANGLE,
-            f"channel '{channel}' reaches {largest:g} rad",
+            largest <= _LARGEST[unit],
+            f"channel '{channel}' reaches {largest:g} {unit}",
             place,
-            f"at most {_LARGEST_ANGLE:g} rad",
-            f"these look like degrees: convert them to radians, or read a CSV with units={{'{channel}': 'deg'}}",
+            f"at most {_LARGEST[unit]:g} {unit}",
+            degrees if unit == "rad" else "convert it again from what was recorded: no machine does that",
         )
     for name in JOINT_STD:
         std, place = getattr(joints, name), f"{where}, attribute {name}"
         if std is not None:
             if np.ndim(std) > 0:
                 _check_shape(std, (len(joints.names),), place, "one number or (nj,)")
-            good = bool(np.all(np.isfinite(std) & (np.asarray(std) >= 0)))
-            require(good, f"{name} is {std}", place, "finite and not negative")
+            good = bool(np.all((np.asarray(std) >= 0) & (np.asarray(std) <= _LARGEST_SPREAD)))
+            require(good, f"{name} is {std}", place, f"not negative, and at most {_LARGEST_SPREAD:g}")
     if joints.effort_kind is not None:
         place, kinds = f"{where}, attribute effort_kind", get_args(EffortKind)
         hint = "leave the attribute out where it is not known"
@@ -435,9 +445,9 @@ def _validate_points(group: PointGroup, where: str) -> None:
     if group.std is not None:
         _check_shape(group.std, group.position.shape, f"{where}/std", "one number or (M, np, 3)")
         seen = group.std[~unseen]
-        wrong = seen[~(np.isfinite(seen) & (seen >= 0))]
+        wrong = seen[~((seen >= 0) & (seen <= _LARGEST_SPREAD))]
         what = f"the standard deviation of a point that was seen is {wrong[:1]}"
-        require(wrong.size == 0, what, f"{where}/std", "finite and not negative")
+        require(wrong.size == 0, what, f"{where}/std", f"not negative, and at most {_LARGEST_SPREAD:g} m")
     if group.pose is not None:
         _check_pose(group.pose, f"{where}, attribute pose")
 

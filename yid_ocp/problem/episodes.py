@@ -22,7 +22,7 @@ from yid_ocp.problem.noise import InputErrors, input_errors
 from yid_ocp.problem.options import ProblemOptions, SensorOptions
 from yid_ocp.problem.start import FittedStart
 from yid_ocp.sensors import SENSORS, Surroundings
-from yid_ocp.sensors.joints import POSITION
+from yid_ocp.sensors.joints import EFFORT, POSITION
 
 Array = NDArray[np.float64]
 
@@ -103,6 +103,7 @@ def prepare_episode(functions: ModelFunctions, recording: Recording, options: Pr
         The recording does not fit the model, is too short, or states no noise level.
     """
     step, system = functions.step, functions.step.system
+    recording = recording.with_effort_kind(options.sensors.get(EFFORT, SensorOptions()).kind)
     grid = make_grid(recording, step.time_step, options.duration)
     if system.driven and recording.joints is None:
         raise DataError("the model's arms are driven but the recording has no joints", where=recording.name)

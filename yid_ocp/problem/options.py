@@ -14,6 +14,7 @@ from yid_ocp.data.doubt import Doubt
 from yid_ocp.model.cable import ClampPath
 from yid_ocp.options import About
 from yid_ocp.problem.measurements import Weighting
+from yid_ocp.sensors.base import EffortKind
 
 StartKind = Literal["equilibrium", "estimated", "fitted_to_points"]
 Positive = Annotated[float, Gt(0)]
@@ -45,6 +46,12 @@ class SensorOptions:
             "standard deviation of a constant error in each joint's torque, another in every recording, instead of the "
             "recorded one (joints.effort of driven joints only)",
             "N m",
+        ),
+    ] = None
+    kind: Annotated[
+        EffortKind | None,
+        About(
+            "what recorded efforts are of the torque that acts, instead of what the recording says (joints.effort only)"
         ),
     ] = None
 

@@ -167,6 +167,10 @@ class RecordingData(Protocol):
     def points(self) -> Sequence[PointData]: ...  # noqa: D102
 
 
+EffortKind = Literal["sample", "mean", "command"]
+"""What a recorded effort is of the torque that acted: its value, its mean until the next sample, or held until then."""
+
+
 class Choice(Protocol):
     """How one group of a recording is used; see `problem.options.SensorOptions`."""
 
@@ -180,6 +184,8 @@ class Choice(Protocol):
     def points(self) -> tuple[str, ...] | None: ...  # noqa: D102
     @property
     def bias_std(self) -> float | Mapping[str, float] | None: ...  # noqa: D102
+    @property
+    def kind(self) -> EffortKind | None: ...  # noqa: D102
 
 
 class Smoothing(Protocol):

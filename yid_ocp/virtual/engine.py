@@ -17,9 +17,9 @@ from typing import Any, Protocol, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from yid_ocp.data.recording import EffortKind
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model.system import System
+from yid_ocp.sensors.base import EffortKind
 from yid_ocp.virtual.mjcf import compiled_model, mujoco_module, mujoco_xml
 from yid_ocp.virtual.motion import Movement
 from yid_ocp.virtual.posture import initial_posture

@@ -30,7 +30,7 @@ from yid_ocp.model.urdf import read_urdf, robot_description_file
 from yid_ocp.model.y_object import Y_FOOT, y_segments
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import Episode
-from yid_ocp.sensors.joints import POSITION, of_arm
+from yid_ocp.sensors.joints import EFFORT, POSITION, of_arm
 from yid_ocp.workflow.doubts import blaming, examined, object_doubts, stop_at
 from yid_ocp.workflow.held import clamp_paths, clamps, straight_values, with_frames
 
@@ -548,6 +548,10 @@ def _check_sensors(run: Run, recordings: Sequence[Recording]) -> None:
                 name,
                 allowed=", ".join(sorted(known)),
                 hint=nearest(name, known),
+            )
+        if run.sensors[name].kind is not None and name != EFFORT:
+            raise run.refuse(
+                f"'{name}' holds no efforts", "sensors", name, "kind", hint=f"say it of {EFFORT}, or leave it out"
             )
 
 
