@@ -62,6 +62,7 @@ WRONG = {
     "negative": (head("ascii", -1) + TEXT, "element vertex -1"),
     "none": (head("ascii", 0), "has no vertices"),
     "cut": (SOUND["little"][:-5], "declares 7 points"),
+    "cut by one byte": (SOUND["little"][:-1], "declares 7 points"),
     "cut text": (head("ascii") + TEXT[:90], "a vertex is not|vertices are missing|declares"),
     "words": (head("ascii") + TEXT.replace(b"0.5", b"0.5 one", 1), "a vertex is not"),
 }
