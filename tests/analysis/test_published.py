@@ -125,7 +125,13 @@ def test_the_truth_was_chosen_from_one_answer_and_this_is_said():
 
 def test_weak_parameters_are_said_with_their_interval():
     said = published_sentences("single_arm_no_vision", judged(T3_bend=replace(OPEN, interval=(0.84, None))), TRUTH)
-    assert said[4].endswith("not informed; in such an experiment it is weakly determined (above 0.84)")
+    assert said[4].endswith(
+        "hardly informed; in such an experiment it is weakly determined, above 0.84, where the value lies"
+    )
+    said = published_sentences("single_arm_no_vision", judged(T1_twist=replace(OPEN, interval=(8.65, 109.7))), TRUTH)
+    assert said[1].startswith(
+        "T1.twist = 0 of the paper: unexplained; such recordings leave 8.65 to 109.7 open and not this, it is not slow"
+    )
 
 
 def test_nothing_is_said_where_the_recordings_are_not_explained_or_a_parameter_is_not_free():

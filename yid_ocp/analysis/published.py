@@ -137,10 +137,10 @@ def _holds(entry: Estimate, value: float) -> bool:
 
 def _words(why: str, value: float, entry: Estimate, truth: float | None, ends: Ends, experiment: str) -> str:
     if why == "not_informed":
-        known = PREDICATES[entry.verdict]
+        known = f"in such an experiment it {PREDICATES[entry.verdict]}"
         if entry.verdict == "weak" and entry.interval not in (None, (None, None)):
-            known += f" ({interval_words(*entry.interval)})"
-        return f"not informed; in such an experiment it {known}"
+            return f"hardly informed; {known}, {interval_words(*entry.interval)}, where the value lies"
+        return f"not informed; {known}"
     if why == "near_truth":
         assert truth is not None
         chosen = experiment == CHOSEN and abs(value - truth) <= ROUNDED * abs(truth)
@@ -154,4 +154,7 @@ def _words(why: str, value: float, entry: Estimate, truth: float | None, ends: E
         )
     if why == "torque_error":
         return f"torque error; {led}"
-    return f"unexplained; it is neither for want of information nor slow, and {led}"
+    told = "such recordings inform it"
+    if entry.verdict == "weak" and entry.interval not in (None, (None, None)):
+        told = f"such recordings leave {interval_words(*entry.interval)} open and not this"
+    return f"unexplained; {told}, it is not slow, and {led}"
