@@ -19,6 +19,7 @@ from yid_ocp.diagnosis.refit import (
     recalled,
     refit,
     refit_all,
+    told,
 )
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.problem.options import ProblemOptions
@@ -98,6 +99,12 @@ def test_weights_stand_about_the_torques_of_the_start_without_the_effects(solved
     problem = Problem(lambda values: 1.0)
     refit(problem, [FRICTION], {"k": 2.0, A: 3.0})
     assert problem.placed == ({**problem.named(np.ones(5)), "k": 2.0, A: 3.0}, {**problem.placed[0], A: 0.25, S: 0.5})
+
+
+def test_a_spread_far_beyond_what_one_would_expect_is_no_knowledge():
+    low, high = FRICTION.prior_range[A]
+    std = {"k": 1e9, A: 101 * (high - low), S: 99 * (FRICTION.prior_range[S][1] - FRICTION.prior_range[S][0])}
+    assert told([FRICTION], std) == {**std, A: math.inf}
 
 
 # -- is a refit half done ---------------------------------------------------------------------------------------------

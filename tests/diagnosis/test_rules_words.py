@@ -128,8 +128,8 @@ def with_effect(of, value, std=0.02, **changed):
     [
         ("N m", 0.0234, "friction@elbow with a = 0.457 ± 0.023 N m closes"),
         ("1", 0.0234, "friction@elbow with a = 0.457 ± 0.023 closes"),
-        ("N m", math.inf, "friction@elbow with a = 0.457 N m closes"),
-        ("N m", math.nan, "friction@elbow with a = 0.457 N m closes"),
+        ("N m", math.inf, "friction@elbow with a unknown closes"),
+        ("N m", math.nan, "friction@elbow with a unknown closes"),
     ],
 )
 def test_an_effect_is_said_with_its_numbers(unit, std, said):
@@ -349,6 +349,15 @@ def nameless(reason, **changed):
 def test_why_a_gap_has_no_name_is_said_with_the_numbers_that_decide_it(reason, changed, said):
     assert said in nameless(reason, **changed)
     assert "friction@elbow" in nameless(reason, **changed)
+
+
+@pytest.mark.parametrize(
+    ("reason", "said"), [("unsure", " close 9"), ("little", " explain 31 %"), ("stand_in", " imitate it")]
+)
+def test_several_effects_do_what_one_does(reason, said):
+    both = (added(FRICTION), added(OFFSET))
+    text = nameless(reason, added=both, explained=0.31, carried=(carried(),))
+    assert f"friction@elbow and offset@wrist{said}" in text
 
 
 def test_what_does_not_carry_over_is_named_with_both_values():

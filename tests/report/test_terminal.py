@@ -218,6 +218,9 @@ def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():
     lines = terminal.diagnose_summary(result)
     assert line_of(lines, "kelvin_voigt@T1").endswith(" < 1e-12")
     assert line_of(lines, "kelvin_voigt@T2").endswith(" 0.034")
+    refitted = terminal.diagnose_summary(result | {"which": [entry | {"closure": 0.5, "p_value": 0.0}]})
+    assert "tau = 0.05 s" in line_of(lines, "kelvin_voigt@T1")
+    assert "tau unknown" in line_of(refitted, "kelvin_voigt@T1")
     assert not any("yid-ocp plan" in line for line in lines)
     section = {"goal": "information", "separate": ["density@T3", "point_mass@w_T3"], "run": "runs/mine"}
     said = terminal.diagnose_summary(result | {"next_plan": section})

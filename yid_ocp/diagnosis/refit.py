@@ -6,6 +6,7 @@ differences between models are paired. G = max(0, chi2/n - 1) is the gap.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -31,6 +32,8 @@ Array = NDArray[np.float64]
 Progress = Callable[[str], None]
 
 SOLVER = GaussNewton(iterations=25, step_tolerance=1e-3, cost_tolerance=1e-5)
+UNTOLD = 100.0
+"""A standard deviation so many times the range in which an engineer would expect a parameter tells nothing of it."""
 """A refit starts near its end and must be good to a small part of its standard deviation, and of the `tie`, only."""
 
 
@@ -209,7 +212,7 @@ def refit(
     if best is None:
         return None
     outcome, finish = best
-    std = own.named(refit_std(own, finish, limits))
+    std = told(effects, own.named(refit_std(own, finish, limits)))
     loss = held_out_loss(own, outcome.x)
     values = own.named(outcome.x)
     if store is not None:
@@ -278,6 +281,12 @@ def refit_std(problem: EstimationProblem, finish: Evaluation, limits: Thresholds
     """Standard deviation of every unknown, shape (nx,), counting the misfit where there is one, as `solve` has it."""
     covariance = covariance_of_fit(problem, finish, judge_fit(problem, finish, limits.gap))
     return plain_std(covariance, problem.start)
+
+
+def told(effects: Sequence[EffectBase], std: Mapping[str, float]) -> dict[str, float]:
+    """Standard deviations of which those that say nothing are infinite: `UNTOLD` times what one would expect at all."""
+    width = {name: high - low for effect in effects for name, (low, high) in effect.prior_range.items()}
+    return {name: math.inf if size > UNTOLD * width.get(name, math.inf) else size for name, size in std.items()}
 
 
 def refit_all(

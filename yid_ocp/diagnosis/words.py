@@ -51,11 +51,11 @@ NEXT = {
 NAMELESS = {
     "nothing": "No known effect explains it.",
     "none": "No known effect explains it (the best, {best}, is not sure to be there and to close a part).",
-    "unsure": "{names} closes {closure:.3g} % of it, but not surely: at least {low:.3g} %, where {least:.3g} % are "
+    "unsure": "{names} close{s} {closure:.3g} % of it, but not surely: at least {low:.3g} %, where {least:.3g} % are "
     "asked.",
-    "little": "{names} explains {explained:.3g} % of what unknown forces, offsets and biases explain, where "
+    "little": "{names} explain{s} {explained:.3g} % of what unknown forces, offsets and biases explain, where "
     "{enough:.3g} % are asked of so many effects.",
-    "stand_in": "{names} imitates it (closing {closure:.3g} % on held-out motions) and is not its cause: {apart}.",
+    "stand_in": "{names} imitate{s} it (closing {closure:.3g} % on held-out motions) and {are} not its cause: {apart}.",
 }
 """Why a gap has no name, by `verdict.Reason`."""
 
@@ -183,6 +183,8 @@ def _nameless(finding: Finding) -> str:
     ]
     return NAMELESS[finding.reason].format(
         names=names,
+        s="s" if len(finding.added) == 1 else "",
+        are="is" if len(finding.added) == 1 else "are",
         closure=100 * finding.closure.value,
         low=100 * finding.closure.low,
         least=100 * finding.limits.closure,
@@ -281,8 +283,8 @@ def _remains(finding: Finding) -> str:
 def _figures(effect: EffectBase, fit: Fit) -> str:
     parts = []
     for name, r in fit.reported(effect).items():
-        std = f" ± {r.std:.2g}" if math.isfinite(r.std) else ""
-        parts.append(f"{name} = {r.value:.3g}{std} {r.unit}".strip().removesuffix(" 1"))
+        known = f"{name} = {r.value:.3g} ± {r.std:.2g} {r.unit}".strip().removesuffix(" 1")
+        parts.append(known if math.isfinite(r.std) else f"{name} unknown")
     return ", ".join(parts)
 
 

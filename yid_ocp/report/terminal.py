@@ -266,6 +266,13 @@ def _percent(value: float | None) -> str:
     return "unknown" if value is None else f"{percent_words(value)} %" if value < 10 else f"{value:.2g} times"
 
 
+def _known(name: str, quantity: Mapping[str, Any], refitted: bool) -> str:
+    """A candidate's parameter; without a refit its value is a first step and has no standard deviation."""
+    if quantity["std"] is None:
+        return f"{name} unknown" if refitted else f"{name} = {quantity['value']:.3g} {quantity['unit']}"
+    return f"{name} = {quantity['value']:.3g} ± {quantity['std']:.2g} {quantity['unit']}"
+
+
 def diagnose_summary(result: Mapping[str, Any]) -> list[str]:
     """Lines that tell a person what a `yid-diagnosis/1` result says."""
     lines = [*_doubt_lines(result), *textwrap.wrap(result["summary"], 100), ""]
@@ -276,8 +283,7 @@ def diagnose_summary(result: Mapping[str, Any]) -> list[str]:
     rows = [("candidate", "parameters", "closure alone", "score", "p")]
     for entry in result["which"][:8]:
         known = {name: q for name, q in entry["parameters"].items() if q["value"] is not None}
-        spread = {name: "" if q["std"] is None else f" ± {q['std']:.2g}" for name, q in known.items()}
-        values = ", ".join(f"{name} = {q['value']:.3g}{spread[name]} {q['unit']}" for name, q in known.items())
+        values = ", ".join(_known(name, quantity, entry["closure"] is not None) for name, quantity in known.items())
         closed = "" if entry["closure"] is None else f"{100 * entry['closure']:.3g} %"
         label = f"{entry['kind']}@{entry['location']}"
         p = f"{entry['p_value']:.2g}" if entry["p_value"] > 1e-12 else "< 1e-12"
