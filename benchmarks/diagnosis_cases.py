@@ -27,6 +27,7 @@ from yid_ocp.config.reader import DIAGNOSIS_DEFAULT, load_config
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis import Finding, Thresholds, diagnose
 from yid_ocp.diagnosis.blind import finer_values
+from yid_ocp.diagnosis.carry_over import disagreeing
 from yid_ocp.diagnosis.hypotheses import CandidateProblem, chosen_effects
 from yid_ocp.diagnosis.refit import refit
 from yid_ocp.parallel import Task, process_pool, run_tasks
@@ -200,6 +201,10 @@ def run(name: str, seeds: Sequence[int]) -> dict[str, str]:
         "verdict": finding.verdict,
         "right": judged,
         "added": ", ".join(effect.label for effect in finding.effects) or "-",
+        "nameless": "-" if finding.effects else ", ".join(entry.effect.label for entry in finding.added) or "-",
+        "why": finding.reason or "-",
+        "explained": f"{100 * finding.explained:.0f} %" if finding.added else "-",
+        "apart": ", ".join(f"{entry.effect}.{entry.name}" for entry in disagreeing(finding.carried)) or "-",
         "not separable": rivals if finding.effects and rivals else "-",
         "where": finding.where[0].location if finding.where else "-",
         "chi2/n held out": f"{finding.held_out_before.chi2_per_dof:.3g}",
