@@ -577,12 +577,16 @@ def event_sentences(events: Events) -> str:
         more = f"; and {count - NAMED} more" if count > NAMED else ""
         first = "One event stands" if count == 1 else f"{count} events stand"
         text.append(f"{first} beside all this, short and in one place: {told}{more}.")
-    for fall in events.falls:
-        text.append(
-            f"From {fall.time:.3g} s on nothing is judged in {fall.recording}, where {fall.joint} moves too fast for "
-            "the model to follow."
-        )
-    return " ".join(text)
+    return " ".join([*text, *fall_sentences(events)])
+
+
+def fall_sentences(events: Events) -> list[str]:
+    """Where judging ends."""
+    why = "moves too fast for the model to follow."
+    return [
+        f"From {fall.time:.3g} s on nothing is judged in {fall.recording}, where {fall.joint} {why}"
+        for fall in events.falls
+    ]
 
 
 def _said(event: Event) -> str:

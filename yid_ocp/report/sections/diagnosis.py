@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.diagnosis import Finding
-from yid_ocp.diagnosis.events import event_sentences
+from yid_ocp.diagnosis.events import fall_sentences
 from yid_ocp.diagnosis.localise import informed_map, units
 from yid_ocp.diagnosis.smoother import Smoothed
 from yid_ocp.problem.episodes import Episode
@@ -116,8 +116,8 @@ def _gap(finding: Finding) -> Chapter:
             sentences.append(f"{said}{worse}.")
     else:
         sentences.append(
-            f"No effect was added, so there is no error after it; chi² per degree of freedom is {first:.3g} "
-            "(one is noise alone)."
+            f"No effect is named, so no error is shown after it; chi² per degree of freedom is {first:.3g} (one is "
+            "noise alone)."
         )
     return Chapter("How large the gap is", sentences, pictures)
 
@@ -246,7 +246,7 @@ def _events(finding: Finding) -> Chapter | None:
         "is judged below, as far as that can be done."
         if events.forces
         else "",
-        event_sentences(events),
+        *fall_sentences(events),
     ]
     pictures = []
     for name in dict.fromkeys(force.recording for force in events.forces):
