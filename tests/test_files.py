@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.errors import DataError, OutputError
-from yid_ocp.files import content_hash, file_sha256, jsonable, new_file, write_json
+from yid_ocp.files import content_hash, file_sha256, is_file, jsonable, new_file, write_json
 
 
 def test_an_interruption_leaves_nothing(tmp_path: Path) -> None:
@@ -81,3 +81,10 @@ def test_numbers_that_json_lacks_become_null_and_a_note() -> None:
     data = {"a": np.array([1.0, np.nan]), "b": {"c": np.float64(np.inf)}, "d": (np.int64(3), Path("x"))}
     assert jsonable(data, notes) == {"a": [1.0, None], "b": {"c": None}, "d": [3, "x"]}
     assert notes == ["a[1] is not known", "b.c is infinite"]
+
+
+@pytest.mark.parametrize("name", ["é" * 300 + ".ply", "a\0b", "nothing", ".."])
+def test_any_name_may_be_asked_for(tmp_path: Path, name: str) -> None:
+    assert not is_file(tmp_path / name)
+    (tmp_path / "something").touch()
+    assert is_file(tmp_path / "something")

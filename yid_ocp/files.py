@@ -67,6 +67,11 @@ def write_json(path: Path, data: Any) -> None:
     write_text(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
 
 
+def is_file(path: Path) -> bool:
+    """Whether there is a file; no name is too long or too odd to ask."""
+    return os.path.isfile(path)
+
+
 def file_sha256(path: Path) -> str:
     """Hash a file, or the files of a folder in the order of their names.
 

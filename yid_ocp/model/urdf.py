@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.errors import ModelError, nearest
+from yid_ocp.files import is_file
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement, merged
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.rotations import Matrix, angles_of, snapped, transform, turn
@@ -161,7 +162,7 @@ class _Found:
 def _file(path: str | Path) -> Path:
     text = str(Path(str(path)))
     file = robot_description_file(text.removeprefix("package:")) if text.startswith("package:") else Path(text)
-    if not file.is_file():
+    if not is_file(file):
         raise ModelError(f"there is no URDF file '{file}'", hint="give a path, or package:NAME for example-robot-data")
     return file
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import DataError, OutputError, nearest
-from yid_ocp.files import new_file
+from yid_ocp.files import is_file, new_file
 from yid_ocp.vision.ply import read_ply
 
 Array = NDArray[np.float64]
@@ -380,7 +380,7 @@ def _read_stamps(path: Path) -> tuple[tuple[str, ...], Array]:
 
 
 def _read_cloud(path: Path) -> Array:
-    if not path.is_file():
+    if not is_file(path):
         raise DataError("the file of the cloud is missing", where=str(path))
     if path.suffix.lower() == ".ply":
         return read_ply(path)
@@ -414,7 +414,7 @@ def _write_cloud(path: Path, points: Array) -> None:
 
 def _read_depth(path: Path) -> Array:
     o3d = open3d_module()
-    if not path.is_file():
+    if not is_file(path):
         raise DataError("the file of the depth image is missing", where=str(path))
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         image = np.asarray(o3d.io.read_image(str(path)))

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import DataError, ModelError
+from yid_ocp.files import is_file
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Mechanism
 from yid_ocp.model.system import System
@@ -311,7 +312,7 @@ def robot_meshes(urdf: str | Path, mechanism: Mechanism, kind: MeshKind = "visua
 
     text = str(urdf)
     path = robot_description_file(text.removeprefix("package:")) if text.startswith("package:") else Path(text)
-    if not path.is_file():
+    if not is_file(path):
         raise ModelError(f"there is no URDF file '{path}'", hint="give a path, or package:NAME")
     try:
         robot = yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False, load_collision_meshes=False)

@@ -16,6 +16,7 @@ from yid_ocp.config.settings import CableObject, EffectSettings, ParameterSettin
 from yid_ocp.data.hdf5 import read_recording
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import ConfigError, DataError, YidError
+from yid_ocp.files import is_file
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.workflow.build import recording_file
 
@@ -83,7 +84,7 @@ def read_estimates(folder: str | Path) -> Estimates:
 
 
 def _result(file: Path) -> dict[str, Any]:
-    if not file.is_file():
+    if not is_file(file):
         raise DataError(
             f"there is no finished run in {file.parent}",
             where=str(file),
@@ -229,7 +230,7 @@ def recordings_without(run: Run) -> tuple[tuple[Recording, ...], str]:
 
 def _read(run: Run, i: int, path: str) -> Recording:
     file = recording_file(path)
-    if not file.is_file():
+    if not is_file(file):
         raise run.refuse(f"there is no such recording: {file}", "recordings", "without", i, hint="check the path")
     return read_recording(file)
 

@@ -20,6 +20,7 @@ from yid_ocp.data.hdf5 import read_recording
 from yid_ocp.data.recording import Recording
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import DataError, ModelError, YidError, nearest
+from yid_ocp.files import is_file
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model import FlexibleObject, Grasp, Mechanism, Segment, System, flexible_object
 from yid_ocp.model.cable import Cable, cable_system, length_values, read_vertices
@@ -230,7 +231,7 @@ def input_files(run: Run) -> dict[str, Path]:
 
 
 def _existing(run: Run, file: Path, noun: str, *key: str | int) -> Path:
-    if file.is_file():
+    if is_file(file):
         return file
     folder = file.parent
     names = [entry.name for entry in folder.glob(f"*{file.suffix}")] if folder.is_dir() else []
