@@ -129,6 +129,25 @@ def test_efforts_beside_inverse_dynamics(arms, runs, case):
         assert "0.3 s earlier" in found[0].what
 
 
+@pytest.mark.parametrize(("kind", "least", "expected"), [("command", 0.3, set()), ("sample", 0.3, {"effort_zero"}),
+                                                         ("command", 2.0, {"effort_zero"})])  # fmt: skip
+def test_a_joint_of_which_nothing_is_asked_may_swing(repository, kind, least, expected):
+    """Friction and what the model lacks are all that it then seems to need; what holds an arm up is more."""
+    robot = read_urdf(str(repository / "models" / "urdf" / "two_drives.urdf"))
+    system = System.build(robot, prescribed=robot.joint_names)
+    arm = Arm.of(system, system.parameters.vector())
+    t = np.arange(0.0, 6.0, 0.005)
+    q = np.stack([np.sin(2 * t), 0.4 * np.sin(3 * t)], axis=1)
+    v = np.stack([2 * np.cos(2 * t), 1.2 * np.cos(3 * t)], axis=1)
+    a = np.stack([-4 * np.sin(2 * t), -3.6 * np.sin(3 * t)], axis=1)
+    q, v, a = (values * least / 2.4 for values in (q, v, a))
+    needed = arm.inverse_dynamics(q, v, a)
+    assert np.sqrt(np.mean(needed[:, 0] ** 2)) == pytest.approx(least, rel=0.3)
+    effort = needed * [0.0, 1.0]
+    recording = Recording(JointGroup(tuple(robot.joint_names), t, q, effort=effort, effort_kind=kind))
+    assert {doubt.cause for doubt in check_efforts(arm, recording)} == expected
+
+
 def test_a_counterbalance_that_the_urdf_does_not_have_is_no_wrong_zero(arms, runs):
     balanced = with_joints(runs[1], effort=lambda j: j.effort + 20.0 * (np.arange(7) == 1))
     assert check_efforts(arms[1], balanced) == []

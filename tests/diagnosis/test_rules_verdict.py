@@ -12,6 +12,7 @@ from yid_ocp.diagnosis.verdict import decide, explained_part, has_gap, shapeless
 
 LIMITS = Thresholds()
 ONE, OTHER = effect("friction@elbow"), effect("offset@elbow")
+ELSEWHERE, THIRD = effect("friction@wrist"), effect("spring@elbow")
 
 
 def scored(*p_values):
@@ -184,8 +185,10 @@ CERTAIN = closed(0.9, 0.8, 0.95)
         ({"added": (added(ONE, [OTHER]),), "explained": 0.1}, "unknown"),
         ({"added": (added(ONE), added(OTHER)), "explained": 0.74}, "unknown"),
         ({"added": (added(ONE), added(OTHER)), "explained": 0.75}, "effect"),
-        ({"added": (added(ONE), added(OTHER), added(ONE)), "explained": 0.87}, "unknown"),
-        ({"added": (added(ONE), added(OTHER), added(ONE)), "explained": 0.88}, "effect"),
+        ({"added": (added(ONE), added(OTHER), added(THIRD)), "explained": 0.87}, "unknown"),
+        ({"added": (added(ONE), added(OTHER), added(THIRD)), "explained": 0.88}, "effect"),
+        ({"added": (added(ONE), added(ELSEWHERE)), "explained": 0.49}, "unknown"),
+        ({"added": (added(ONE), added(ELSEWHERE)), "explained": 0.5}, "effect"),
         ({"carried": False}, "unknown"),
         ({"carried": False, "gap": False}, "no_gap"),
     ],
@@ -214,6 +217,8 @@ CERTAIN = closed(0.9, 0.8, 0.95)
         "two explain enough",
         "three explain too little for three",
         "three explain enough",
+        "one law at two places explains too little",
+        "one law at two places explains enough",
         "does not carry over",
         "does not carry over where there is no gap",
     ],

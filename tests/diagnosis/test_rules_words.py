@@ -338,7 +338,11 @@ def nameless(reason, **changed):
     ("reason", "changed", "said"),
     [
         ("unsure", {"closure": closed(0.4, 0.01, 0.7)}, "closes 40 % of it, but not surely: at least 1 %, where 5 %"),
-        ("little", {"explained": 0.31}, "explains 31 % of what unknown forces, offsets and biases explain, where 50 %"),
+        (
+            "little",
+            {"explained": 0.31},
+            "explains 31 % of what unknown forces, offsets and biases explain, where 50 % are asked of one kind",
+        ),
         (
             "stand_in",
             {"closure": closed(0.91), "carried": (carried(),)},

@@ -98,9 +98,9 @@ def decide(
     return "confusable" if len(added[0].rivals) > 1 else "effect"
 
 
-def needed(count: int, limits: Thresholds) -> float:
-    """Part of the smoother's explanation that so many effects have to reach."""
-    return 1.0 - (1.0 - limits.explained) ** count
+def needed(added: Sequence[Added], limits: Thresholds) -> float:
+    """Part of the smoother's explanation that effects have to reach; one law at several places is one assumption."""
+    return 1.0 - (1.0 - limits.explained) ** len({entry.effect.kind for entry in added})
 
 
 def why_unknown(
@@ -108,14 +108,14 @@ def why_unknown(
 ) -> Reason:
     """Why no effect is named where there is a gap; empty where one is.
 
-    Several effects have to explain more than one: each further one at least the part `explained` of what could be left.
-    Two or three together imitate almost anything, but only in part.
+    Effects of several kinds have to explain more than one: each further kind at least the part `explained` of what
+    could be left. Two or three together imitate almost anything, but only in part.
     """
     if not added:
         return "none"
     if not (total.low > limits.closure or total.sure):
         return "unsure"
-    if explained < needed(len(added), limits):
+    if explained < needed(added, limits):
         return "little"
     return "" if carried else "stand_in"
 

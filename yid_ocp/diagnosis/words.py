@@ -54,7 +54,7 @@ NAMELESS = {
     "unsure": "{names} close{s} {closure:.3g} % of it, but not surely: at least {low:.3g} %, where {least:.3g} % are "
     "asked.",
     "little": "{names} explain{s} {explained:.3g} % of what unknown forces, offsets and biases explain, where "
-    "{enough:.3g} % are asked of so many effects.",
+    "{enough:.3g} % are asked of {kinds}.",
     "stand_in": "{names} imitate{s} it (closing {closure:.3g} % on held-out motions) and {are} not its cause: {apart}.",
 }
 """Why a gap has no name, by `verdict.Reason`."""
@@ -181,6 +181,7 @@ def _nameless(finding: Finding) -> str:
         f"estimate on and {entry.again:.3g} ± {entry.again_std:.2g} on the held-out ones"
         for entry in disagreeing(finding.carried)
     ]
+    kinds = len({entry.effect.kind for entry in finding.added})
     return NAMELESS[finding.reason].format(
         names=names,
         s="s" if len(finding.added) == 1 else "",
@@ -189,7 +190,8 @@ def _nameless(finding: Finding) -> str:
         low=100 * finding.closure.low,
         least=100 * finding.limits.closure,
         explained=100 * finding.explained,
-        enough=100 * needed(len(finding.added), finding.limits),
+        kinds=f"effects of {kinds} kinds" if kinds > 1 else "one kind of effect",
+        enough=100 * needed(finding.added, finding.limits),
         apart="; ".join(apart[:2]),
     )
 

@@ -162,6 +162,7 @@ def _beside_the_model(
     run: Run, system: System, arm: Arm | None, cable: Cable | None, recording: Recording
 ) -> list[Doubt]:
     gravity = np.array(run.model.gravity, float)
+    recording = recording.with_effort_kind(_choice(run)(EFFORT).kind)
     if cable is not None:
         return list(check_cable(cable, recording, gravity))
     found: list[Doubt] = []

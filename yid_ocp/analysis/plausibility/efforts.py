@@ -49,6 +49,8 @@ NOTHING = 1e-3
 """Efforts below this tell nothing [N m]."""
 LAG = 0.1
 """Steps in which a lag of efforts behind the motion is looked for; a shorter one is no gross error [s]."""
+COMMANDED = 0.2
+"""Part of the largest effort that a joint of which nothing is asked may seem to need: it swings, and has friction."""
 ABOVE_LIMIT = 1.3
 """Factor by which an effort may exceed the URDF's limit, which some makers state for continuous use."""
 
@@ -90,7 +92,7 @@ def check_efforts(arm: Arm, recording: Recording) -> list[Doubt]:
     most = [float(np.max(np.abs(values), initial=0.0)) for values in (needed, motion.effort)]
     if not most[0] > NOTHING or not max(most) < ABSURD:
         return [replace(doubt, recording=recording.name, group="joints") for doubt in found]
-    dead = _dead(motion.effort, needed, size)
+    dead = _dead(motion.effort, needed, COMMANDED * size if joints.effort_taken_as == "command" else 2 * ERROR * size)
     if dead.any():
         found.append(_zero(arm, dead))
     else:
@@ -116,11 +118,11 @@ def _limits(arm: Arm, motion: Motion, largest: Array) -> Iterator[Doubt]:
         )
 
 
-def _dead(effort: Array, needed: Array, size: Array) -> NDArray[np.bool_]:
-    """Joints whose effort is zero throughout although gravity and motion need some."""
+def _dead(effort: Array, needed: Array, least: Array) -> NDArray[np.bool_]:
+    """Joints whose effort is zero throughout although gravity and motion need more than the least that counts."""
     wanted = np.sqrt(np.mean(needed**2, axis=0))
     silent = np.max(np.abs(effort), axis=0) < 1e-3 * wanted
-    return np.asarray(silent & (wanted > 2 * ERROR * size))
+    return np.asarray(silent & (wanted > least))
 
 
 def _zero(arm: Arm, dead: NDArray[np.bool_]) -> Doubt:
@@ -128,7 +130,7 @@ def _zero(arm: Arm, dead: NDArray[np.bool_]) -> Doubt:
     which = "all joints" if dead.all() else ", ".join(names)
     return Doubt(
         "effort_zero",
-        f"the effort of {which} is zero throughout, while gravity alone needs more",
+        f"the effort of {which} is zero throughout, while gravity and motion need more",
         "not_trusted",
         1e3,
         "record efforts; to leave these out, move the arms as measured and switch their efforts off",
