@@ -149,6 +149,8 @@ def test_a_comparison_without_a_parameter_that_is_found_has_nothing_to_agree_on(
     lines = terminal.compare_summary(compared)
     assert "no parameter can be found from these recordings, so there is nothing to agree on" in lines
     assert line_of(lines, "cost (whitened)").split()[-2:] == ["5", "failed"]
+    assert line_of(lines, "a").split()[1:4] == ["2", "±", "0.1"]
+    assert line_of(lines, "a").split()[4:6] == ["2", "1"], "a method that failed has no ±"
     assert "published" in lines[0]
     assert "truth" not in lines[0]
     assert "a = 1 of the paper: unexplained" in lines

@@ -174,9 +174,14 @@ def compare_summary(result: Mapping[str, Any]) -> list[str]:
         cells = []
         for entry in runs.values():
             found = entry["parameters"][name]
-            cells.append(parameter_words(found["value"], found["std"], found["interval"]))
-        known = [f"{result[key][name]:.4g}" if name in result[key] else "" for key in beside]
-        rows.append((name, *cells, *known, VERDICT_WORDS[judged["parameters"][name]["verdict"]]))
+            ended = entry["status"] not in (
+                "stalled",
+                "failed",
+            )  # elsewhere a curvature tells nothing of how sure it is
+            known = (found["std"], found["interval"]) if ended else (None, None)
+            cells.append(parameter_words(found["value"], *known))
+        others = [f"{result[key][name]:.4g}" if name in result[key] else "" for key in beside]
+        rows.append((name, *cells, *others, VERDICT_WORDS[judged["parameters"][name]["verdict"]]))
     fit = judged["fit"]
     lines = [*_misfit(fit), *_doubt_lines(result), *table(rows), "", *table(_efforts(methods)), ""]
     for name, entry in methods.items():
