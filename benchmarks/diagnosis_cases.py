@@ -179,7 +179,9 @@ def right(case: Case, finding: Finding) -> bool:
     true = {effect.label for effect in case.withheld}
     if case.verdict == "unknown":
         places = {effect.location for effect in case.withheld}
-        return finding.verdict == "unknown" and finding.where[0].location in places
+        # places that the data cannot tell apart are said together
+        said = {finding.where[0].location, *finding.where[0].also}
+        return finding.verdict == "unknown" and bool(said & places)
     if case.verdict == "no_gap":
         return finding.verdict == "no_gap"
     named = [effect.label for effect in finding.effects]
@@ -206,7 +208,7 @@ def run(name: str, seeds: Sequence[int]) -> dict[str, str]:
         "explained": f"{100 * finding.explained:.0f} %" if finding.added else "-",
         "apart": ", ".join(f"{entry.effect}.{entry.name}" for entry in disagreeing(finding.carried)) or "-",
         "not separable": rivals if finding.effects and rivals else "-",
-        "where": finding.where[0].location if finding.where else "-",
+        "where": " or ".join([finding.where[0].location, *finding.where[0].also]) if finding.where else "-",
         "chi2/n held out": f"{finding.held_out_before.chi2_per_dof:.3g}",
         "with the truth": "-" if math.isnan(best) else f"{best:.3g}",
         "closure": f"{100 * finding.closure.value:.0f} %" if finding.effects else "-",
