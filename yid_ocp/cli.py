@@ -68,6 +68,13 @@ def _doubting(parser: argparse.ArgumentParser, optional: bool = False) -> None:
     parser.add_argument("--strict", action="append_const", const=strict, dest="overrides", help=text)
 
 
+def _working(parser: argparse.ArgumentParser) -> None:
+    text = "processes that share the work; as many as there are processors when absent"
+    parser.add_argument("--workers", metavar="N", type=int, help=text)
+    text = "HOST:PORT of a Dask scheduler, or its scheduler file, whose workers do the work instead"
+    parser.add_argument("--scheduler", metavar="ADDRESS", default="", help=text)
+
+
 def _doubting_or_embedded(parser: argparse.ArgumentParser) -> None:
     _doubting(parser, optional=True)
 
@@ -91,6 +98,7 @@ def _identifiability(parser: argparse.ArgumentParser) -> None:
 
 def _blind(parser: argparse.ArgumentParser) -> None:
     _configured(parser, optional=True)
+    _working(parser)
     parser.add_argument("--cases", type=int, default=20, help="size of the ensemble")
     parser.add_argument("--seed", type=int, default=1, help="from which it is drawn")
 

@@ -21,9 +21,9 @@ from yid_ocp.files import jsonable, write_json, write_text
 from yid_ocp.parallel import Task, TaskResult, run_tasks
 from yid_ocp.report.tables import blind_table
 from yid_ocp.report.terminal import blind_summary
+from yid_ocp.version import versions
 from yid_ocp.workflow.build import build_problem, build_system
 from yid_ocp.workflow.command import DONE, carry_out
-from yid_ocp.workflow.folder import versions
 from yid_ocp.workflow.progress import SILENT, Progress
 
 COMMITMENT, LABELS, RESULT, TABLE = "commitment.json", "sealed/labels.json", "result.json", "table.md"

@@ -1,9 +1,10 @@
-"""The one place that starts threads and processes: maps over shared memory, and tasks that keep what they finished.
+"""Tasks that keep what they finished, done by processes of this machine or by the workers of a scheduler.
 
 A task is a function at the top of a module with plain data and paths. Its result is one JSON file, written whole by
-whoever worked it out, under a name that is the hash of the function's name, the package's version and the arguments; a
-path counts by its file's name and content, wherever it stands. So a task that is done is never done again, whatever
-became of the run that did it, and any `concurrent.futures.Executor` whose workers see the same files will do.
+whoever worked it out, under a name that is the hash of the function's name, the sources it depends on and the
+arguments; a path counts by its file's name and content, wherever it stands. So a task that is done is never done again,
+whatever became of the run that did it, and any `concurrent.futures.Executor` whose workers see the same files will do:
+what one of them did twice, because the first was given up as lost, is the same file.
 """
 
 from __future__ import annotations
@@ -15,83 +16,38 @@ import json
 import logging
 import multiprocessing
 import os
-import signal
-import threading
+import socket
 import time
 from collections import deque
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
+    CancelledError,
     Executor,
     Future,
-    ProcessPoolExecutor,
-    ThreadPoolExecutor,
     wait,
 )
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
-from yid_ocp.errors import OutputError
+from yid_ocp.errors import ConfigError, OutputError
 from yid_ocp.files import content_hash, file_sha256, reason, write_json
-from yid_ocp.version import package_version
+from yid_ocp.parallel.cluster import cluster, unlike_words
+from yid_ocp.parallel.processes import process_pool
+from yid_ocp.parallel.threads import processors
+from yid_ocp.version import differences, fingerprint, package_code
 
 FORMAT = "yid-task/1"
+ARRIVING = 60.0
+"""Time until a file that another machine wrote has to be seen here, as file systems of clusters are [s]."""
+SILENCE = 60.0
+"""Time without any news after which it is looked whether there are workers at all [s]."""
 log = logging.getLogger(__name__)
-Item = TypeVar("Item")
-Result = TypeVar("Result")
-Key = TypeVar("Key", bound=Hashable)
-Value = TypeVar("Value")
 Function = Callable[..., Any]
 Progress = Callable[[int, int, str], None]
 """Told how many of how many tasks are done, and which one was last."""
-
-
-def map_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """Results in the order of the items, worked out by as many threads as there are processors.
-
-    Compiled code runs outside Python's lock, so that threads share memory and still work side by side.
-    """
-    entries = list(items)
-    workers = min(len(entries), os.cpu_count() or 1)
-    if workers < 2:
-        return [function(entry) for entry in entries]
-    with ThreadPoolExecutor(max_workers=workers) as pool:
-        return list(pool.map(function, entries))
-
-
-# CasADi marks the nodes of expressions while it differentiates them: two threads at once on expressions that share
-# symbols give wrong derivatives. Evaluating finished functions is safe.
-SYMBOLIC = threading.RLock()
-"""Held by whoever builds or differentiates expressions that others may hold too."""
-
-
-class Once(Generic[Key, Value]):
-    """Values that are worked out once, whichever thread asks first, one thread at a time in the whole program.
-
-    For what is made of CasADi's expressions, which threads must not work on side by side.
-
-    Parameters
-    ----------
-    make : callable
-        From the key to the value; must depend on nothing else.
-    """
-
-    def __init__(self, make: Callable[[Key], Value]) -> None:
-        self._make = make
-        self._known: dict[Key, Value] = {}
-
-    def __call__(self, key: Key) -> Value:
-        """The value for a key."""
-        if key not in self._known:
-            with SYMBOLIC:
-                if key not in self._known:
-                    self._known[key] = self._make(key)
-        return self._known[key]
-
-
-# -- tasks ------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -135,17 +91,66 @@ class TaskResult:
     resumed: bool = False
 
 
+@dataclass(frozen=True)
+class Workers:
+    """Who does the tasks of a run.
+
+    Attributes
+    ----------
+    processes : int, optional
+        Processes on this machine; as many as there are processors when absent.
+    scheduler : str
+        Address of a Dask scheduler, or its scheduler file, whose workers do the tasks instead.
+
+    Raises
+    ------
+    ConfigError
+        No process at all, or both.
+    """
+
+    processes: int | None = None
+    scheduler: str = ""
+
+    def __post_init__(self) -> None:
+        if self.processes is not None and self.processes < 1:
+            raise ConfigError(f"{self.processes} workers", where="--workers", allowed="a whole number from 1")
+        if self.processes is not None and self.scheduler:
+            raise ConfigError(
+                "workers are asked for here and of a scheduler",
+                where="--workers and --scheduler",
+                allowed="one of the two",
+                hint="leave --workers out: the scheduler knows how many workers it has",
+            )
+
+    def check(self) -> None:
+        """Find out before long work whether these workers can be had at all.
+
+        Raises
+        ------
+        WorkerError
+            Dask is not installed, no scheduler answers, or a worker is not fit for the work.
+        """
+        if self.scheduler:
+            with cluster(self.scheduler):
+                pass
+
+
+LOCAL = Workers()
+"""Processes on this machine."""
+
+
 def run_tasks(
     function: Function,
     tasks: Sequence[Task],
     folder: Path,
-    executor: Executor | None = None,
+    workers: Workers | Executor = LOCAL,
     progress: Progress | None = None,
+    code: str | None = None,
 ) -> list[TaskResult]:
     """Run a function on every task whose result is not in the folder yet.
 
     A task that raises leaves `HASH.error.json` and a warning, and the others go on; the next run tries it again. An
-    interruption leaves the results that are finished.
+    interruption leaves the results that are finished. A worker of other sources than these does nothing.
 
     Parameters
     ----------
@@ -154,10 +159,12 @@ def run_tasks(
     tasks : sequence of Task
     folder : Path
         Of results; made where absent.
-    executor : concurrent.futures.Executor, optional
-        As many processes as there are processors when absent. Those stop at once when the run is interrupted, and a
-        process that dies takes no task with it but the one that killed it.
+    workers : Workers or concurrent.futures.Executor
+        Processes of this machine stop at once when the run is interrupted, and one that dies takes no task with it but
+        the one that killed it. Workers of a scheduler end the task that they are at.
     progress : callable, optional
+    code : str, optional
+        Hash of the sources that results depend on, where that is not the whole package; see `version.code_hash`.
 
     Returns
     -------
@@ -170,8 +177,13 @@ def run_tasks(
         A task's file cannot be read.
     OutputError
         The folder cannot be made.
+    WorkerError
+        As `Workers.check`.
     """
-    jobs = [_Job(function, task, task_input(function, task), folder) for task in tasks]
+    own, maker = package_code() if code is None else code, fingerprint()
+    jobs = [
+        _Job(function, _anywhere(task), task_input(function, task, own), folder.absolute(), maker) for task in tasks
+    ]
     unique = {job.key: job for job in reversed(jobs)}
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -190,17 +202,26 @@ def run_tasks(
             progress(len(found), len(unique), result.name)
 
     waiting = list(dict.fromkeys(unique[job.key] for job in jobs if job.key not in found))
-    if executor is None:
-        _in_own_processes(waiting, finished)
-    else:
-        lost, never = _drain(executor, waiting, len(waiting), finished)
-        for job in (*lost, *never):
-            finished(job, job.kept() or TaskResult(job.task.name, error="the executor broke"))
+    if waiting:
+        _done_by(workers, waiting, finished)
     return [replace(found[job.key], name=job.task.name) for job in jobs]
 
 
-def task_input(function: Function, task: Task) -> dict[str, Any]:
-    """What a task's result depends on, as plain data: function, version, arguments, and hashes of files.
+def _done_by(workers: Workers | Executor, jobs: Sequence[_Job], finished: Finished) -> None:
+    if isinstance(workers, Workers) and not workers.scheduler:
+        _in_own_processes(jobs, finished, workers.processes or processors())
+        return
+    with contextlib.ExitStack() as held:
+        executor, look = workers, None
+        if isinstance(executor, Workers):
+            executor, look = held.enter_context(cluster(executor.scheduler, jobs[0].function, jobs[0].folder))
+        lost, never = _drain(executor, jobs, len(jobs), finished, look)
+        for job in (*lost, *never):
+            finished(job, job.kept() or TaskResult(job.task.name, error="the executor broke"))
+
+
+def task_input(function: Function, task: Task, code: str) -> dict[str, Any]:
+    """What a task's result depends on, as plain data: function, hash of sources, arguments, and hashes of files.
 
     Raises
     ------
@@ -212,7 +233,20 @@ def task_input(function: Function, task: Task) -> dict[str, Any]:
     if "<" in function.__qualname__:
         raise ValueError(f"{function.__qualname__} does not stand at the top of a module")
     name = f"{function.__module__}.{function.__qualname__}"
-    return {"function": name, "version": package_version(), "arguments": _described(task.arguments)}
+    return {"function": name, "code": code, "arguments": _described(task.arguments)}
+
+
+def _anywhere(task: Task) -> Task:
+    """The task with absolute paths: a worker may be in another folder."""
+
+    def absolute(value: Any) -> Any:
+        if isinstance(value, Path):
+            return value.absolute()
+        if isinstance(value, Mapping):
+            return {key: absolute(entry) for key, entry in value.items()}
+        return [absolute(entry) for entry in value] if isinstance(value, (list, tuple)) else value
+
+    return replace(task, arguments=absolute(task.arguments))
 
 
 def _described(value: Any) -> Any:
@@ -229,12 +263,13 @@ def _described(value: Any) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class _Job:
-    """A task and the file of its result."""
+    """A task, the file of its result, and what the worker has to be like that works it out."""
 
     function: Function
     task: Task
     input: Mapping[str, Any]
     folder: Path
+    maker: Mapping[str, str]
 
     @property
     def key(self) -> str:
@@ -255,14 +290,20 @@ class _Job:
         return None
 
 
-def _perform(function: Function, task: Task, described: Mapping[str, Any], file: Path) -> str:
+Finished = Callable[[_Job, TaskResult], None]
+
+
+def _perform(job: _Job) -> str:
     """Work a task out and write its result, in whatever process or machine; returns why that failed, or nothing."""
+    unlike = differences(job.maker, fingerprint())
+    if unlike:
+        return f"WorkerError: {unlike_words(socket.gethostname(), unlike)}"
     begun = time.perf_counter()
-    entry = {"format": FORMAT, "name": task.name, "input": described}
-    failed = file.with_suffix(".error.json")
+    entry = {"format": FORMAT, "name": job.task.name, "input": job.input}
+    failed = job.file.with_suffix(".error.json")
     try:
-        value = function(**task.arguments)
-        write_json(file, {**entry, "seconds": time.perf_counter() - begun, "value": value})
+        value = job.function(**job.task.arguments)
+        write_json(job.file, {**entry, "seconds": time.perf_counter() - begun, "value": value})
     except Exception as error:
         text = f"{type(error).__name__}: {error}"
         with contextlib.suppress(OutputError):
@@ -284,28 +325,40 @@ def _give_back() -> None:
 
 
 def _drain(
-    executor: Executor, jobs: Sequence[_Job], at_once: int, finished: Callable[[_Job, TaskResult], None]
+    executor: Executor,
+    jobs: Sequence[_Job],
+    at_once: int,
+    finished: Finished,
+    look: Callable[[], None] | None = None,
 ) -> tuple[list[_Job], list[_Job]]:
-    """Run jobs, so many at once; returns those that were lost when the executor broke, and those that never began."""
+    """Run jobs, so many at once; returns those that were lost when the executor broke, and those that never began.
+
+    `look` is called now and then while nothing happens.
+    """
     queue, running, lost = deque(jobs), dict[Future[str], _Job](), list[_Job]()
     try:
         while (queue and not lost) or running:
             while queue and not lost and len(running) < at_once:
                 job = queue[0]
                 try:
-                    future = executor.submit(_perform, job.function, job.task, job.input, job.file)
+                    future = executor.submit(_perform, job)
                 except BrokenExecutor:
                     lost.append(queue.popleft())
                 else:
                     running[future] = queue.popleft()
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
+            done = wait(running, None if look is None else SILENCE, FIRST_COMPLETED).done
+            if not done and look is not None:
+                look()
+            for future in done:
                 job = running.pop(future)
-                error = future.exception()
-                if isinstance(error, BrokenExecutor):
+                try:
+                    text = future.result()
+                except (BrokenExecutor, CancelledError):  # so says Dask where its scheduler went away
                     lost.append(job)
                     continue
-                text = future.result() if error is None else f"{type(error).__name__}: {error}"
-                result = None if text else job.kept()
+                except Exception as error:
+                    text = _words_of_executor(error)
+                result = None if text else _arrived(job, look is not None)
                 finished(job, result or TaskResult(job.task.name, error=text or "it left no result"))
     except BaseException:
         for future in running:
@@ -314,38 +367,30 @@ def _drain(
     return lost, list(queue)
 
 
+def _words_of_executor(error: Exception) -> str:
+    """Why an executor gave a task up."""
+    if type(error).__name__ == "KilledWorker":
+        return "every worker that tried it ended abruptly"
+    return f"{type(error).__name__}: {error}"
+
+
+def _arrived(job: _Job, elsewhere: bool) -> TaskResult | None:
+    """The result that was written, waited for where another machine may have done that."""
+    until = time.monotonic() + (ARRIVING if elsewhere else 0.0)
+    while (found := job.kept()) is None and time.monotonic() < until:
+        os.listdir(job.folder)  # makes a network's file system look again
+        time.sleep(0.5)
+    return found
+
+
 # -- processes --------------------------------------------------------------------------------------------------------
 
 
-def process_pool(workers: int | None = None) -> ProcessPoolExecutor:
-    """Fresh processes, as many as there are processors when not said; they leave interruptions to their parent.
-
-    They are started anew instead of forked: a fork copies the locks of threads that it does not copy.
-    """
-    context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(workers or os.cpu_count() or 1, mp_context=context, initializer=_begin_worker)
-
-
-def _begin_worker() -> None:
-    for name in ("SIGINT", "SIGHUP"):  # a terminal sends them to all; the parent says when to end
-        if hasattr(signal, name):
-            signal.signal(getattr(signal, name), signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    """A worker whose parent was killed would wait for tasks for ever."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
-
-
-def _in_own_processes(jobs: Sequence[_Job], finished: Callable[[_Job, TaskResult], None]) -> None:
+def _in_own_processes(jobs: Sequence[_Job], finished: Finished, count: int) -> None:
     """Run jobs in processes of their own, in spite of those that end their process."""
     rest = list(jobs)
     while rest:
-        suspects, rest = _with_pool(min(len(rest), os.cpu_count() or 1), rest, finished)
+        suspects, rest = _with_pool(min(len(rest), count), rest, finished)
         # one of those that ran together ended its process; alone, each shows whether it is the one
         for job in suspects:
             kept = job.kept()
@@ -355,9 +400,7 @@ def _in_own_processes(jobs: Sequence[_Job], finished: Callable[[_Job, TaskResult
                 finished(job, TaskResult(job.task.name, error="its process ended abruptly"))
 
 
-def _with_pool(
-    workers: int, jobs: Sequence[_Job], finished: Callable[[_Job, TaskResult], None]
-) -> tuple[list[_Job], list[_Job]]:
+def _with_pool(workers: int, jobs: Sequence[_Job], finished: Finished) -> tuple[list[_Job], list[_Job]]:
     others = set(multiprocessing.active_children())
     pool = process_pool(workers)
     try:
