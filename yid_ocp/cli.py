@@ -103,6 +103,19 @@ def _blind(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=1, help="from which it is drawn")
 
 
+def _batch(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("configs", metavar="CONFIG.yaml", nargs="+", help="settings of one run each")
+    text = "pattern of recordings in quotes, such as 'fleet/*.h5': a run of every configuration for each of them"
+    parser.add_argument("--recordings", metavar="GLOB", help=text)
+    parser.add_argument("--command", dest="each", choices=("solve", "diagnose"), default="solve", help="to run")
+    text = "folder of all runs (default: runs/batch-DATE-TIME); the same one again does what is not done yet"
+    parser.add_argument("--out", metavar="DIR", help=text)
+    text = "replace a setting in every run; may be repeated"
+    parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[], dest="overrides", help=text)
+    parser.add_argument("--quiet", action="store_true", help="print nothing but the folder's path")
+    _working(parser)
+
+
 def _simulate(parser: argparse.ArgumentParser) -> None:
     _configured(parser)
     parser.add_argument("--seed", type=int, default=0, help="of the noise and of a virtual experiment's motion")
@@ -163,6 +176,7 @@ COMMANDS: tuple[Command, ...] = (
         "blind",
         _blind,
     ),
+    Command("batch", "solve or diagnose many recordings or robots, one table and report of all", "batch", _batch),
     Command("report", "compare runs of one model: what drifted, which run to distrust", "report", _report),
     Command("plan", "plan a motion of the arms with the identified model", "plan", _configured),
     Command("simulate", "write what the model says would be recorded", "simulate", _simulate),
