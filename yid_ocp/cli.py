@@ -68,8 +68,8 @@ def _doubting(parser: argparse.ArgumentParser, optional: bool = False) -> None:
     parser.add_argument("--strict", action="append_const", const=strict, dest="overrides", help=text)
 
 
-def _working(parser: argparse.ArgumentParser) -> None:
-    text = "processes that share the work; as many as there are processors when absent"
+def _working(parser: argparse.ArgumentParser, absent: str = "as many as there are processors") -> None:
+    text = f"processes that share the work; {absent} when absent"
     parser.add_argument("--workers", metavar="N", type=int, help=text)
     text = "HOST:PORT of a Dask scheduler, or its scheduler file, whose workers do the work instead"
     parser.add_argument("--scheduler", metavar="ADDRESS", default="", help=text)
@@ -93,6 +93,7 @@ def _identifiability(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--initial", action="store_true", help="judge at the initial values, without solving")
     text = "judge with initial states estimated along, whatever the settings assume"
     parser.add_argument("--unknown-start", action="store_true", help=text)
+    _working(parser, "this process alone")
     parser.add_argument("--unknown-grasp", action="store_true", help="judge with the places of grasps estimated along")
 
 

@@ -3,25 +3,15 @@
 from __future__ import annotations
 
 import json
-from concurrent.futures import Executor, Future
-from typing import Any
 
 import pytest
+from here import Here
 
 from yid_ocp.data import read_recording, write_recording
 from yid_ocp.errors import ConfigError, OutputError
 from yid_ocp.workflow.batch import batch_members, run_batch
 
 QUICK = ("output.report=false", "output.discretisation=none", "recordings.held_out=[]")
-
-
-class Here(Executor):
-    """Does tasks in this process, one after the other."""
-
-    def submit(self, function: Any, /, *arguments: Any, **named: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        future.set_result(function(*arguments, **named))
-        return future
 
 
 @pytest.fixture

@@ -26,7 +26,7 @@ from yid_ocp.report.terminal import batch_summary
 from yid_ocp.version import versions
 from yid_ocp.workflow.baseline import read_estimates, refuse_unlike
 from yid_ocp.workflow.build import input_files
-from yid_ocp.workflow.command import DONE, FAILED, asked_workers, carry_out
+from yid_ocp.workflow.command import DONE, FAILED, carry_out, given_workers
 from yid_ocp.workflow.diagnose import run_diagnose
 from yid_ocp.workflow.progress import SILENT, Progress
 from yid_ocp.workflow.report import history_result
@@ -75,7 +75,7 @@ class BatchOutcome:
 def run(arguments: argparse.Namespace) -> int:
     """The command."""
     members = batch_members(arguments.configs, arguments.recordings, arguments.overrides)
-    workers = asked_workers(arguments)
+    workers = given_workers(arguments) or LOCAL
     out = arguments.out or Path("runs") / f"batch-{time.strftime('%Y%m%d-%H%M%S')}"
     outcome = carry_out(
         lambda shown: run_batch(members, out, arguments.each, workers, shown), batch_summary, arguments.quiet

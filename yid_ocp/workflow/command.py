@@ -59,14 +59,16 @@ def carry_out(
     return outcome
 
 
-def asked_workers(arguments: argparse.Namespace) -> Workers:
-    """The workers that a command is given by `--workers` or `--scheduler`, known to be there.
+def given_workers(arguments: argparse.Namespace) -> Workers | None:
+    """The workers that a command is given by `--workers` or `--scheduler`, known to be there; None for neither.
 
     Raises
     ------
     ConfigError, WorkerError
         As `Workers`.
     """
+    if arguments.workers is None and not arguments.scheduler:
+        return None
     workers = Workers(arguments.workers, arguments.scheduler)
     workers.check()
     return workers
