@@ -97,11 +97,22 @@ def _identifiability(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--unknown-grasp", action="store_true", help="judge with the places of grasps estimated along")
 
 
+def _overrides(parser: argparse.ArgumentParser) -> None:
+    text = "replace a setting in every run; may be repeated"
+    parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[], dest="overrides", help=text)
+    parser.add_argument("--quiet", action="store_true", help="print nothing but the folder's path")
+
+
 def _blind(parser: argparse.ArgumentParser) -> None:
-    _configured(parser, optional=True)
-    _working(parser)
+    text = "settings of experiments, which are varied as far as there are cases for it; embedded ones when absent"
+    parser.add_argument("configs", metavar="CONFIG.yaml", nargs="*", help=text)
+    parser.add_argument("--out", metavar="DIR", help="folder of the proof; the same one again does what is not done")
     parser.add_argument("--cases", type=int, default=20, help="size of the ensemble")
     parser.add_argument("--seed", type=int, default=1, help="from which it is drawn")
+    text = "draw an ensemble to set thresholds by, other cases than those that are reported for the same seed"
+    parser.add_argument("--calibration", action="store_true", help=text)
+    _overrides(parser)
+    _working(parser)
 
 
 def _batch(parser: argparse.ArgumentParser) -> None:
@@ -111,9 +122,7 @@ def _batch(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--command", dest="each", choices=("solve", "diagnose"), default="solve", help="to run")
     text = "folder of all runs (default: runs/batch-DATE-TIME); the same one again does what is not done yet"
     parser.add_argument("--out", metavar="DIR", help=text)
-    text = "replace a setting in every run; may be repeated"
-    parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[], dest="overrides", help=text)
-    parser.add_argument("--quiet", action="store_true", help="print nothing but the folder's path")
+    _overrides(parser)
     _working(parser)
 
 
