@@ -78,10 +78,13 @@ def draw_blind(folder: Path, result: Mapping[str, Any]) -> None:
     rows, columns = shown["true"], shown["said"]
     figure = Figure(figsize=(3.0 + 0.34 * len(columns), 2.2 + 0.26 * len(rows)), layout="constrained")
     axes = figure.subplots()
-    counts = np.array(shown["counts"], float)
-    axes.imshow(counts / np.maximum(counts.sum(1, keepdims=True), 1.0), cmap="Blues", vmin=0.0, vmax=1.0)
+    counts = np.array(shown["counts"], float).reshape(len(rows), len(columns))
+    parts = counts / np.maximum(counts.sum(1, keepdims=True), 1.0)
+    if rows:
+        axes.imshow(parts, cmap="Blues", vmin=0.0, vmax=1.0)
     for i, j in zip(*np.nonzero(counts), strict=True):
-        axes.text(j, i, f"{counts[i, j]:.0f}", ha="center", va="center", fontsize=8)
+        colour = "white" if parts[i, j] > 0.5 else "black"
+        axes.text(j, i, f"{counts[i, j]:.0f}", ha="center", va="center", fontsize=8, color=colour)
     axes.set_xticks(range(len(columns)), columns, rotation=90)
     axes.set_yticks(range(len(rows)), rows)
     axes.set_xlabel("said first")
