@@ -16,8 +16,8 @@ from typing import Any
 
 import pytest
 
-from yid_ocp.errors import ConfigError, DataError, OutputError
-from yid_ocp.parallel import Task, Workers, map_threads, process_pool, processors, run_tasks
+from yid_ocp.errors import ConfigError, DataError, OutputError, WorkerError
+from yid_ocp.parallel import Task, TaskResult, Workers, map_threads, process_pool, processors, run_tasks, values_of
 from yid_ocp.parallel import tasks as parallel_tasks
 from yid_ocp.parallel.threads import threads as threads_of_process
 from yid_ocp.version import fingerprint
@@ -245,6 +245,16 @@ def test_a_result_that_json_cannot_hold_is_a_failure(tmp_path, threads):
     assert "not JSON compliant" in found[0].error
     assert "not JSON serializable" in found[1].error
     assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_what_all_tasks_found_or_why_one_did_not():
+    good, bad = TaskResult("a", 1), TaskResult("b", error="ZeroDivisionError: no b")
+    assert values_of([good, good]) == [1, 1]
+    with pytest.raises(RuntimeError, match="1 of 2 tasks failed, b with ZeroDivisionError: no b; the same command"):
+        values_of([good, bad])
+    ours = TaskResult("c", error="DataError: no such file\n  where: here\n  try: there")
+    with pytest.raises(WorkerError, match="c with DataError: no such file; where: here; try: there"):
+        values_of([good, ours])
 
 
 def test_what_cannot_be_a_task_is_refused_before_any_runs(tmp_path, threads):

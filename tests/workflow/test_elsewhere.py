@@ -8,7 +8,7 @@ import pytest
 from here import Here
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.errors import SolverError
+from yid_ocp.errors import SolverError, WorkerError
 from yid_ocp.workflow import elsewhere
 from yid_ocp.workflow.identifiability import Question, run_identifiability
 
@@ -55,10 +55,11 @@ def test_an_interrupted_run_goes_on(repository, tmp_path, monkeypatch):
 
 def test_a_part_that_fails_is_said(repository, tmp_path, monkeypatch):
     def failing(name, **arguments):
-        raise ZeroDivisionError(name)
+        raise SolverError(f"no {name}", hint="mend it")
 
     failing.__module__, failing.__qualname__ = "yid_ocp.workflow.elsewhere", "profiled"
     monkeypatch.setattr(elsewhere, "profiled", failing)
     run = load_config(repository / "configs" / "springs_series_joint.yaml", QUICK)
-    with pytest.raises(SolverError, match=r"2 of 2 parts failed, spring_1.stiffness with ZeroDivisionError"):
+    words = r"2 of 2 tasks failed, spring_1.stiffness with SolverError: no spring_1.stiffness(.|\n)*mend it"
+    with pytest.raises(WorkerError, match=words):
         run_identifiability(run, tmp_path / "run", question=Question(intervals="all"), workers=Here())

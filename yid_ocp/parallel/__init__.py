@@ -7,6 +7,7 @@ from yid_ocp.parallel.tasks import Task as Task
 from yid_ocp.parallel.tasks import TaskResult as TaskResult
 from yid_ocp.parallel.tasks import Workers as Workers
 from yid_ocp.parallel.tasks import run_tasks as run_tasks
+from yid_ocp.parallel.tasks import values_of as values_of
 from yid_ocp.parallel.threads import SYMBOLIC as SYMBOLIC
 from yid_ocp.parallel.threads import Once as Once
 from yid_ocp.parallel.threads import map_threads as map_threads

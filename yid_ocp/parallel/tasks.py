@@ -32,7 +32,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from yid_ocp.errors import ConfigError, OutputError
+from yid_ocp.errors import ConfigError, OutputError, WorkerError, YidError
 from yid_ocp.files import content_hash, file_sha256, reason, write_json
 from yid_ocp.parallel.cluster import cluster, unlike_words
 from yid_ocp.parallel.processes import process_pool
@@ -205,6 +205,28 @@ def run_tasks(
     if waiting:
         _done_by(workers, waiting, finished)
     return [replace(found[job.key], name=job.task.name) for job in jobs]
+
+
+def values_of(results: Sequence[TaskResult]) -> list[Any]:
+    """What tasks found that are all needed.
+
+    Raises
+    ------
+    WorkerError
+        One failed for a reason that its reader can mend.
+    RuntimeError
+        One failed for another reason.
+    """
+    failed = [entry for entry in results if entry.error]
+    if not failed:
+        return [entry.value for entry in results]
+    first, _, rest = failed[0].error.partition("\n")
+    what = f"{len(failed)} of {len(results)} tasks failed, {failed[0].name} with {first}"
+    ours = {kind.__name__ for kind in YidError.__subclasses__()}
+    if first.partition(":")[0] in ours:
+        told = "; ".join(line.strip() for line in rest.splitlines())
+        raise WorkerError(f"{what}; {told}" if told else what, hint="the same command does again what failed")
+    raise RuntimeError(f"{what}; the same command tries them again")
 
 
 def _done_by(workers: Workers | Executor, jobs: Sequence[_Job], finished: Finished) -> None:

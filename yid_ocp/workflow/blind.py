@@ -31,7 +31,7 @@ from yid_ocp.diagnosis.blind import (
 )
 from yid_ocp.errors import ConfigError, OutputError, YidError
 from yid_ocp.files import jsonable, write_json, write_text
-from yid_ocp.parallel import LOCAL, Task, TaskResult, Workers, run_tasks
+from yid_ocp.parallel import LOCAL, Task, Workers, run_tasks, values_of
 from yid_ocp.report.pictures import draw_blind
 from yid_ocp.report.tables import blind_table
 from yid_ocp.report.terminal import blind_summary
@@ -123,7 +123,7 @@ def run_blind(
     try:
         cases = _made(_named(runs), folder, count, seed, progress, workers, purpose)
         progress.stage(f"diagnosing {count} cases")
-        answers = _values(run_tasks(diagnosed, cases, folder / ANSWERS, workers, progress.advance))
+        answers = values_of(run_tasks(diagnosed, cases, folder / ANSWERS, workers, progress.advance))
         commitment = json.loads((folder / COMMITMENT).read_text("utf-8"))
         labels = opened((folder / LABELS).read_text("utf-8"), commitment["sha256"])
         progress.stage("scoring")
@@ -224,7 +224,7 @@ def _make(
     used = [name for name in experiments if any(entry.experiment == name for entry in plan)]
     progress.stage(f"preparing {len(used)} {'experiment' if len(used) == 1 else 'experiments'}")
     tasks = [Task(name, {**experiments[name].told, "folder": str(folder / PREPARED), "name": name}) for name in used]
-    _values(run_tasks(prepared, tasks, folder / PREPARED / "tasks", workers, progress.advance))
+    values_of(run_tasks(prepared, tasks, folder / PREPARED / "tasks", workers, progress.advance))
     progress.stage(f"making {count} cases")
     tasks = []
     for entry in plan:
@@ -232,7 +232,7 @@ def _make(
         known = {"first": folder / PREPARED / f"{name}.h5", "detectable": folder / PREPARED / f"{name}.json"}
         wanted = {"planned": asdict(entry), "folder": str(folder / CASES)}
         tasks.append(Task(f"case {entry.number}", {**experiments[name].told, **known, **wanted}))
-    made = _values(run_tasks(drawn, tasks, folder / DRAWN, workers, progress.advance))
+    made = values_of(run_tasks(drawn, tasks, folder / DRAWN, workers, progress.advance))
     text, digest = seal([Label.from_dict(entry["label"]) for entry in made])
     write_text(folder / LABELS, text)
     write_json(folder / CASES / "cases.json", [entry["case"] for entry in made])
@@ -344,19 +344,8 @@ def _best(
         if gap and label.category in ("single", "pair"):
             arguments = {key: value for key, value in case.arguments.items() if key != "without"}
             tasks.append(Task(case.name, {**arguments, "label": label.to_dict()}))
-    best = _values(run_tasks(closed_at_best, tasks, folder / BEST, workers, progress.advance))
+    best = values_of(run_tasks(closed_at_best, tasks, folder / BEST, workers, progress.advance))
     return {task.name: value for task, value in zip(tasks, best, strict=True) if value is not None}
-
-
-def _values(results: Sequence[TaskResult]) -> list[Any]:
-    """Values of tasks that are all done."""
-    failed = [entry for entry in results if entry.error]
-    if failed:
-        raise RuntimeError(
-            f"{len(failed)} of {len(results)} cases failed, {failed[0].name} with {failed[0].error}; "
-            "the same command tries them again"
-        )
-    return [entry.value for entry in results]
 
 
 def _nothing(message: str) -> dict[str, Any]:

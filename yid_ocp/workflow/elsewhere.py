@@ -27,8 +27,7 @@ from yid_ocp.analysis.start_in_motion import without_memory
 from yid_ocp.analysis.what_if import Change, Judge, Outcome, WhatIfOptions, judged_changes
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import Run
-from yid_ocp.errors import SolverError
-from yid_ocp.parallel import Task, TaskResult, Workers, run_tasks
+from yid_ocp.parallel import Task, Workers, run_tasks, values_of
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import Solution
 from yid_ocp.workflow.build import build_problem, build_step, build_system, input_files
@@ -99,11 +98,11 @@ class Elsewhere:
 
         Raises
         ------
-        SolverError
+        WorkerError
             One could not be worked out.
         """
         tasks = [Task(name, {**self.told, "name": name}) for name in names]
-        found = self._values(run_tasks(profiled, tasks, self._folder(), self.workers, self.progress.advance))
+        found = values_of(run_tasks(profiled, tasks, self._folder(), self.workers, self.progress.advance))
         parameters, profiles = dict(information.parameters), dict(information.profiles)
         for name, told in zip(names, found, strict=True):
             parameters[name] = _parameter(told["parameter"])
@@ -124,7 +123,7 @@ class Elsewhere:
                 arguments = {**self.told, "sets": named, "inflation": inflation}
                 tasks.append(Task(" and ".join(mechanics) or "sensors", arguments))
             self.progress.stage(f"judging {len(sets)} experiments")
-            done = self._values(run_tasks(outcomes, tasks, self._folder(), self.workers, self.progress.advance))
+            done = values_of(run_tasks(outcomes, tasks, self._folder(), self.workers, self.progress.advance))
             found: dict[int, Outcome] = {}
             for members, told in zip(groups.values(), done, strict=True):
                 found |= {i: _outcome(entry) for i, entry in zip(members, told, strict=True)}
@@ -141,16 +140,6 @@ class Elsewhere:
     def _folder(self) -> Path:
         self.results.parent.mkdir(parents=True, exist_ok=True)
         return self.results
-
-    @staticmethod
-    def _values(results: Sequence[TaskResult]) -> list[Any]:
-        failed = [entry for entry in results if entry.error]
-        if failed:
-            raise SolverError(
-                f"{len(failed)} of {len(results)} parts failed, {failed[0].name} with {failed[0].error}",
-                hint="the same command tries them again; without --workers and --scheduler it needs no workers",
-            )
-        return [entry.value for entry in results]
 
 
 # -- tasks ------------------------------------------------------------------------------------------------------------
