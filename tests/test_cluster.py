@@ -13,11 +13,15 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from here import Here
 
+from yid_ocp.config.reader import load_config
 from yid_ocp.errors import WorkerError
 from yid_ocp.parallel import Task, Workers, run_tasks
 from yid_ocp.parallel.cluster import cluster as connected
 from yid_ocp.version import fingerprint
+from yid_ocp.workflow.blind import run_blind
+from yid_ocp.workflow.progress import Silent
 
 distributed = pytest.importorskip("distributed", reason="clusters need Dask: pip install 'yid-ocp[cluster]'")
 
@@ -161,3 +165,40 @@ def test_a_scheduler_file_will_do(scheduler, tmp_path):
         client.write_scheduler_file(str(file))
     found = run_tasks(deadly, [Task("", {"number": 5})], tmp_path / "results", Workers(scheduler=str(file)))
     assert found[0].value == 5
+
+
+CASES = 12
+
+
+class Killing(Silent):
+    """Ends a worker in the middle of the diagnoses, as soon as a third of them is done."""
+
+    def __init__(self, scheduler: Any) -> None:
+        self.scheduler, self.diagnosing, self.killed = scheduler, False, 0
+
+    def stage(self, text: str) -> None:
+        self.diagnosing = text.startswith("diagnosing")
+
+    def advance(self, done: int, total: int, text: str) -> None:
+        if self.diagnosing and not self.killed and 3 * done >= total:
+            self.killed = processes(self.scheduler)[0]
+            os.kill(self.killed, signal.SIGKILL)
+
+
+@pytest.mark.slow
+def test_a_blind_proof_survives_a_killed_worker(scheduler, pendulum, tmp_path):
+    pytest.importorskip("mujoco", reason="blind proofs need MuJoCo: pip install 'yid-ocp[blind]'")
+    settings = ("model.arms.mode=driven", "recordings.held_out=[]", "output.report=false", "problem.compiler=true")
+    run = load_config(pendulum, (*settings, "diagnosis.candidates=[joint_viscous, joint_coulomb]"))
+    killing = Killing(scheduler)
+    there = run_blind([run], tmp_path / "there", CASES, 3, killing, Workers(scheduler=scheduler.address))
+    assert killing.killed
+    here = run_blind([run], tmp_path / "here", CASES, 3, workers=Here())
+    for own in (there.result, here.result):
+        own.pop("seconds")
+        for entry in own["marks"]:
+            entry.pop("seconds")
+    assert there.result == here.result
+    for folder in ("there", "here"):
+        answers = [json.loads(path.read_text())["name"] for path in (tmp_path / folder / "answers").glob("*.json")]
+        assert sorted(answers) == [f"case_{i:03d}" for i in range(CASES)]
