@@ -1,6 +1,6 @@
 """Whether the standard deviations of `solve` are true: cells of MuJoCo twins whose truth is known.
 
-    python benchmarks/coverage.py --out FOLDER [CELL ...] [--twins 40] [--first 0] [--jobs 2] [--record-only]
+    python benchmarks/coverage.py --out FOLDER [CELL ...] [--twins 40] [--first 0] [--workers 2] [--record-only]
 
 A cell is a kind of experiment: arms, noise of the torques, controller, start, sensors, time step. Each of its twins
 has a motion, noise and stiffnesses of its own, drawn around those of the embedded recordings, and is solved as a user
@@ -22,7 +22,6 @@ import sys
 import tempfile
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -35,11 +34,12 @@ import yid_ocp
 from yid_ocp.config.reader import load_config
 from yid_ocp.data.hdf5 import write_recording
 from yid_ocp.errors import ModelError
-from yid_ocp.files import content_hash, file_sha256, write_json
+from yid_ocp.files import content_hash, write_json
 from yid_ocp.model.system import System
-from yid_ocp.parallel import Task, TaskResult, process_pool, run_tasks
+from yid_ocp.parallel import Task, TaskResult, Workers, run_tasks
 from yid_ocp.report.terminal import solve_summary, table
 from yid_ocp.sensors.base import EffortKind
+from yid_ocp.version import code_hash
 from yid_ocp.virtual.engine import Simulation, simulate_in_mujoco
 from yid_ocp.virtual.experiment import ArmNoise, VirtualExperiment, paper_system, virtual_experiment
 from yid_ocp.virtual.motion import Excitation, Motion, multisine
@@ -184,13 +184,12 @@ def gentle_enough(
 # -- solutions --------------------------------------------------------------------------------------------------------
 
 
-def solve_twin(config: Path, recording: Path, settings: Sequence[str], code: str) -> dict[str, Any]:
+def solve_twin(config: Path, recording: Path, settings: Sequence[str]) -> dict[str, Any]:
     """What the command `solve` says of a twin."""
     given = [f"recordings.estimate=[{json.dumps(str(recording))}]", "recordings.held_out=[]", "output.report=false"]
     with tempfile.TemporaryDirectory() as folder:
         result = run_solve(load_config(config, [*given, *settings]), Path(folder) / "run").result
     return {
-        "code": code,
         "status": result["status"],
         "message": result["message"],
         "seconds": result["seconds"],
@@ -202,12 +201,6 @@ def solve_twin(config: Path, recording: Path, settings: Sequence[str], code: str
         },
         "diagnose": any("diagnose" in line for line in solve_summary(result)),
     }
-
-
-def code_hash(folder: Path) -> str:
-    """Hash of the sources in a folder."""
-    files = sorted(path for path in folder.rglob("*") if path.suffix in (".py", ".c"))
-    return content_hash({str(path.relative_to(folder)): file_sha256(path) for path in files})
 
 
 # -- scores -----------------------------------------------------------------------------------------------------------
@@ -379,7 +372,7 @@ def _median(values: Sequence[float]) -> str:
 # -- the run ----------------------------------------------------------------------------------------------------------
 
 
-def record(names: Sequence[str], numbers: Sequence[int], pool: Executor, out: Path) -> dict[str, list[TaskResult]]:
+def record(names: Sequence[str], numbers: Sequence[int], workers: Workers, out: Path) -> dict[str, list[TaskResult]]:
     """Record twins of some cells by their numbers; what stands in the folder is not done again."""
     recordings = out.resolve() / "recordings"
     recordings.mkdir(parents=True, exist_ok=True)
@@ -392,13 +385,12 @@ def record(names: Sequence[str], numbers: Sequence[int], pool: Executor, out: Pa
         for name in names
         for k in numbers
     ]
-    made = run_tasks(make_twin, tasks, out / "made", pool, print_progress)
+    made = run_tasks(make_twin, tasks, out / "made", workers, print_progress, code)
     return {name: made[i * len(numbers) : (i + 1) * len(numbers)] for i, name in enumerate(names)}
 
 
-def solve(made: Mapping[str, Sequence[TaskResult]], pool: Executor, out: Path) -> dict[str, list[Twin]]:
+def solve(made: Mapping[str, Sequence[TaskResult]], workers: Workers, out: Path) -> dict[str, list[Twin]]:
     """Solve the twins that were recorded; what stands in the folder is not done again."""
-    code = code_hash(PACKAGE)
     whole = [(name, entry) for name, entries in made.items() for entry in entries if not entry.error]
     tasks = [
         Task(
@@ -407,12 +399,11 @@ def solve(made: Mapping[str, Sequence[TaskResult]], pool: Executor, out: Path) -
                 "config": CELLS[name].config,
                 "recording": Path(entry.value["file"]),
                 "settings": list(CELLS[name].settings),
-                "code": code,
             },
         )
         for name, entry in whole
     ]
-    solved = run_tasks(solve_twin, tasks, out / "solved", pool, print_progress)
+    solved = run_tasks(solve_twin, tasks, out / "solved", workers, print_progress)
     done = {entry.value["file"]: result for (_, entry), result in zip(whole, solved, strict=True)}
     return {
         name: [_twin(entry, None if entry.error else done[entry.value["file"]]) for entry in entries]
@@ -435,10 +426,16 @@ def command(description: str, what: str, known: Mapping[str, Any], twins: int) -
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("names", nargs="*", metavar=what.upper(), help=f"of {', '.join(known)}; all when absent")
     parser.add_argument("--twins", type=int, default=twins, help=f"of each {what}")
-    parser.add_argument("--jobs", type=int, default=None, help="processes; as many as there are processors when absent")
+    working(parser)
     parser.add_argument("--out", type=Path, required=True, help="folder of recordings and results")
     parser.add_argument("--record-only", action="store_true", help="make the recordings, to be used later")
     return parser
+
+
+def working(parser: argparse.ArgumentParser) -> None:
+    """Add what says who does the work."""
+    parser.add_argument("--workers", type=int, help="processes; as many as there are processors when absent")
+    parser.add_argument("--scheduler", default="", help="of Dask workers that do the work instead")
 
 
 def asked_for(parser: argparse.ArgumentParser, asked: Sequence[str], known: Mapping[str, Any], what: str) -> list[str]:
@@ -454,11 +451,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--first", type=int, default=0, help="number of the first twin, to add to those of another run")
     chosen = parser.parse_args(arguments)
     names = asked_for(parser, chosen.names, CELLS, "cell")
-    with process_pool(chosen.jobs) as pool:
-        made = record(names, range(chosen.first, chosen.first + chosen.twins), pool, chosen.out)
-        if chosen.record_only:
-            return 1 if any(entry.error for entries in made.values() for entry in entries) else 0
-        twins = solve(made, pool, chosen.out)
+    workers = Workers(chosen.workers, chosen.scheduler)
+    made = record(names, range(chosen.first, chosen.first + chosen.twins), workers, chosen.out)
+    if chosen.record_only:
+        return 1 if any(entry.error for entries in made.values() for entry in entries) else 0
+    twins = solve(made, workers, chosen.out)
     write_json(
         chosen.out / "coverage.json", {cell: [asdict(twin) for twin in entries] for cell, entries in twins.items()}
     )

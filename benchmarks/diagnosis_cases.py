@@ -30,7 +30,7 @@ from yid_ocp.diagnosis.blind import finer_values
 from yid_ocp.diagnosis.carry_over import disagreeing
 from yid_ocp.diagnosis.hypotheses import CandidateProblem, chosen_effects
 from yid_ocp.diagnosis.refit import refit
-from yid_ocp.parallel import Task, process_pool, run_tasks
+from yid_ocp.parallel import Task, Workers, run_tasks
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.virtual.experiment import VirtualExperiment
 from yid_ocp.virtual.injected import InjectedEffect, injected_experiment
@@ -225,8 +225,8 @@ def main() -> int:
     parser.add_argument("--keep", type=Path, metavar="DIR", help="folder of results, which are not worked out again")
     arguments = parser.parse_args()
     tasks = [Task(name, {"name": name, "seeds": list(arguments.seeds)}) for name in arguments.cases]
-    with tempfile.TemporaryDirectory() as folder, process_pool(arguments.workers) as pool:
-        results = run_tasks(run, tasks, arguments.keep or Path(folder), pool, show)
+    with tempfile.TemporaryDirectory() as folder:
+        results = run_tasks(run, tasks, arguments.keep or Path(folder), Workers(arguments.workers), show)
     rows = [result.value for result in results if not result.error]
     for i, row in enumerate(rows):
         if i == 0:

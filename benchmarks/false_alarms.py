@@ -1,6 +1,7 @@
 """What `diagnose` says of MuJoCo twins whose torques are wrong as stated: false alarms, and effects that it misses.
 
-    python benchmarks/false_alarms.py --out FOLDER [KIND ...] [--twins 15] [--candidates all] [--jobs 2] [--record-only]
+    python benchmarks/false_alarms.py --out FOLDER [KIND ...] [--twins 15] [--candidates all] [--workers 2]
+                                      [--record-only]
 
 A kind is an experiment of `coverage.py` with white noise and constant offsets of the torques, both stated, and nothing
 else that the model does not know (clean kinds), or with one effect in MuJoCo's own terms (the others). Every twin has a
@@ -17,7 +18,6 @@ import sys
 import tempfile
 import zlib
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,6 @@ from coverage import (
     SPREAD,
     Cell,
     asked_for,
-    code_hash,
     command,
     gentle_enough,
     print_progress,
@@ -41,8 +40,9 @@ from make_recordings import OFFSETS, TRUTH
 from yid_ocp.config.reader import DIAGNOSIS_DEFAULT, load_config
 from yid_ocp.data.hdf5 import write_recording
 from yid_ocp.files import content_hash, write_json
-from yid_ocp.parallel import Task, TaskResult, process_pool, run_tasks
+from yid_ocp.parallel import Task, TaskResult, Workers, run_tasks
 from yid_ocp.report.terminal import table
+from yid_ocp.version import code_hash
 from yid_ocp.virtual.engine import Simulation
 from yid_ocp.virtual.experiment import ArmNoise, VirtualExperiment, paper_system
 from yid_ocp.virtual.injected import InjectedEffect, injected_experiment
@@ -119,7 +119,7 @@ def make_pair(name: str, recipe: Mapping[str, Any], number: int, folder: str, co
 # -- diagnoses --------------------------------------------------------------------------------------------------------
 
 
-def diagnose_twin(config: Path, estimate: Path, held_out: Path, settings: Sequence[str], code: str) -> dict[str, Any]:
+def diagnose_twin(config: Path, estimate: Path, held_out: Path, settings: Sequence[str]) -> dict[str, Any]:
     """What the command `diagnose` says of a twin."""
     given = [
         f"recordings.{key}=[{json.dumps(str(path))}]" for key, path in zip(USES, (estimate, held_out), strict=True)
@@ -133,7 +133,6 @@ def diagnose_twin(config: Path, estimate: Path, held_out: Path, settings: Sequen
         for name, value in entry.detectable.items()
     }
     return {
-        "code": code,
         "verdict": finding.verdict,
         "chi2_per_dof": finding.before.chi2_per_dof,
         "held_out_chi2_per_dof": finding.held_out_before.chi2_per_dof,
@@ -217,7 +216,7 @@ def _said(found: Mapping[str, Any]) -> str:
 # -- the run ----------------------------------------------------------------------------------------------------------
 
 
-def record(names: Sequence[str], number: int, pool: Executor, out: Path) -> dict[str, list[TaskResult]]:
+def record(names: Sequence[str], number: int, workers: Workers, out: Path) -> dict[str, list[TaskResult]]:
     """Record so many twins of some kinds; what stands in the folder is not done again."""
     recordings = out.resolve() / "recordings"
     recordings.mkdir(parents=True, exist_ok=True)
@@ -230,15 +229,14 @@ def record(names: Sequence[str], number: int, pool: Executor, out: Path) -> dict
         for k in range(number)
         for name in names
     ]
-    made = run_tasks(make_pair, tasks, out / "made", pool, print_progress)
+    made = run_tasks(make_pair, tasks, out / "made", workers, print_progress, code)
     return {name: made[i :: len(names)] for i, name in enumerate(names)}
 
 
 def diagnosed(
-    made: Mapping[str, Sequence[TaskResult]], candidates: str, pool: Executor, out: Path
+    made: Mapping[str, Sequence[TaskResult]], candidates: str, workers: Workers, out: Path
 ) -> dict[str, list[Twin]]:
     """Diagnose the twins that were recorded; what stands in the folder is not done again."""
-    code = code_hash(PACKAGE)
     whole = [(name, k) for k in range(max(map(len, made.values()))) for name in made if not made[name][k].error]
     tasks = [
         Task(
@@ -247,12 +245,11 @@ def diagnosed(
                 "config": CONFIGS / KINDS[name].cell.config.name,
                 **{use: Path(path) for use, path in zip(USES, made[name][k].value, strict=True)},
                 "settings": [f"diagnosis.candidates={candidates}", *KINDS[name].cell.settings],
-                "code": code,
             },
         )
         for name, k in whole
     ]
-    results = dict(zip(whole, run_tasks(diagnose_twin, tasks, out / "found", pool, print_progress), strict=True))
+    results = dict(zip(whole, run_tasks(diagnose_twin, tasks, out / "found", workers, print_progress), strict=True))
     return {
         name: [
             Twin(error=entry.error) if entry.error else Twin(results[name, k].value or {}, results[name, k].error)
@@ -267,11 +264,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--candidates", default="all", help="`all`, or a list such as [kelvin_voigt, effort_offset]")
     chosen = parser.parse_args(arguments)
     names = asked_for(parser, chosen.names, KINDS, "kind")
-    with process_pool(chosen.jobs) as pool:
-        made = record(names, chosen.twins, pool, chosen.out)
-        if chosen.record_only:
-            return 1 if any(entry.error for entries in made.values() for entry in entries) else 0
-        twins = diagnosed(made, chosen.candidates, pool, chosen.out)
+    workers = Workers(chosen.workers, chosen.scheduler)
+    made = record(names, chosen.twins, workers, chosen.out)
+    if chosen.record_only:
+        return 1 if any(entry.error for entries in made.values() for entry in entries) else 0
+    twins = diagnosed(made, chosen.candidates, workers, chosen.out)
     findings = {name: [asdict(twin) for twin in entries] for name, entries in twins.items()}
     write_json(chosen.out / "false_alarms.json", findings)
     print("\n".join(report(twins)))

@@ -19,15 +19,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from coverage import CONFIGS, PACKAGE, code_hash, print_progress, solve_twin
+from coverage import CONFIGS, PACKAGE, print_progress, solve_twin, working
 from make_recordings import OFFSET, OFFSETS, ROUGH, TRUTH, WHITE
 
 from yid_ocp.analysis.published import PUBLISHED, explained
 from yid_ocp.data.hdf5 import write_recording
 from yid_ocp.errors import ModelError
 from yid_ocp.files import content_hash, write_json
-from yid_ocp.parallel import Task, process_pool, run_tasks
+from yid_ocp.parallel import Task, Workers, run_tasks
 from yid_ocp.report.terminal import table
+from yid_ocp.version import code_hash
 from yid_ocp.virtual.experiment import PointCamera, VirtualExperiment, paper_system, virtual_experiment
 from yid_ocp.virtual.motion import Excitation, multisine
 from yid_ocp.virtual.posture import initial_posture
@@ -66,44 +67,42 @@ def make_member(experiment: str, errors: Sequence[Sequence[float]], number: int,
 
 
 def run(
-    experiments: Sequence[str], kinds: Sequence[str], members: int, jobs: int | None, out: Path
+    experiments: Sequence[str], kinds: Sequence[str], members: int, workers: Workers, out: Path
 ) -> dict[str, dict[str, Any]]:
     """What steepest descent finds: experiment, errors of the torques, parameter to the members' values."""
     recordings = out.resolve() / "recordings"
     recordings.mkdir(parents=True, exist_ok=True)
-    maker, estimator = code_hash(PACKAGE / "virtual"), code_hash(PACKAGE)
+    maker = code_hash(PACKAGE / "virtual")
     keys = [(experiment, errors, k) for experiment in experiments for errors in kinds for k in range(members)]
-    with process_pool(jobs) as pool:
-        tasks = [
-            Task(
-                f"recording {k} of {experiment}, {errors}",
-                {
-                    "experiment": experiment,
-                    "errors": [list(std) for std in ERRORS[errors]],
-                    "number": k,
-                    "folder": str(recordings),
-                    "code": maker,
-                },
-            )
-            for experiment, errors, k in keys
-        ]
-        made = run_tasks(make_member, tasks, out / "made", pool, print_progress)
-        lost = [entry for entry in made if entry.error]
-        if lost:
-            raise ModelError(f"{lost[0].name} failed: {lost[0].error}")
-        tasks = [
-            Task(
-                f"solution {k} of {experiment}, {errors}",
-                {
-                    "config": CONFIGS / f"{experiment}.yaml",
-                    "recording": Path(entry.value),
-                    "settings": list(METHOD),
-                    "code": estimator,
-                },
-            )
-            for (experiment, errors, k), entry in zip(keys, made, strict=True)
-        ]
-        solved = run_tasks(solve_twin, tasks, out / "solved", pool, print_progress)
+    tasks = [
+        Task(
+            f"recording {k} of {experiment}, {errors}",
+            {
+                "experiment": experiment,
+                "errors": [list(std) for std in ERRORS[errors]],
+                "number": k,
+                "folder": str(recordings),
+                "code": maker,
+            },
+        )
+        for experiment, errors, k in keys
+    ]
+    made = run_tasks(make_member, tasks, out / "made", workers, print_progress, maker)
+    lost = [entry for entry in made if entry.error]
+    if lost:
+        raise ModelError(f"{lost[0].name} failed: {lost[0].error}")
+    tasks = [
+        Task(
+            f"solution {k} of {experiment}, {errors}",
+            {
+                "config": CONFIGS / f"{experiment}.yaml",
+                "recording": Path(entry.value),
+                "settings": list(METHOD),
+            },
+        )
+        for (experiment, errors, k), entry in zip(keys, made, strict=True)
+    ]
+    solved = run_tasks(solve_twin, tasks, out / "solved", workers, print_progress)
     found: dict[str, dict[str, Any]] = {}
     for (experiment, errors, _), entry in zip(keys, solved, strict=True):
         values = found.setdefault(experiment, {}).setdefault(errors, {name: [] for name in TRUTH})
@@ -140,14 +139,14 @@ def main() -> None:
     )
     parser.add_argument("--errors", nargs="+", choices=list(ERRORS), default=list(ERRORS), help="of the torques")
     parser.add_argument("--members", type=int, default=8, help="of each ensemble")
-    parser.add_argument("--jobs", type=int, default=None, help="processes; as many as there are processors when absent")
+    working(parser)
     parser.add_argument("--out", type=Path, required=True, help="folder of recordings and solutions")
     chosen = parser.parse_args()
     unknown = sorted(set(chosen.experiments) - set(PUBLISHED))
     if unknown:
         parser.error(f"there is no experiment '{unknown[0]}'; choose from {', '.join(PUBLISHED)}")
     experiments = [name for name in PUBLISHED if name in chosen.experiments or not chosen.experiments]
-    found = run(experiments, chosen.errors, chosen.members, chosen.jobs, chosen.out)
+    found = run(experiments, chosen.errors, chosen.members, Workers(chosen.workers, chosen.scheduler), chosen.out)
     write_json(chosen.out / "torque_ensemble.json", found)
     print("\n".join(report(found)))
 

@@ -16,8 +16,11 @@ from typing import Any
 
 import pytest
 
-from yid_ocp.errors import DataError, OutputError
-from yid_ocp.parallel import Task, map_threads, process_pool, run_tasks
+from yid_ocp.errors import ConfigError, DataError, OutputError, WorkerError
+from yid_ocp.parallel import Task, TaskResult, Workers, map_threads, process_pool, processors, run_tasks, values_of
+from yid_ocp.parallel import tasks as parallel_tasks
+from yid_ocp.parallel.threads import threads as threads_of_process
+from yid_ocp.version import fingerprint
 
 # -- what tasks do ----------------------------------------------------------------------------------------------------
 
@@ -31,6 +34,15 @@ def counted(number: int, calls: Path | str) -> dict[str, Any]:
 
 def length(file: Path, unit: str = "characters") -> str:
     return f"{file.name}: {len(file.read_text())} {unit}"
+
+
+def place(file: Path, more: list[Path]) -> list[str]:
+    return [str(file), *map(str, more)]
+
+
+def thread_count(number: int) -> int:
+    del number
+    return threads_of_process()
 
 
 def fragile(number: int, broken: str = "") -> int:
@@ -148,14 +160,51 @@ def test_a_changed_input_is_done_again(tmp_path, threads):
     assert not resumed(moved.rename(tmp_path / "b" / "other"))
 
 
-def test_another_version_and_another_function_do_not_count(tmp_path, threads, monkeypatch):
+def test_other_sources_and_another_function_do_not_count(tmp_path, threads, monkeypatch):
     def resumed(function: Any) -> bool:
         (result,) = run_tasks(function, tasks_of(1), tmp_path, threads)
         return result.resumed
 
     assert [resumed(slow), resumed(slow), resumed(fragile)] == [False, True, False]
-    monkeypatch.setattr("yid_ocp.parallel.package_version", lambda: "99")
+    monkeypatch.setattr("yid_ocp.parallel.tasks.package_code", lambda: "99")
     assert [resumed(slow), resumed(slow)] == [False, True]
+
+
+def test_results_may_depend_on_less_than_the_whole_package(tmp_path, threads, monkeypatch):
+    run_tasks(slow, tasks_of(1), tmp_path, threads, code="of a folder")
+    monkeypatch.setattr("yid_ocp.parallel.tasks.package_code", lambda: "99")
+    assert run_tasks(slow, tasks_of(1), tmp_path, threads, code="of a folder")[0].resumed
+    assert not run_tasks(slow, tasks_of(1), tmp_path, threads, code="of another")[0].resumed
+
+
+def test_a_worker_of_other_sources_does_nothing(tmp_path, threads, monkeypatch):
+    calls = tmp_path / "calls"
+    here = fingerprint()
+    monkeypatch.setattr("yid_ocp.parallel.tasks.fingerprint", lambda: {**here, "code": "a" * 64})
+    monkeypatch.setattr("yid_ocp.parallel.tasks._perform", perform_with(here, parallel_tasks._perform, monkeypatch))
+    (found,) = run_tasks(counted, tasks_of(1, calls=str(calls)), tmp_path / "results", threads)
+    assert "is of another version: code" in found.error
+    assert f"{here['code'][:12]} instead of aaaaaaaaaaaa" in found.error
+    assert not calls.exists()
+    assert not list((tmp_path / "results").iterdir())
+
+
+def perform_with(fingerprint, perform, monkeypatch):
+    """What a worker of this fingerprint does."""
+
+    def performed(job):
+        with monkeypatch.context() as patch:
+            patch.setattr("yid_ocp.parallel.tasks.fingerprint", lambda: fingerprint)
+            return perform(job)
+
+    return performed
+
+
+def test_paths_are_absolute_for_workers_elsewhere(tmp_path, threads, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("text").write_text("four")
+    (found,) = run_tasks(place, [Task("", {"file": Path("text"), "more": [Path("text")]})], Path("results"), threads)
+    assert found.value == [str(tmp_path / "text")] * 2
 
 
 def test_progress_is_told_of_every_task(tmp_path, threads):
@@ -196,6 +245,16 @@ def test_a_result_that_json_cannot_hold_is_a_failure(tmp_path, threads):
     assert "not JSON compliant" in found[0].error
     assert "not JSON serializable" in found[1].error
     assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_what_all_tasks_found_or_why_one_did_not():
+    good, bad = TaskResult("a", 1), TaskResult("b", error="ZeroDivisionError: no b")
+    assert values_of([good, good]) == [1, 1]
+    with pytest.raises(RuntimeError, match="1 of 2 tasks failed, b with ZeroDivisionError: no b; the same command"):
+        values_of([good, bad])
+    ours = TaskResult("c", error="DataError: no such file\n  where: here\n  try: there")
+    with pytest.raises(WorkerError, match="c with DataError: no such file; where: here; try: there"):
+        values_of([good, ours])
 
 
 def test_what_cannot_be_a_task_is_refused_before_any_runs(tmp_path, threads):
@@ -251,6 +310,27 @@ def test_one_worker_and_two_find_the_same(tmp_path):
 def test_tasks_run_in_processes_of_their_own(tmp_path):
     (found,) = run_tasks(process_name, tasks_of(1), tmp_path)
     assert found.value != multiprocessing.current_process().name
+
+
+def test_processes_share_the_threads_of_the_machine(tmp_path, monkeypatch):
+    monkeypatch.setenv("YID_OCP_THREADS", "4")
+    found = run_tasks(thread_count, tasks_of(2), tmp_path, Workers(processes=2))
+    assert [entry.value for entry in found] == [2, 2]
+
+
+@pytest.mark.parametrize("said", ["0", "-1", "two", "1.5"])
+def test_a_wrong_number_of_threads_is_refused(said, monkeypatch):
+    monkeypatch.setenv("YID_OCP_THREADS", said)
+    with pytest.raises(ConfigError, match="YID_OCP_THREADS is"):
+        map_threads(abs, [1, 2])
+
+
+def test_no_workers_and_workers_in_two_places_are_refused():
+    assert processors() >= 1
+    with pytest.raises(ConfigError, match="0 workers"):
+        Workers(processes=0)
+    with pytest.raises(ConfigError, match="here and of a scheduler"):
+        Workers(processes=2, scheduler="localhost:8786")
 
 
 def test_a_task_that_ends_its_process_takes_no_other_with_it(tmp_path, caplog):

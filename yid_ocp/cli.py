@@ -68,6 +68,13 @@ def _doubting(parser: argparse.ArgumentParser, optional: bool = False) -> None:
     parser.add_argument("--strict", action="append_const", const=strict, dest="overrides", help=text)
 
 
+def _working(parser: argparse.ArgumentParser, absent: str = "as many as there are processors") -> None:
+    text = f"processes that share the work; {absent} when absent"
+    parser.add_argument("--workers", metavar="N", type=int, help=text)
+    text = "HOST:PORT of a Dask scheduler, or its scheduler file, whose workers do the work instead"
+    parser.add_argument("--scheduler", metavar="ADDRESS", default="", help=text)
+
+
 def _doubting_or_embedded(parser: argparse.ArgumentParser) -> None:
     _doubting(parser, optional=True)
 
@@ -86,13 +93,37 @@ def _identifiability(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--initial", action="store_true", help="judge at the initial values, without solving")
     text = "judge with initial states estimated along, whatever the settings assume"
     parser.add_argument("--unknown-start", action="store_true", help=text)
+    _working(parser, "this process alone")
     parser.add_argument("--unknown-grasp", action="store_true", help="judge with the places of grasps estimated along")
 
 
+def _overrides(parser: argparse.ArgumentParser) -> None:
+    text = "replace a setting in every run; may be repeated"
+    parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[], dest="overrides", help=text)
+    parser.add_argument("--quiet", action="store_true", help="print nothing but the folder's path")
+
+
 def _blind(parser: argparse.ArgumentParser) -> None:
-    _configured(parser, optional=True)
+    text = "settings of experiments, which are varied as far as there are cases for it; embedded ones when absent"
+    parser.add_argument("configs", metavar="CONFIG.yaml", nargs="*", help=text)
+    parser.add_argument("--out", metavar="DIR", help="folder of the proof; the same one again does what is not done")
     parser.add_argument("--cases", type=int, default=20, help="size of the ensemble")
     parser.add_argument("--seed", type=int, default=1, help="from which it is drawn")
+    text = "draw an ensemble to set thresholds by, other cases than those that are reported for the same seed"
+    parser.add_argument("--calibration", action="store_true", help=text)
+    _overrides(parser)
+    _working(parser)
+
+
+def _batch(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("configs", metavar="CONFIG.yaml", nargs="+", help="settings of one run each")
+    text = "pattern of recordings in quotes, such as 'fleet/*.h5': a run of every configuration for each of them"
+    parser.add_argument("--recordings", metavar="GLOB", help=text)
+    parser.add_argument("--command", dest="each", choices=("solve", "diagnose"), default="solve", help="to run")
+    text = "folder of all runs (default: runs/batch-DATE-TIME); the same one again does what is not done yet"
+    parser.add_argument("--out", metavar="DIR", help=text)
+    _overrides(parser)
+    _working(parser)
 
 
 def _simulate(parser: argparse.ArgumentParser) -> None:
@@ -155,6 +186,7 @@ COMMANDS: tuple[Command, ...] = (
         "blind",
         _blind,
     ),
+    Command("batch", "solve or diagnose many recordings or robots, one table and report of all", "batch", _batch),
     Command("report", "compare runs of one model: what drifted, which run to distrust", "report", _report),
     Command("plan", "plan a motion of the arms with the identified model", "plan", _configured),
     Command("simulate", "write what the model says would be recorded", "simulate", _simulate),

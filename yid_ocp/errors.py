@@ -49,6 +49,10 @@ class OutputError(YidError):
     """A result cannot be written where it was asked for."""
 
 
+class WorkerError(YidError):
+    """Workers cannot be reached, or are not fit for the tasks that they are to do."""
+
+
 class ResourceError(YidError):
     """The machine has too little memory for what was asked of it."""
 

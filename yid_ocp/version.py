@@ -1,13 +1,67 @@
-"""The version of this package."""
+"""Versions: of this package, of its sources, and of what its numbers depend on."""
 
 from __future__ import annotations
 
+import functools
+import hashlib
+import platform
+from collections.abc import Mapping
 from importlib import metadata
+from pathlib import Path
+
+SOURCES = (".py", ".c")
+NUMERICAL = ("casadi", "numpy", "scipy", "h5py")
+"""Packages whose versions stand beside every result."""
 
 
 def package_version() -> str:
     """Version of this package, `0+unknown` where it is not installed."""
+    return _version("yid-ocp", "0+unknown")
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python, this package and what its numbers depend on."""
+    result = {"python": platform.python_version(), "platform": f"{platform.system()} {platform.machine()}"}
+    return result | {name: _version(name, "not installed") for name in ("yid-ocp", *NUMERICAL)}
+
+
+def code_hash(folder: Path) -> str:
+    """SHA-256 of the sources in a folder and those in it, by name and content; 64 hexadecimal digits."""
+    digest = hashlib.sha256()
+    for file in sorted(path for path in folder.rglob("*") if path.suffix in SOURCES):
+        content = hashlib.sha256(file.read_bytes()).hexdigest()
+        digest.update(f"{file.relative_to(folder).as_posix()} {content}\n".encode())
+    return digest.hexdigest()
+
+
+@functools.cache
+def package_code() -> str:
+    """`code_hash` of this package, as it was when this process first asked."""
+    return code_hash(Path(__file__).parent)
+
+
+def fingerprint() -> dict[str, str]:
+    """What has to be the same in two processes for their numbers to be of one kind."""
+    python = ".".join(platform.python_version_tuple()[:2])
+    own = {name: text for name, text in versions().items() if name in ("yid-ocp", *NUMERICAL)}
+    return {"python": python, **own, "code": package_code()}
+
+
+def differences(here: Mapping[str, str], there: Mapping[str, str]) -> list[str]:
+    """Where two fingerprints differ, in words."""
+
+    def shown(name: str, value: str) -> str:
+        return value[:12] if name == "code" else value
+
+    return [
+        f"{name} {shown(name, there.get(name, 'unknown'))} instead of {shown(name, value)}"
+        for name, value in here.items()
+        if there.get(name) != value
+    ]
+
+
+def _version(package: str, otherwise: str) -> str:
     try:
-        return metadata.version("yid-ocp")
+        return metadata.version(package)
     except metadata.PackageNotFoundError:
-        return "0+unknown"
+        return otherwise

@@ -89,7 +89,10 @@ class Table:
         self.known = {frozenset(key.split("_")): entry for key, entry in known.items()}
         self.asked = []
 
-    def of(self, changes):
+    def of_all(self, sets):
+        return [self._of(changes) for changes in sets]
+
+    def _of(self, changes):
         names = tuple(entry.name for entry in changes)
         self.asked.append(names)
         found, gain = self.known.get(frozenset(names), (0, 0.0))
@@ -341,21 +344,21 @@ def test_an_outcome_counts_what_is_identifiable_and_is_worked_out_once():
     base = layout("abcd", [1.0, 2.0, 1.0, 1.0], information=np.diag([100.0, 1.0, 1.0, 0.01]), notes=("one", "two"))
     builder = Builder(base=base)
     outcomes = _Outcomes(Recorded(episodes=2), builder, 1.0)
-    found = outcomes.of(())
+    (found,) = outcomes.of_all([()])
     assert (found.changes, found.words, found.message) == ((), "as it is", "one; two")
     assert found.std_relative == pytest.approx({"a": 0.1, "b": 0.5, "c": 1.0, "d": 10.0})
     assert found.verdicts == {"a": "identifiable", "b": "weak", "c": "weak", "d": "not_identifiable"}
     assert found.identifiable == 1
     assert found.gain == pytest.approx(gained(100.0, 4.0, 1.0, 0.01))
     assert len(base.told[0]) == 2
-    assert outcomes.of(()) is found
+    assert outcomes.of_all([()])[0] is found
     assert outcomes.count == 1
     assert builder.asked == [frozenset()]
 
 
 def test_a_fit_that_is_worse_than_its_noise_informs_less():
     base = layout("a", [1.0], information=[[100.0]])
-    assert _Outcomes(Recorded(), Builder(base=base), 4.0).of(()).std_relative == pytest.approx({"a": 0.2})
+    assert _Outcomes(Recorded(), Builder(base=base), 4.0).of_all([()])[0].std_relative == pytest.approx({"a": 0.2})
 
 
 def test_the_order_of_changes_does_not_matter():
@@ -363,15 +366,15 @@ def test_the_order_of_changes_does_not_matter():
     builder = Builder(motion_weld=both)
     outcomes = _Outcomes(Recorded(), builder, 1.0)
     weld, motion, rate = change("weld"), change("motion"), change("rate:5")
-    found = outcomes.of((weld, motion, rate))
+    (found,) = outcomes.of_all([(weld, motion, rate)])
     assert found.changes == ("weld", "motion", "rate:5")
     assert found.words == "words of weld; words of motion; words of rate:5"
     assert builder.asked == [frozenset({"weld", "motion"})]
-    assert outcomes.of((rate, motion, weld)) is found
+    assert outcomes.of_all([(rate, motion, weld)])[0] is found
 
 
 def test_what_cannot_be_built_tells_nothing():
-    found = _Outcomes(Recorded(), Builder(weld="it snaps"), 1.0).of((change("weld"),))
+    (found,) = _Outcomes(Recorded(), Builder(weld="it snaps"), 1.0).of_all([(change("weld"),)])
     assert (found.verdicts, found.std_relative, found.identifiable, found.gain) == ({}, {}, 0, -math.inf)
     assert found.message == "it snaps"
 

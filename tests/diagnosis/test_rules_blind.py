@@ -12,12 +12,13 @@ import pytest
 from factories import amplitude, effect, shape, signature
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
-from yid_ocp.diagnosis.blind import Ensemble, finer_values
+from yid_ocp.diagnosis.blind import Conditions, Ensemble, Label, Planned, finer_values, planned
 from yid_ocp.diagnosis.blind import ensemble as module
-from yid_ocp.diagnosis.blind.ensemble import OUTSIDE_SIZES
+from yid_ocp.diagnosis.blind.ensemble import OUTSIDE_SIZES, Detectable
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import ConfigError, ModelError
-from yid_ocp.virtual.experiment import PointCamera
+from yid_ocp.virtual.engine import Simulation
+from yid_ocp.virtual.experiment import ArmNoise, PointCamera
 from yid_ocp.virtual.injected import InjectedEffect
 from yid_ocp.virtual.motion import Excitation
 from yid_ocp.virtual.outside import OUTSIDE
@@ -77,15 +78,15 @@ def drawn(monkeypatch):
     def multisine(of, truth, **settings):
         return {"of": of, "truth": dict(truth), **settings}
 
-    def build(seed=3, candidates=(DAMPER, FRICTION, TILT, SOLID), finer=None, failures=0, **given):
+    def build(seed=3, candidates=(DAMPER, FRICTION, TILT, SOLID), finer=None, failures=0, conditions=None, **given):
         build.failures = failures
         monkeypatch.setattr(module, "chosen_effects", lambda *_: list(candidates))
-        ensemble = Ensemble(problem(**given), seed, finer)
+        ensemble = Ensemble(problem(**given), seed, finer, conditions=conditions)
         columns = {"kelvin_voigt": [[100.0]], "joint_coulomb": [[0.5]], "gravity_tilt": [[30.0, 40.0]]}
         signatures = [
             signature(of, columns.get(of.kind, [[50.0]]), **({"s": 0.25} if of.shapes else {})) for of in candidates
         ]
-        ensemble._point = SimpleNamespace(signatures=tuple(signatures))
+        ensemble._detectable = tuple(Detectable.of(entry) for entry in signatures)
         return ensemble
 
     monkeypatch.setattr(module, "injected_experiment", experiment)
@@ -97,8 +98,8 @@ def drawn(monkeypatch):
 def test_an_ensemble_starts_where_the_recording_does(drawn):
     ensemble = drawn()
     assert ensemble.posture == {"s0": 0.1, "s1": 0.2, "w0": 0.3}
-    assert not ensemble.vision
-    assert drawn(pose=np.eye(4)).vision
+    assert not ensemble.conditions.vision
+    assert drawn(pose=np.eye(4)).conditions.vision
 
 
 @pytest.mark.parametrize(
@@ -160,31 +161,18 @@ def test_a_finer_chain_moves_as_the_nominal_one_and_has_its_own_values(drawn, mo
     assert drawn.made[0]["motion"]["of"] is nominal
 
 
-def test_every_share_of_an_ensemble_is_drawn(drawn):
-    ensemble = drawn(finer=lambda times: "fine")
-    categories = [ensemble._category(i, 100) for i in range(100)]
-    counts = {name: categories.count(name) for name in set(categories)}
-    assert counts == {"null": 20, "single": 50, "outside": 15, "left_out": 5, "pair": 5, "finer_chain": 5}
-    without = [drawn()._category(i, 100) for i in range(100)]
-    assert without.count("single") == 55
-    assert [a for a, b in zip(categories, without, strict=True) if a != b] == ["finer_chain"] * 5
-    assert categories != [drawn(seed=4, finer=lambda times: "fine")._category(i, 100) for i in range(100)]
-    assert categories != sorted(categories)
-
-
-def of_category(ensemble, monkeypatch, category):
-    monkeypatch.setattr(ensemble, "_category", lambda number, count: category)
-    return ensemble.draw(7, 100)
+def of_category(ensemble, category, multiple=None):
+    return ensemble.draw(Planned(7, "one", category, multiple))
 
 
 @pytest.mark.parametrize("category", ["null", "finer_chain"])
 def test_clean_cases_have_nothing_injected(drawn, monkeypatch, category):
     ensemble = drawn(finer=lambda times: SimpleNamespace(fine=times))
     monkeypatch.setattr(module, "finer_values", lambda *_: {})
-    case, told = of_category(ensemble, monkeypatch, category)
+    case, told = of_category(ensemble, category)
     assert (told.injected, told.multiple, told.category) == ((), None, category)
     assert (case.name, told.case) == ("case_007", "case_007")
-    assert (case.estimate.name, case.held_out.name) == ("case_007_estimate", "case_007_held_out")
+    assert (case.estimate[0].name, case.held_out.name) == ("case_007_estimate_0", "case_007_held_out")
     assert len(drawn.made) == 2
     assert drawn.made[0]["injected"] == drawn.made[1]["injected"] == ()
     assert drawn.made[0]["seed"] != drawn.made[1]["seed"]
@@ -195,7 +183,7 @@ def test_clean_cases_have_nothing_injected(drawn, monkeypatch, category):
 
 
 def test_a_single_effect_is_in_both_recordings_and_some_other_kind_is_left_out(drawn, monkeypatch):
-    case, told = of_category(drawn(), monkeypatch, "single")
+    case, told = of_category(drawn(), "single")
     [injected] = told.injected
     assert [made["injected"] for made in drawn.made] == [(injected,)] * 2
     assert [made["truth"] for made in drawn.made] == [told.truth] * 2
@@ -204,51 +192,129 @@ def test_a_single_effect_is_in_both_recordings_and_some_other_kind_is_left_out(d
 
 
 def test_a_left_out_effect_is_the_one_at_work(drawn, monkeypatch):
-    case, told = of_category(drawn(), monkeypatch, "left_out")
+    case, told = of_category(drawn(), "left_out")
     assert case.without == (told.injected[0].kind,)
 
 
 def test_with_one_other_kind_none_is_left_out(drawn, monkeypatch):
     ensemble = drawn(candidates=(DAMPER, FRICTION))
-    assert of_category(ensemble, monkeypatch, "single")[0].without == ()
-    assert of_category(ensemble, monkeypatch, "null")[0].without[0] in ("kelvin_voigt", "joint_coulomb")
+    assert of_category(ensemble, "single")[0].without == ()
+    assert of_category(ensemble, "null")[0].without[0] in ("kelvin_voigt", "joint_coulomb")
 
 
 def test_a_pair_is_two_effects_of_the_largest_size(drawn, monkeypatch):
     for seed in range(6):
         ensemble = drawn(seed=seed)
-        _, told = of_category(ensemble, monkeypatch, "pair")
+        _, told = of_category(ensemble, "pair")
         labels = [e.label for e in told.injected]
         assert len(set(labels)) == len(labels) <= 2
-    same, size = drawn(candidates=(DAMPER,))._injected("pair", np.random.default_rng(1))
+    same, size = drawn(candidates=(DAMPER,))._injected(Planned(0, "one", "pair", 10.0), np.random.default_rng(1))
     assert (len(same), size) == (1, pytest.approx(0.2 * 100 / 3.858))
 
 
 def test_outside_effects_are_in_no_library(drawn, monkeypatch):
-    _, told = of_category(drawn(), monkeypatch, "outside")
+    _, told = of_category(drawn(), "outside")
     assert told.injected[0].kind in OUTSIDE
     assert told.multiple is None
 
 
 def test_a_motion_that_cannot_be_simulated_is_drawn_anew(drawn, monkeypatch):
-    case, told = of_category(drawn(failures=0), monkeypatch, "null")
+    case, told = of_category(drawn(failures=0), "null")
     drawn.made.clear()
-    again, other = of_category(drawn(failures=3), monkeypatch, "null")
+    again, other = of_category(drawn(failures=3), "null")
     assert other.truth != told.truth
     assert case.name == again.name
     drawn.made.clear()
-    of_category(drawn(failures=7), monkeypatch, "null")
+    of_category(drawn(failures=7), "null")
     drawn.made.clear()
     with pytest.raises(ModelError, match="no motion of this experiment"):
-        of_category(drawn(failures=8), monkeypatch, "null")
+        of_category(drawn(failures=8), "null")
 
 
 def test_a_case_is_the_same_whatever_was_drawn_before(drawn):
     ensemble = drawn()
-    first = [ensemble.draw(i, 20)[1] for i in range(4)]
-    assert drawn().draw(3, 20)[1] == first[3]
+    wanted = [Planned(i, "one", "single", 3.0) for i in range(4)]
+    first = [ensemble.draw(entry)[1] for entry in wanted]
+    assert drawn().draw(wanted[3])[1] == first[3]
+    assert Label.from_dict(json.loads(json.dumps(first[3].to_dict()))) == first[3]
+    assert first[3].experiment == "one"
     assert len({json.dumps(entry.truth) for entry in first}) == 4
-    assert drawn(seed=9).draw(3, 20)[1].truth != first[3].truth
+    assert drawn(seed=9).draw(wanted[3])[1].truth != first[3].truth
+    # an ensemble to calibrate by shares no case with the one that is reported
+    assert drawn(conditions=Conditions(purpose="calibration")).draw(wanted[3])[1].truth != first[3].truth
+
+
+def test_an_experiment_has_its_recordings_noise_and_step(drawn):
+    noise, simulation = ArmNoise(effort=0.1), Simulation(time_step=5e-5)
+    case, _ = of_category(drawn(conditions=Conditions(3, noise, simulation)), "null")
+    assert [entry.name for entry in case.estimate] == [f"case_007_estimate_{i}" for i in range(3)]
+    assert len(drawn.made) == 4
+    assert all((made["noise"], made["simulation"]) == (noise, simulation) for made in drawn.made)
+    assert len({made["seed"] for made in drawn.made}) == 4
+
+
+def test_what_is_detectable_survives_as_plain_data(drawn):
+    ensemble = drawn()
+    told = json.loads(json.dumps([entry.to_dict() for entry in ensemble.detectable]))
+    other = drawn(seed=5)
+    other.knowing(told)
+    for one, two in zip(ensemble.detectable, other.detectable, strict=True):
+        assert (one.effect, one.shape) == (two.effect, two.shape)
+        np.testing.assert_array_equal(one.columns, two.columns)
+    # the size is that of the whole signature
+    tall = signature(TILT, np.random.default_rng(0).normal(size=(50, 2)))
+    way = np.array([0.3, -0.7])
+    assert np.linalg.norm(Detectable.of(tall).columns @ way) == pytest.approx(np.linalg.norm(tall.columns @ way))
+
+
+# -- the plan ---------------------------------------------------------------------------------------------------------
+
+WEIGHTS = {"a": 0.4, "b": 0.2, "bare": 0.1}
+WHOLE = frozenset({"a", "b"})
+
+
+def counted(plan, key):
+    found = {}
+    for entry in plan:
+        found[key(entry)] = found.get(key(entry), 0) + 1
+    return found
+
+
+def test_every_sort_and_size_is_planned_and_spread_over_the_experiments():
+    plan = planned(300, 3, WEIGHTS, WHOLE)
+    assert [entry.number for entry in plan] == list(range(300))
+    assert counted(plan, lambda e: e.category) == {
+        "null": 60, "single": 144, "pair": 30, "outside": 30, "left_out": 18, "finer_chain": 18
+    }  # fmt: skip
+    singles = [entry for entry in plan if entry.category == "single"]
+    assert counted(singles, lambda e: e.multiple) == {1.0: 48, 3.0: 48, 10.0: 48}
+    by_experiment = counted(plan, lambda e: e.experiment)
+    assert all(abs(by_experiment[name] - 300 * part / 0.7) <= 1 for name, part in WEIGHTS.items())
+    for of in (lambda e: e.category == "null", lambda e: e.multiple == 3.0, lambda e: e.category == "outside"):
+        own = counted([entry for entry in plan if of(entry)], lambda e: e.experiment)
+        total = sum(own.values())
+        assert all(abs(own[name] / total - part / 0.7) < 0.1 for name, part in WEIGHTS.items())
+    assert {entry.experiment for entry in plan if entry.category == "finer_chain"} == WHOLE
+    assert [entry.category for entry in plan] != sorted(entry.category for entry in plan)
+    assert plan == planned(300, 3, WEIGHTS, WHOLE)
+    assert plan != planned(300, 4, WEIGHTS, WHOLE)
+    assert plan != planned(300, 3, WEIGHTS, WHOLE, "calibration")
+
+
+def test_few_cases_have_few_experiments():
+    assert counted(planned(20, 1, WEIGHTS, WHOLE), lambda e: e.experiment).keys() == {"a", "b"}
+    assert counted(planned(2, 1, WEIGHTS, WHOLE), lambda e: e.experiment) == {"a": 2}
+    assert len(planned(1, 1, WEIGHTS)) == 1
+
+
+def test_an_object_without_links_has_single_effects_instead_of_finer_chains():
+    found = counted(planned(100, 1, {"bare": 1.0}), lambda e: e.category)
+    assert found == {"null": 20, "single": 54, "pair": 10, "outside": 10, "left_out": 6}
+
+
+def test_no_case_is_no_ensemble():
+    with pytest.raises(ConfigError, match="0 cases"):
+        planned(0, 1, WEIGHTS)
 
 
 # -- sizes ------------------------------------------------------------------------------------------------------------
@@ -339,11 +405,14 @@ def test_kinds_come_before_places(drawn):
     assert len(places) > 6
 
 
-def test_single_effects_come_in_three_sizes(drawn):
+def test_single_effects_have_the_size_that_is_planned(drawn):
     ensemble = drawn(candidates=(SOLID, TILT))
-    sizes = [ensemble._injected("single", np.random.default_rng(seed))[1] for seed in range(30)]
-    assert {1.0, 3.0, 10.0} <= set(sizes)
-    assert ensemble._injected("left_out", np.random.default_rng(1))[1] >= 3.0
+    for size in (1.0, 3.0, 10.0):
+        wanted = Planned(0, "one", "single", size)
+        sizes = [ensemble._injected(wanted, np.random.default_rng(seed))[1] for seed in range(30)]
+        assert size in sizes
+        assert max(sizes) <= size * (1 + 1e-12)
+    assert ensemble._injected(Planned(0, "one", "left_out", 10.0), np.random.default_rng(1))[1] >= 3.0
 
 
 # -- outside the library ----------------------------------------------------------------------------------------------

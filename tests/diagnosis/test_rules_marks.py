@@ -233,7 +233,54 @@ def test_rates_are_over_the_cases_that_they_speak_of():
 def test_no_cases_of_a_sort_have_no_rate():
     found = score([])
     assert found["cases"] == 0
-    assert {found[key] for key in found if key not in ("format", "cases", "detection", "marks")} == {None}
+    whole = ("format", "cases", "detection", "detection_intervals", "marks", "intervals", "experiments")
+    assert {found[key] for key in found if key not in (*whole, "confusion", "calibration")} == {None}
+    assert all(entry["rate"] is None for entry in found["intervals"].values())
+    assert found["confusion"]["counts"] == []
+
+
+@pytest.mark.parametrize(
+    ("count", "total", "low", "high"),
+    # tables of the binomial distribution
+    [(0, 10, 0.0, 0.3085), (10, 10, 0.6915, 1.0), (3, 60, 0.0104, 0.1392), (85, 100, 0.7647, 0.9135)],
+)
+def test_rates_have_binomial_intervals(count, total, low, high):
+    found = scoring.proportion([True] * count + [False] * (total - count))
+    assert (found["count"], found["of"], found["rate"]) == (count, total, count / total)
+    assert (found["low"], found["high"]) == (pytest.approx(low, abs=1e-4), pytest.approx(high, abs=1e-4))
+
+
+def test_what_was_said_of_what_is_counted():
+    marks = [
+        mark(label("single", KV), said("effect", [RIGHT])),
+        mark(label("single", KV), said("effect", ["density@T1"])),
+        mark(label("single", KV), said("no_gap")),
+        mark(label("null"), said("no_gap")),
+        mark(label("null"), said("unknown")),
+        mark(label("null"), said("no_gap")),
+    ]
+    found = scoring.confusion(marks)
+    assert (found["true"], found["said"]) == (
+        ["kelvin_voigt", "null"],
+        ["density", "kelvin_voigt", "no_gap", "unknown"],
+    )
+    assert found["counts"] == [[1, 1, 1, 0], [0, 0, 2, 1]]
+
+
+def test_intervals_and_p_values_are_held_against_what_they_promise():
+    def single(miss):
+        values = {"kelvin_voigt@T1": {"tau": {"value": 0.05 + 0.01 * miss, "std": 0.01, "unit": "s"}}}
+        return mark(label("single", KV), said("effect", [RIGHT], values=values))
+
+    def null(p):
+        told = said("no_gap")
+        return mark(label("null"), {**told, "gap": {**told["gap"], "before": {"p_value": p}}})
+
+    found = scoring.calibration([single(0.5), single(-1.5), single(2.1), null(0.03), null(0.4), null(0.9)])
+    held = {entry["level"]: entry["count"] for entry in found["intervals"]}
+    assert (held[0.5], held[0.8], held[0.9], held[0.95], held[0.99]) == (1, 1, 2, 2, 3)
+    assert {entry["level"]: entry["count"] for entry in found["p_values"]} == {0.01: 0, 0.05: 1, 0.1: 1, 0.2: 1, 0.5: 2}
+    assert {entry["of"] for entry in found["intervals"]} == {3}
 
 
 # -- seals ------------------------------------------------------------------------------------------------------------
@@ -246,6 +293,7 @@ def test_a_sealed_text_is_sorted_and_holds_all():
             "case": "case_000",
             "category": "single",
             "injected": [{"kind": "kelvin_voigt", "location": "T1", "values": {"tau": 0.05}}],
+            "experiment": "",
             "multiple": 3.0,
             "truth": {"T1.bend": 12.0},
         }

@@ -9,7 +9,7 @@ import pytest
 
 from yid_ocp.solvers import Iterate
 from yid_ocp.workflow.command import carry_out
-from yid_ocp.workflow.progress import SILENT, BarProgress, PlainProgress, shown
+from yid_ocp.workflow.progress import SILENT, BarProgress, PlainProgress, duration_words, shown
 
 ENTRY = Iterate(3, 12.5, np.zeros(1), 0.1, 4, 1.25, "first 2 s")
 
@@ -36,6 +36,50 @@ def test_the_tenths_begin_again_with_every_stage(capsys):
         progress.stage("tracking")
         progress.advance(5, 10, "half")
     assert capsys.readouterr().err.count("5 of 10, half") == 2
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock that is set by hand."""
+    now = [100.0]
+    monkeypatch.setattr("yid_ocp.workflow.progress.time.monotonic", lambda: now[0])
+    return now
+
+
+def test_the_time_left_counts_what_this_run_did(capsys, clock):
+    progress = PlainProgress()
+    progress.stage("diagnosing")
+    for done, now in ((10, 100.0), (12, 160.0), (19, 370.0), (20, 400.0)):
+        clock[0] = now
+        progress.advance(done, 20, f"case {done}")
+    lines = capsys.readouterr().err.splitlines()[1:]
+    # ten were done before and took nothing; two in a minute leave eight for four minutes
+    assert lines == [
+        "  10 of 20, case 10",
+        "  12 of 20, case 12, about 4 min left",
+        "  19 of 20, case 19, about 30 s left",
+        "  20 of 20, case 20",
+    ]
+
+
+def test_slow_parts_have_a_line_each_and_quick_ones_one_in_ten(capsys, clock):
+    progress = PlainProgress()
+    progress.stage("diagnosing")
+    for done in range(4):
+        clock[0] += 30.0
+        progress.advance(done, 1000, f"case {done}")
+    assert len(capsys.readouterr().err.splitlines()) == 5
+    for done in range(4, 99):
+        clock[0] += 0.01
+        progress.advance(done, 1000, f"case {done}")
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"), [(0.4, "0 s"), (89.0, "89 s"), (90.0, "2 min"), (5399.0, "90 min"), (9000.0, "2.5 h")]
+)
+def test_times_for_people(seconds, words):
+    assert duration_words(seconds) == words
 
 
 class Bars:
@@ -66,7 +110,7 @@ def test_a_bar_moves_with_its_stage_and_is_full_when_the_next_begins():
         ("update", 1, {"description": "solving: iteration 3, cost 12.5, 1.2 s, first 2 s"}),
         ("update", 1, {"description": "solving", "total": 1, "completed": 1}),
         ("add", "tracking", None),
-        ("update", 4, {"description": "tracking: frame 1", "completed": 1, "total": 4}),
+        ("update", 4, {"description": "tracking: 1 of 4, frame 1", "completed": 1, "total": 4}),
         ("update", 4, {"description": "tracking", "total": 1, "completed": 1}),
     ]
 

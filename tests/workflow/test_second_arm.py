@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.workflow.build import build_system
-from yid_ocp.workflow.identifiability import second_arm
+from yid_ocp.workflow.second_arm import second_arm
 
 
 def test_the_other_arm_of_a_robot(repository):

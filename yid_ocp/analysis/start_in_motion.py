@@ -53,8 +53,7 @@ def safe_start(problem: EstimationProblem, solver: Solver, solution: Solution, l
     moving = _moving(problem)
     if not memory or not moving or solution.evaluation is None:
         return SafeStart(problem, solution)
-    free = tuple(name for name in problem.free if name not in (*memory, SPEED_SCALE))
-    without = problem.freeing(free).at(dict.fromkeys(memory, 0.0))
+    without = without_memory(problem)
     known = dict(zip(solution.names, solution.x, strict=True))
     other = solve(without, solver, without.vector(known).tolist(), limits=limits)
     if other.evaluation is None:
@@ -65,6 +64,13 @@ def safe_start(problem: EstimationProblem, solver: Solver, solution: Solution, l
             return SafeStart(problem, solution, f"memory is kept: {_words(kept, dropped)}")
         return SafeStart(without, other, f"memory is not kept: {_words(kept, dropped)}")
     return SafeStart(without, other, "memory is not kept: too few recordings start in motion to bear it out")
+
+
+def without_memory(problem: EstimationProblem) -> EstimationProblem:
+    """The problem of a cable that remembers nothing of its start."""
+    memory = [name for name in problem.shared if name.endswith(MEMORY)]
+    free = tuple(name for name in problem.free if name not in (*memory, SPEED_SCALE))
+    return problem.freeing(free).at(dict.fromkeys(memory, 0.0))
 
 
 def _words(kept: float, dropped: float) -> str:

@@ -145,6 +145,10 @@ class WhatIfOptions:
     only: tuple[str, ...] | None = None
 
 
+Judge = Callable[[Sequence[Sequence[Change]], float], list[Outcome]]
+"""From sets of changes, and the factor by which variances are larger than stated, to what they would tell."""
+
+
 def what_if(
     problem: EstimationProblem,
     solution: Solution | ArrayLike | None = None,
@@ -154,6 +158,7 @@ def what_if(
     second_arm: System | None = None,
     options: WhatIfOptions | None = None,
     progress: Callable[[str], None] | None = None,
+    judge: Judge | None = None,
 ) -> WhatIf:
     """Rank changes of an experiment by how many parameters they would make identifiable.
 
@@ -173,6 +178,8 @@ def what_if(
     options : WhatIfOptions, optional
     progress : callable, optional
         Told what takes time.
+    judge : callable, optional
+        Judges sets of changes elsewhere, as `judged_changes` does there.
 
     Returns
     -------
@@ -190,22 +197,38 @@ def what_if(
     fit = None if solution is None else identifiability(problem, x, start=start, grasp_std=grasp_std)
     inflation = 1.0 if fit is None else max(1.0, fit.chi2_per_dof)
     setting = Setting(problem, x, start, grasp_std, second_arm, options.torque_std, options.seed)
-    outcomes = _Outcomes(setting, LayoutBuilder(setting, progress), inflation)
-    base = outcomes.of(())
+    outcomes = _Outcomes(setting, LayoutBuilder(setting, progress), inflation, judge)
+    (base,) = outcomes.of_all([()])
     if not base.verdicts:
         raise SolverError(base.message)
     known = possible_changes(setting, outcomes.builder)
     changes = [change for change in known if options.only is None or change.name in options.only]
-    singles = ranked([outcomes.of((change,)) for change in changes])
+    singles = ranked(outcomes.of_all([(change,) for change in changes]))
     greedy = _greedy(outcomes, changes, base, options.largest)
     smallest = _smallest(outcomes, changes, base, options.largest)
     return WhatIf(base, tuple(singles), tuple(ranked(smallest)), tuple(greedy), outcomes.count)
 
 
+def judged_changes(setting: Setting, sets: Sequence[Sequence[str]], inflation: float) -> list[Outcome]:
+    """What an experiment would tell with each of several sets of changes, by their names.
+
+    Parameters
+    ----------
+    setting : Setting
+    sets : sequence of sequence of str
+        Names of `possible_changes`.
+    inflation : float
+        Factor by which variances are larger than stated.
+    """
+    outcomes = _Outcomes(setting, LayoutBuilder(setting), inflation)
+    known = {change.name: change for change in possible_changes(setting, outcomes.builder)}
+    return outcomes.of_all([[known[name] for name in names] for names in sets])
+
+
 def _smallest(outcomes: _Outcomes, changes: Sequence[Change], base: Outcome, largest: int) -> list[Outcome]:
     """All sets of as few changes as will do with which every parameter is identifiable."""
     for size in range(0 if base.complete else 1, largest + 1):
-        found = [outcomes.of(chosen) for chosen in itertools.combinations(changes, size) if compatible(chosen)]
+        found = outcomes.of_all([chosen for chosen in itertools.combinations(changes, size) if compatible(chosen)])
         complete = [outcome for outcome in found if outcome.complete]
         if complete or not changes:
             return complete
@@ -253,10 +276,13 @@ class _Outcomes:
     builder : LayoutBuilder
     inflation : float
         Factor by which variances are larger than stated.
+    judge : callable, optional
+        Who works them out instead.
     """
 
-    def __init__(self, setting: Setting, builder: LayoutBuilder, inflation: float) -> None:
+    def __init__(self, setting: Setting, builder: LayoutBuilder, inflation: float, judge: Judge | None = None) -> None:
         self.setting, self.builder, self.inflation = setting, builder, inflation
+        self._judge = judge or (lambda sets, _: [self._outcome(changes) for changes in sets])
         self._known: dict[frozenset[str], Outcome] = {}
 
     @property
@@ -264,12 +290,13 @@ class _Outcomes:
         """Sets worked out so far."""
         return len(self._known)
 
-    def of(self, changes: Sequence[Change]) -> Outcome:
-        """The outcome of some changes together."""
-        key = frozenset(change.name for change in changes)
-        if key not in self._known:
-            self._known[key] = self._outcome(changes)
-        return self._known[key]
+    def of_all(self, sets: Sequence[Sequence[Change]]) -> list[Outcome]:
+        """The outcomes of several sets of changes."""
+        keys = [frozenset(change.name for change in changes) for changes in sets]
+        new = {key: changes for key, changes in zip(keys, sets, strict=True) if key not in self._known}
+        if new:
+            self._known |= dict(zip(new, self._judge(list(new.values()), self.inflation), strict=True))
+        return [self._known[key] for key in keys]
 
     def _outcome(self, changes: Sequence[Change]) -> Outcome:
         names = tuple(change.name for change in changes)
@@ -342,7 +369,7 @@ def _greedy(outcomes: _Outcomes, changes: Sequence[Change], base: Outcome, large
         trials = [(*chosen, change) for change in changes if change not in chosen and compatible((*chosen, change))]
         if not trials:
             break
-        found = [outcomes.of(trial) for trial in trials]
+        found = outcomes.of_all(trials)
         top = ranked(found)[0]
         if (top.identifiable, top.gain) <= (best.identifiable, best.gain):
             break

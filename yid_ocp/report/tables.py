@@ -138,31 +138,55 @@ def blind_table(result: Mapping[str, Any]) -> list[str]:
     def row(*cells: str) -> str:
         return f"| {' | '.join(cells)} |"
 
-    lines = [row("what", "value"), row("---", "---")]
+    def rate(own: Mapping[str, Any]) -> str:
+        if not own["of"]:
+            return "-"
+        return f"{share(own['rate'])} ({own['count']} of {own['of']}, {share(own['low'])} to {share(own['high'])})"
+
+    sure = {name: rate(own) for name, own in result["intervals"].items()}
+    lines = [row("what", "value, and its binomial 95 % interval"), row("---", "---")]
     lines += [
-        row("false alarms on clean data", share(result["false_alarms"])),
-        row("true kind and place first, of the gaps found", share(result["kind_first"])),
-        row("among the first two", share(result["kind_in_two"])),
-        row("place first", share(result["location_first"])),
-        row("sets named as not separable hold the truth", share(result["confusable_covers"])),
+        row("false alarms on clean data", sure["false_alarms"]),
+        row("true kind and place first, of the gaps found", sure["kind_first"]),
+        row("among the first two", sure["kind_in_two"]),
+        row("place first", sure["location_first"]),
+        row("sets named as not separable hold the truth", sure["confusable_covers"]),
         row("their size", "-" if result["confusable_size"] is None else f"{result['confusable_size']:.1f}"),
-        row("unknown said of effects outside the library", share(result["unknown_recall"])),
-        row("their place", share(result["unknown_location"])),
-        row("pairs found", share(result["pairs_right"])),
+        row("unknown said of effects outside the library", sure["unknown_recall"]),
+        row("their place", sure["unknown_location"]),
+        row("pairs found", sure["pairs_right"]),
         row("closure over that of the true effect refitted", share(result["closure_of_best"])),
         row("median error of the effects' parameters", share(result["parameter_error"], 1)),
-        row("their 95 % intervals that hold the truth", share(result["interval_coverage"])),
+        row("their 95 % intervals that hold the truth", sure["interval_coverage"]),
         row("time of one diagnosis", "-" if result["seconds"] is None else f"{result['seconds']:.0f} s"),
     ]
     lines += ["", row("size / detectable", "cases", "gap seen", "right"), row(*["---"] * 4)]
     for size, entry in result["detection"].items():
-        lines.append(row(size, str(entry["cases"]), share(entry["gap"]), share(entry["right"])))
-    head = ("case", "sort", "truth", "size", "verdict", "added", "not separable", "place", "closure", "best", "time")
+        own = result["detection_intervals"][size]
+        lines.append(row(size, str(entry["cases"]), rate(own["gap"]), rate(own["right"])))
+    lines += ["", row("experiment", "cases", "false alarms", "right"), row(*["---"] * 4)]
+    for name, own in result["experiments"].items():
+        lines.append(row(name, str(own["cases"]), rate(own["false_alarms"]), rate(own["right"])))
+    head = (
+        "case",
+        "experiment",
+        "sort",
+        "truth",
+        "size",
+        "verdict",
+        "added",
+        "not separable",
+        "place",
+        "closure",
+        "best",
+        "time",
+    )
     lines += ["", row(*head), row(*["---"] * len(head))]
     for entry in result["marks"]:
         lines.append(
             row(
                 entry["case"],
+                entry["experiment"],
                 entry["category"],
                 entry["truth"],
                 "-" if entry["multiple"] is None else f"{entry['multiple']:.3g}",

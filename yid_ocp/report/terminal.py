@@ -16,6 +16,7 @@ from yid_ocp.report.earlier import (
     history_sentences,
     run_rows,
 )
+from yid_ocp.report.fleet import SHOWN, batch_rows, batch_sentences, spread_rows
 from yid_ocp.report.tables import (
     blind_table,
     distance_rows,
@@ -473,6 +474,13 @@ def simulate_summary(result: Mapping[str, Any]) -> list[str]:
 def blind_summary(result: Mapping[str, Any]) -> list[str]:
     """Lines that tell a person what a `yid-blind/1` result says: the score alone."""
     return [line.strip("| ").replace(" | ", ": ") for line in blind_table(result)[2:15]]
+
+
+def batch_summary(result: Mapping[str, Any]) -> list[str]:
+    """Lines that tell a person what a `yid-batch/1` result says."""
+    spread = spread_rows(result)
+    said = [line for text in batch_sentences(result) for line in textwrap.wrap(text, 100)]
+    return [*table(batch_rows(result, SHOWN)), "", *(table(spread) if len(spread) > 1 else []), "", *said]
 
 
 def recording_summary(recording: Recording) -> list[str]:

@@ -8,26 +8,40 @@ import logging
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from concurrent.futures import Executor
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from yid_ocp.config.reader import DIAGNOSIS_DEFAULT, load_config
+from yid_ocp.config.reader import DEFAULT, DIAGNOSIS_DEFAULT, load_config
 from yid_ocp.config.settings import Run, dump_config
 from yid_ocp.data.hdf5 import read_recording, write_recording
-from yid_ocp.diagnosis.blind import Case, Ensemble, Label, answer, best_closure, mark, opened, score, seal
-from yid_ocp.errors import OutputError, YidError
+from yid_ocp.diagnosis.blind import (
+    PURPOSES,
+    Case,
+    Label,
+    Planned,
+    answer,
+    best_closure,
+    mark,
+    opened,
+    planned,
+    score,
+    seal,
+)
+from yid_ocp.errors import ConfigError, OutputError, YidError
 from yid_ocp.files import jsonable, write_json, write_text
-from yid_ocp.parallel import Task, TaskResult, run_tasks
+from yid_ocp.parallel import LOCAL, Task, Workers, run_tasks, values_of
+from yid_ocp.report.pictures import draw_blind
 from yid_ocp.report.tables import blind_table
 from yid_ocp.report.terminal import blind_summary
-from yid_ocp.workflow.build import build_problem, build_system
-from yid_ocp.workflow.command import DONE, carry_out
-from yid_ocp.workflow.folder import versions
+from yid_ocp.version import package_code, versions
+from yid_ocp.workflow.command import DONE, carry_out, given_workers
+from yid_ocp.workflow.experiments import VARIATIONS, Experiment, experiments_of, refuse_unfit
 from yid_ocp.workflow.progress import SILENT, Progress
 
 COMMITMENT, LABELS, RESULT, TABLE = "commitment.json", "sealed/labels.json", "result.json", "table.md"
-CONFIG, CASES, ANSWERS, BEST = "config.yaml", "cases", "answers", "best"
+CONFIGS, PREPARED, DRAWN, CASES, ANSWERS, BEST = "configs", "prepared", "sealed/drawn", "cases", "answers", "best"
 log = logging.getLogger(__name__)
 
 
@@ -41,31 +55,53 @@ class BlindOutcome:
 
 def run(arguments: argparse.Namespace) -> int:
     """The command."""
-    settings = load_config(arguments.config, arguments.overrides, DIAGNOSIS_DEFAULT)
-    out = arguments.out or f"{settings.name}-blind-{arguments.seed}"
+    given = arguments.configs or [None]
+    runs = [load_config(path, arguments.overrides, DIAGNOSIS_DEFAULT) for path in given]
+    if not arguments.configs and arguments.cases >= TWO_ARMS:
+        runs.append(load_config(None, arguments.overrides, DEFAULT))
+    workers = given_workers(arguments) or LOCAL
+    purpose = PURPOSES[int(arguments.calibration)]
+    out = arguments.out or f"{runs[0].name}-blind-{'calibration-' if arguments.calibration else ''}{arguments.seed}"
 
     def proved(shown: Progress) -> BlindOutcome:
-        return run_blind(settings, out, arguments.cases, arguments.seed, shown)
+        return run_blind(runs, out, arguments.cases, arguments.seed, shown, workers, purpose)
 
     carry_out(proved, blind_summary, arguments.quiet)
     return DONE
 
 
-def run_blind(run: Run, out: str | Path, count: int = 20, seed: int = 1, progress: Progress = SILENT) -> BlindOutcome:
+TWO_ARMS = 100
+"""Cases from which the embedded proof has experiments with two arms as well."""
+
+
+def run_blind(
+    runs: Sequence[Run],
+    out: str | Path,
+    count: int = 20,
+    seed: int = 1,
+    progress: Progress = SILENT,
+    workers: Workers | Executor = LOCAL,
+    purpose: str = PURPOSES[0],
+) -> BlindOutcome:
     """Prove a diagnosis blind, in several processes; what a folder of the same name holds is not done again.
 
     Parameters
     ----------
-    run : Run
-        The experiment: its model, its first recording's posture and sensors, `diagnosis.candidates`.
+    runs : sequence of Run
+        Configurations: models, posture and sensors of their first recordings, `diagnosis.candidates`. Each is varied
+        (`workflow.experiments.VARIATIONS`) as far as there are cases for it.
     out : str or Path
-        Folder: `config.yaml`, `cases/` (recordings), `sealed/labels.json`, `commitment.json` (hash of the labels,
-        written before the first diagnosis), `answers/` and `best/` (results of tasks, see `yid_ocp.parallel`), then
-        `result.json` (`yid-blind/1`) and `table.md`.
+        Folder: `configs/`, `prepared/` (what is detectable in every experiment), `cases/` (recordings),
+        `sealed/labels.json`, `commitment.json` (hash of the labels, written before the first diagnosis, and of the
+        sources that made the cases), `answers/` and `best/` (results of tasks, see `yid_ocp.parallel`), then
+        `result.json` (`yid-blind/1`), `table.md` and pictures.
     count : int
         Number of cases.
     seed : int
     progress : Progress, optional
+    workers : Workers or Executor, optional
+    purpose : {'report', 'calibration'}
+        The same seed draws other cases for each.
 
     Returns
     -------
@@ -73,26 +109,25 @@ def run_blind(run: Run, out: str | Path, count: int = 20, seed: int = 1, progres
 
     Raises
     ------
-    ConfigError, DataError, ModelError, SolverError
+    ConfigError, DataError, ModelError, SolverError, WorkerError
     OutputError
         The folder holds another ensemble.
     """
-    folder = Path(out)
+    folder = Path(out).absolute()
     if count < 1:
-        raise run.refuse(f"an ensemble of {count} cases", "diagnosis", hint="give --cases from 1")
-    if run.diagnosis.noise_fraction < 1 or any(entry.std is not None for entry in run.sensors.values()):
-        raise run.refuse(
-            "virtual recordings have the noise of `virtual_experiment`, not that of these settings",
-            "sensors",
-            hint="leave sensors.*.std and diagnosis.noise_fraction out",
-        )
-    cases = _made(run, folder, count, seed, progress)
+        raise runs[0].refuse(f"an ensemble of {count} cases", "diagnosis", hint="give --cases from 1")
+    if seed < 0:
+        raise ConfigError(f"seed = {seed}", where="--seed", allowed="a whole number from 0")
+    for entry in runs:
+        refuse_unfit(entry)
     try:
+        cases = _made(_named(runs), folder, count, seed, progress, workers, purpose)
         progress.stage(f"diagnosing {count} cases")
-        answers = _values(run_tasks(diagnosed, cases, folder / ANSWERS, progress=progress.advance))
-        labels = opened((folder / LABELS).read_text("utf-8"), json.loads((folder / COMMITMENT).read_text())["sha256"])
+        answers = values_of(run_tasks(diagnosed, cases, folder / ANSWERS, workers, progress.advance))
+        commitment = json.loads((folder / COMMITMENT).read_text("utf-8"))
+        labels = opened((folder / LABELS).read_text("utf-8"), commitment["sha256"])
         progress.stage("scoring")
-        best = _best(cases, labels, answers, folder, progress)
+        best = _best(cases, labels, answers, folder, progress, workers)
     except KeyboardInterrupt:
         log.warning("finished cases are in %s; the same command goes on with the others", folder)
         raise
@@ -100,84 +135,166 @@ def run_blind(run: Run, out: str | Path, count: int = 20, seed: int = 1, progres
         mark(label, found["result"], best.get(label.case, math.nan), float(found["seconds"]))
         for label, found in zip(labels, answers, strict=True)
     ]
-    result = score(marks) | {"seed": seed, "versions": versions(), "candidates": run.diagnosis.candidates}
+    result = score(marks) | {
+        "seed": seed,
+        "purpose": purpose,
+        "code": package_code(),
+        "code_of_cases": commitment["code"],
+        "versions": versions(),
+        "candidates": {entry.name: entry.diagnosis.candidates for entry in runs},
+        "variations": {name: varied.words for name, varied in VARIATIONS.items()},
+    }
     written = jsonable(result)
     write_json(folder / RESULT, written)
     write_text(folder / TABLE, "\n".join(blind_table(written)) + "\n")
+    draw_blind(folder, written)
     return BlindOutcome(folder, written)
 
 
 # -- the ensemble -----------------------------------------------------------------------------------------------------
 
 
-def _made(run: Run, folder: Path, count: int, seed: int, progress: Progress) -> list[Task]:
+def _named(runs: Sequence[Run]) -> dict[str, Run]:
+    names = [entry.name for entry in runs]
+    twice = [name for i, name in enumerate(names) if name in names[:i]]
+    if twice:
+        raise ConfigError(
+            f"two configurations are called {twice[0]}", where="blind", hint="give each a name of its own"
+        )
+    return dict(zip(names, runs, strict=True))
+
+
+def _made(
+    runs: Mapping[str, Run],
+    folder: Path,
+    count: int,
+    seed: int,
+    progress: Progress,
+    workers: Workers | Executor,
+    purpose: str,
+) -> list[Task]:
     """The diagnosis of every case, of those in the folder or made now; labels are sealed before this returns."""
     commitment = folder / COMMITMENT
+    configs = {name: dump_config(entry) for name, entry in runs.items()}
     if not commitment.exists():
-        _make(run, folder, count, seed, progress)
+        _make(configs, folder, count, seed, progress, workers, purpose)
     said = json.loads(commitment.read_text("utf-8"))
-    if (said["cases"], said["seed"], said["config"]) != (count, seed, dump_config(run)):
+    if (said["cases"], said["seed"], said["purpose"], said["configs"]) != (count, seed, purpose, configs):
         raise OutputError(
-            f"'{folder}' holds another ensemble ({said['cases']} cases, seed {said['seed']})",
+            f"'{folder}' holds another ensemble ({said['cases']} cases, seed {said['seed']}, for {said['purpose']})",
             where="--out",
-            hint="choose another folder, or the same configuration, --cases and --seed",
+            hint="choose another folder, or the same configurations, --cases, --seed and --calibration",
         )
     tasks = []
     for entry in json.loads((folder / CASES / "cases.json").read_text("utf-8")):
         name = str(entry["name"])
+        config, _, variation = str(entry["experiment"]).rpartition(".")
         arguments = {
-            "config": folder / CONFIG,
-            "seed": seed,
+            **Experiment(folder / CONFIGS / f"{config}.yaml", variation, seed, purpose).told,
+            "first": folder / PREPARED / f"{entry['experiment']}.h5",
             "name": name,
-            "estimate": folder / CASES / f"{name}_estimate.h5",
-            "held_out": folder / CASES / f"{name}_held_out.h5",
+            "estimate": [folder / CASES / file for file in entry["estimate"]],
+            "held_out": folder / CASES / entry["held_out"],
         }
         tasks.append(Task(name, {**arguments, "without": entry["without"]}))
     return tasks
 
 
-def _make(run: Run, folder: Path, count: int, seed: int, progress: Progress) -> None:
+def _make(
+    configs: Mapping[str, str],
+    folder: Path,
+    count: int,
+    seed: int,
+    progress: Progress,
+    workers: Workers | Executor,
+    purpose: str,
+) -> None:
     """Draw the cases and commit to their labels."""
-    progress.stage("building the model and its compiled step")
-    ensemble = _ensemble(run, seed)
     try:
-        for name in (CASES, "sealed"):
+        for name in (CONFIGS, PREPARED, CASES, DRAWN):
             (folder / name).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"the folder cannot be made: {error}", where=str(folder)) from error
-    config = dump_config(run)
-    write_text(folder / CONFIG, config)
+    for name, text in configs.items():
+        write_text(folder / CONFIGS / f"{name}.yaml", text)
+    files = {name: folder / CONFIGS / f"{name}.yaml" for name in configs}
+    experiments, chains = experiments_of(files, seed, purpose)
+    weights = {name: VARIATIONS[entry.variation].weight for name, entry in experiments.items()}
+    plan = planned(count, seed, weights, chains, purpose)
+    used = [name for name in experiments if any(entry.experiment == name for entry in plan)]
+    progress.stage(f"preparing {len(used)} {'experiment' if len(used) == 1 else 'experiments'}")
+    tasks = [Task(name, {**experiments[name].told, "folder": str(folder / PREPARED), "name": name}) for name in used]
+    values_of(run_tasks(prepared, tasks, folder / PREPARED / "tasks", workers, progress.advance))
     progress.stage(f"making {count} cases")
-    cases, labels = [], []
-    for number in range(count):
-        progress.advance(number, count, f"case {number}")
-        case, label = ensemble.draw(number, count)
-        for recording in (case.estimate, case.held_out):
-            write_recording(recording, folder / CASES / f"{recording.name}.h5")
-        cases.append({"name": case.name, "without": list(case.without)})
-        labels.append(label)
-    text, digest = seal(labels)
+    tasks = []
+    for entry in plan:
+        name = entry.experiment
+        known = {"first": folder / PREPARED / f"{name}.h5", "detectable": folder / PREPARED / f"{name}.json"}
+        wanted = {"planned": asdict(entry), "folder": str(folder / CASES)}
+        tasks.append(Task(f"case {entry.number}", {**experiments[name].told, **known, **wanted}))
+    made = values_of(run_tasks(drawn, tasks, folder / DRAWN, workers, progress.advance))
+    text, digest = seal([Label.from_dict(entry["label"]) for entry in made])
     write_text(folder / LABELS, text)
-    write_json(folder / CASES / "cases.json", cases)
-    write_json(folder / COMMITMENT, {"sha256": digest, "cases": count, "seed": seed, "config": config})
-
-
-def _ensemble(run: Run, seed: int) -> Ensemble:
-    problem = build_problem(run)
-    finer = (lambda times: build_system(run, times)) if problem.system.segments else None
-    return Ensemble(problem, seed, finer, run.diagnosis.candidates, run.diagnosis)
+    write_json(folder / CASES / "cases.json", [entry["case"] for entry in made])
+    said = {"sha256": digest, "cases": count, "seed": seed, "purpose": purpose, "configs": dict(configs)}
+    write_json(folder / COMMITMENT, said | {"code": package_code()})
 
 
 # -- tasks: each builds the problem again, which takes a twentieth of the time of a diagnosis -------------------------
 
 
+def prepared(config: Path, variation: str, seed: int, purpose: str, folder: str, name: str) -> dict[str, int]:
+    """Write an experiment's first recording, and how large every candidate has to be to show."""
+    experiment = Experiment(config, variation, seed, purpose)
+    first = Path(folder) / f"{name}.h5"
+    experiment.begin(first)
+    _, ensemble = experiment.ensemble(first)
+    detectable = [entry.to_dict() for entry in ensemble.detectable]
+    write_json(Path(folder) / f"{name}.json", detectable)
+    return {"candidates": len(detectable)}
+
+
+def drawn(
+    config: Path,
+    variation: str,
+    seed: int,
+    purpose: str,
+    first: Path,
+    detectable: Path,
+    planned: Mapping[str, Any],
+    folder: str,
+) -> dict[str, Any]:
+    """Make a case: write its recordings, and say its label and what its diagnosis is told."""
+    _, ensemble = Experiment(config, variation, seed, purpose).ensemble(first)
+    ensemble.knowing(json.loads(detectable.read_text("utf-8")))
+    case, label = ensemble.draw(Planned(**planned))
+    for recording in (*case.estimate, case.held_out):
+        write_recording(recording, Path(folder) / f"{recording.name}.h5")
+    told = {
+        "name": case.name,
+        "experiment": planned["experiment"],
+        "estimate": [f"{recording.name}.h5" for recording in case.estimate],
+        "held_out": f"{case.held_out.name}.h5",
+        "without": list(case.without),
+    }
+    found: dict[str, Any] = jsonable({"label": label.to_dict(), "case": told})
+    return found
+
+
 def diagnosed(
-    config: Path, seed: int, name: str, estimate: Path, held_out: Path, without: Sequence[str]
+    config: Path,
+    variation: str,
+    seed: int,
+    purpose: str,
+    first: Path,
+    name: str,
+    estimate: Sequence[Path],
+    held_out: Path,
+    without: Sequence[str],
 ) -> dict[str, Any]:
     """The answer to a case, from its recordings alone: {seconds, result}, result as `yid-diagnosis/1`."""
-    run = load_config(config)
-    ensemble = _ensemble(run, seed)
-    case = Case(name, read_recording(estimate), read_recording(held_out), tuple(without))
+    run, ensemble = Experiment(config, variation, seed, purpose).ensemble(first)
+    case = _case(name, estimate, held_out, without)
     begun = time.perf_counter()
     try:
         result = answer(ensemble, case, run.diagnosis.candidates, run.diagnosis).to_dict()
@@ -188,16 +305,28 @@ def diagnosed(
 
 
 def closed_at_best(
-    config: Path, seed: int, name: str, estimate: Path, held_out: Path, label: Mapping[str, Any]
+    config: Path,
+    variation: str,
+    seed: int,
+    purpose: str,
+    first: Path,
+    name: str,
+    estimate: Sequence[Path],
+    held_out: Path,
+    label: Mapping[str, Any],
 ) -> float | None:
     """What of a case's gap its true effects close, refitted; None where that cannot be worked out."""
-    run = load_config(config)
-    case = Case(name, read_recording(estimate), read_recording(held_out), ())
+    run, ensemble = Experiment(config, variation, seed, purpose).ensemble(first)
+    case = _case(name, estimate, held_out, ())
     try:
-        best = best_closure(_ensemble(run, seed), case, Label.from_dict(label), run.diagnosis.candidates)
+        best = best_closure(ensemble, case, Label.from_dict(label), run.diagnosis.candidates)
     except YidError:
         return None
     return best if math.isfinite(best) else None
+
+
+def _case(name: str, estimate: Sequence[Path], held_out: Path, without: Sequence[str]) -> Case:
+    return Case(name, tuple(read_recording(path) for path in estimate), read_recording(held_out), tuple(without))
 
 
 def _best(
@@ -206,6 +335,7 @@ def _best(
     answers: Sequence[Mapping[str, Any]],
     folder: Path,
     progress: Progress,
+    workers: Workers | Executor,
 ) -> dict[str, float]:
     """By case, what its true effects close, where one of them or two were withheld and a gap was seen."""
     tasks = []
@@ -214,19 +344,8 @@ def _best(
         if gap and label.category in ("single", "pair"):
             arguments = {key: value for key, value in case.arguments.items() if key != "without"}
             tasks.append(Task(case.name, {**arguments, "label": label.to_dict()}))
-    best = _values(run_tasks(closed_at_best, tasks, folder / BEST, progress=progress.advance))
+    best = values_of(run_tasks(closed_at_best, tasks, folder / BEST, workers, progress.advance))
     return {task.name: value for task, value in zip(tasks, best, strict=True) if value is not None}
-
-
-def _values(results: Sequence[TaskResult]) -> list[Any]:
-    """Values of tasks that are all done."""
-    failed = [entry for entry in results if entry.error]
-    if failed:
-        raise RuntimeError(
-            f"{len(failed)} of {len(results)} cases failed, {failed[0].name} with {failed[0].error}; "
-            "the same command tries them again"
-        )
-    return [entry.value for entry in results]
 
 
 def _nothing(message: str) -> dict[str, Any]:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
+from yid_ocp.parallel import Workers
 from yid_ocp.workflow.progress import Progress, shown
 
 DONE, FAILED, WRONG_INPUT = 0, 1, 2
@@ -55,6 +57,21 @@ def carry_out(
     near = os.path.relpath(outcome.folder)
     print(outcome.folder if quiet or near.startswith("..") else f"run folder: {near}")
     return outcome
+
+
+def given_workers(arguments: argparse.Namespace) -> Workers | None:
+    """The workers that a command is given by `--workers` or `--scheduler`, known to be there; None for neither.
+
+    Raises
+    ------
+    ConfigError, WorkerError
+        As `Workers`.
+    """
+    if arguments.workers is None and not arguments.scheduler:
+        return None
+    workers = Workers(arguments.workers, arguments.scheduler)
+    workers.check()
+    return workers
 
 
 def print_lines(lines: Sequence[str]) -> None:

@@ -6,12 +6,10 @@ import contextlib
 import json
 import logging
 import os
-import platform
 import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import metadata
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -21,6 +19,7 @@ from yid_ocp import interruption
 from yid_ocp.config.settings import Run, dump_config
 from yid_ocp.errors import OutputError
 from yid_ocp.files import file_sha256, jsonable, reason, write_text
+from yid_ocp.version import versions
 from yid_ocp.workflow.build import input_files
 
 log = logging.getLogger(__name__)
@@ -309,14 +308,3 @@ def _clear(temporary: Path | None, made: Sequence[Path]) -> None:
         for parent in made:
             with contextlib.suppress(OSError):
                 parent.rmdir()
-
-
-def versions() -> dict[str, str]:
-    """Versions of Python, this package and what its numbers depend on."""
-    result = {"python": platform.python_version(), "platform": f"{platform.system()} {platform.machine()}"}
-    for package in ("yid-ocp", "casadi", "numpy", "scipy", "h5py"):
-        try:
-            result[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            result[package] = "not installed"
-    return result

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from concurrent.futures import Executor
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -20,9 +21,9 @@ from yid_ocp.analysis.profile import small
 from yid_ocp.analysis.start_in_motion import safe_start
 from yid_ocp.analysis.what_if import Outcome, WhatIf, what_if
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.settings import GraspSettings, Run
-from yid_ocp.errors import YidError
+from yid_ocp.config.settings import Run
 from yid_ocp.model.system import System
+from yid_ocp.parallel import Workers
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.null_test import GapLimits
 from yid_ocp.report.html import write_report
@@ -30,13 +31,14 @@ from yid_ocp.report.sections import Findings
 from yid_ocp.report.terminal import identifiability_summary
 from yid_ocp.solvers import Iterate, Solution, Status, solve
 from yid_ocp.workflow.build import build_problem, build_step, build_system
-from yid_ocp.workflow.command import DONE, FAILED, carry_out
+from yid_ocp.workflow.command import DONE, FAILED, carry_out, given_workers
 from yid_ocp.workflow.doubts import doubts_result
+from yid_ocp.workflow.elsewhere import Elsewhere
 from yid_ocp.workflow.folder import RunFolder, new_run_folder
 from yid_ocp.workflow.progress import SILENT, Progress
+from yid_ocp.workflow.second_arm import second_arm
 
 FORMAT = "yid-identifiability/1"
-OTHER_SIDE = {"left": "right", "right": "left"}
 
 
 @dataclass(frozen=True)
@@ -91,15 +93,21 @@ def run(arguments: argparse.Namespace) -> int:
         what_if=arguments.what_if,
     )
 
+    workers = given_workers(arguments)
+
     def judged(shown: Progress) -> IdentifiabilityOutcome:
-        return run_identifiability(settings, arguments.out, shown, asked)
+        return run_identifiability(settings, arguments.out, shown, asked, workers)
 
     outcome = carry_out(judged, identifiability_summary, arguments.quiet)
     return DONE if outcome.ok else FAILED
 
 
 def run_identifiability(
-    run: Run, out: str | Path | None = None, progress: Progress = SILENT, question: Question | None = None
+    run: Run,
+    out: str | Path | None = None,
+    progress: Progress = SILENT,
+    question: Question | None = None,
+    workers: Workers | Executor | None = None,
 ) -> IdentifiabilityOutcome:
     """Solve, judge and write the run folder.
 
@@ -110,6 +118,8 @@ def run_identifiability(
         The run folder; see `new_run_folder`.
     progress : Progress, optional
     question : Question, optional
+    workers : Workers or Executor, optional
+        Who works out intervals, one parameter a task, and the experiments of `what_if`; this process when absent.
 
     Returns
     -------
@@ -127,17 +137,22 @@ def run_identifiability(
         system = build_system(run)
         problem = build_problem(run, build_step(run, with_grasp_offsets(system)))
         limits = run.diagnosis.of_a_fit
-        solution = None
+        solution, whole = None, problem
         if asked.at == "solution":
             solved = _solved(run, problem, folder, progress)
             safe = safe_start(problem, run.solver, solved, limits)
             problem, solution = safe.problem, safe.solution
+        elsewhere = None
+        if workers is not None:
+            point = (problem, solution, problem is whole, asked.start, asked.grasp_std)
+            elsewhere = Elsewhere.of(workers, folder, run, *point, progress)
         unknown = information = ranking = None
         if solution is None or solution.status != Status.FAILED:
             progress.stage("Fisher information")
             unknown = identifiability(problem, solution, start="unknown", grasp_std=GRASP_STD, limits=limits)
-            information = _information(problem, solution, asked, progress, limits)
-            ranking = _ranking(run, system, problem, solution, asked, progress) if asked.what_if else None
+            information = _information(problem, solution, asked, progress, limits, elsewhere)
+            if asked.what_if:
+                ranking = _ranking(run, system, problem, solution, asked, progress, elsewhere)
         result = identifiability_result(problem, solution, information, unknown, ranking, asked)
         folder.log("end", status=result["status"], message=result["message"])
         written = folder.finish(result)
@@ -145,6 +160,8 @@ def run_identifiability(
             progress.stage("writing the report")
             findings = Findings(run.name, run.description, written, solution=solution)
             write_report(folder.path / "report.html", findings)
+    if elsewhere is not None:
+        elsewhere.clear()
     return IdentifiabilityOutcome(folder.path, written, information)
 
 
@@ -159,7 +176,12 @@ def _solved(run: Run, problem: EstimationProblem, folder: RunFolder, progress: P
 
 
 def _information(
-    problem: EstimationProblem, solution: Solution | None, asked: Question, progress: Progress, limits: GapLimits
+    problem: EstimationProblem,
+    solution: Solution | None,
+    asked: Question,
+    progress: Progress,
+    limits: GapLimits,
+    elsewhere: Elsewhere | None,
 ) -> Identifiability:
     judged = partial(identifiability, problem, solution, start=asked.start, grasp_std=asked.grasp_std, limits=limits)
     information = judged()
@@ -167,6 +189,8 @@ def _information(
     if not wanted:
         return information
     progress.stage(f"intervals of {len(wanted)} parameters by profile likelihood")
+    if elsewhere is not None and set(wanted) <= set(information.names):
+        return elsewhere.with_profiles(information, wanted)
     return judged(intervals=wanted)
 
 
@@ -177,6 +201,7 @@ def _ranking(
     solution: Solution | None,
     asked: Question,
     progress: Progress,
+    elsewhere: Elsewhere | None,
 ) -> WhatIf:
     other = second_arm(run, system)
     return what_if(
@@ -186,6 +211,7 @@ def _ranking(
         grasp_std=asked.grasp_std,
         second_arm=None if other is None else with_grasp_offsets(other),
         progress=progress.stage,
+        judge=None if elsewhere is None else elsewhere.judge(),
     )
 
 
@@ -194,34 +220,6 @@ def _wanted(problem: EstimationProblem, information: Identifiability, asked: Que
     if asked.intervals not in ("auto", "all"):
         return asked.intervals
     return information.names if asked.intervals == "all" or small(problem) else ()
-
-
-def second_arm(run: Run, system: System) -> System | None:
-    """The run's system with the robot's other arm at a free end of the object; None where there is no such thing."""
-    model = run.model
-    joints = model.arms.joints
-    if joints is None or model.arms.mode != "driven" or len(model.grasp) != 1:
-        return None
-    side, grasp = next(iter(model.grasp.items()))
-    prefix = f"{side}_"
-    if side not in OTHER_SIDE or not all(name.startswith(prefix) for name in (*joints, grasp.holder)):
-        return None
-    parents = {segment.parent for segment in system.segments}
-    free = [f"w_{s.name}" for s in system.segments if s.name not in parents and f"w_{s.name}" != grasp.held]
-    if not free:
-        return None
-
-    def mirrored(name: str) -> str:
-        return f"{OTHER_SIDE[side]}_{name.removeprefix(prefix)}"
-
-    arms = replace(model.arms, joints=(*joints, *(mirrored(name) for name in joints)))
-    added = GraspSettings(holder=mirrored(grasp.holder), held=free[0], kind=grasp.kind, rpy=grasp.rpy)
-    changed = replace(model, arms=arms, grasp={**model.grasp, OTHER_SIDE[side]: added})
-    try:
-        return build_system(replace(run, model=changed))
-    except YidError:
-        # the robot has no other arm of that name
-        return None
 
 
 def identifiability_result(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
+import time
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Protocol
 
@@ -11,6 +12,11 @@ from yid_ocp.solvers import Iterate
 
 if TYPE_CHECKING:
     import rich.progress
+
+OFTEN = 5.0
+"""Least time between two lines of one tenth of a stage [s]."""
+SOON = 2.0
+"""Time that a stage has to last before the rest of it is guessed [s]."""
 
 
 class Progress(Protocol):
@@ -45,15 +51,44 @@ class Silent:
 SILENT = Silent()
 
 
-class PlainProgress:
-    """A line on standard error for every stage and iterate, and for every tenth of a stage; for logs and pipes."""
+class TimeLeft:
+    """How long the rest of a stage will take, from what its parts took so far."""
 
     def __init__(self) -> None:
-        self._tenths = 0
+        self._first: tuple[int, float] | None = None
+
+    def words(self, done: int, total: int) -> str:
+        """Of the time left, once there is something to tell it from; empty before, and for short stages."""
+        now = time.monotonic()
+        if self._first is None:
+            # what stood there before this run began took no time
+            self._first = (done, now)
+        known, begun = self._first
+        if done <= known or done >= total or now - begun < SOON:
+            return ""
+        return f", about {duration_words((now - begun) * (total - done) / (done - known))} left"
+
+
+def duration_words(seconds: float) -> str:
+    """A time for people: seconds, minutes or hours."""
+    for unit, size in (("h", 3600.0), ("min", 60.0)):
+        if seconds >= 1.5 * size:
+            return f"{seconds / size:.1f} h" if unit == "h" else f"{seconds / size:.0f} min"
+    return f"{seconds:.0f} s"
+
+
+class PlainProgress:
+    """Lines on standard error for logs and pipes.
+
+    One for every stage and iterate, for every tenth of a stage, and for what else is done `OFTEN` after the last line.
+    """
+
+    def __init__(self) -> None:
+        self._tenths, self._last, self._left = 0, 0.0, TimeLeft()
 
     def stage(self, text: str) -> None:
         """See `Progress`."""
-        self._tenths = 0
+        self._tenths, self._last, self._left = 0, time.monotonic(), TimeLeft()
         print(f"{text} ...", file=sys.stderr, flush=True)
 
     def iterate(self, entry: Iterate) -> None:
@@ -62,10 +97,10 @@ class PlainProgress:
 
     def advance(self, done: int, total: int, text: str) -> None:
         """See `Progress`."""
-        tenths = 10 * done // max(total, 1)
-        if tenths > self._tenths:  # a line for every frame would be too many
-            self._tenths = tenths
-            print(f"  {done} of {total}, {text}", file=sys.stderr, flush=True)
+        tenths, left = 10 * done // max(total, 1), self._left.words(done, total)
+        if tenths > self._tenths or time.monotonic() > self._last + OFTEN:  # a line for every frame would be too many
+            self._tenths, self._last = tenths, time.monotonic()
+            print(f"  {done} of {total}, {text}{left}", file=sys.stderr, flush=True)
 
 
 class BarProgress:
@@ -74,12 +109,12 @@ class BarProgress:
     def __init__(self, bars: rich.progress.Progress) -> None:
         self._bars = bars
         self._task: rich.progress.TaskID | None = None
-        self._text = ""
+        self._text, self._left = "", TimeLeft()
 
     def stage(self, text: str) -> None:
         """See `Progress`."""
         self.close()
-        self._text = text
+        self._text, self._left = text, TimeLeft()
         self._task = self._bars.add_task(text, total=None)
 
     def iterate(self, entry: Iterate) -> None:
@@ -90,7 +125,8 @@ class BarProgress:
     def advance(self, done: int, total: int, text: str) -> None:
         """See `Progress`."""
         if self._task is not None:
-            self._bars.update(self._task, description=f"{self._text}: {text}", completed=done, total=total)
+            words = f"{self._text}: {done} of {total}, {text}{self._left.words(done, total)}"
+            self._bars.update(self._task, description=words, completed=done, total=total)
 
     def close(self) -> None:
         """Mark the running stage as done."""

@@ -15,9 +15,10 @@ from yid_ocp.files import file_sha256
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import Findings
 from yid_ocp.report.terminal import history_summary
+from yid_ocp.version import versions
 from yid_ocp.workflow.baseline import read_estimates, refuse_unlike
 from yid_ocp.workflow.command import DONE, carry_out
-from yid_ocp.workflow.folder import new_run_folder, versions
+from yid_ocp.workflow.folder import new_run_folder
 from yid_ocp.workflow.progress import SILENT, Progress
 
 FORMAT = "yid-history/1"

@@ -31,14 +31,14 @@ def answer(
 
 def library(system: System, case: Case, candidates: Choice) -> list[str]:
     """Candidates of a case, as `kind@location`."""
-    effects = chosen_effects(system, [case.estimate], candidates)
+    effects = chosen_effects(system, case.estimate, candidates)
     return [effect.label for effect in effects if effect.kind not in case.without]
 
 
 def best_closure(ensemble: Ensemble, case: Case, label: Label, candidates: Choice = "all") -> float:
     """Held-out closure of the true effects, refitted: the most that a diagnosis could reach."""
     problem = ensemble.of(case.estimate)
-    effects = chosen_effects(problem.system, [case.estimate], candidates)
+    effects = chosen_effects(problem.system, case.estimate, candidates)
     composed = CandidateProblem.of(problem, effects, [case.held_out])
     nominal = nominal_fit(problem, composed)
     true = {entry.label: entry for entry in label.injected}

@@ -1,8 +1,7 @@
-"""Cases drawn at random, and their labels.
+"""Cases of one experiment drawn at random, and their labels.
 
-Some are clean, some have one effect at one, three or ten times its detectable size, some two, some an effect that is in
-no library or that was left out of the library, some twice as many links as the model. Labels are written apart from
-the recordings and their hash is published before any recording is looked at.
+What sort a case is of stands in the plan. Labels are written apart from the recordings and their hash is published
+before any recording is looked at.
 """
 
 from __future__ import annotations
@@ -10,29 +9,30 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from yid_ocp.data.recording import Recording
+from yid_ocp.diagnosis.blind.plan import PURPOSES, SIZES, Planned
 from yid_ocp.diagnosis.diagnose import nominal_fit
 from yid_ocp.diagnosis.hypotheses import CandidateProblem, Choice, chosen_effects
 from yid_ocp.diagnosis.screening import Linearisation, Signature, linearise
 from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
-from yid_ocp.effects.base import Quantity, segment_springs
+from yid_ocp.effects.base import EffectBase, Quantity, segment_springs
 from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.virtual.experiment import PointCamera, VirtualExperiment
+from yid_ocp.virtual.engine import Simulation
+from yid_ocp.virtual.experiment import ArmNoise, PointCamera, VirtualExperiment
 from yid_ocp.virtual.injected import KINDS, InjectedEffect, injected_experiment
 from yid_ocp.virtual.motion import Excitation, multisine
 from yid_ocp.virtual.outside import OUTSIDE
 
-SIZES = (1.0, 3.0, 10.0)
-"""Multiples of the detectable size."""
-SHARES: Mapping[str, float] = {"null": 0.2, "single": 0.5, "outside": 0.15, "left_out": 0.05, "pair": 0.05}
-"""What an ensemble is made of; the rest has a finer chain."""
+Array = NDArray[np.float64]
+
 SPREAD = 1.5
 """Factor by which true stiffnesses lie above or below the problem's start, at most."""
 OUTSIDE_SIZES: Mapping[str, tuple[str, float, float, str]] = {
@@ -70,6 +70,8 @@ class Label:
         Of the detectable size, as made; None where that has no meaning.
     truth : dict of str to float
         Nominal parameters.
+    experiment : str
+        In which it was made.
     """
 
     case: str
@@ -77,16 +79,18 @@ class Label:
     injected: tuple[InjectedEffect, ...]
     multiple: float | None
     truth: Mapping[str, float]
+    experiment: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON."""
-        return asdict(self) | {"injected": [asdict(e) for e in self.injected]}
+        own: dict[str, Any] = asdict(self)
+        return own | {"injected": [asdict(effect) for effect in self.injected]}
 
     @staticmethod
     def from_dict(data: Mapping[str, Any]) -> Label:
         """From JSON."""
         injected = tuple(InjectedEffect(**entry) for entry in data["injected"])
-        return Label(data["case"], data["category"], injected, data["multiple"], data["truth"])
+        return Label(**{**data, "injected": injected})
 
 
 @dataclass(frozen=True)
@@ -96,13 +100,14 @@ class Case:
     Attributes
     ----------
     name : str
-    estimate, held_out : Recording
+    estimate : tuple of Recording
+    held_out : Recording
     without : tuple of str
         Kinds that are left out of the library; mostly one that has nothing to do with the case.
     """
 
     name: str
-    estimate: Recording
+    estimate: tuple[Recording, ...]
     held_out: Recording
     without: tuple[str, ...]
 
@@ -126,6 +131,57 @@ def opened(text: str, commitment: str) -> list[Label]:
     return [Label.from_dict(entry) for entry in json.loads(text)]
 
 
+@dataclass(frozen=True)
+class Conditions:
+    """How the recordings of an experiment are made.
+
+    Attributes
+    ----------
+    recordings : int
+        To estimate on; one more is held out.
+    noise : ArmNoise
+    simulation : Simulation
+        Duration of each, and the engine's step.
+    vision : bool
+        Whether a camera sees the object.
+    purpose : str
+        Of `PURPOSES`.
+    """
+
+    recordings: int = 1
+    noise: ArmNoise = field(default_factory=ArmNoise)
+    simulation: Simulation = field(default_factory=Simulation)
+    vision: bool = False
+    purpose: str = PURPOSES[0]
+
+
+@dataclass(frozen=True)
+class Detectable:
+    """How large an effect has to be to show in an experiment.
+
+    Attributes
+    ----------
+    effect : EffectBase
+    shape : dict of str to float
+        Values of its shape parameters.
+    columns : ndarray, shape (p, p)
+        |columns a| is by how many standard deviations of the data the amplitudes a move the residual.
+    """
+
+    effect: EffectBase
+    shape: Mapping[str, float]
+    columns: Array
+
+    @staticmethod
+    def of(signature: Signature) -> Detectable:
+        """From a candidate's signature on a clean recording."""
+        return Detectable(signature.effect, signature.shape, np.asarray(np.linalg.qr(signature.columns, mode="r")))
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON."""
+        return {"effect": self.effect.label, "shape": dict(self.shape), "columns": self.columns.tolist()}
+
+
 class Ensemble:
     """Draws cases of one experiment.
 
@@ -140,6 +196,10 @@ class Ensemble:
         The library.
     limits : Thresholds
         For the detectable size.
+    simulated : System, optional
+        What moves, where that is not the problem's: the same with its arms driven.
+    conditions : Conditions
+        Whether there is a camera is seen from the problem's first recording.
 
     Raises
     ------
@@ -154,8 +214,12 @@ class Ensemble:
         finer: Callable[[int], System] | None = None,
         candidates: Choice = "all",
         limits: Thresholds = DEFAULTS,
+        *,
+        simulated: System | None = None,
+        conditions: Conditions | None = None,
     ) -> None:
-        if not problem.system.driven or problem.system.prescribed:
+        self.simulated = problem.system if simulated is None else simulated
+        if not self.simulated.driven or self.simulated.prescribed:
             raise ConfigError(
                 "a blind proof moves driven arms",
                 where="model",
@@ -166,21 +230,20 @@ class Ensemble:
         self.problem, self.seed, self._finer = problem, seed, finer
         self._candidates, self._limits = candidates, limits
         recording = problem.episodes[0].recording
-        assert recording.joints is not None
-        names = list(recording.joints.names)
-        self.posture = {j: float(recording.joints.position[0, names.index(j)]) for j in problem.system.driven}
-        self.vision = any(group.pose is not None for group in recording.points)
-        effects = chosen_effects(problem.system, [recording], candidates)
-        if not {effect.kind for effect in effects} & set(KINDS):
+        self.posture = first_posture(self.simulated, recording)
+        seen = any(group.pose is not None for group in recording.points)
+        self.conditions = replace(conditions or Conditions(), vision=seen)
+        self._effects = chosen_effects(problem.system, [recording], candidates)
+        if not {effect.kind for effect in self._effects} & set(KINDS):
             raise ConfigError(
                 "none of the candidates can be done in MuJoCo",
                 where="diagnosis.candidates",
                 allowed=", ".join(KINDS),
             )
-        self._point: Linearisation | None = None
+        self._detectable: tuple[Detectable, ...] | None = None
 
     def _rng(self, *path: int) -> np.random.Generator:
-        return np.random.default_rng([self.seed, *path])
+        return np.random.default_rng([self.seed, PURPOSES.index(self.conditions.purpose), *path])
 
     def truth(self, rng: np.random.Generator) -> dict[str, float]:
         """True values of the free parameters, log-uniform about their start."""
@@ -196,113 +259,103 @@ class Ensemble:
         links: int = 1,
     ) -> Recording:
         """One recording, without a word on what is in it."""
-        system = self.problem.system
+        system = self.simulated
         if links > 1:
             assert self._finer is not None
             system = self._finer(links)
-        motion = multisine(
-            self.problem.system,
-            truth,
-            seed=int(rng.integers(2**31)),
-            posture=self.posture,
-            excitation=Excitation(travel=TRAVEL),
-        )
-        experiment = VirtualExperiment(
-            motion=motion,
-            posture=self.posture,
-            camera=PointCamera() if self.vision else None,
-            seed=int(rng.integers(2**31)),
-        )
-        made = injected_experiment(
-            system,
-            truth if links == 1 else finer_values(self.problem.system, system, truth),
-            injected,
-            experiment,
-        )
+        values = truth if links == 1 else finer_values(self.simulated, system, truth)
+        made = recorded(self.simulated, system, self.posture, truth, values, injected, rng, self.conditions)
         return replace(made, name=name, description="", source="", truth={})
 
     def point(self) -> Linearisation:
-        """The candidates' signatures on a clean recording: what of each would be detectable."""
-        if self._point is None:
-            rng = self._rng(0)
-            clean = self.record(self.truth(rng), (), rng, "clean")
-            problem = self.of(clean)
-            effects = chosen_effects(problem.system, [clean], self._candidates)
-            composed = CandidateProblem.of(problem, effects, [self.record(self.truth(rng), (), rng, "other")])
-            nominal = nominal_fit(problem, composed, limits=self._limits)
-            self._point = linearise(composed, (), nominal.values, self._limits.shape_values)
-        return self._point
+        """The candidates' signatures on clean recordings: what of each would be detectable."""
+        rng = self._rng(0)
+        names = [f"clean_{i}" for i in range(self.conditions.recordings)]
+        clean = tuple(self.record(self.truth(rng), (), rng, name) for name in names)
+        problem = self.of(clean)
+        effects = chosen_effects(problem.system, clean, self._candidates)
+        composed = CandidateProblem.of(problem, effects, [self.record(self.truth(rng), (), rng, "other")])
+        nominal = nominal_fit(problem, composed, limits=self._limits)
+        return linearise(composed, (), nominal.values, self._limits.shape_values)
 
-    def of(self, recording: Recording) -> EstimationProblem:
-        """The nominal problem of a recording."""
+    @property
+    def detectable(self) -> tuple[Detectable, ...]:
+        """How large every candidate has to be, worked out once."""
+        if self._detectable is None:
+            self._detectable = tuple(Detectable.of(signature) for signature in self.point().signatures)
+        return self._detectable
+
+    def knowing(self, detectable: Sequence[Mapping[str, Any]]) -> None:
+        """Take what is detectable from `Detectable.to_dict`, as another process worked it out."""
+        by_label = {effect.label: effect for effect in self._effects}
+        self._detectable = tuple(
+            Detectable(
+                by_label[entry["effect"]], dict(entry["shape"]), np.atleast_2d(np.array(entry["columns"], float))
+            )
+            for entry in detectable
+        )
+
+    def of(self, recordings: Sequence[Recording]) -> EstimationProblem:
+        """The nominal problem of recordings."""
         nominal = self.problem
         values = dict(zip(nominal.system.parameters.names, map(float, nominal.theta), strict=True))
-        return EstimationProblem(nominal.step, [recording], nominal.free, nominal.options, values)
+        return EstimationProblem(nominal.step, list(recordings), nominal.free, nominal.options, values)
 
-    def draw(self, number: int, count: int) -> tuple[Case, Label]:
-        """Case `number` of `count`; the same for the same seed, whatever was drawn before.
+    def draw(self, wanted: Planned) -> tuple[Case, Label]:
+        """A case as planned; the same for the same seed and purpose, whatever was drawn before.
 
         Raises
         ------
         ModelError
             None of several draws could be simulated.
         """
+        name = f"case_{wanted.number:03d}"
+        purposes = [f"estimate_{i}" for i in range(self.conditions.recordings)]
         for attempt in range(8):
-            rng = self._rng(1, number, attempt)
-            category = self._category(number, count)
+            rng = self._rng(1, wanted.number, attempt)
             truth = self.truth(rng)
-            injected, multiple = self._injected(category, rng)
-            links = 2 if category == "finer_chain" else 1
-            name = f"case_{number:03d}"
+            injected, multiple = self._injected(wanted, rng)
+            links = 2 if wanted.category == "finer_chain" else 1
             try:
-                estimate, held_out = (
-                    self.record(truth, injected, rng, f"{name}_{purpose}", links)
-                    for purpose in ("estimate", "held_out")
+                *estimate, held_out = (
+                    self.record(truth, injected, rng, f"{name}_{purpose}", links) for purpose in (*purposes, "held_out")
                 )
             except ModelError:
                 continue  # the motion throws the object about; draw another
-            left_out = (injected[0].kind,) if category == "left_out" else self._other_kind(injected, rng)
-            return Case(name, estimate, held_out, left_out), Label(name, category, injected, multiple, truth)
-        raise ModelError("no motion of this experiment can be simulated", where=f"case {number}")
-
-    def _category(self, number: int, count: int) -> str:
-        edges = np.cumsum(list(SHARES.values()))
-        # an even spread over the ensemble, in an order that the seed decides
-        order = self._rng(2).permutation(count)
-        position = (float(order[number]) + 0.5) / count
-        place = int(np.searchsorted(edges, position))
-        category = [*SHARES, "finer_chain"][place]
-        return "single" if category == "finer_chain" and self._finer is None else category
+            left_out = (injected[0].kind,) if wanted.category == "left_out" else self._other_kind(injected, rng)
+            label = Label(name, wanted.category, injected, multiple, truth, wanted.experiment)
+            return Case(name, tuple(estimate), held_out, left_out), label
+        raise ModelError("no motion of this experiment can be simulated", where=f"case {wanted.number}")
 
     def _other_kind(self, injected: Sequence[InjectedEffect], rng: np.random.Generator) -> tuple[str, ...]:
         at_work = {effect.kind for effect in injected}
-        kinds = sorted({s.effect.kind for s in self.point().signatures} - at_work)
+        kinds = sorted({entry.effect.kind for entry in self.detectable} - at_work)
         return (str(rng.choice(kinds)),) if len(kinds) > 1 else ()
 
-    def _injected(self, category: str, rng: np.random.Generator) -> tuple[tuple[InjectedEffect, ...], float | None]:
-        if category in ("null", "finer_chain"):
+    def _injected(self, wanted: Planned, rng: np.random.Generator) -> tuple[tuple[InjectedEffect, ...], float | None]:
+        if wanted.category in ("null", "finer_chain"):
             return (), None
-        if category == "outside":
+        if wanted.category == "outside":
             return (self._outside(rng),), None
-        if category == "pair":
-            (one, size), (two, _) = self._inside(rng, SIZES[-1]), self._inside(rng, SIZES[-1])
-            return ((one, two) if one.label != two.label else (one,)), size
-        size = SIZES[-1] if category == "left_out" else float(rng.choice(SIZES))
+        size = SIZES[-1] if wanted.multiple is None else wanted.multiple
+        if wanted.category == "pair":
+            (one, multiple), (two, _) = self._inside(rng, size), self._inside(rng, size)
+            return ((one, two) if one.label != two.label else (one,)), multiple
         effect, multiple = self._inside(rng, size)
         return (effect,), multiple
 
     def _inside(self, rng: np.random.Generator, wanted: float) -> tuple[InjectedEffect, float]:
         """An effect of the library at so many times its detectable size, or as near as its range lets it come."""
         groups: dict[str, dict[str, list[int]]] = {}
-        for i, signature in enumerate(self.point().signatures):
-            if signature.effect.kind in KINDS:
-                places = groups.setdefault(signature.effect.kind, {})
-                places.setdefault(signature.effect.location, []).append(i)
+        for i, entry in enumerate(self.detectable):
+            if entry.effect.kind in KINDS:
+                places = groups.setdefault(entry.effect.kind, {})
+                places.setdefault(entry.effect.location, []).append(i)
         best: tuple[InjectedEffect, float] | None = None
         for _ in range(40):
             kind = str(rng.choice(sorted(groups)))
             place = str(rng.choice(sorted(groups[kind])))
-            drawn = self._sized(self.point().signatures[int(rng.choice(groups[kind][place]))], rng, wanted)
+            drawn = self._sized(self.detectable[int(rng.choice(groups[kind][place]))], rng, wanted)
             if drawn is None:
                 continue
             made, multiple = drawn
@@ -313,27 +366,25 @@ class Ensemble:
         assert best is not None
         return best
 
-    def _sized(
-        self, signature: Signature, rng: np.random.Generator, wanted: float
-    ) -> tuple[InjectedEffect, float] | None:
+    def _sized(self, entry: Detectable, rng: np.random.Generator, wanted: float) -> tuple[InjectedEffect, float] | None:
         """Amplitudes in a random proportion at so many times the detectable size, as far as the range allows."""
-        effect = signature.effect
+        effect = entry.effect
         quantities: dict[str, Quantity] = {f"{effect.label}.{q.name}": q for q in effect.quantities}
         room = {n: effect.prior_range[n] for n in effect.amplitudes}
         neutral = np.array([quantities[n].neutral for n in effect.amplitudes])
         low, high = (np.array([room[n][side] for n in effect.amplitudes]) - neutral for side in (0, 1))
         way = rng.uniform(low, high)
-        seen = float(np.linalg.norm(signature.columns @ way))
+        seen = float(np.linalg.norm(entry.columns @ way))
         if seen <= 0:
             return None
         reach = np.min(np.where(way > 0, high, low)[way != 0] / way[way != 0])
         factor = min(wanted * self._limits.detection / seen, float(reach))
-        values = dict(zip(effect.amplitudes, neutral + factor * way, strict=True)) | signature.shape
-        reported = {name: entry.value for name, entry in effect.reported(values).items()}
+        values = {**dict(zip(effect.amplitudes, neutral + factor * way, strict=True)), **entry.shape}
+        reported = {name: told.value for name, told in effect.reported(values).items()}
         return InjectedEffect(effect.kind, effect.location, reported), factor * seen / self._limits.detection
 
     def _outside(self, rng: np.random.Generator) -> InjectedEffect:
-        system = self.problem.system
+        system = self.simulated
         places: dict[str, tuple[str, ...]] = {
             "joint": system.driven[: max(len(system.driven) // 2, 1)],
             "segment": tuple(segment.name for segment in system.segments),
@@ -347,7 +398,7 @@ class Ensemble:
         if part_of == "torque":
             size *= self._largest_torque(location)
         elif part_of == "stiffness":
-            start = dict(zip(system.parameters.names, self.problem.theta, strict=True))
+            start = dict(zip(self.problem.system.parameters.names, self.problem.theta, strict=True))
             bends = any(spring.kind == "bend" for spring in segment_springs(system, location))
             size *= float(start.get(f"{location}.bend", 10.0)) if bends else 10.0
         return InjectedEffect(kind, location, {"size": size})
@@ -358,6 +409,63 @@ class Ensemble:
         if recorded is None or recorded.effort is None or joint not in recorded.names:
             return 10.0
         return float(np.nanmax(np.abs(recorded.effort[:, recorded.names.index(joint)])))
+
+
+def recorded(
+    nominal: System,
+    simulated: System,
+    posture: Mapping[str, float],
+    truth: Mapping[str, float],
+    values: Mapping[str, float],
+    injected: Sequence[InjectedEffect],
+    rng: np.random.Generator,
+    conditions: Conditions,
+) -> Recording:
+    """A recording of a motion that is drawn for the nominal system, made with the simulated one.
+
+    Parameters
+    ----------
+    nominal, simulated : System
+    posture : mapping of str to float
+        Of the driven joints at the start.
+    truth, values : mapping of str to float
+        Parameters of the nominal and of the simulated system.
+    injected : sequence of InjectedEffect
+    rng : numpy.random.Generator
+        Of motion and noise.
+    conditions : Conditions
+    """
+    excitation = Excitation(travel=TRAVEL, duration=conditions.simulation.duration)
+    motion = multisine(nominal, truth, seed=int(rng.integers(2**31)), posture=posture, excitation=excitation)
+    experiment = VirtualExperiment(
+        motion=motion,
+        posture=posture,
+        simulation=conditions.simulation,
+        noise=conditions.noise,
+        camera=PointCamera() if conditions.vision else None,
+        seed=int(rng.integers(2**31)),
+    )
+    return injected_experiment(simulated, values, injected, experiment)
+
+
+def first_posture(system: System, recording: Recording) -> dict[str, float]:
+    """Where the driven joints begin in a recording.
+
+    Raises
+    ------
+    ConfigError
+        One of them is not recorded.
+    """
+    joints = recording.joints
+    names = [] if joints is None else list(joints.names)
+    missing = [name for name in system.driven if name not in names]
+    if joints is None or missing:
+        raise ConfigError(
+            f"the first recording does not say where {missing[0]} begins",
+            where="recordings.estimate",
+            allowed="a recording of all driven joints",
+        )
+    return {name: float(joints.position[0, names.index(name)]) for name in system.driven}
 
 
 def finer_values(nominal: System, finer: System, truth: Mapping[str, float]) -> dict[str, float]:

@@ -8,11 +8,15 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
+import scipy.stats
 
 from yid_ocp.diagnosis.blind.ensemble import Label
+from yid_ocp.diagnosis.blind.plan import SHARES
 from yid_ocp.effects import EFFECTS
 
 FORMAT = "yid-blind/1"
+SORTS = tuple(SHARES)
+VERDICTS = ("no_gap", "unknown", "insufficient_data", "effect", "confusable")
 
 
 @dataclass(frozen=True)
@@ -37,6 +41,11 @@ class Mark:
     errors : dict of str to (float, bool)
         Relative error of every parameter of the true effect where it was added, and whether its 95 % interval has it.
     seconds : float
+    experiment : str
+    z : mapping of str to float
+        (estimate - truth)/std of the same parameters.
+    p_value : float
+        Of the null test on the recordings that were estimated on.
     """
 
     case: str
@@ -55,6 +64,19 @@ class Mark:
     best: float
     errors: Mapping[str, tuple[float, bool]] = field(default_factory=dict)
     seconds: float = math.nan
+    experiment: str = ""
+    z: Mapping[str, float] = field(default_factory=dict)
+    p_value: float = math.nan
+
+    @property
+    def sort(self) -> str:
+        """The row of the confusion matrix: the kind of a single effect, else the category."""
+        return self.truth.partition("@")[0] if self.category == "single" else self.category
+
+    @property
+    def said(self) -> str:
+        """Its column: the kind of the effect that was added first, else the verdict."""
+        return self.verdict if self.answer == "-" else self.answer.partition("@")[0]
 
 
 def mark(label: Label, result: Mapping[str, Any], best: float = math.nan, seconds: float = math.nan) -> Mark:
@@ -86,6 +108,7 @@ def mark(label: Label, result: Mapping[str, Any], best: float = math.nan, second
     else:
         right = bool(true) and (named[:1] == true or (true[0] in alike and len(alike) <= 3))
     errors: dict[str, tuple[float, bool]] = {}
+    z: dict[str, float] = {}
     for effect in label.injected:
         if effect.label not in named or effect.kind not in EFFECTS:
             continue
@@ -96,7 +119,10 @@ def mark(label: Label, result: Mapping[str, Any], best: float = math.nan, second
                 continue
             miss = found["value"] - value
             errors[f"{effect.label}.{name}"] = (abs(miss) / max(abs(value), 1e-9), abs(miss) <= 1.96 * found["std"])
-    closed = result["gap"]["closure"]
+            if found["std"] > 0:
+                z[f"{effect.label}.{name}"] = miss / found["std"]
+    closed, before = result["gap"]["closure"], result["gap"].get("before") or {}
+    p_value = before.get("p_value")
     return Mark(
         label.case,
         label.category,
@@ -114,13 +140,31 @@ def mark(label: Label, result: Mapping[str, Any], best: float = math.nan, second
         best,
         errors,
         seconds,
+        label.experiment,
+        z,
+        math.nan if p_value is None else float(p_value),
     )
+
+
+def proportion(hits: Sequence[bool]) -> dict[str, float | int | None]:
+    """How many of how many, and the 95 % interval of the rate (Clopper and Pearson 1934, doi:10.1093/biomet/26.4.404).
+
+    Parameters
+    ----------
+    hits : sequence of bool
+    """
+    count, total = sum(map(bool, hits)), len(hits)
+    if not total:
+        return {"count": 0, "of": 0, "rate": None, "low": None, "high": None}
+    low = 0.0 if count == 0 else float(scipy.stats.beta.ppf(0.025, count, total - count + 1))
+    high = 1.0 if count == total else float(scipy.stats.beta.ppf(0.975, count + 1, total - count))
+    return {"count": count, "of": total, "rate": count / total, "low": low, "high": high}
 
 
 def score(marks: Sequence[Mark]) -> dict[str, Any]:
     """Rates over an ensemble; None where there was no case of the sort."""
 
-    def rate(values: Sequence[bool | float]) -> float | None:
+    def mean(values: Sequence[float]) -> float | None:
         return float(np.mean(values)) if len(values) else None
 
     singles = [m for m in marks if m.category == "single"]
@@ -130,29 +174,74 @@ def score(marks: Sequence[Mark]) -> dict[str, Any]:
     errors = [entry for m in singles for entry in m.errors.values()]
     relative = [m.closure / m.best for m in singles if m.best > 0 and math.isfinite(m.closure)]
     sizes = sorted({m.multiple for m in singles if math.isfinite(m.multiple)})
+    shares = {
+        "false_alarms": [m.gap for m in marks if m.category == "null"],
+        "kind_first": [m.kind_first for m in seen],
+        "kind_in_two": [m.kind_second for m in seen],
+        "location_first": [m.location_first for m in seen],
+        "confusable_covers": [m.truth in m.confusable for m in named],
+        "unknown_recall": [m.verdict == "unknown" for m in strange],
+        "unknown_location": [m.location_first for m in strange if m.gap],
+        "pairs_right": [m.right for m in marks if m.category == "pair"],
+        "interval_coverage": [inside for _, inside in errors],
+    }
+    intervals = {name: proportion(hits) for name, hits in shares.items()}
+    detected = {}
+    for size in sizes:
+        own = [m for m in singles if m.multiple == size]
+        detected[f"{size:.3g}"] = {"gap": proportion([m.gap for m in own]), "right": proportion([m.right for m in own])}
     return {
         "format": FORMAT,
         "cases": len(marks),
-        "false_alarms": rate([m.gap for m in marks if m.category == "null"]),
+        **{name: entry["rate"] for name, entry in intervals.items()},
+        "intervals": intervals,
         "detection": {
-            f"{size:.3g}": {
-                "cases": sum(m.multiple == size for m in singles),
-                "gap": rate([m.gap for m in singles if m.multiple == size]),
-                "right": rate([m.right for m in singles if m.multiple == size]),
-            }
-            for size in sizes
+            size: {"cases": own["gap"]["of"], "gap": own["gap"]["rate"], "right": own["right"]["rate"]}
+            for size, own in detected.items()
         },
-        "kind_first": rate([m.kind_first for m in seen]),
-        "kind_in_two": rate([m.kind_second for m in seen]),
-        "location_first": rate([m.location_first for m in seen]),
-        "confusable_covers": rate([m.truth in m.confusable for m in named]),
-        "confusable_size": rate([len(m.confusable) for m in named]),
-        "unknown_recall": rate([m.verdict == "unknown" for m in strange]),
-        "unknown_location": rate([m.location_first for m in strange if m.gap]),
-        "pairs_right": rate([m.right for m in marks if m.category == "pair"]),
-        "closure_of_best": rate(relative),
+        "detection_intervals": detected,
+        "confusable_size": mean([len(m.confusable) for m in named]),
+        "closure_of_best": mean(relative),
         "parameter_error": None if not errors else float(np.median([e for e, _ in errors])),
-        "interval_coverage": rate([inside for _, inside in errors]),
-        "seconds": rate([m.seconds for m in marks if math.isfinite(m.seconds)]),
+        "seconds": mean([m.seconds for m in marks if math.isfinite(m.seconds)]),
+        "experiments": _by_experiment(marks),
+        "confusion": confusion(marks),
+        "calibration": calibration(marks),
         "marks": [asdict(m) for m in marks],
+    }
+
+
+def _by_experiment(marks: Sequence[Mark]) -> dict[str, dict[str, Any]]:
+    """Cases, false alarms and right answers of every experiment."""
+    found = {}
+    for name in dict.fromkeys(m.experiment for m in marks):
+        own = [m for m in marks if m.experiment == name]
+        found[name] = {
+            "cases": len(own),
+            "false_alarms": proportion([m.gap for m in own if m.category == "null"]),
+            "right": proportion([m.right for m in own if m.category not in ("null", "finer_chain")]),
+        }
+    return found
+
+
+def confusion(marks: Sequence[Mark]) -> dict[str, Any]:
+    """How often what was said of what: true sorts (rows), answers (columns) and counts."""
+    rows = sorted({m.sort for m in marks}, key=lambda name: (name in SORTS, name))
+    columns = sorted({m.said for m in marks}, key=lambda name: (name in VERDICTS, name))
+    counts = [[sum((m.sort, m.said) == (row, column) for m in marks) for column in columns] for row in rows]
+    return {"true": rows, "said": columns, "counts": counts}
+
+
+def calibration(marks: Sequence[Mark]) -> dict[str, Any]:
+    """What is promised and what is kept: intervals of the effects' parameters, p-values of clean recordings.
+
+    Of each nominal level: how many intervals of that level hold the truth, how many clean cases have a smaller p-value.
+    """
+    z = [abs(value) for m in marks if m.category == "single" for value in m.z.values()]
+    p = [m.p_value for m in marks if m.category == "null" and math.isfinite(m.p_value)]
+    levels = (0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
+    quantiles = {level: float(scipy.stats.norm.ppf(0.5 * (1 + level))) for level in levels}
+    return {
+        "intervals": [{"level": a, **proportion([x <= quantiles[a] for x in z])} for a in levels],
+        "p_values": [{"level": a, **proportion([x < a for x in p])} for a in (0.01, 0.05, 0.1, 0.2, 0.5)],
     }

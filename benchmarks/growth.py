@@ -1,0 +1,277 @@
+"""How cost and memory grow: with variables, horizon, recordings, candidates, and what a second worker is worth.
+
+    python benchmarks/growth.py [AXIS ...] [--quick] [--json FILE] [--workers 1 2] [--cases 24]
+
+Every point is measured in a process of its own: processor time of one evaluation with its derivatives (residual and
+Jacobian by six stiffnesses, what an iteration of Gauss-Newton costs in the main), and by how much the process grew
+beyond what it was before. Slopes are those of logarithms, so that 1 is linear growth; compilation is not counted.
+
+`workers` solves the same problems with one process and with several. Its efficiency is work over what the processes
+were there for: the processor time of one process over that of several (what is done twice, and what they take from
+each other's caches) times the part of the time that they were busy.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import resource
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from yid_ocp.config.reader import load_config
+from yid_ocp.data.hdf5 import read_recording, write_recording
+from yid_ocp.diagnosis.diagnose import nominal_fit
+from yid_ocp.diagnosis.hypotheses import CandidateProblem, chosen_effects
+from yid_ocp.diagnosis.screening import linearise
+from yid_ocp.diagnosis.thresholds import DEFAULTS
+from yid_ocp.files import write_json
+from yid_ocp.parallel import Task, Workers, process_pool, run_tasks
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.report.terminal import table
+from yid_ocp.solvers import GaussNewton, solve
+from yid_ocp.workflow.build import build_problem
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+CONFIG = REPOSITORY / "configs" / "single_arm_no_vision.yaml"
+# torques that are exact: an evaluation is one pass
+RECORDING = REPOSITORY / "tests" / "data" / "clean" / "single_arm_no_vision_estimate.h5"
+ARM, TUBES, JOINTS = 7, 3, 3  # joints of the arm, tubes, joints of a link: n = 7 + 9 links
+VARIABLES: Mapping[bool, tuple[int, ...]] = {False: (25, 43, 79, 151, 295, 403), True: (16, 25)}
+HORIZONS: Mapping[bool, tuple[int, ...]] = {False: (500, 1000, 5000, 10_000, 50_000), True: (10, 40)}
+RECORDINGS: Mapping[bool, tuple[int, ...]] = {False: (1, 2, 5, 10, 20, 50), True: (1, 3)}
+CANDIDATES: Mapping[bool, tuple[int, ...]] = {False: (5, 10, 20, 40, 80), True: (1, 2)}
+CASES: Mapping[bool, int] = {False: 24, True: 2}
+DURATION = 5.0  # of the recording [s]
+MIB = 1024.0**2
+
+# -- what is measured -------------------------------------------------------------------------------------------------
+
+
+def settings_of(links: int, quick: bool, files: Sequence[Path] = (RECORDING,), step: float = 0.01) -> list[str]:
+    """Settings of one arm on a Y of so many links a tube, as stiff as one of four links of 12 N m/rad."""
+    stiffness = json.dumps({
+        f"T{tube}.{way}": {"free": True, "initial": 3.0 * links, "bounds": [0.0, 1e4]}
+        for tube in (1, 2, 3) for way in ("bend", "twist")
+    })  # fmt: skip
+    given = [
+        f"model.object.links={links}",
+        f"parameters={stiffness}",
+        f"recordings.estimate={json.dumps([str(file) for file in files])}",
+        "recordings.held_out=[]",
+        f"problem.time_step={step}",
+    ]
+    return [*given, "problem.compiler=false", "problem.duration=0.1"] if quick else given
+
+
+def problem_of(settings: Sequence[str]) -> EstimationProblem:
+    return build_problem(load_config(CONFIG, settings))
+
+
+def evaluation(settings: Sequence[str]) -> dict[str, float]:
+    """An evaluation with its derivatives, after one that compiles and warms up."""
+    problem = problem_of(settings)
+    x = problem.start
+    short = problem.with_options(replace(problem.options, duration=5 * problem.step.time_step))
+    warm = short.evaluate(short.start)  # compiles, and needs next to no memory
+    assert warm.ok, warm.message
+    before = peak()
+    begun = time.process_time()
+    found = problem.evaluate(x)
+    assert found.ok, found.message
+    return {
+        "cpu": time.process_time() - begun,
+        "memory": peak() - before,
+        "variables": problem.system.size,
+        "steps": sum(episode.grid.steps for episode in problem.episodes),
+    }
+
+
+def screening(settings: Sequence[str], count: int) -> dict[str, float]:
+    """The composed problem of so many candidates, and one sweep of all their sensitivities."""
+    problem = problem_of(settings)
+    recording = problem.episodes[0].recording
+    effects = chosen_effects(problem.system, [recording], "all")[:count]
+    before = peak()
+    composed = CandidateProblem.of(problem, effects, [recording])
+    nominal = nominal_fit(problem, composed)
+    linearise(composed, (), nominal.values, DEFAULTS.shape_values)  # compiles
+    begun = time.process_time()
+    linearise(composed, (), nominal.values, DEFAULTS.shape_values)
+    return {"cpu": time.process_time() - begun, "memory": peak() - before, "candidates": len(effects)}
+
+
+def case(settings: list[str], seed: int) -> dict[str, float]:
+    """One solve from values of its own: a task as workers do them."""
+    begun = time.process_time()
+    problem = problem_of(settings)
+    rng = np.random.default_rng(seed)
+    values = {name: float(x * math.exp(rng.uniform(-0.3, 0.3))) for name, x in zip(problem.names, problem.start)}  # noqa: B905
+    solution = solve(problem, GaussNewton(iterations=6), start=problem.vector(values).tolist(), restarts=False)
+    return {"cpu": time.process_time() - begun, "cost": float(solution.cost)}
+
+
+def peak() -> float:
+    """Largest resident memory of this process so far [MiB]."""
+    used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return used / MIB if sys.platform == "darwin" else used / 1024.0
+
+
+# -- axes -------------------------------------------------------------------------------------------------------------
+
+
+def alone(function: Callable[..., dict[str, float]], *arguments: Any) -> dict[str, float]:
+    """What a function measures in a process of its own."""
+    with process_pool(1) as pool:
+        return pool.submit(function, *arguments).result()
+
+
+def variables(quick: bool) -> list[dict[str, float]]:
+    sizes = VARIABLES[quick]
+    return [alone(evaluation, settings_of((n - ARM) // (TUBES * JOINTS), quick)) for n in sizes]
+
+
+def horizon(quick: bool) -> list[dict[str, float]]:
+    """More steps by finer ones: the recording is the same."""
+    found = []
+    for steps in HORIZONS[quick]:
+        step = (0.1 if quick else DURATION) / steps
+        found.append(alone(evaluation, settings_of(1 if quick else 4, quick, step=step)))
+    return found
+
+
+def recordings(quick: bool) -> list[dict[str, float]]:
+    found = []
+    with tempfile.TemporaryDirectory() as folder:
+        files = [_another(i, Path(folder)) for i in range(max(RECORDINGS[quick]))]
+        for count in RECORDINGS[quick]:
+            point = alone(evaluation, settings_of(1 if quick else 4, quick, files[:count]))
+            found.append(point | {"recordings": count})
+    return found
+
+
+def candidates(quick: bool) -> list[dict[str, float]]:
+    return [alone(screening, settings_of(1 if quick else 4, quick), count) for count in CANDIDATES[quick]]
+
+
+def _another(number: int, folder: Path) -> Path:
+    """The recording with other noise: the same data would count once."""
+    recording = read_recording(RECORDING)
+    joints, rng = recording.joints, np.random.default_rng(number)
+    assert joints is not None
+    noisy = joints.position + 1e-6 * rng.standard_normal(joints.position.shape)
+    path = folder / f"recording_{number:02d}.h5"
+    write_recording(replace(recording, joints=replace(joints, position=noisy), name=path.stem), path)
+    return path
+
+
+AXES: Mapping[str, tuple[Callable[[bool], list[dict[str, float]]], str]] = {
+    "variables": (variables, "variables"),
+    "horizon": (horizon, "steps"),
+    "recordings": (recordings, "recordings"),
+    "candidates": (candidates, "candidates"),
+}
+"""What is measured along every axis, and by which key it goes."""
+
+
+def slope(points: Sequence[Mapping[str, float]], by: str, of: str) -> float:
+    """Exponent of a power law through some points, NaN for fewer than two."""
+    known = [(point[by], point[of]) for point in points if point[of] > 0]
+    if len({x for x, _ in known}) < 2:
+        return math.nan
+    x, y = np.log(np.array(known)).T
+    return float(np.polyfit(x, y, 1)[0])
+
+
+# -- workers ----------------------------------------------------------------------------------------------------------
+
+
+def efficiency(counts: Sequence[int], cases: int, quick: bool) -> list[dict[str, float]]:
+    """The same tasks by different numbers of processes; the first number is what the others are compared with."""
+    settings = settings_of(1 if quick else 4, quick)
+    case(settings, 0)  # compiles
+    runs = [shared(settings, count, cases) for count in counts]
+    assert len({tuple(costs) for _, costs in runs}) == 1, "workers change the answers"
+    points = [point for point, _ in runs]
+    return [point | {"efficiency": points[0]["cpu"] / point["cpu"] * point["occupied"]} for point in points]
+
+
+def shared(settings: list[str], count: int, cases: int) -> tuple[dict[str, float], list[float]]:
+    """Tasks by so many processes: their processor time and how busy the processes were, and what they found."""
+    ends: list[float] = []
+    with tempfile.TemporaryDirectory() as folder:
+        tasks = [Task(f"case {k}", {"settings": settings, "seed": k}) for k in range(cases)]
+        progress = lambda *_: ends.append(time.monotonic())  # noqa: E731
+        results = run_tasks(case, tasks, Path(folder), Workers(processes=count), progress)
+    failed = [entry.error for entry in results if entry.error]
+    assert not failed, failed[0]
+    # processes start once, however many tasks there are: the time counts from when the first task began
+    span = ends[-1] - ends[0] + min(entry.seconds for entry in results)
+    busy = sum(entry.seconds for entry in results)
+    cpu = sum(entry.value["cpu"] for entry in results)
+    point = {"workers": count, "cpu": cpu, "occupied": min(1.0, busy / (count * span))}
+    return point, [entry.value["cost"] for entry in results]
+
+
+# -- the run ----------------------------------------------------------------------------------------------------------
+
+
+def report(found: Mapping[str, Sequence[Mapping[str, float]]], slopes: Mapping[str, Mapping[str, float]]) -> list[str]:
+    """Tables for a person."""
+    lines: list[str] = []
+    for axis, points in found.items():
+        if axis == "workers":
+            rows: list[Sequence[str]] = [("workers", "CPU [s]", "occupied", "efficiency")]
+            rows += [
+                (str(int(p["workers"])), f"{p['cpu']:.3g}", f"{p['occupied']:.2f}", f"{p['efficiency']:.2f}")
+                for p in points
+            ]
+        else:
+            by = AXES[axis][1]
+            rows = [(by, "CPU [s]", "memory [MiB]")]
+            rows += [(f"{p[by]:g}", f"{p['cpu']:.3g}", f"{p['memory']:.3g}") for p in points]
+            rows.append(("slope", *(f"{slopes[axis][of]:.2f}" for of in ("cpu", "memory"))))
+        lines += [*table(rows), ""]
+    return lines
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure, print and store."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    known = [*AXES, "workers"]
+    parser.add_argument("axes", nargs="*", metavar="AXIS", help=f"of {', '.join(known)}; all when absent")
+    parser.add_argument("--quick", action="store_true", help="small models without a compiler: whether it runs at all")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="store points and slopes")
+    parser.add_argument("--workers", type=int, nargs="+", default=[1, 2], help="numbers of processes to compare")
+    parser.add_argument("--cases", type=int, help=f"that they share ({CASES[False]}; {CASES[True]} where quick)")
+    chosen = parser.parse_args(arguments)
+    unknown = sorted(set(chosen.axes) - set(known))
+    if unknown:
+        parser.error(f"there is no axis '{unknown[0]}'; choose from {', '.join(known)}")
+    found: dict[str, list[dict[str, float]]] = {}
+    slopes: dict[str, dict[str, float]] = {}
+    for axis in [name for name in known if name in chosen.axes or not chosen.axes]:
+        print(f"{axis} ...", file=sys.stderr, flush=True)
+        if axis == "workers":
+            found[axis] = efficiency(chosen.workers, chosen.cases or CASES[chosen.quick], chosen.quick)
+            continue
+        measure, by = AXES[axis]
+        found[axis] = measure(chosen.quick)
+        slopes[axis] = {of: slope(found[axis], by, of) for of in ("cpu", "memory")}
+    if chosen.json is not None:
+        kept = {axis: {of: value for of, value in own.items() if math.isfinite(value)} for axis, own in slopes.items()}
+        write_json(chosen.json, {"points": found, "slopes": kept})
+    print("\n".join(report(found, slopes)))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,204 @@
+"""Tasks on a Dask cluster of this machine: a killed worker, workers that are not fit, schedulers that are not there."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from here import Here
+
+from yid_ocp.config.reader import load_config
+from yid_ocp.errors import WorkerError
+from yid_ocp.parallel import Task, Workers, run_tasks
+from yid_ocp.parallel.cluster import cluster as connected
+from yid_ocp.version import fingerprint
+from yid_ocp.workflow.blind import run_blind
+from yid_ocp.workflow.progress import Silent
+
+distributed = pytest.importorskip("distributed", reason="clusters need Dask: pip install 'yid-ocp[cluster]'")
+
+
+def squared(number: int, marks: str) -> int:
+    """A task that says which process began it, and when it ended."""
+    begun = Path(marks) / f"{number}.{os.getpid()}.begun"
+    begun.write_text("")
+    time.sleep(0.15)
+    begun.with_suffix(".ended").write_text("")
+    return number**2
+
+
+def deadly(number: int) -> int:
+    if number == 1:
+        os._exit(7)
+    return number
+
+
+def tasks(marks: Path, count: int = 12) -> list[Task]:
+    marks.mkdir()
+    return [Task(f"task {i}", {"number": i, "marks": str(marks)}) for i in range(count)]
+
+
+@pytest.fixture(scope="module")
+def scheduler():
+    """Address of a scheduler with two workers of one thread each, and the cluster itself."""
+    with distributed.LocalCluster(
+        n_workers=2,
+        threads_per_worker=1,
+        processes=True,
+        dashboard_address=None,
+        host="127.0.0.1",
+        scheduler_kwargs={"allowed_failures": 1},
+    ) as cluster:
+        cluster.wait_for_workers(2)
+        yield SimpleNamespace(address=cluster.scheduler_address, cluster=cluster)
+
+
+def processes(scheduler: Any) -> list[int]:
+    with distributed.Client(scheduler.address, set_as_default=False) as client:
+        return list(client.run(os.getpid).values())
+
+
+def test_a_killed_worker_loses_nothing_and_nothing_counts_twice(scheduler, tmp_path):
+    marks = tmp_path / "marks"
+    workers = processes(scheduler)
+    killed: list[int] = []
+
+    def kill_one(done: int, total: int, name: str) -> None:
+        """Once four are done, end a worker that is at a task."""
+        if done < 4 or killed:
+            return
+        until = time.monotonic() + 20
+        while time.monotonic() < until:
+            begun, ended = ({path.stem for path in marks.glob(f"*.{what}")} for what in ("begun", "ended"))
+            at_work = {int(stem.partition(".")[2]) for stem in begun - ended} & set(workers)
+            if at_work:
+                killed.append(at_work.pop())
+                os.kill(killed[0], signal.SIGKILL)
+                return
+
+    found = run_tasks(squared, tasks(marks), tmp_path / "there", Workers(scheduler=scheduler.address), kill_one)
+    assert len(killed) == 1
+    assert [entry.error for entry in found] == [""] * 12
+    begun, ended = ([path.stem.partition(".")[0] for path in marks.glob(f"*.{what}")] for what in ("begun", "ended"))
+    assert len(begun) > 12  # what the killed worker was at began again
+    assert set(ended) == {str(i) for i in range(12)}
+    with ThreadPoolExecutor(12) as pool:
+        here = run_tasks(squared, tasks(tmp_path / "more"), tmp_path / "here", pool)
+    assert [entry.value for entry in found] == [entry.value for entry in here] == [i**2 for i in range(12)]
+    files = {path.name: json.loads(path.read_text()) for path in (tmp_path / "there").iterdir()}
+    assert sorted(entry["name"] for entry in files.values()) == sorted(entry.name for entry in found)
+    again = run_tasks(
+        squared, [Task("", {"number": i, "marks": str(marks)}) for i in range(12)], tmp_path / "there"
+    )  # whoever did them, they are done
+    assert all(entry.resumed for entry in again)
+
+
+def test_a_task_that_ends_every_worker_fails_alone(scheduler, tmp_path, caplog):
+    found = run_tasks(
+        deadly, [Task(str(i), {"number": i}) for i in range(3)], tmp_path, Workers(scheduler=scheduler.address)
+    )
+    assert [entry.value for entry in found] == [0, None, 2]
+    assert found[1].error == "every worker that tried it ended abruptly"
+    scheduler.cluster.wait_for_workers(2)
+
+
+def test_a_worker_of_another_version_is_refused(scheduler, tmp_path, monkeypatch):
+    other = {**fingerprint(), "yid-ocp": "99.0", "code": "b" * 64}
+    monkeypatch.setattr("yid_ocp.parallel.cluster.fingerprint", lambda: other)
+    with pytest.raises(WorkerError, match=r"of another version: yid-ocp \S+ instead of 99.0, code \w+ instead of bbb"):
+        Workers(scheduler=scheduler.address).check()
+    monkeypatch.setattr("yid_ocp.parallel.cluster.fingerprint", lambda: {**fingerprint(), "python": "2.7"})
+    with pytest.raises(WorkerError, match=r"python 3\.\S+ instead of 2.7"):
+        Workers(scheduler=scheduler.address).check()
+
+
+def test_what_a_worker_cannot_import_or_see_is_said(scheduler, tmp_path, monkeypatch):
+    squared_elsewhere = SimpleNamespace(__module__="nowhere.to_be_found")
+    with (
+        pytest.raises(WorkerError, match="ModuleNotFoundError: No module named 'nowhere'"),
+        connected(scheduler.address, squared_elsewhere, tmp_path),
+    ):
+        pass
+    monkeypatch.setattr("yid_ocp.parallel.cluster.Path.write_text", lambda *_, **__: 0)
+    monkeypatch.setattr("yid_ocp.parallel.cluster.Path.unlink", lambda *_, **__: None)
+    with pytest.raises(WorkerError, match=f"does not see {tmp_path}"), connected(scheduler.address, squared, tmp_path):
+        pass
+
+
+def test_workers_of_several_threads_are_refused():
+    with (
+        distributed.LocalCluster(n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None) as cluster,
+        pytest.raises(WorkerError, match="2 tasks at once in one process"),
+    ):
+        Workers(scheduler=cluster.scheduler_address).check()
+
+
+@pytest.mark.parametrize(
+    ("address", "words"),
+    [("127.0.0.1:1", "no scheduler answers"), ("nowhere", "no scheduler answers"), ("a:b:c", "no scheduler answers")],
+)
+def test_a_scheduler_that_is_not_there_is_said(address, words, monkeypatch):
+    monkeypatch.setattr("yid_ocp.parallel.cluster.CONNECTING", 0.5)
+    with pytest.raises(WorkerError, match=words) as caught:
+        Workers(scheduler=address).check()
+    assert address in str(caught.value)
+    assert "dask scheduler" in str(caught.value)
+
+
+def test_dask_is_optional(monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(WorkerError, match=r"pip install 'yid-ocp\[cluster\]'"):
+        Workers(scheduler="localhost:8786").check()
+
+
+def test_a_scheduler_file_will_do(scheduler, tmp_path):
+    file = tmp_path / "scheduler.json"
+    with distributed.Client(scheduler.address, set_as_default=False) as client:
+        client.write_scheduler_file(str(file))
+    found = run_tasks(deadly, [Task("", {"number": 5})], tmp_path / "results", Workers(scheduler=str(file)))
+    assert found[0].value == 5
+
+
+CASES = 12
+
+
+class Killing(Silent):
+    """Ends a worker in the middle of the diagnoses, as soon as a third of them is done."""
+
+    def __init__(self, scheduler: Any) -> None:
+        self.scheduler, self.diagnosing, self.killed = scheduler, False, 0
+
+    def stage(self, text: str) -> None:
+        self.diagnosing = text.startswith("diagnosing")
+
+    def advance(self, done: int, total: int, text: str) -> None:
+        if self.diagnosing and not self.killed and 3 * done >= total:
+            self.killed = processes(self.scheduler)[0]
+            os.kill(self.killed, signal.SIGKILL)
+
+
+@pytest.mark.slow
+def test_a_blind_proof_survives_a_killed_worker(scheduler, pendulum, tmp_path):
+    pytest.importorskip("mujoco", reason="blind proofs need MuJoCo: pip install 'yid-ocp[blind]'")
+    settings = ("model.arms.mode=driven", "recordings.held_out=[]", "output.report=false", "problem.compiler=true")
+    run = load_config(pendulum, (*settings, "diagnosis.candidates=[joint_viscous, joint_coulomb]"))
+    killing = Killing(scheduler)
+    there = run_blind([run], tmp_path / "there", CASES, 3, killing, Workers(scheduler=scheduler.address))
+    assert killing.killed
+    here = run_blind([run], tmp_path / "here", CASES, 3, workers=Here())
+    for own in (there.result, here.result):
+        own.pop("seconds")
+        for entry in own["marks"]:
+            entry.pop("seconds")
+    assert there.result == here.result
+    for folder in ("there", "here"):
+        answers = [json.loads(path.read_text())["name"] for path in (tmp_path / folder / "answers").glob("*.json")]
+        assert sorted(answers) == [f"case_{i:03d}" for i in range(CASES)]

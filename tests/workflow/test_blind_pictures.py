@@ -1,0 +1,46 @@
+"""The table and the pictures of a blind proof, from marks that are made up."""
+
+from __future__ import annotations
+
+import pytest
+from PIL import Image
+
+from yid_ocp.diagnosis.blind import Mark, score
+from yid_ocp.errors import OutputError
+from yid_ocp.files import jsonable
+from yid_ocp.report.pictures import draw_blind
+from yid_ocp.report.tables import blind_table
+
+
+def made(category: str, gap: bool, right: bool, size: float = float("nan"), experiment: str = "one", **more) -> Mark:
+    answer = "kelvin_voigt@T1" if gap else "-"
+    verdict = "effect" if gap else "no_gap"
+    truth = "-" if category == "null" else "kelvin_voigt@T1"
+    told = ("case_000", category, truth, verdict, answer, size)
+    return Mark(*told, gap, gap, gap, gap, (), right, 0.9, 1.0, experiment=experiment, **more)
+
+
+MARKS = [
+    *(made("single", i % 4 > 0, i % 4 > 1, 3.0, z={"kelvin_voigt@T1.tau": 0.3 * i}) for i in range(8)),
+    *(made("null", False, True, experiment="two", p_value=0.1 * i) for i in range(5)),
+]
+
+
+@pytest.mark.parametrize("marks", [MARKS, MARKS[8:], []], ids=["all", "clean ones", "none"])
+def test_pictures_are_drawn_of_whatever_there_is(tmp_path, marks):
+    draw_blind(tmp_path, jsonable(score(marks)))
+    for name in ("detection", "confusion", "calibration"):
+        with Image.open(tmp_path / f"{name}.png") as picture:
+            assert min(picture.size) > 100
+
+
+def test_the_table_has_rates_with_intervals_by_size_and_by_experiment():
+    lines = blind_table(jsonable(score(MARKS)))
+    assert "| false alarms on clean data | 0 % (0 of 5, 0 % to 52 %) |" in lines
+    assert "| 3 | 8 | 75 % (6 of 8, 35 % to 97 %) | 50 % (4 of 8, 16 % to 84 %) |" in lines
+    assert "| two | 5 | 0 % (0 of 5, 0 % to 52 %) | - |" in lines
+
+
+def test_a_folder_that_is_not_there_is_said(tmp_path):
+    with pytest.raises(OutputError, match="cannot be written"):
+        draw_blind(tmp_path / "nowhere", jsonable(score(MARKS)))

@@ -1,0 +1,93 @@
+"""A blind proof of a driven pendulum, in this process: sealed before it is answered, and done once."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+
+import pytest
+from here import Here
+
+from yid_ocp.config.reader import load_config
+from yid_ocp.errors import ConfigError, DataError, OutputError
+from yid_ocp.workflow import blind
+from yid_ocp.workflow.blind import run_blind
+from yid_ocp.workflow.experiments import VARIATIONS, experiments_of
+
+SETTINGS = (
+    "model.arms.mode=driven",
+    "recordings.held_out=[]",
+    "diagnosis.candidates=[joint_viscous, joint_coulomb]",
+    "problem.compiler=true",
+    "output.report=false",
+)
+
+
+@pytest.fixture
+def driven(pendulum):
+    pytest.importorskip("mujoco", reason="blind proofs need MuJoCo: pip install 'yid-ocp[blind]'")
+    return load_config(pendulum, SETTINGS)
+
+
+@pytest.mark.slow
+def test_a_proof_is_sealed_answered_and_not_done_again(driven, tmp_path, monkeypatch):
+    folder = tmp_path / "proof"
+    sealed_at, first = [], blind.diagnosed
+
+    def watched(**arguments):
+        """What a diagnosis is told, and whether the labels were committed to before."""
+        sealed_at.append(json.loads((folder / "commitment.json").read_text())["sha256"])
+        assert not {"label", "planned", "detectable", "category"} & set(arguments)
+        return first(**arguments)
+
+    watched.__module__, watched.__qualname__ = first.__module__, first.__qualname__
+    monkeypatch.setattr(blind, "diagnosed", watched)
+    outcome = run_blind([driven], folder, 2, 3, workers=Here())
+    text = (folder / "sealed" / "labels.json").read_bytes()
+    assert sealed_at == [hashlib.sha256(text).hexdigest()] * 2
+    labels = json.loads(text)
+    assert [entry["case"] for entry in labels] == ["case_000", "case_001"]
+    assert {entry["experiment"] for entry in labels} == {"pendulum.as_configured"}
+    for path in (folder / "cases").glob("*.h5"):
+        assert not any(word in path.read_bytes() for word in (b"joint_", b"single", b"multiple"))
+    marks = outcome.result["marks"]
+    assert [entry["category"] for entry in marks] == [entry["category"] for entry in labels]
+    assert outcome.result["code"] == outcome.result["code_of_cases"]
+    assert {"detection.png", "confusion.png", "calibration.png", "table.md"} <= {p.name for p in folder.iterdir()}
+
+    again = run_blind([driven], folder, 2, 3, workers=Here())
+    assert len(sealed_at) == 2
+    assert again.result == outcome.result
+    with pytest.raises(OutputError, match=r"another ensemble \(2 cases, seed 3, for report\)"):
+        run_blind([driven], folder, 2, 3, workers=Here(), purpose="calibration")
+    (folder / "sealed" / "labels.json").write_bytes(text.replace(b"case_001", b"case_002"))
+    with pytest.raises(DataError, match="committed"):
+        run_blind([driven], folder, 2, 3, workers=Here())
+
+
+def test_what_cannot_be_proved_is_refused(driven, pendulum, tmp_path, cli):
+    prescribed = load_config(pendulum)
+    with pytest.raises(ConfigError, match=r"moves driven arms(.|\n)*model.arms.mode"):
+        run_blind([prescribed], tmp_path / "proof", 2, 3, workers=Here())
+    with pytest.raises(ConfigError, match="two configurations are called pendulum"):
+        run_blind([driven, driven], tmp_path / "proof", 2, 3, workers=Here())
+    with pytest.raises(ConfigError, match="seed = -1"):
+        run_blind([driven], tmp_path / "proof", 2, -1, workers=Here())
+    assert not (tmp_path / "proof").exists()
+    options = [part for setting in SETTINGS for part in ("--set", setting)]
+    done = cli("blind", pendulum, *options, "--scheduler", "127.0.0.1:1", "--out", tmp_path / "proof")
+    assert done.code == 2
+    assert "no scheduler answers" in done.err
+
+
+def test_an_experiment_is_varied_as_far_as_its_configuration_allows(repository, driven, pendulum):
+    whole = repository / "configs" / "single_arm_vision.yaml"
+    experiments, chains = experiments_of({"whole": whole, "pendulum": pendulum}, 1, "report")
+    assert {name for name in experiments if name.startswith("whole")} == {f"whole.{name}" for name in VARIATIONS}
+    # there is nothing to take out of its hands
+    of_pendulum = {name.partition(".")[2] for name in experiments if name.startswith("pendulum")}
+    assert of_pendulum == {name for name, varied in VARIATIONS.items() if not varied.bare}
+    assert chains == {f"whole.{name}" for name, varied in VARIATIONS.items() if not varied.bare}
+    bare = experiments["whole.bare_arm_efforts"].simulated()
+    assert bare.model.object is None
+    assert bare.model.arms.mode == "driven"

@@ -1,0 +1,65 @@
+"""Intervals and what-if by workers: the same numbers as in one process, and only once."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from here import Here
+
+from yid_ocp.config.reader import load_config
+from yid_ocp.errors import SolverError, WorkerError
+from yid_ocp.workflow import elsewhere
+from yid_ocp.workflow.identifiability import Question, run_identifiability
+
+QUICK = ("output.report=false",)
+KEYS = ("parameters", "directions", "profiles", "what_if", "correlations", "fit")
+
+
+def read(outcome):
+    told = json.loads((outcome.folder / "result.json").read_text())
+    return {key: told[key] for key in KEYS}
+
+
+@pytest.mark.parametrize("name", ["springs_torsion", "springs_series_joint"])
+def test_workers_find_what_one_process_does(repository, tmp_path, name):
+    run = load_config(repository / "configs" / f"{name}.yaml", QUICK)
+    asked = Question(intervals="all", what_if=True, start="unknown", grasp_std=0.01)
+    alone = run_identifiability(run, tmp_path / "alone", question=asked)
+    shared = run_identifiability(run, tmp_path / "shared", question=asked, workers=Here())
+    assert read(shared) == read(alone)
+    assert {path.name for path in tmp_path.iterdir()} == {"alone", "shared"}
+
+
+def test_an_interrupted_run_goes_on(repository, tmp_path, monkeypatch):
+    run = load_config(repository / "configs" / "springs_series_joint.yaml", QUICK)
+    asked = Question(intervals="all")
+    names, done = [], elsewhere.profiled
+
+    def twice(name, **arguments):
+        if len(names) == 1:
+            raise KeyboardInterrupt
+        names.append(name)
+        return done(name=name, **arguments)
+
+    twice.__module__, twice.__qualname__ = done.__module__, done.__qualname__
+    monkeypatch.setattr(elsewhere, "profiled", twice)
+    with pytest.raises(KeyboardInterrupt):
+        run_identifiability(run, tmp_path / "run", question=asked, workers=Here())
+    assert len(list((tmp_path / "run.partial" / "tasks").glob("*.json"))) == 1
+    monkeypatch.setattr(elsewhere, "profiled", done)
+    outcome = run_identifiability(run, tmp_path / "run", question=asked, workers=Here())
+    assert set(outcome.result["profiles"]) == {"spring_1.stiffness", "spring_2.stiffness"}
+    assert not (tmp_path / "run.partial").exists()
+
+
+def test_a_part_that_fails_is_said(repository, tmp_path, monkeypatch):
+    def failing(name, **arguments):
+        raise SolverError(f"no {name}", hint="mend it")
+
+    failing.__module__, failing.__qualname__ = "yid_ocp.workflow.elsewhere", "profiled"
+    monkeypatch.setattr(elsewhere, "profiled", failing)
+    run = load_config(repository / "configs" / "springs_series_joint.yaml", QUICK)
+    words = r"2 of 2 tasks failed, spring_1.stiffness with SolverError: no spring_1.stiffness(.|\n)*mend it"
+    with pytest.raises(WorkerError, match=words):
+        run_identifiability(run, tmp_path / "run", question=Question(intervals="all"), workers=Here())

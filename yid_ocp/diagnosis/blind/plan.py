@@ -1,0 +1,111 @@
+"""Which cases an ensemble has: sorts and sizes, dealt to experiments so that each has its part of every sort."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from yid_ocp.errors import ConfigError
+
+Key = TypeVar("Key", str, float)
+SIZES = (1.0, 3.0, 10.0)
+"""Multiples of the detectable size."""
+SHARES: Mapping[str, float] = {
+    "null": 0.2,
+    "single": 0.48,
+    "pair": 0.1,
+    "outside": 0.1,
+    "left_out": 0.06,
+    "finer_chain": 0.06,
+}
+"""What an ensemble is made of."""
+PURPOSES = ("report", "calibration")
+"""What an ensemble is for; the same seed draws other cases for each, so that none is both."""
+FEWEST = 3
+"""Cases below which an experiment is not worth its compiled step."""
+
+
+@dataclass(frozen=True)
+class Planned:
+    """What is to be made as a case.
+
+    Attributes
+    ----------
+    number : int
+    experiment : str
+    category : str
+        Of `SHARES`.
+    multiple : float, optional
+        Of the detectable size; None where that has no meaning.
+    """
+
+    number: int
+    experiment: str
+    category: str
+    multiple: float | None
+
+
+def planned(
+    count: int,
+    seed: int,
+    weights: Mapping[str, float],
+    chains: frozenset[str] = frozenset(),
+    purpose: str = PURPOSES[0],
+) -> list[Planned]:
+    """The cases of an ensemble, in an order that the seed decides.
+
+    Parameters
+    ----------
+    count : int
+    seed : int
+    weights : mapping of experiment to float
+        How large a part of the cases each gets; those that would get fewer than `FEWEST` get none, but for the largest.
+    chains : frozenset of str
+        Experiments whose object can be made of finer links.
+    purpose : str
+        Of `PURPOSES`.
+
+    Raises
+    ------
+    ConfigError
+        No case at all.
+    """
+    if count < 1:
+        raise ConfigError(f"an ensemble of {count} cases", where="--cases", allowed="a whole number from 1")
+    total = sum(weights.values())
+    kept = {name: part / total for name, part in weights.items() if count * part / total >= FEWEST}
+    if not kept:
+        kept = {max(weights, key=lambda name: weights[name]): 1.0}
+    slots: list[tuple[str, float | None]] = []
+    for category, number in _dealt(count, SHARES).items():
+        if category == "single":
+            for size, times in _dealt(number, dict.fromkeys(SIZES, 1.0)).items():
+                slots += [(category, size)] * times
+        else:
+            slots += [(category, SIZES[-1] if category in ("pair", "left_out") else None)] * number
+    # the experiment that is furthest behind its part gets the next case, so that every sort is spread over all
+    given = dict.fromkeys(kept, 0)
+    cases = []
+    slots.sort(
+        key=lambda slot: slot[0] != "finer_chain"
+    )  # what few can do comes first, so that the rest makes up for it
+    for i, slot in enumerate(slots):
+        able = [name for name in kept if slot[0] != "finer_chain" or name in chains]
+        name = max(able or kept, key=lambda entry: kept[entry] * (i + 1) - given[entry])
+        given[name] += 1
+        cases.append((name, *(slot if able else ("single", SIZES[1]))))
+    order = np.random.default_rng([seed, PURPOSES.index(purpose), 2]).permutation(count)
+    return [Planned(number, *cases[int(place)]) for number, place in enumerate(order)]
+
+
+def _dealt(count: int, parts: Mapping[Key, float]) -> dict[Key, int]:
+    """So many things in these proportions, by the largest remainders."""
+    total = sum(parts.values())
+    exact = {key: count * part / total for key, part in parts.items()}
+    found = {key: int(value) for key, value in exact.items()}
+    for key in sorted(exact, key=lambda key: found[key] - exact[key])[: count - sum(found.values())]:
+        found[key] += 1
+    return found

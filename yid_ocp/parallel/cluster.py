@@ -1,0 +1,137 @@
+"""A cluster: the workers of a Dask scheduler as an executor, once they are known to be fit for the work."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import logging
+import secrets
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor
+from pathlib import Path
+from typing import Any
+
+from yid_ocp.errors import WorkerError
+from yid_ocp.version import differences, fingerprint
+
+CONNECTING = 15.0
+"""Time in which a scheduler has to answer [s]."""
+Function = Callable[..., Any]
+log = logging.getLogger(__name__)
+
+
+@contextlib.contextmanager
+def cluster(
+    scheduler: str, function: Function | None = None, folder: Path | None = None
+) -> Iterator[tuple[Executor, Callable[[], None]]]:
+    """An executor on the workers of a Dask scheduler, and what says that there are none while tasks wait.
+
+    Raises
+    ------
+    WorkerError
+        Dask is not installed, no scheduler answers, or a worker cannot do the function or does not see the folder.
+    """
+    try:
+        distributed = importlib.import_module("distributed")
+    except ImportError as error:
+        raise WorkerError(
+            "a scheduler needs Dask, which is not installed",
+            where="--scheduler",
+            hint="pip install 'yid-ocp[cluster]', or leave --scheduler out for processes on this machine",
+        ) from error
+    path = Path(scheduler).expanduser()
+    where = {"scheduler_file": str(path)} if path.is_file() else {"address": scheduler}
+    try:
+        client = distributed.Client(**where, timeout=CONNECTING, set_as_default=False)
+    except (OSError, ValueError, TypeError, LookupError) as error:  # TimeoutError is an OSError
+        raise WorkerError(
+            f"no scheduler answers: {str(error).splitlines()[0] if str(error) else type(error).__name__}",
+            where=scheduler,
+            allowed="HOST:PORT of a running `dask scheduler`, or the path of its scheduler file",
+            hint="start one with `dask scheduler` and workers with `dask worker HOST:PORT --nthreads 1`",
+        ) from error
+
+    def look() -> None:
+        if not client.nthreads():
+            log.warning("the scheduler at %s has no workers; tasks wait for them", scheduler)
+
+    with client:
+        look()
+        _refuse_unfit(client, function, folder)
+        # Dask would take a task that failed before for done where the function counted as pure
+        yield client.get_executor(pure=False), look
+
+
+def _refuse_unfit(client: Any, function: Function | None, folder: Path | None) -> None:
+    """Refuse workers of other versions, of several threads, or that do not see what is here.
+
+    What they are asked travels whole, not by name: a worker without this package could not even read the name of a
+    function of it, and would be lost for its scheduler.
+    """
+    for address, count in client.nthreads().items():
+        if count > 1:
+            raise WorkerError(
+                f"a worker would do {count} tasks at once in one process",
+                where=address,
+                allowed="one task at a time in every process",
+                hint="start workers with --nthreads 1, and --nworkers for as many as the machine has processors",
+            )
+    here = fingerprint()
+    for address, entry in client.get_versions()["workers"].items():
+        said = str(entry["host"]["python"])
+        if said.split(".")[:2] != here["python"].split("."):  # functions do not travel between these
+            raise _unfit(address, [f"python {said} instead of {here['python']}"])
+    module = "" if function is None or function.__module__ == "__main__" else function.__module__
+    probe = None if folder is None else folder / f".{secrets.token_hex(8)}.probe"
+    try:
+        if probe is not None:
+            probe.write_text("", encoding="utf-8")
+        found = client.run(_question(module, "" if probe is None else str(probe)))
+    finally:
+        if probe is not None:
+            probe.unlink(missing_ok=True)
+    for address, said in found.items():
+        if isinstance(said, str):
+            raise WorkerError(
+                f"a worker cannot do the tasks: {said}",
+                where=address,
+                allowed="workers that import the same modules and see the same folders as this process",
+                hint="install yid-ocp where the workers run, and choose --out on a file system that all of them share",
+            )
+        unlike = differences(here, said)
+        if unlike:
+            raise _unfit(address, unlike)
+
+
+def _question(module: str, probe: str) -> Callable[[], Any]:
+    """What asks a worker for its fingerprint; it answers in words where it cannot give one."""
+
+    def asked() -> Any:
+        import importlib
+        import os
+
+        try:
+            made = importlib.import_module("yid_ocp.version").fingerprint()
+            if module:
+                importlib.import_module(module)
+        except Exception as error:
+            return f"{type(error).__name__}: {error}"
+        if probe and not os.path.exists(probe):
+            return f"it does not see {os.path.dirname(probe)}"
+        return made
+
+    return asked
+
+
+def _unfit(worker: str, unlike: Sequence[str]) -> WorkerError:
+    return WorkerError(
+        unlike_words(worker, unlike),
+        where=worker,
+        allowed="workers of the same versions and sources as this process",
+        hint="install the same version there, and start the workers again",
+    )
+
+
+def unlike_words(worker: str, unlike: Sequence[str]) -> str:
+    """That a worker is of another version, and in what; see `version.differences`."""
+    return f"the worker {worker} is of another version: {', '.join(unlike)}"

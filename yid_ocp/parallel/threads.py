@@ -1,0 +1,80 @@
+"""Maps over shared memory by threads, and values that threads share."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Hashable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Generic, TypeVar
+
+from yid_ocp.errors import ConfigError
+
+THREADS = "YID_OCP_THREADS"
+"""Environment variable: threads that one process may use; as many as it has processors when absent."""
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+Key = TypeVar("Key", bound=Hashable)
+Value = TypeVar("Value")
+
+
+def map_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
+    """Results in the order of the items, worked out by as many threads as the process may use.
+
+    Compiled code runs outside Python's lock, so that threads share memory and still work side by side.
+    """
+    entries = list(items)
+    workers = min(len(entries), threads())
+    if workers < 2:
+        return [function(entry) for entry in entries]
+    with ThreadPoolExecutor(max_workers=workers) as pool:
+        return list(pool.map(function, entries))
+
+
+def processors() -> int:
+    """How many processors this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def threads() -> int:
+    """How many threads this process may use at once.
+
+    Raises
+    ------
+    ConfigError
+        `YID_OCP_THREADS` is no number of threads.
+    """
+    said = os.environ.get(THREADS, "")
+    if said and not (said.isdecimal() and int(said)):
+        raise ConfigError(f"{THREADS} is '{said}'", where="environment", allowed="a whole number from 1")
+    return int(said) if said else processors()
+
+
+# CasADi marks the nodes of expressions while it differentiates them: two threads at once on expressions that share
+# symbols give wrong derivatives. Evaluating finished functions is safe.
+SYMBOLIC = threading.RLock()
+"""Held by whoever builds or differentiates expressions that others may hold too."""
+
+
+class Once(Generic[Key, Value]):
+    """Values that are worked out once, whichever thread asks first, one thread at a time in the whole program.
+
+    For what is made of CasADi's expressions, which threads must not work on side by side.
+
+    Parameters
+    ----------
+    make : callable
+        From the key to the value; must depend on nothing else.
+    """
+
+    def __init__(self, make: Callable[[Key], Value]) -> None:
+        self._make = make
+        self._known: dict[Key, Value] = {}
+
+    def __call__(self, key: Key) -> Value:
+        """The value for a key."""
+        if key not in self._known:
+            with SYMBOLIC:
+                if key not in self._known:
+                    self._known[key] = self._make(key)
+        return self._known[key]

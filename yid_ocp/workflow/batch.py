@@ -1,0 +1,283 @@
+"""The command `batch`: a fleet, many recordings or robots, each a run folder; one table and report of all."""
+
+from __future__ import annotations
+
+import argparse
+import glob
+import json
+import logging
+import shutil
+import time
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from yid_ocp.analysis.history import history
+from yid_ocp.config.reader import load_config
+from yid_ocp.config.settings import Run
+from yid_ocp.errors import ConfigError, OutputError, YidError, nearest
+from yid_ocp.files import file_sha256, jsonable, reason, write_json
+from yid_ocp.parallel import LOCAL, Task, TaskResult, Workers, run_tasks
+from yid_ocp.report.html import write_report
+from yid_ocp.report.sections import Findings
+from yid_ocp.report.terminal import batch_summary
+from yid_ocp.version import versions
+from yid_ocp.workflow.baseline import read_estimates, refuse_unlike
+from yid_ocp.workflow.build import input_files
+from yid_ocp.workflow.command import DONE, FAILED, carry_out, given_workers
+from yid_ocp.workflow.diagnose import run_diagnose
+from yid_ocp.workflow.progress import SILENT, Progress
+from yid_ocp.workflow.report import history_result
+from yid_ocp.workflow.solve import run_solve
+
+FORMAT = "yid-batch/1"
+RESULT, RUNS, TASKS = "batch.json", "runs", "tasks"
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Member:
+    """One run of a batch.
+
+    Attributes
+    ----------
+    name : str
+        Of its folder.
+    config : Path
+    settings : tuple of str
+        `a.b=c` each, over those of the file.
+    """
+
+    name: str
+    config: Path
+    settings: tuple[str, ...]
+
+    def load(self) -> Run:
+        """The settings; errors as `load_config`."""
+        return load_config(self.config, self.settings)
+
+
+@dataclass(frozen=True)
+class BatchOutcome:
+    """What `run_batch` leaves: the folder and the contents of its batch.json."""
+
+    folder: Path
+    result: dict[str, Any]
+
+    @property
+    def ok(self) -> bool:
+        """Whether every run ended well."""
+        return all(entry["ok"] for entry in self.result["runs"])
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """The command."""
+    members = batch_members(arguments.configs, arguments.recordings, arguments.overrides)
+    workers = given_workers(arguments) or LOCAL
+    out = arguments.out or Path("runs") / f"batch-{time.strftime('%Y%m%d-%H%M%S')}"
+    outcome = carry_out(
+        lambda shown: run_batch(members, out, arguments.each, workers, shown), batch_summary, arguments.quiet
+    )
+    return DONE if outcome.ok else FAILED
+
+
+def batch_members(
+    configs: Sequence[str | Path], recordings: str | None = None, overrides: Sequence[str] = ()
+) -> list[Member]:
+    """The runs of a batch: one for each configuration, or for each with each recording that a pattern matches.
+
+    Parameters
+    ----------
+    configs : sequence of str or Path
+    recordings : str, optional
+        A pattern such as `fleet/*.h5`, `**` for any folders; a run then estimates on one recording and holds none out,
+        unless the overrides say otherwise.
+    overrides : sequence of str
+        `a.b=c` each, for every run.
+
+    Raises
+    ------
+    ConfigError
+        A configuration is not there or given twice, or no recording matches.
+    """
+    paths = [Path(config) for config in configs]
+    for i, path in enumerate(paths):
+        if not path.is_file():
+            near = [entry.name for entry in path.parent.glob("*.yaml")] if path.parent.is_dir() else []
+            hint = nearest(path.name, near) if near else "check the path"
+            raise ConfigError("there is no such configuration file", where=str(path), hint=hint)
+        if path.resolve() in [other.resolve() for other in paths[:i]]:
+            raise ConfigError("a configuration is given twice", where=str(path), hint="list every one once")
+    if recordings is None:
+        return _named([(path.stem, path, tuple(overrides)) for path in paths])
+    files = sorted(Path(match) for match in glob.glob(recordings, recursive=True) if Path(match).is_file())
+    if not files:
+        raise ConfigError(
+            "no recording matches",
+            where=f"--recordings {recordings}",
+            allowed="a pattern such as 'fleet/*.h5' or 'fleet/**/*.h5', relative to the working folder",
+            hint="put the pattern in quotes, so that the shell leaves it alone, and check the folder",
+        )
+    entries = []
+    for path in paths:
+        for file in files:
+            own = (f"recordings.estimate=[{json.dumps(str(file.resolve()))}]", "recordings.held_out=[]")
+            stem = file.stem if len(paths) == 1 else f"{path.stem}-{file.stem}"
+            entries.append((stem, path, (*own, *overrides)))
+    return _named(entries)
+
+
+def _named(entries: Sequence[tuple[str, Path, tuple[str, ...]]]) -> list[Member]:
+    """Members with names of their own, those of one stem numbered."""
+    members: list[Member] = []
+    for stem, path, settings in entries:
+        taken, name, number = {member.name for member in members}, stem, 1
+        while name in taken:
+            number += 1
+            name = f"{stem}-{number}"
+        members.append(Member(name, path.resolve(), settings))
+    return members
+
+
+def run_batch(
+    members: Sequence[Member],
+    out: str | Path,
+    command: str = "solve",
+    workers: Workers | Executor = LOCAL,
+    progress: Progress = SILENT,
+) -> BatchOutcome:
+    """Run a command on every member of a batch; what the folder holds of them is not done again.
+
+    Parameters
+    ----------
+    members : sequence of Member
+        See `batch_members`.
+    out : str or Path
+        Folder: `runs/NAME/` (a run folder each), `tasks/` (results of tasks, see `yid_ocp.parallel`), then `batch.json`
+        (`yid-batch/1`) and `report.html`.
+    command : {'solve', 'diagnose'}
+    workers : Workers or Executor, optional
+    progress : Progress, optional
+
+    Returns
+    -------
+    BatchOutcome
+        Also where runs failed: each says why.
+
+    Raises
+    ------
+    OutputError
+        The folder holds something else, or cannot be made.
+    WorkerError
+    """
+    folder = _folder(Path(out))
+    results: dict[str, TaskResult] = {}
+    tasks = []
+    for member in members:
+        try:
+            run = member.load()
+            # what it depends on beside its settings; their content counts, wherever they stand
+            inputs = sorted({str(path.absolute()) for path in input_files(run).values()})
+            for path in inputs:
+                file_sha256(Path(path))
+        except YidError as error:
+            results[member.name] = TaskResult(member.name, error=f"{type(error).__name__}: {error}")
+            log.warning("%s cannot begin: %s", member.name, error.what)
+            continue
+        arguments = {
+            "name": member.name,
+            "config": member.config,
+            "settings": list(member.settings),
+            "inputs": [Path(path) for path in inputs],
+            "command": command,
+            "folder": str(folder / RUNS),
+        }
+        tasks.append(Task(member.name, arguments))
+    progress.stage(f"{command} of {len(tasks)} runs")
+    done = run_tasks(run_member, tasks, folder / TASKS, workers, progress.advance)
+    results |= {entry.name: entry for entry in done}
+    entries = [_entry(results[member.name], folder) for member in members]
+    result = {
+        "format": FORMAT,
+        "command": command,
+        "runs": entries,
+        "history": _alike([folder / RUNS / entry["name"] for entry in entries if entry["ok"]]),
+        "versions": versions(),
+    }
+    written: dict[str, Any] = jsonable(result)
+    write_json(folder / RESULT, written)
+    progress.stage("writing the report")
+    about = f"{len(entries)} runs of {command} side by side."
+    write_report(folder / "report.html", Findings(folder.name, about, written))
+    return BatchOutcome(folder, written)
+
+
+def run_member(
+    name: str, config: Path, settings: Sequence[str], inputs: Sequence[Path], command: str, folder: str
+) -> dict[str, Any]:
+    """Run one member in a folder of its name; what stands there of an earlier attempt goes."""
+    del inputs  # they are part of what the result is kept by
+    target = Path(folder) / name
+    if target.exists():
+        shutil.rmtree(target)
+    run = load_config(config, settings)
+    begun = time.perf_counter()
+    if command == "diagnose":
+        result = run_diagnose(run, target).result
+        judged, fit = result["model"]["parameters"], result["gap"]["before"]
+        status, ok, message = result["verdict"], True, result["summary"]
+    else:
+        result = run_solve(run, target).result
+        judged, fit = result["parameters"], result["fit"]
+        status, ok, message = result["status"], result["status"] == "converged", result["message"]
+    kept = ("value", "std", "unit", "verdict")
+    found: dict[str, Any] = jsonable({
+        "status": status,
+        "ok": ok,
+        "message": message,
+        "chi2_per_dof": fit.get("chi2_per_dof"),
+        "effects": [f"{entry['kind']}@{entry['location']}" for entry in result.get("effects", ())],
+        "parameters": {n: {key: own.get(key) for key in kept} for n, own in judged.items() if own.get("free", True)},
+        "seconds": time.perf_counter() - begun,
+    })  # fmt: skip
+    return found
+
+
+def _entry(result: TaskResult, folder: Path) -> dict[str, Any]:
+    """What stands of a run in batch.json."""
+    own = {"name": result.name, "folder": f"{RUNS}/{result.name}" if (folder / RUNS / result.name).is_dir() else None}
+    if result.error:
+        failed = {"status": "error", "ok": False, "message": result.error, "chi2_per_dof": None, "effects": []}
+        return own | failed | {"parameters": {}, "seconds": None}
+    return own | dict(result.value)
+
+
+def _alike(folders: Sequence[Path]) -> dict[str, Any] | None:
+    """`yid-history/1` of runs of one model, whose parameters mean the same thing; None where these are not that."""
+    try:
+        if len(folders) < 2:
+            return None
+        refuse_unlike(folders)
+        found: dict[str, Any] = history_result(history([read_estimates(folder) for folder in folders]))
+    except YidError:
+        return None
+    return found
+
+
+def _folder(path: Path) -> Path:
+    """The folder of a batch, made or found."""
+    folder = path.expanduser().absolute()
+    try:
+        if folder.is_dir() and any(folder.iterdir()) and not (folder / TASKS).is_dir():
+            raise OutputError(
+                "the folder holds something that is no batch",
+                where=str(folder),
+                allowed="a new name, an empty folder, or the folder of a batch, which goes on",
+                hint="choose another name with --out",
+            )
+        (folder / RUNS).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"the folder cannot be made: {reason(error)}", where=str(folder)) from error
+    return folder

@@ -1,0 +1,40 @@
+"""A run's robot with its other arm at the object too."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from yid_ocp.config.settings import GraspSettings, Run
+from yid_ocp.errors import YidError
+from yid_ocp.model.system import System
+from yid_ocp.workflow.build import build_system
+
+OTHER_SIDE = {"left": "right", "right": "left"}
+
+
+def second_arm(run: Run, system: System) -> System | None:
+    """The run's system with the robot's other arm at a free end of the object; None where there is no such thing."""
+    model = run.model
+    joints = model.arms.joints
+    if joints is None or model.arms.mode != "driven" or len(model.grasp) != 1:
+        return None
+    side, grasp = next(iter(model.grasp.items()))
+    prefix = f"{side}_"
+    if side not in OTHER_SIDE or not all(name.startswith(prefix) for name in (*joints, grasp.holder)):
+        return None
+    parents = {segment.parent for segment in system.segments}
+    free = [f"w_{s.name}" for s in system.segments if s.name not in parents and f"w_{s.name}" != grasp.held]
+    if not free:
+        return None
+
+    def mirrored(name: str) -> str:
+        return f"{OTHER_SIDE[side]}_{name.removeprefix(prefix)}"
+
+    arms = replace(model.arms, joints=(*joints, *(mirrored(name) for name in joints)))
+    added = GraspSettings(holder=mirrored(grasp.holder), held=free[0], kind=grasp.kind, rpy=grasp.rpy)
+    changed = replace(model, arms=arms, grasp={**model.grasp, OTHER_SIDE[side]: added})
+    try:
+        return build_system(replace(run, model=changed))
+    except YidError:
+        # the robot has no other arm of that name
+        return None
