@@ -34,7 +34,7 @@ def test_the_configuration_is_valid(text) -> None:
     from yid_ocp.config.settings import EffectSettings
 
     [block] = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
-    [entry] = YAML(typ="safe").load(block)["model"]["effects"]
+    [entry] = YAML(typ="safe", pure=True).load(block)["model"]["effects"]
     said = EffectSettings(**entry)
     assert (said.kind, said.location, said.values) == ("joint_churning", "left_e1", {"c": 0.3})
 

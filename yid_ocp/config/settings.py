@@ -185,7 +185,10 @@ class ModelSettings:
 
     robot: Annotated[
         FilePath | None,
-        About("URDF file, or package:NAME of example-robot-data; null for an object held by the world or by clamps"),
+        About(
+            "URDF file, package:NAME of example-robot-data, or default:NAME.urdf of this package; null for an object held "
+            "by the world or by clamps"
+        ),
     ] = None
     clamps: Annotated[
         Mapping[str, ClampSettings],

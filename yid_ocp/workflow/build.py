@@ -26,7 +26,7 @@ from yid_ocp.model.cable import Cable, cable_system, length_values, read_vertice
 from yid_ocp.model.parameters import Parameters
 from yid_ocp.model.rotations import placement_matrix, roll_pitch_yaw
 from yid_ocp.model.system import Spring
-from yid_ocp.model.urdf import read_urdf, robot_description_file
+from yid_ocp.model.urdf import read_urdf, robot_file
 from yid_ocp.model.y_object import Y_FOOT, y_segments
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import Episode
@@ -217,8 +217,7 @@ def input_files(run: Run) -> dict[str, Path]:
     robot = run.model.robot
     if robot is not None:
         with located(run, "model", "robot"):
-            package = robot.startswith("package:")
-            file = robot_description_file(robot.removeprefix("package:")) if package else Path(robot)
+            file = robot_file(robot)
         files[robot] = _existing(run, file, "URDF file", "model", "robot")
     if isinstance(run.model.object, CableObject):
         file = Path(run.model.object.undeformed)
