@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from yid_ocp.errors import ModelError
-from yid_ocp.model import Mechanism, urdf
+from yid_ocp.model import Mechanism
+from yid_ocp.model import urdf as urdf_files
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, merged
 from yid_ocp.model.rotations import roll_pitch_yaw, transform
 from yid_ocp.model.system import floating_clamp
@@ -331,8 +332,8 @@ def test_and_where_a_wheel_put_them(urdf_folder, tmp_path, monkeypatch) -> None:
             return urdf_folder / self.name
 
     files = [Installed("../../../share/yid_ocp/urdf/turntable.urdf"), Installed("yid_ocp/cli.py")]
-    monkeypatch.setattr(urdf, "__file__", str(tmp_path / "site-packages" / "yid_ocp" / "model" / "urdf.py"))
-    monkeypatch.setattr(urdf.metadata, "files", {"yid-ocp": files}.__getitem__)
+    monkeypatch.setattr(urdf_files, "__file__", str(tmp_path / "site-packages" / "yid_ocp" / "model" / "urdf.py"))
+    monkeypatch.setattr(urdf_files.metadata, "files", {"yid-ocp": files}.__getitem__)
     assert robot_file("default:turntable.urdf") == urdf_folder / "turntable.urdf"
-    with pytest.raises(ModelError, match="no URDF 'cli.py'"):
+    with pytest.raises(ModelError, match="no URDF"):
         robot_file("default:cli.py")

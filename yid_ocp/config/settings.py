@@ -186,8 +186,8 @@ class ModelSettings:
     robot: Annotated[
         FilePath | None,
         About(
-            "URDF file, package:NAME of example-robot-data, or default:NAME.urdf of this package; null for an object held "
-            "by the world or by clamps"
+            "URDF file, package:NAME of example-robot-data, or default:NAME.urdf of this package; null for an object "
+            "held by the world or by clamps"
         ),
     ] = None
     clamps: Annotated[
