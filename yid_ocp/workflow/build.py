@@ -33,6 +33,7 @@ from yid_ocp.problem.episodes import Episode
 from yid_ocp.sensors.joints import POSITION, of_arm
 from yid_ocp.workflow.doubts import blaming, examined, object_doubts, stop_at
 from yid_ocp.workflow.held import clamp_paths, clamps, straight_values, with_frames
+from yid_ocp.workflow.plugins import load_plugins
 
 GIVEN_FRAMES = 2  # of a cable's free points, from which every prediction starts
 LARGEST_GAP = 0.01  # what encoder noise and a slightly wrong length of the object can make of a grasp [m]
@@ -74,6 +75,8 @@ def build_system(run: Run, finer: int = 1) -> System:
         Names that do not exist, values outside their bounds; the error names the setting.
     """
     model = run.model
+    input_files(run)
+    load_plugins(run)
     if isinstance(model.object, CableObject):
         return _cable_model(run)
     robot = _robot(run)
@@ -197,14 +200,13 @@ def _robot(run: Run) -> Mechanism | None:
     model = run.model
     if model.robot is None:
         return None
-    input_files(run)
     with located(run, "model", "arms", "joints"):
         arms = model.arms
         return read_urdf(model.robot, joints=arms.joints, locked=arms.locked, exclude_links=arms.exclude_links)
 
 
 def input_files(run: Run) -> dict[str, Path]:
-    """Every file that a run reads, by its name in the settings: configuration, robot, recordings.
+    """Every file that a run reads, by its name in the settings: configuration, plug-ins, robot, recordings.
 
     Raises
     ------
@@ -214,6 +216,8 @@ def input_files(run: Run) -> dict[str, Path]:
     files: dict[str, Path] = {}
     if run.file:
         files["configuration"] = Path(run.file)
+    for i, path in enumerate(run.plugins):
+        files[path] = _existing(run, Path(path), "plug-in", "plugins", i)
     robot = run.model.robot
     if robot is not None:
         with located(run, "model", "robot"):

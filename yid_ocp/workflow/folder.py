@@ -22,6 +22,7 @@ from yid_ocp.config.settings import Run, dump_config
 from yid_ocp.errors import OutputError
 from yid_ocp.files import file_sha256, jsonable, reason, write_text
 from yid_ocp.workflow.build import input_files
+from yid_ocp.workflow.plugins import plugin_versions
 
 log = logging.getLogger(__name__)
 _UNFINISHED, _LOCK, _NAMES = ".partial", "lock", 1000
@@ -319,4 +320,4 @@ def versions() -> dict[str, str]:
             result[package] = metadata.version(package)
         except metadata.PackageNotFoundError:
             result[package] = "not installed"
-    return result
+    return result | plugin_versions()
