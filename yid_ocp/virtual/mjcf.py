@@ -85,7 +85,7 @@ def mujoco_xml(
     """
     if not time_step > 0:
         raise ConfigError(f"time_step = {time_step}", where="mujoco_xml", allowed="a positive number of seconds")
-    tree = replace(system.mechanism, parameters=system.parameters).numeric(values)
+    tree, weights = _weighed(replace(system.mechanism, parameters=system.parameters).numeric(values))
     value = Evaluator(system, values)
     _refuse_inexpressible(system, value, emulate)
 
@@ -103,7 +103,8 @@ def mujoco_xml(
     ElementTree.SubElement(option, "flag", contact="disable")
     sites = _sites(system, tree, value)
     base = ElementTree.SubElement(ElementTree.SubElement(root, "worldbody"), "body", name="world_base")
-    elements = _bodies(tree, joint_terms(system, value), sites, base)
+    ElementTree.SubElement(base, "inertial", pos="0 0 0", mass="0", diaginertia="0 0 0")  # Pinocchio asks for one
+    elements = _bodies(tree, weights, joint_terms(system, value), sites, base)
     for name, frame in sites:
         ElementTree.SubElement(elements[frame.joint], "site", {"name": name, **_pose(frame.placement)})
     _add_grasps(system, value, root, time_step)
@@ -114,7 +115,11 @@ def mujoco_xml(
 
 
 def _bodies(
-    tree: Mechanism, terms: Mapping[str, JointTerms], sites: list[tuple[str, Frame]], world: ElementTree.Element
+    tree: Mechanism,
+    weights: Mapping[str, float],
+    terms: Mapping[str, JointTerms],
+    sites: list[tuple[str, Frame]],
+    world: ElementTree.Element,
 ) -> dict[int, ElementTree.Element]:
     """Add bodies with their joints and masses; the body of every joint by its index, -1 for the world."""
     carried = {frame.joint: name for name, frame in reversed(sites)}
@@ -137,10 +142,10 @@ def _bodies(
                 where=f"joint {joint.name}",
                 allowed="up to six; a body with mass on the last of them",
             )
-        body, weight = _weighed(joint)
+        body = merged(joint.bodies)
         if body is not None:
-            if weight != 1:
-                elements[j].set("gravcomp", _text([1 - weight]))
+            if joint.name in weights:
+                elements[j].set("gravcomp", _text([1 - weights[joint.name]]))
             ElementTree.SubElement(elements[j], "inertial", _inertial(body))
         elif not any(_shares_body(tree, k) and tree.joints[k].parent == j for k in range(len(tree.joints))):
             raise ModelError(
@@ -151,13 +156,17 @@ def _bodies(
     return elements
 
 
-def _weighed(joint: Joint) -> tuple[Inertia | None, float]:
-    """What a joint carries as one body, and the part of its weight that it has."""
-    shares = [1.0 if body.gravity_fraction is None else float(body.gravity_fraction) for body in joint.bodies]
-    if len(set(shares)) > 1:
-        what = f"bodies on '{joint.name}' have different parts of their weight"
-        raise ModelError(what, where="mujoco_xml", allowed="one part of its weight for all that a joint carries")
-    return merged(replace(body, gravity_fraction=None) for body in joint.bodies), next(iter(shares), 1.0)
+def _weighed(tree: Mechanism) -> tuple[Mechanism, dict[str, float]]:
+    """The tree with bodies of their whole weight, and by joint the part of it that those have which have not all."""
+    weights: dict[str, float] = {}
+    for joint in tree.joints:
+        shares = {1.0 if body.gravity_fraction is None else float(body.gravity_fraction) for body in joint.bodies}
+        if len(shares) > 1:
+            what = f"bodies on '{joint.name}' have different parts of their weight"
+            raise ModelError(what, where="mujoco_xml", allowed="one part of its weight for all that a joint carries")
+        weights |= {joint.name: share for share in shares if share != 1}
+    joints = tuple(replace(j, bodies=tuple(replace(b, gravity_fraction=None) for b in j.bodies)) for j in tree.joints)
+    return replace(tree, joints=joints), weights
 
 
 def _joint_attributes(joint: Joint, terms: JointTerms) -> dict[str, str]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
@@ -207,6 +207,6 @@ def _point_error(group: PointGroup, i: int, start: float, played: _Played, colum
     return Error(float(np.sqrt(square.mean())), noise, "m")
 
 
-def _at(t: ArrayLike, known: Array, values: Array) -> Array:
+def _at(t: Array, known: Array, values: Array) -> Array:
     """Values at other times, linear in between, shape (len(t), width)."""
     return np.stack([np.interp(t, known, column) for column in values.T], axis=1)

@@ -36,14 +36,14 @@ class Calibrated:
     nominal : Run
         Its settings as they were.
     values : mapping of parameter name to value
-    free : frozenset of str
-        Parameters that were estimated.
+    std : mapping of parameter name to float or None
+        Of those that were estimated, None where nothing is known of them.
     """
 
     run: Run
     nominal: Run
     values: Mapping[str, float]
-    free: frozenset[str]
+    std: Mapping[str, float | None]
 
 
 def read_model(folder: str | Path) -> Calibrated:
@@ -74,9 +74,9 @@ def read_model(folder: str | Path) -> Calibrated:
         EffectSettings(kind=label.partition("@")[0], location=label.partition("@")[2], values=own)
         for label, own in found.items()
     ]
-    free = frozenset(name for name, entry in parameters.items() if entry.get("free"))
+    std = {name: entry.get("std") for name, entry in parameters.items() if entry.get("free")}
     model = replace(nominal.model, effects=(*nominal.model.effects, *effects))
-    return Calibrated(replace(nominal, model=model), nominal, values, free)
+    return Calibrated(replace(nominal, model=model), nominal, values, std)
 
 
 def export_model(
@@ -121,7 +121,13 @@ def export_model(
         "result": file_sha256(Path(folder) / "result.json"),
         "effects": {label: vars(entry) for label, entry in said.items()},
         "parameters": {
-            name: {"value": calibrated.values.get(name, full.parameters[name].value), **vars(entry)}
+            name: {
+                "value": calibrated.values.get(name, full.parameters[name].value),
+                "unit": full.parameters[name].unit,
+                "estimated": name in calibrated.std,
+                "std": calibrated.std.get(name),
+                **vars(entry),
+            }
             for name, entry in said_of_parameters(full, said, form).items()
         },
         "grasps": {grasp.name: vars(_said_of_grasp(form)) for grasp in full.grasps},
@@ -147,14 +153,14 @@ def manifest_file(out: Path) -> Path:
 
 
 def calibrated_settings(calibrated: Calibrated) -> Run:
-    """The run's settings with the effects that it found and the estimates as initial values: it starts where it ended."""
+    """The run's settings with the effects that it found, and the estimates as initial values."""
     system = build_system(calibrated.run)
     chosen = dict(parameter_settings(calibrated.run, system.parameters))
-    for name in calibrated.free:
+    for name in calibrated.std:
         chosen.setdefault(name, ParameterSettings(free=True))
     values = calibrated.values
     parameters = {
-        name: replace(said, initial=values[name]) if name in calibrated.free else said for name, said in chosen.items()
+        name: replace(said, initial=values[name]) if name in calibrated.std else said for name, said in chosen.items()
     }
     return replace(calibrated.run, parameters=parameters)
 
