@@ -164,7 +164,7 @@ def _weighed(tree: Mechanism) -> tuple[Mechanism, dict[str, float]]:
         if len(shares) > 1:
             what = f"bodies on '{joint.name}' have different parts of their weight"
             raise ModelError(what, where="mujoco_xml", allowed="one part of its weight for all that a joint carries")
-        weights |= {joint.name: share for share in shares if share != 1}
+        weights |= dict.fromkeys([joint.name] if shares - {1.0} else [], next(iter(shares), 1.0))
     joints = tuple(replace(j, bodies=tuple(replace(b, gravity_fraction=None) for b in j.bodies)) for j in tree.joints)
     return replace(tree, joints=joints), weights
 
