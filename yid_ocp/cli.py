@@ -150,8 +150,12 @@ def _import(parser: argparse.ArgumentParser) -> None:
 
 
 def _export(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("recording", metavar="RECORDING.h5", help="recording to write as CSV")
-    parser.add_argument("--out", metavar="DIR", required=True, help="folder for the CSV files")
+    text = "recording to write as CSV, or run folder of solve or diagnose whose model to write"
+    parser.add_argument("source", metavar="RECORDING.h5|RUN", help=text)
+    text = "of a run's model: mjcf (default), urdf, sdf, or yaml for a configuration that starts at the estimates"
+    parser.add_argument("--format", metavar="FORMAT", help=text)
+    text = "folder for the CSV files, or file for the model; its manifest stands beside it"
+    parser.add_argument("--out", metavar="PATH", required=True, help=text)
     parser.add_argument("--quiet", action="store_true", help="print nothing but the files' paths")
 
 
@@ -194,7 +198,7 @@ COMMANDS: tuple[Command, ...] = (
     Command("inspect", "show the model's equations: names, patterns, single entries, numbers", "inspect", _inspect),
     Command("track", "measure the object's points in the frames of a depth camera", "track", _doubting),
     Command("import", "turn CSV, rosbag or MCAP into a recording", "import_recording", _import),
-    Command("export", "turn a recording into CSV", "export_recording", _export),
+    Command("export", "turn a recording into CSV, or a run's model into MJCF, URDF, SDF or YAML", "export", _export),
     Command("schema", "print the JSON Schema of configuration files, for editors", "schema", _schema),
 )
 

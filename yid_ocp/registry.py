@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Generic, TypeVar
 
 from yid_ocp.errors import ConfigError, nearest
@@ -28,11 +28,19 @@ class Registry(Generic[T]):
 
         def enter(entry: T) -> T:
             if name in self._entries:
-                raise ValueError(f"{self.noun} '{name}' is registered twice")
+                raise ConfigError(
+                    f"the name '{name}' is taken: another {self.noun} has it",
+                    hint="register it under another name",
+                )
             self._entries[name] = entry
             return entry
 
         return enter
+
+    def forget(self, names: Iterable[str]) -> None:
+        """Take entries out again, of a module that failed before it was whole."""
+        for name in names:
+            self._entries.pop(name, None)
 
     def __getitem__(self, name: str) -> T:
         if name not in self._entries:

@@ -28,7 +28,7 @@ def test_written_back_every_setting_is_there(written):
         "track: {options: {filters: {behind: null}}}\n"
     )
     run = load_config(written(text))
-    told = YAML(typ="safe").load(dump_config(run))
+    told = YAML(typ="safe", pure=True).load(dump_config(run))
     assert told["solver"] == {
         "name": "lifted",
         "node_interval": 3,

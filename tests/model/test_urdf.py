@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import casadi as ca
 import numpy as np
@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 
 from yid_ocp.errors import ModelError
 from yid_ocp.model import Mechanism
+from yid_ocp.model import urdf as urdf_files
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, merged
 from yid_ocp.model.rotations import roll_pitch_yaw, transform
 from yid_ocp.model.system import floating_clamp
-from yid_ocp.model.urdf import read_urdf, urdf_text
+from yid_ocp.model.urdf import read_urdf, robot_file, urdf_text
 from yid_ocp.model.y_object import y_object
 
 LINK = '<link name="{name}"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
@@ -215,6 +216,7 @@ def test_a_broken_urdf_is_refused(name, tmp_path):
     [
         (lambda path: read_urdf("nowhere.urdf"), ["'nowhere.urdf'", "package:NAME"]),
         (lambda path: read_urdf("package:backster"), ["'backster'", "did you mean 'baxter'?"]),
+        (lambda path: read_urdf("default:y_objekt.urdf"), ["'y_objekt.urdf'", "did you mean 'y_object.urdf'?"]),
         (lambda path: read_urdf(path, joints=["swimg"]), ["'swimg'", "did you mean 'swing'?"]),
         (lambda path: read_urdf(path, locked={"nods": 1.0}), ["'nods'", "did you mean 'nod'?"]),
         (lambda path: read_urdf(path, joints=["bolt"]), ["movable joint 'bolt'"]),
@@ -318,3 +320,20 @@ def test_a_joint_that_follows_cannot_be_chosen(tmp_path):
         read_urdf(follower(tmp_path), joints=("first", "second"))
     with pytest.raises(ModelError, match="follows a joint 'frist'"):
         read_urdf(follower(tmp_path, "frist"))
+
+
+def test_mechanisms_that_ship_with_the_package_are_found_by_name(urdf_folder) -> None:
+    assert robot_file("default:turntable.urdf").samefile(urdf_folder / "turntable.urdf")
+
+
+def test_and_where_a_wheel_put_them(urdf_folder, tmp_path, monkeypatch) -> None:
+    class Installed(PurePosixPath):
+        def locate(self):
+            return urdf_folder / self.name
+
+    files = [Installed("../../../share/yid_ocp/urdf/turntable.urdf"), Installed("yid_ocp/cli.py")]
+    monkeypatch.setattr(urdf_files, "__file__", str(tmp_path / "site-packages" / "yid_ocp" / "model" / "urdf.py"))
+    monkeypatch.setattr(urdf_files.metadata, "files", {"yid-ocp": files}.__getitem__)
+    assert robot_file("default:turntable.urdf") == urdf_folder / "turntable.urdf"
+    with pytest.raises(ModelError, match="no URDF"):
+        robot_file("default:cli.py")

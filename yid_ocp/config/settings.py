@@ -185,7 +185,10 @@ class ModelSettings:
 
     robot: Annotated[
         FilePath | None,
-        About("URDF file, or package:NAME of example-robot-data; null for an object held by the world or by clamps"),
+        About(
+            "URDF file, package:NAME of example-robot-data, or default:NAME.urdf of this package; null for an object "
+            "held by the world or by clamps"
+        ),
     ] = None
     clamps: Annotated[
         Mapping[str, ClampSettings],
@@ -385,6 +388,7 @@ class Run:
     """
 
     description: Annotated[str, About("one sentence for the report")] = ""
+    plugins: Annotated[tuple[FilePath, ...], About("Python files that register effects or sensors; they are run")] = ()
     model: Annotated[ModelSettings, About("what the world is made of")] = field(default_factory=ModelSettings)
     recordings: Annotated[RecordingSettings, About("the data")] = field(default_factory=RecordingSettings)
     sensors: Annotated[Mapping[str, SensorOptions], About("by group of the recordings: points, joints.effort")] = field(

@@ -11,6 +11,7 @@ import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -66,6 +67,42 @@ def robot_description_file(robot: str) -> Path:
     raise ModelError(f"example-robot-data has no robot '{robot}'", hint=nearest(robot, stems))
 
 
+def robot_file(robot: str | Path) -> Path:
+    """File of a robot as settings name it; it need not exist.
+
+    Parameters
+    ----------
+    robot : str or Path
+        A URDF file, `package:NAME` for one of example-robot-data, or `default:NAME.urdf` for a small mechanism that
+        ships with this package.
+
+    Raises
+    ------
+    ModelError
+        The package has no such robot.
+    """
+    scheme, _, name = str(robot).partition(":")
+    if scheme == "package":
+        return robot_description_file(name)
+    if scheme != "default":
+        return Path(robot)
+    known = _shipped()
+    if name not in known:
+        raise ModelError(f"no URDF '{name}' ships with yid_ocp", where=str(robot), hint=nearest(name, known))
+    return known[name]
+
+
+def _shipped() -> dict[str, Path]:
+    """URDF files of this package by name: in the repository, or where its wheel put them."""
+    folder = Path(__file__).resolve().parents[2] / "models" / "urdf"
+    if folder.is_dir():
+        return {path.name: path for path in folder.glob("*.urdf")}
+    with contextlib.suppress(metadata.PackageNotFoundError):
+        files = metadata.files("yid-ocp") or ()
+        return {entry.name: Path(str(entry.locate())) for entry in files if entry.suffix == ".urdf"}
+    return {}
+
+
 def read_urdf(
     path: str | Path,
     joints: Sequence[str] | None = None,
@@ -79,7 +116,7 @@ def read_urdf(
     Parameters
     ----------
     path : str or Path
-        A URDF file; `package:baxter` (or any robot folder of example-robot-data) finds that package's file.
+        As `robot_file`: a URDF file, `package:baxter` (or any robot folder of example-robot-data), `default:NAME.urdf`.
     joints : sequence of str, optional
         Names of the joints to keep as degrees of freedom, which are then ordered as given as far as parents come
         first; all movable ones when absent.
@@ -160,8 +197,7 @@ class _Found:
 
 
 def _file(path: str | Path) -> Path:
-    text = str(Path(str(path)))
-    file = robot_description_file(text.removeprefix("package:")) if text.startswith("package:") else Path(text)
+    file = robot_file(path)
     if not is_file(file):
         raise ModelError(f"there is no URDF file '{file}'", hint="give a path, or package:NAME for example-robot-data")
     return file

@@ -483,6 +483,34 @@ def batch_summary(result: Mapping[str, Any]) -> list[str]:
     return [*table(batch_rows(result, SHOWN)), "", *(table(spread) if len(spread) > 1 else []), "", *said]
 
 
+def export_summary(manifest: Mapping[str, Any]) -> list[str]:
+    """Lines that tell a person what a `yid-export/1` manifest says."""
+    said = [*manifest["effects"].items(), *((f"grasp {name}", own) for name, own in manifest.get("grasps", {}).items())]
+    effects = {name.rpartition(".")[0] for name in manifest["parameters"] if "@" in name}
+    said += [
+        (name, entry)
+        for name, entry in manifest["parameters"].items()
+        if entry["status"] != "native" and name.rpartition(".")[0] not in effects
+    ]
+    rows: Rows = [("of the model", "in the file", "how, or why not")]
+    rows += [(name, entry["status"], entry["how"]) for name, entry in said]
+    lines = [*table(rows), ""] if len(rows) > 1 else []
+    gate = manifest["gate"]
+    if gate is None:
+        return lines
+    if gate["status"] != "done":
+        return [*lines, f"not replayed: {gate['reason']}", ""]
+    rows = [("replayed channel", "nominal", "exported", "noise", "unit")]
+    for name, entry in gate["channels"].items():
+        sizes = (f"{entry[key]:.3g}" for key in ("before", "after", "noise"))
+        rows.append((name, *sizes, entry["unit"]))
+    lines += [*table(rows), ""]
+    if gate["fall"] is not None:
+        held = "held-out recordings" if gate["which"] == "held_out" else "the recordings that were fitted"
+        lines += [f"replayed in MuJoCo, the error beyond noise on {held} falls by {100 * gate['fall']:.3g} %", ""]
+    return lines
+
+
 def recording_summary(recording: Recording) -> list[str]:
     """Lines that tell a person what a recording holds."""
     rows: Rows = [("group", "samples", "names")]

@@ -202,14 +202,14 @@ def simulate_in_mujoco(
     model = compiled_model(mujoco_xml(system, values, time_step=chosen.time_step))
     nominal_damping = np.array(model.dof_damping)
     with _at_work(mujoco, model, injected):
-        scene = _Scene.of(system, mujoco, model)
+        scene = Scene.of(system, mujoco, model)
         start = initial_posture(system, values) if posture is None else posture
         scene.data.qpos[:] = model.qpos_spring
         scene.data.qpos[[model.joint(name).id for name in start]] = list(start.values())
-        balance = _settle(scene, nominal_damping)
+        balance = settle(scene, nominal_damping)
         if injected is not None:
             injected.begin(scene.data)
-        controller = _Controller(scene, motion, balance)
+        controller = Controller(scene, motion, balance)
         frames = np.round(np.asarray(frame_times, float) / chosen.time_step).astype(int)
         result = _play(scene, controller, chosen, frames)
         lost = scene.data.warning[_BAD_ACCELERATION].number > 0
@@ -219,8 +219,8 @@ def simulate_in_mujoco(
 
 
 @dataclass(frozen=True, eq=False)
-class _Scene:
-    """A compiled model with its state; `order` of all joints and `driven` ones, sites of points and of grasps' ends."""
+class Scene:
+    """A compiled model with its state; `order` of all joints and moved ones, sites of points and of grasps' ends."""
 
     mujoco: ModuleType
     model: Any
@@ -231,12 +231,14 @@ class _Scene:
     ends: list[list[int]]
 
     @staticmethod
-    def of(system: System, mujoco: ModuleType, model: Any) -> _Scene:
+    def of(system: System, mujoco: ModuleType, model: Any) -> Scene:
+        """The scene of a system's model; moved are its driven joints, or its prescribed ones where none is driven."""
         # Every joint has one coordinate, so positions, velocities and joints share their addresses.
         order = np.array([model.joint(name).id for name in system.mechanism.joint_names])
         sites = [model.site(name).id for name in system.points]
         ends = [[model.site(f"grasp_{g.name}_{end}").id for end in ("holder", "held")] for g in system.grasps]
-        return _Scene(mujoco, model, mujoco.MjData(model), order, order[list(system.driven_indices)], sites, ends)
+        moved = order[list(system.driven_indices or system.prescribed_indices)]
+        return Scene(mujoco, model, mujoco.MjData(model), order, moved, sites, ends)
 
 
 @contextlib.contextmanager
@@ -253,7 +255,7 @@ def _at_work(mujoco: ModuleType, model: Any, injected: EngineTerms | None) -> It
         mujoco.set_mjcb_passive(None)
 
 
-def _settle(scene: _Scene, damping: Array) -> Array:
+def settle(scene: Scene, damping: Array) -> Array:
     """Bring the scene to static equilibrium with the driven joints where they are; return their torques [N m].
 
     On the way there joints damp as `damping` says: of several shapes that an object can rest in, it must not depend on
@@ -287,19 +289,19 @@ def _settle(scene: _Scene, damping: Array) -> Array:
     return balance
 
 
-class _Controller:
+class Controller:
     """Torques of the driven joints: the arms' inverse dynamics along the motion, the grasps' load at rest, feedback.
 
     Parameters
     ----------
-    scene : _Scene
+    scene : Scene
         At rest, before the motion.
     motion : Movement
     balance : ndarray, shape (nu,)
         Torques that hold the scene at rest [N m].
     """
 
-    def __init__(self, scene: _Scene, motion: Movement, balance: Array) -> None:
+    def __init__(self, scene: Scene, motion: Movement, balance: Array) -> None:
         self._scene, self._motion = scene, motion
         self._free = copy.copy(scene.model)
         self._free.opt.disableflags |= int(scene.mujoco.mjtDisableBit.mjDSBL_EQUALITY)
@@ -325,7 +327,7 @@ class _Controller:
         return np.array(shadow.qfrc_inverse[driven])
 
 
-def _play(scene: _Scene, controller: _Controller, simulation: Simulation, frames: Integers) -> SimulatedRun:
+def _play(scene: Scene, controller: Controller, simulation: Simulation, frames: Integers) -> SimulatedRun:
     """Simulate period by period of the controller, the torque held in each; `frames` count the simulator's steps."""
     mujoco, model, data = scene.mujoco, scene.model, scene.data
     inner, steps, periods = simulation.inner_steps, simulation.samples, simulation.controller_periods

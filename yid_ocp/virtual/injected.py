@@ -23,8 +23,9 @@ from yid_ocp.effects.base import arms, object_joints
 from yid_ocp.errors import ConfigError, ModelError, nearest
 from yid_ocp.model.system import System
 from yid_ocp.virtual.experiment import VirtualExperiment, virtual_experiment
-from yid_ocp.virtual.mjcf import Evaluator, mujoco_module
+from yid_ocp.virtual.mjcf import mujoco_module
 from yid_ocp.virtual.outside import OUTSIDE, Force, Scene
+from yid_ocp.virtual.terms import Evaluator
 
 Array = NDArray[np.float64]
 

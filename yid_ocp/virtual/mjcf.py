@@ -1,7 +1,8 @@
-"""A system as a MuJoCo model, for virtual experiments in an engine that is not ours."""
+"""A system as a MuJoCo model: for virtual experiments in an engine that is not ours, and to export it."""
 
 from __future__ import annotations
 
+import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -14,11 +15,23 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from yid_ocp.errors import ConfigError, DataError, ModelError
-from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement, merged
-from yid_ocp.model.system import Effect, MidpointState, System
+from yid_ocp.model.system import System
+from yid_ocp.virtual.terms import ASPECTS, Evaluator, JointTerms, actuation, effect_aspects, joint_terms
 
 Array = NDArray[np.float64]
+
+NATIVE = frozenset(
+    {
+        *("stiffness", "rest", "damping", "geometry", "inertia", "weight"),
+        *("gravity", "grasp", "sprung_joint", "armature", "cubic_stiffness"),
+    }
+)
+"""Aspects of an effect for which MuJoCo has a term of its own."""
+EMULATED = frozenset({"dry_friction", "grasp_compliance"})
+"""Those that it has something like."""
+IGNORED = frozenset({"reading", "torque_gain", "torque_offset", "torque_delay", "torque_lag"})
+"""Those between sensors, or recorded torques, and the mechanics."""
 
 _JOINTS_PER_BODY = 6  # as many as MuJoCo allows
 _AXIS_LEVER = 0.1  # [m] between the two points that keep two axes parallel
@@ -30,13 +43,15 @@ def mujoco_xml(
     *,
     time_step: float = 5e-4,
     integrator: str = "implicitfast",
+    emulate: bool = False,
+    actuators: bool = False,
 ) -> str:
     """The system as a MuJoCo model (MJCF).
 
     Joints keep their names. Consecutive joints that carry no mass and sit at one place become one body with several
     joints, which is the same kinematics. Every point and every end of a grasp is a site: points under their own name,
-    grasps as `grasp_NAME_holder` and `grasp_NAME_held`. There are no contacts, limits or actuators: torques go in as
-    `qfrc_applied`.
+    grasps as `grasp_NAME_holder` and `grasp_NAME_held`. There are no contacts or limits. All stands in one body
+    `world_base` that does not move, since some readers take no more than one root.
 
     Parameters
     ----------
@@ -48,6 +63,12 @@ def mujoco_xml(
     integrator : str
         `implicitfast`, `implicit`, `Euler` or `RK4`; the twist of a thin tube has a damping time of some 10 us,
         which an explicit one cannot follow.
+    emulate : bool
+        Whether what MuJoCo has only something like is taken: dry friction that sticks for one that is rounded off, a
+        tendon for a compliant point grasp. Refused otherwise.
+    actuators : bool
+        Whether every driven joint has an actuator of its name whose control is the recorded torque, with gain, offset,
+        delay and lag between that and the torque that acts; without, true torques go in as `qfrc_applied`.
 
     Returns
     -------
@@ -58,15 +79,15 @@ def mujoco_xml(
     ------
     ModelError
         What MuJoCo cannot express: a moving body without mass, more than six massless joints at one place, a frame on
-        one of them, a compliant grasp or coordinate, an effect that adds forces.
+        one of them, a compliant grasp, a cubic spring beside a rest angle, an effect beyond `NATIVE`.
     ConfigError
         Unknown parameter, or `time_step` not positive.
     """
     if not time_step > 0:
         raise ConfigError(f"time_step = {time_step}", where="mujoco_xml", allowed="a positive number of seconds")
-    tree = replace(system.mechanism, parameters=system.parameters).numeric(values)
+    tree, weights = _weighed(replace(system.mechanism, parameters=system.parameters).numeric(values))
     value = Evaluator(system, values)
-    _refuse_inexpressible(system, value)
+    _refuse_inexpressible(system, value, emulate)
 
     root = ElementTree.Element("mujoco", model=tree.name)
     ElementTree.SubElement(root, "compiler", angle="radian", autolimits="false", inertiafromgeom="false")
@@ -81,27 +102,26 @@ def mujoco_xml(
     )
     ElementTree.SubElement(option, "flag", contact="disable")
     sites = _sites(system, tree, value)
-    elements = _bodies(system, tree, value, sites, ElementTree.SubElement(root, "worldbody"))
+    base = ElementTree.SubElement(ElementTree.SubElement(root, "worldbody"), "body", name="world_base")
+    ElementTree.SubElement(base, "inertial", pos="0 0 0", mass="0", diaginertia="0 0 0")  # Pinocchio asks for one
+    elements = _bodies(tree, weights, joint_terms(system, value), sites, base)
     for name, frame in sites:
         ElementTree.SubElement(elements[frame.joint], "site", {"name": name, **_pose(frame.placement)})
-    _add_grasps(system, ElementTree.SubElement(root, "equality"), time_step)
+    _add_grasps(system, value, root, time_step)
+    if actuators:
+        _add_actuators(system, value, ElementTree.SubElement(root, "actuator"), time_step)
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
 def _bodies(
-    system: System,
     tree: Mechanism,
-    value: Evaluator,
+    weights: Mapping[str, float],
+    terms: Mapping[str, JointTerms],
     sites: list[tuple[str, Frame]],
     world: ElementTree.Element,
 ) -> dict[int, ElementTree.Element]:
     """Add bodies with their joints and masses; the body of every joint by its index, -1 for the world."""
-    springs: dict[str, list[tuple[float, float]]] = {}
-    damping = {joint: float(value(coefficient)[0]) for joint, coefficient in system.damping.items()}
-    for entry in system.elastic:
-        springs.setdefault(entry.joint, []).append((float(value(entry.stiffness)[0]), float(value(entry.rest)[0])))
-        damping[entry.joint] = damping.get(entry.joint, 0.0) + float(value(entry.damping)[0])
     carried = {frame.joint: name for name, frame in reversed(sites)}
     elements: dict[int, ElementTree.Element] = {-1: world}
     for j, joint in enumerate(tree.joints):
@@ -114,7 +134,7 @@ def _bodies(
             elements[j] = ElementTree.SubElement(
                 elements[joint.parent], "body", {"name": f"{joint.name}_body", **_pose(joint.placement)}
             )
-        attributes = _joint_attributes(joint, damping.get(joint.name, 0.0), springs.get(joint.name, []))
+        attributes = _joint_attributes(joint, terms.get(joint.name, JointTerms()))
         ElementTree.SubElement(elements[j], "joint", attributes)
         if len(elements[j].findall("joint")) > _JOINTS_PER_BODY:
             raise ModelError(
@@ -124,6 +144,8 @@ def _bodies(
             )
         body = merged(joint.bodies)
         if body is not None:
+            if joint.name in weights:
+                elements[j].set("gravcomp", _text([1 - weights[joint.name]]))
             ElementTree.SubElement(elements[j], "inertial", _inertial(body))
         elif not any(_shares_body(tree, k) and tree.joints[k].parent == j for k in range(len(tree.joints))):
             raise ModelError(
@@ -134,45 +156,77 @@ def _bodies(
     return elements
 
 
-def _joint_attributes(joint: Joint, damping: float, springs: list[tuple[float, float]]) -> dict[str, str]:
-    attributes = {"name": joint.name, "axis": _text(joint.axis), "damping": _text([damping])}
+def _weighed(tree: Mechanism) -> tuple[Mechanism, dict[str, float]]:
+    """The tree with bodies of their whole weight, and by joint the part of it that those have which have not all."""
+    weights: dict[str, float] = {}
+    for joint in tree.joints:
+        shares = {1.0 if body.gravity_fraction is None else float(body.gravity_fraction) for body in joint.bodies}
+        if len(shares) > 1:
+            what = f"bodies on '{joint.name}' have different parts of their weight"
+            raise ModelError(what, where="mujoco_xml", allowed="one part of its weight for all that a joint carries")
+        weights |= dict.fromkeys([joint.name] if shares - {1.0} else [], next(iter(shares), 1.0))
+    joints = tuple(replace(j, bodies=tuple(replace(b, gravity_fraction=None) for b in j.bodies)) for j in tree.joints)
+    return replace(tree, joints=joints), weights
+
+
+def _joint_attributes(joint: Joint, terms: JointTerms) -> dict[str, str]:
+    attributes = {"name": joint.name, "axis": _text(joint.axis), "damping": _text([terms.damping])}
     attributes["type"] = "hinge" if joint.kind == "revolute" else "slide"
-    stiffness = sum(k for k, _ in springs)
-    if stiffness > 0:
-        attributes["stiffness"] = _text([stiffness])
-        attributes["springref"] = _text([sum(k * rest for k, rest in springs) / stiffness])
+    if terms.stiffness > 0:
+        attributes["stiffness"] = _text([terms.stiffness])
+        attributes["springref"] = _text([terms.pull / terms.stiffness])
+    if terms.cubic:
+        if terms.pull or not hasattr(mujoco_module().MjModel, "jnt_stiffnesspoly"):
+            what = f"the spring at '{joint.name}' has a cubic part"
+            allowed = "none beside a rest angle, and MuJoCo with polynomial stiffness (3.6 or newer)"
+            raise ModelError(what, where="mujoco_xml", allowed=allowed)
+        attributes["stiffness"] = _text([terms.stiffness, 0.0, terms.cubic])
+    if terms.armature:
+        attributes["armature"] = _text([terms.armature])
+    if terms.friction:
+        attributes["frictionloss"] = _text([terms.friction])
     return attributes
 
 
-def _add_grasps(system: System, equality: ElementTree.Element, time_step: float) -> None:
+def _add_grasps(system: System, value: Evaluator, root: ElementTree.Element, time_step: float) -> None:
+    equality = ElementTree.SubElement(root, "equality")
     firm = {"solref": _text([2 * time_step, 1.0]), "solimp": "0.9999 0.9999 0.001 0.5 2"}
     for grasp in system.grasps:
+        ends = [f"grasp_{grasp.name}_{end}" for end in ("holder", "held")]
+        compliance = float(value(grasp.compliance)[0])
+        if compliance > 0:
+            # a tendon of no length pulls with its stiffness, and damps, along the line between both ends
+            relaxation = 0.0 if grasp.relaxation is None else float(value(grasp.relaxation)[0])
+            sizes = {"stiffness": _text([1 / compliance]), "damping": _text([relaxation / compliance])}
+            tendons = root.find("tendon")
+            tendons = ElementTree.SubElement(root, "tendon") if tendons is None else tendons
+            spring = ElementTree.SubElement(
+                tendons, "spatial", {"name": f"grasp_{grasp.name}", "springlength": "0", **sizes}
+            )
+            for end in ends:
+                ElementTree.SubElement(spring, "site", site=end)
+            continue
         kind = "weld" if grasp.kind == "weld" else "connect"
-        for end in ("", "_ahead") if grasp.kind == "axis" else ("",):
-            ends = {"site1": f"grasp_{grasp.name}_holder{end}", "site2": f"grasp_{grasp.name}_held{end}"}
-            ElementTree.SubElement(equality, kind, {"name": f"grasp_{grasp.name}{end}", **ends, **firm})
+        for suffix in ("", "_ahead") if grasp.kind == "axis" else ("",):
+            sites = {"site1": ends[0] + suffix, "site2": ends[1] + suffix}
+            ElementTree.SubElement(equality, kind, {"name": f"grasp_{grasp.name}{suffix}", **sites, **firm})
 
 
-class Evaluator:
-    """Numbers of expressions in a system's parameters, each flattened column by column.
-
-    Parameters
-    ----------
-    system : System
-    values : mapping of str to float, optional
-        Parameter values by name; nominal where absent.
-    """
-
-    def __init__(self, system: System, values: Mapping[str, float] | None = None) -> None:
-        self._symbols, self._theta = system.parameters.symbols, system.parameters.vector(values)
-
-    def __call__(self, expression: ca.SX) -> Array:
-        """Values of an expression in nothing but parameters."""
-        return np.array(ca.densify(ca.Function("value", [self._symbols], [expression])(self._theta))).ravel(order="F")
-
-    def vanishes(self, expression: ca.SX) -> bool:
-        """Whether an expression, of other symbols as well, is zero whatever these are."""
-        return bool(ca.sparsify(ca.substitute(expression, self._symbols, ca.DM(self._theta))).is_zero())
+def _add_actuators(system: System, value: Evaluator, actuator: ElementTree.Element, time_step: float) -> None:
+    """Actuators from recorded torques to those that act."""
+    for joint, found in actuation(system, value).items():
+        attributes = {"name": joint, "joint": joint, "gainprm": _text([found.gain])}
+        if found.offset:
+            attributes |= {"biastype": "affine", "biasprm": _text([-found.offset, 0.0, 0.0])}
+        if found.lag > 0:
+            attributes |= {"dyntype": "filterexact", "dynprm": _text([found.lag])}
+        if found.delay > 0:
+            if not hasattr(mujoco_module().MjModel, "actuator_delay"):
+                what, allowed = f"the torque of '{joint}' acts late", "MuJoCo with delays of actuators (3.5 or newer)"
+                raise ModelError(what, where="mujoco_xml", allowed=allowed)
+            samples = math.ceil(found.delay / time_step) + 1
+            attributes |= {"delay": _text([found.delay]), "nsample": str(samples), "interp": "linear"}
+        ElementTree.SubElement(actuator, "general", attributes)
 
 
 def mujoco_module() -> ModuleType:
@@ -194,32 +248,25 @@ def compiled_model(text: str) -> Any:
         raise ModelError(f"MuJoCo does not accept the model: {error}", where="mujoco_xml") from error
 
 
-def _refuse_inexpressible(system: System, value: Evaluator) -> None:
+def _refuse_inexpressible(system: System, value: Evaluator, emulate: bool) -> None:
+    able = NATIVE | EMULATED if emulate else NATIVE
     for effect in system.effects:
-        if effect.internal or not value.vanishes(_own_terms(system, effect)):
+        for aspect in sorted(effect_aspects(system, effect, value)[1] - able - IGNORED):
             raise ModelError(
-                f"effect '{effect.kind}@{effect.location}' adds forces of its own",
+                f"effect '{effect.kind}@{effect.location}' has what MuJoCo cannot express: {ASPECTS[aspect]}",
                 where="mujoco_xml",
-                allowed="effects that change masses, lengths, stiffness, damping, gravity or grasps",
+                allowed="effects that change " + ", ".join(ASPECTS[name] for name in ASPECTS if name in able),
             )
     for grasp in system.grasps:
-        if not value.vanishes(grasp.compliance):
-            raise ModelError(f"grasp '{grasp.name}' is compliant", where="mujoco_xml", allowed="rigid grasps")
+        if not value.vanishes(grasp.compliance) and not (emulate and grasp.kind == "point"):
+            allowed = "rigid grasps" if not emulate else "rigid grasps, and springs in place of point grasps"
+            raise ModelError(f"grasp '{grasp.name}' is compliant", where="mujoco_xml", allowed=allowed)
     for joint, compliance in system.compliant.items():
-        if not value.vanishes(compliance):
-            raise ModelError(f"joint '{joint}' is compliant", where="mujoco_xml", allowed="compliance zero")
+        if value.vanishes(compliance):
+            allowed, hint = "a compliance above zero", "leave the effect out"
+            raise ModelError(f"joint '{joint}' is rigid", where="mujoco_xml", allowed=allowed, hint=hint)
     if not value.vanishes(system.time_scale - 1):
         raise ModelError("the clock is scaled", where="mujoco_xml", allowed="a clock that tells the true time")
-
-
-def _own_terms(system: System, effect: Effect) -> ca.SX:
-    q, v = ca.SX.sym("q", system.size), ca.SX.sym("v", system.size)
-    u, reaction = ca.SX.sym("u", len(system.driven)), ca.SX.sym("reaction", system.constraint_count)
-    none = ca.SX(0, 1)
-    kinematics = forward_kinematics(system.mechanism, q)
-    terms = effect.terms(MidpointState(system, kinematics, q, v, none, none, u, reaction, {}, ca.SX.sym("h")))
-    forces = (terms.force, terms.viscous, None if terms.closed is None else terms.closed.force)
-    return ca.vertcat(terms.lagrangian, *(none if force is None else force for force in forces))
 
 
 def _shares_body(tree: Mechanism, j: int) -> bool:

@@ -15,7 +15,7 @@ from yid_ocp.errors import ModelError
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Mechanism, Placement
 from yid_ocp.model.system import System
-from yid_ocp.virtual.mjcf import Evaluator
+from yid_ocp.virtual.terms import Evaluator
 
 Array = NDArray[np.float64]
 

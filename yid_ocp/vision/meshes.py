@@ -22,7 +22,7 @@ from yid_ocp.files import is_file
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Mechanism
 from yid_ocp.model.system import System
-from yid_ocp.model.urdf import robot_description_file
+from yid_ocp.model.urdf import robot_file
 from yid_ocp.vision.frames import Pinhole, open3d_module
 
 Array = NDArray[np.float64]
@@ -310,8 +310,7 @@ def robot_meshes(urdf: str | Path, mechanism: Mechanism, kind: MeshKind = "visua
     """
     import yourdfpy
 
-    text = str(urdf)
-    path = robot_description_file(text.removeprefix("package:")) if text.startswith("package:") else Path(text)
+    path = robot_file(urdf)
     if not is_file(path):
         raise ModelError(f"there is no URDF file '{path}'", hint="give a path, or package:NAME")
     try:

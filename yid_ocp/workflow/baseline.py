@@ -43,17 +43,7 @@ def read_estimates(folder: str | Path) -> Estimates:
         There is no finished run, its result cannot be read, is one of another command or of an older format, or its
         solve failed.
     """
-    file = Path(folder) / "result.json"
-    result = _result(file)
-    if result.get("format") not in FORMATS:
-        raise DataError(
-            f"the run folder is one of another command ({result.get('format')})",
-            where=str(file),
-            allowed=" or ".join(FORMATS),
-            hint="give a run folder of `solve` or `diagnose`",
-        )
-    if result.get("status") == "failed":
-        raise DataError(f"the run failed: {result.get('message')}", where=str(file), hint="give one that converged")
+    file, result = Path(folder) / "result.json", run_result(folder)
     try:
         said = result.get("model", result)  # of a diagnosis, the model that it ended with
         known, parameters = said["covariance"], said["parameters"]
@@ -81,6 +71,22 @@ def read_estimates(folder: str | Path) -> Estimates:
     if not np.all(np.isfinite(matrix)) or not np.all(np.diag(matrix) > 0):
         raise DataError("its covariance is none", where=str(file), allowed="finite, with a positive diagonal")
     return Estimates(str(folder), names, values, matrix, units, explains, effects)
+
+
+def run_result(folder: str | Path) -> dict[str, Any]:
+    """Contents of result.json of a run of `solve` or `diagnose` that did not fail; errors as `read_estimates`."""
+    file = Path(folder) / "result.json"
+    result = _result(file)
+    if result.get("format") not in FORMATS:
+        raise DataError(
+            f"the run folder is one of another command ({result.get('format')})",
+            where=str(file),
+            allowed=" or ".join(FORMATS),
+            hint="give a run folder of `solve` or `diagnose`",
+        )
+    if result.get("status") == "failed":
+        raise DataError(f"the run failed: {result.get('message')}", where=str(file), hint="give one that converged")
+    return result
 
 
 def _result(file: Path) -> dict[str, Any]:

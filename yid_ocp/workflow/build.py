@@ -27,13 +27,14 @@ from yid_ocp.model.cable import Cable, cable_system, length_values, read_vertice
 from yid_ocp.model.parameters import Parameters
 from yid_ocp.model.rotations import placement_matrix, roll_pitch_yaw
 from yid_ocp.model.system import Spring
-from yid_ocp.model.urdf import read_urdf, robot_description_file
+from yid_ocp.model.urdf import read_urdf, robot_file
 from yid_ocp.model.y_object import Y_FOOT, y_segments
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.sensors.joints import EFFORT, POSITION, of_arm
 from yid_ocp.workflow.doubts import blaming, examined, object_doubts, stop_at
 from yid_ocp.workflow.held import clamp_paths, clamps, straight_values, with_frames
+from yid_ocp.workflow.plugins import load_plugins
 
 GIVEN_FRAMES = 2  # of a cable's free points, from which every prediction starts
 LARGEST_GAP = 0.01  # what encoder noise and a slightly wrong length of the object can make of a grasp [m]
@@ -75,6 +76,8 @@ def build_system(run: Run, finer: int = 1) -> System:
         Names that do not exist, values outside their bounds; the error names the setting.
     """
     model = run.model
+    input_files(run)
+    load_plugins(run)
     if isinstance(model.object, CableObject):
         return _cable_model(run)
     robot = _robot(run)
@@ -198,14 +201,13 @@ def _robot(run: Run) -> Mechanism | None:
     model = run.model
     if model.robot is None:
         return None
-    input_files(run)
     with located(run, "model", "arms", "joints"):
         arms = model.arms
         return read_urdf(model.robot, joints=arms.joints, locked=arms.locked, exclude_links=arms.exclude_links)
 
 
 def input_files(run: Run) -> dict[str, Path]:
-    """Every file that a run reads, by its name in the settings: configuration, robot, recordings.
+    """Every file that a run reads, by its name in the settings: configuration, plug-ins, robot, recordings.
 
     Raises
     ------
@@ -215,11 +217,12 @@ def input_files(run: Run) -> dict[str, Path]:
     files: dict[str, Path] = {}
     if run.file:
         files["configuration"] = Path(run.file)
+    for i, path in enumerate(run.plugins):
+        files[path] = _existing(run, Path(path), "plug-in", "plugins", i)
     robot = run.model.robot
     if robot is not None:
         with located(run, "model", "robot"):
-            package = robot.startswith("package:")
-            file = robot_description_file(robot.removeprefix("package:")) if package else Path(robot)
+            file = robot_file(robot)
         files[robot] = _existing(run, file, "URDF file", "model", "robot")
     if isinstance(run.model.object, CableObject):
         file = Path(run.model.object.undeformed)

@@ -26,12 +26,11 @@ from yid_ocp.report.sections import Findings
 from yid_ocp.report.terminal import diagnose_summary
 from yid_ocp.sensors.joints import EFFORT, POSITION
 from yid_ocp.solvers import Solution, solve
-from yid_ocp.version import versions
 from yid_ocp.workflow.baseline import earlier_runs, recordings_without, refuse_same, with_effects_of
 from yid_ocp.workflow.build import build_problem
 from yid_ocp.workflow.command import DONE, carry_out
 from yid_ocp.workflow.doubts import doubts_result
-from yid_ocp.workflow.folder import new_run_folder
+from yid_ocp.workflow.folder import new_run_folder, used_versions
 from yid_ocp.workflow.information import next_plan
 from yid_ocp.workflow.progress import SILENT, Progress
 from yid_ocp.workflow.refits import Refits
@@ -89,7 +88,7 @@ def run_diagnose(run: Run, out: str | Path | None = None, progress: Progress = S
     """
     with new_run_folder(run, out, "diagnose") as folder:
         folder.begin(run, "diagnose")
-        refits = Refits(folder, folder.inputs, dump_config(run), versions())
+        refits = Refits(folder, folder.inputs, dump_config(run), used_versions())
 
         def stage(text: str) -> None:
             folder.log("stage", text=text)

@@ -21,6 +21,7 @@ from yid_ocp.errors import OutputError
 from yid_ocp.files import file_sha256, jsonable, reason, write_text
 from yid_ocp.version import versions
 from yid_ocp.workflow.build import input_files
+from yid_ocp.workflow.plugins import plugin_versions
 
 log = logging.getLogger(__name__)
 _UNFINISHED, _LOCK, _NAMES = ".partial", "lock", 1000
@@ -53,11 +54,11 @@ class RunFolder:
         """Write config.yaml, hash what the run reads and log the start; errors as `input_files`."""
         self.write("config.yaml", dump_config(run))
         self.inputs |= {name: file_sha256(path) for name, path in input_files(run).items()}
-        self.log("start", command=command, versions=versions(), inputs=self.inputs)
+        self.log("start", command=command, versions=used_versions(), inputs=self.inputs)
 
     def finish(self, result: Mapping[str, Any]) -> dict[str, Any]:
         """Write result.json with inputs and versions; returns what was written."""
-        return self.write_json("result.json", {**result, "inputs": self.inputs, "versions": versions()})
+        return self.write_json("result.json", {**result, "inputs": self.inputs, "versions": used_versions()})
 
     def log(self, event: str, **entries: Any) -> None:
         """Add a line to log.jsonl."""
@@ -308,3 +309,8 @@ def _clear(temporary: Path | None, made: Sequence[Path]) -> None:
         for parent in made:
             with contextlib.suppress(OSError):
                 parent.rmdir()
+
+
+def used_versions() -> dict[str, str]:
+    """Versions of Python, this package, what its numbers depend on, and packages whose plug-ins are in use."""
+    return versions() | plugin_versions()

@@ -1,0 +1,211 @@
+"""Effects as springs, dampers, rotors and actuators of MuJoCo: equal to the equations that they have here."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from yid_ocp.effects import EFFECTS, make_effect
+from yid_ocp.errors import ModelError
+from yid_ocp.export.manifest import said_of_effects
+from yid_ocp.model import Grasp, Segment, System, flexible_object
+from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body
+from yid_ocp.model.system import MidpointState
+from yid_ocp.model.urdf import read_urdf
+from yid_ocp.virtual.mjcf import compiled_model, mujoco_xml
+from yid_ocp.virtual.terms import Evaluator, joint_terms
+
+mujoco = pytest.importorskip("mujoco", reason="exported models need MuJoCo: pip install 'yid-ocp[blind]'")
+
+MECHANICAL = {
+    "kelvin_voigt": ("T", {"tau": 0.05}),
+    "cubic_stiffness": ("T", {"k3": 4.0}),
+    "rest_curvature": ("T", {"qx": 0.1, "qy": -0.05}),
+    "bend_anisotropy": ("T", {"ratio": 0.3}),
+    "joint_spring": ("elbow", {"stiffness": 5.0, "rest_angle": 0.4}),
+    "density": ("B", {"scale": 1.2}),
+    "link_mass": ("elbow", {"scale": 0.8}),
+    "point_mass": ("w_B", {"mass": 0.05}),
+    "payload": ("tip", {"mass": 0.4, "mx": 0.02, "mz": 0.04}),
+    "length_scale": ("T", {"scale": 1.02}),
+    "rotor_inertia": ("shoulder", {"armature": 0.3}),
+    "joint_viscous": ("elbow", {"b": 0.2}),
+    "gravity_tilt": ("world", {"rx": 0.02, "ry": -0.03}),
+    "mount_compliance": ("base", {"stiffness": 50.0}),
+}
+OTHERS = {
+    "gravity_scale": ("object", {"fraction": -0.4}, "native"),
+    "grasp_offset": ("hold", {"dx": 0.01}, "native"),
+    "effort_gain": ("elbow", {"scale": 1.25}, "native"),
+    "effort_offset": ("elbow", {"offset": 0.3}, "native"),
+    "effort_delay": ("gripper", {"delay": 0.02}, "native"),
+    "effort_lag": ("elbow", {"time_constant": 0.03}, "native"),
+    "joint_coulomb": ("elbow", {"tau_c": 0.4}, "emulated"),
+    "joint_presliding": ("elbow", {"tau_c": 0.4}, "emulated"),
+    "grasp_compliance": ("hold", {"stiffness": 500.0, "damping": 3.0}, "emulated"),
+    "standard_linear_solid": ("T", {"ratio": 0.3}, "not representable"),
+    "hysteresis": ("T", {"stiffness": 0.5}, "not representable"),
+    "joint_stribeck": ("elbow", {"tau_s": 0.3}, "not representable"),
+    "aerodynamic_drag": ("T", {"cd": 1.0}, "not representable"),
+    "grasp_slip": ("hold", {"slip_per_load": 1e-3}, "not representable"),
+    "encoder_offset": ("elbow", {"offset": 0.01}, "not representable"),
+    "series_elasticity": ("elbow", {"stiffness": 500.0}, "not representable"),
+    "backlash": ("elbow", {"width": 0.01}, "not representable"),
+    "camera_translation": ("camera", {"x": 0.01}, "not representable"),
+    "camera_rotation": ("camera", {"rx": 0.01}, "not representable"),
+    "camera_scale": ("camera", {"scale": 1.01}, "not representable"),
+    "camera_latency": ("camera", {"delay": 0.05}, "not representable"),
+    "surface_offset": ("camera", {"fraction": 0.5}, "not representable"),
+    "clock_scale": ("clock", {"scale": 1.05}, "not representable"),
+    # two branches on joints without mass, which only writing the model shows
+    "junction_compliance": ("w_T", {"stiffness": 50.0}, "native"),
+}
+
+
+@pytest.fixture(scope="module")
+def system() -> System:
+    """Two driven joints, a trunk with two branches, the tip of one of them held by the ceiling."""
+    item = flexible_object(
+        [
+            Segment("T", 0.4, 0.2, 0.01, 2, bend=8.0, twist=5.0),
+            Segment("B", 0.2, 0.1, 0.01, 1, parent="T", bend=6.0),
+            Segment("C", 0.2, 0.1, 0.01, 1, parent="T", bend=6.0),
+        ]
+    )
+    robot = read_urdf("default:double_pendulum.urdf")
+    grasps = [Grasp("hold", "ceiling", "w_B")]
+    driven = robot.joint_names
+    return System.build(robot, objects=[(item, "tip", None)], grasps=grasps, driven=driven, damping=0.1)
+
+
+def with_effect(system: System, kind: str, location: str, values: dict[str, float]) -> System:
+    return system.with_effects([make_effect(kind, location, system, values)])
+
+
+def test_every_kind_of_the_library_is_looked_at() -> None:
+    ours = {kind for kind in EFFECTS if EFFECTS[kind].__module__.startswith("yid_ocp.effects")}
+    assert set(MECHANICAL) | set(OTHERS) == ours
+
+
+@pytest.mark.parametrize("kind", MECHANICAL)
+def test_mechanics_equals_the_symbolic_one(system: System, kind: str) -> None:
+    changed = with_effect(system, kind, *MECHANICAL[kind])
+    q, v = ca.SX.sym("q", changed.size), ca.SX.sym("v", changed.size)
+    kinematics = forward_kinematics(changed.mechanism, q)
+    rigid = rigid_body(kinematics, v, changed.gravity)
+    [effect] = changed.effects
+    none = ca.SX(0, 1)
+    terms = effect.terms(MidpointState(changed, kinematics, q, v, none, none, none, none, {}, ca.SX(1)))
+    passive = changed.viscous_force(v) - ca.gradient(changed.elastic_energy(q), q) + ca.gradient(terms.lagrangian, q)
+    for joint, compliance in changed.compliant.items():
+        at = changed.mechanism.joint_index(joint)
+        passive[at] -= (q[at] + changed.relaxing[joint] * v[at]) / compliance
+    if terms.viscous is not None:
+        passive += terms.viscous
+    mass = mass_matrix(rigid, changed.mechanism) + ca.hessian(terms.lagrangian, v)[0]
+    bias = ca.jtimes(rigid.by_v, q, v) - rigid.by_q
+    ours = ca.Function("ours", [q, v, changed.parameters.symbols], [mass, bias, passive])
+    model = compiled_model(mujoco_xml(changed))
+    data = mujoco.MjData(model)
+    order = [model.joint(name).id for name in changed.mechanism.joint_names]
+    rng = np.random.default_rng(0)
+    for _ in range(2):
+        posture, velocity = rng.uniform(-1, 1, changed.size), rng.uniform(-1, 1, changed.size)
+        data.qpos[order], data.qvel[order] = posture, velocity
+        mujoco.mj_forward(model, data)
+        full = np.zeros((model.nv, model.nv))
+        for column in range(model.nv):
+            mujoco.mj_mulM(model, data, full[column], np.eye(model.nv)[column])
+        expected = [np.array(ca.densify(e)) for e in ours(posture, velocity, changed.parameters.vector())]
+        np.testing.assert_allclose(full[np.ix_(order, order)], expected[0], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(data.qfrc_bias[order], expected[1].ravel(), rtol=0, atol=1e-9)
+        np.testing.assert_allclose(data.qfrc_passive[order], expected[2].ravel(), rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", [*MECHANICAL, *OTHERS])
+def test_what_is_said_of_it(system: System, kind: str) -> None:
+    location, values, *status = (*MECHANICAL[kind], "native") if kind in MECHANICAL else OTHERS[kind]
+    [said] = said_of_effects(with_effect(system, kind, location, values), {}, "mjcf").values()
+    assert [said.status] == status
+    neutral = with_effect(system, kind, location, {})
+    assert said_of_effects(neutral, {}, "mjcf")[f"{kind}@{location}"].how.startswith("neutral")
+
+
+def test_what_has_no_term_is_refused(system: System) -> None:
+    for kind, (location, values, status) in OTHERS.items():
+        changed = with_effect(system, kind, location, values)
+        [said] = said_of_effects(changed, {}, "mjcf").values()
+        motion = not said.how.startswith("what a sensor reads")
+        if kind == "junction_compliance" or (status == "not representable" and motion):
+            with pytest.raises(ModelError):
+                mujoco_xml(changed, emulate=True)
+        if status == "emulated":
+            with pytest.raises(ModelError):
+                mujoco_xml(changed)
+            mujoco_xml(changed, emulate=True)
+
+
+def test_a_part_of_the_weight(system: System) -> None:
+    changed = with_effect(system, "gravity_scale", "object", {"fraction": -0.4})
+    model, whole = (compiled_model(mujoco_xml(s)) for s in (changed, system))
+    light, heavy = mujoco.MjData(model), mujoco.MjData(whole)
+    for m, d in ((model, light), (whole, heavy)):
+        d.qpos[:] = np.linspace(-0.5, 0.5, m.nq)
+        mujoco.mj_forward(m, d)
+    loads = np.zeros(model.nv)  # of the object's weight, by the Jacobians of its bodies
+    for body in range(model.nbody):
+        if model.body(body).name.startswith(("T_", "B_", "C_")):
+            jacobian = np.zeros((3, model.nv))
+            mujoco.mj_jacBodyCom(whole, heavy, jacobian, None, body)
+            loads += jacobian.T @ (whole.body_mass[body] * whole.opt.gravity)
+    np.testing.assert_allclose(light.qfrc_passive - heavy.qfrc_passive, -0.4 * loads, atol=1e-9)
+
+
+def test_recorded_torques_become_those_that_act(system: System) -> None:
+    system = replace(system, grasps=(), gravity=ca.SX(ca.DM.zeros(3)))
+    for kind in ("effort_gain", "effort_offset", "effort_lag"):
+        location, values, _ = OTHERS[kind]
+        system = with_effect(system, kind, location, values)
+    late = with_effect(system, "effort_delay", "gripper", {"delay": 0.02})
+    for changed, delay in ((system, 0.0), (late, 0.02)):
+        if delay and not hasattr(mujoco.MjModel, "actuator_delay"):
+            continue
+        model = compiled_model(mujoco_xml(changed, time_step=1e-3, actuators=True))
+        data = mujoco.MjData(model)
+        at, found = model.joint("elbow").id, []
+        for _ in range(120):
+            data.ctrl[:] = 2.0
+            mujoco.mj_step(model, data)
+            found.append(data.qfrc_actuator[at])
+        # the lag acts on what was recorded, the other two on what follows it
+        t = 1e-3 * np.arange(120) - delay
+        expected = 2.0 * (1 - np.exp(-np.maximum(t, 0.0) / 0.03)) / 1.25 - 0.3 / 1.25
+        np.testing.assert_allclose(found, expected, atol=0.06)  # a step late
+        assert found[-1] == pytest.approx(expected[-1], abs=2e-3)
+
+
+def test_a_grasp_that_gives_way_is_a_tendon(system: System) -> None:
+    changed = with_effect(system, *("grasp_compliance", *OTHERS["grasp_compliance"][:2]))
+    model = compiled_model(mujoco_xml(changed, emulate=True))
+    data = mujoco.MjData(model)
+    data.qpos[:] = 0.1
+    mujoco.mj_forward(model, data)
+    apart = data.site("grasp_hold_holder").xpos - data.site("grasp_hold_held").xpos
+    jacobian = np.zeros((3, model.nv))
+    mujoco.mj_jacSite(model, data, jacobian, None, model.site("grasp_hold_held").id)
+    plain = compiled_model(mujoco_xml(replace(changed, grasps=()), emulate=True))
+    other = mujoco.MjData(plain)
+    other.qpos[:] = 0.1
+    mujoco.mj_forward(plain, other)
+    np.testing.assert_allclose(data.qfrc_passive - other.qfrc_passive, 500.0 * jacobian.T @ apart, atol=1e-8)
+    assert model.tendon_damping[0] == pytest.approx(3.0)
+
+
+def test_dry_friction_is_friction_of_the_joint(system: System) -> None:
+    changed = with_effect(system, "joint_coulomb", "elbow", {"tau_c": 0.4})
+    assert joint_terms(changed, Evaluator(changed))["elbow"].friction == 0.4
+    model = compiled_model(mujoco_xml(changed, emulate=True))
+    assert model.dof_frictionloss[model.joint("elbow").id] == 0.4

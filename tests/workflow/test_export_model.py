@@ -1,0 +1,202 @@
+"""The model of a run in other engines, and back in a configuration."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from yid_ocp.config.reader import DIAGNOSIS_DEFAULT, load_config
+from yid_ocp.config.settings import dump_config
+from yid_ocp.workflow.build import build_system, read_recordings
+from yid_ocp.workflow.diagnose import run_diagnose
+from yid_ocp.workflow.export_model import export_model, manifest_file
+
+mujoco = pytest.importorskip("mujoco", reason="exported models need MuJoCo: pip install 'yid-ocp[blind]'")
+
+
+def written_run(folder, effects, run):
+    """A run folder as `diagnose` leaves it that found the truth of the embedded recordings, and some effects."""
+    system = build_system(run)
+    truth = read_recordings(run, "estimate")[0].truth
+    values = {p.name: p.value for p in system.parameters} | effects
+    values |= {name: value for name, value in truth.items() if name.endswith((".bend", ".twist"))}
+    free = {*(name for name in values if name.endswith((".bend", ".twist"))), *effects}
+    parameters = {
+        name: {"value": value, "std": 0.01 if name in free else 0.0, "unit": "", "free": name in free}
+        for name, value in values.items()
+    }
+    folder.mkdir()
+    (folder / "config.yaml").write_text(dump_config(run))
+    result = {"format": "yid-diagnosis/1", "verdict": "effect", "model": {"parameters": parameters, "covariance": {}}}
+    (folder / "result.json").write_text(json.dumps(result))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory):
+    run = load_config(None, default=DIAGNOSIS_DEFAULT)
+    return written_run(tmp_path_factory.mktemp("found") / "run", {"kelvin_voigt@T1.tau": 0.05}, run)
+
+
+def gate_holds(gate) -> None:
+    assert (gate["status"], gate["which"]) == ("done", "held_out")
+    assert gate["fall"] >= 0.8
+    angles, arm = gate["channels"]["joints.position"], gate["channels"]["points_arm.w_T2"]
+    # the angles' noise is small beside their error: there the plain error falls as far
+    assert angles["after"] <= 0.2 * angles["before"]
+    assert arm["after"] == pytest.approx(arm["noise"], rel=0.1)
+    assert arm["before"] > 4 * arm["noise"]
+
+
+def test_the_embedded_diagnosis_in_mujoco(cli, found, tmp_path) -> None:
+    out = tmp_path / "y.xml"
+    done = cli("export", found, "--out", out)
+    assert done.code == 0, done.err
+    assert "kelvin_voigt@T1  native" in done.out
+    manifest = json.loads(manifest_file(out).read_text())
+    gate_holds(manifest["gate"])
+    assert manifest["effects"] == {"kelvin_voigt@T1": {"status": "native", "how": "damping of joints"}}
+    entry = manifest["parameters"]["kelvin_voigt@T1.tau"]
+    assert (entry["value"], entry["std"], entry["status"]) == (0.05, 0.01, "native")
+    system = build_system(load_config(found / "config.yaml"))
+    assert set(manifest["parameters"]) == {*system.parameters.names, "kelvin_voigt@T1.tau"}
+    model = mujoco.MjModel.from_xml_path(str(out))
+    bend = manifest["parameters"]["T1.bend"]["value"]
+    joint = model.joint("T1_2_y").id
+    assert model.jnt_stiffness[joint] == pytest.approx(bend)
+    assert model.dof_damping[joint] == pytest.approx(0.05 + 0.05 * bend)
+    assert model.nu == len(system.driven)
+    pinocchio = pytest.importorskip("pinocchio")
+    other = pinocchio.buildModelFromMJCF(str(out))
+    assert other.nv == model.nv == system.size
+    assert sum(body.mass for body in other.inertias) == pytest.approx(model.body_mass.sum())
+
+
+@pytest.mark.slow
+def test_what_a_diagnosis_found_in_mujoco(tmp_path) -> None:
+    run = load_config(None, default=DIAGNOSIS_DEFAULT)
+    run_diagnose(replace(run, output=replace(run.output, report=False)), tmp_path / "run")
+    gate_holds(export_model(tmp_path / "run", tmp_path / "y.xml")["gate"])
+
+
+def test_urdf_loads_in_three_readers(found, tmp_path) -> None:
+    pinocchio, yourdfpy = pytest.importorskip("pinocchio"), pytest.importorskip("yourdfpy")
+    out = tmp_path / "y.urdf"
+    manifest = export_model(found, out, "urdf")
+    said = {name: entry["status"] for name, entry in manifest["parameters"].items()}
+    assert said["T1.bend"] == "not representable"
+    assert said["kelvin_voigt@T1.tau"] == said["T1.damping"] == said["T1.mass"] == "native"
+    assert manifest["grasps"]["left"]["status"] == "not representable"
+    system = build_system(load_config(found / "config.yaml"))
+    robot = yourdfpy.URDF.load(str(out), load_meshes=False).robot
+    assert [j.name for j in robot.joints if j.type != "fixed"] == list(system.mechanism.joint_names)
+    ours = pinocchio.buildModelFromUrdf(str(out))
+    model = mujoco.MjModel.from_xml_path(str(out))
+    assert ours.nv == model.nv == system.size
+    assert sum(body.mass for body in ours.inertias) == pytest.approx(model.body_mass.sum(), abs=1e-6)
+    bend = manifest["parameters"]["T1.bend"]["value"]
+    assert model.dof_damping[model.joint("T1_2_y").dofadr[0]] == pytest.approx(0.05 + 0.05 * bend)
+
+
+def test_sdf_has_springs_too(found, tmp_path) -> None:
+    out = tmp_path / "y.sdf"
+    manifest = export_model(found, out, "sdf")
+    assert manifest["parameters"]["T1.bend"]["status"] == "native"
+    model = ElementTree.parse(out).getroot().find("world/model")
+    assert model is not None
+    system = build_system(load_config(found / "config.yaml"))
+    assert [joint.get("name") for joint in model.findall("joint")] == list(system.mechanism.joint_names)
+    dynamics = model.find("joint[@name='T1_2_y']/axis/dynamics")
+    bend = manifest["parameters"]["T1.bend"]["value"]
+    sizes = {entry.tag: float(entry.text) for entry in dynamics}
+    assert sizes == pytest.approx(
+        {"damping": 0.05 + 0.05 * bend, "friction": 0.0, "spring_stiffness": bend, "spring_reference": 0.0}
+    )
+    masses = [float(entry.text) for entry in model.findall("link/inertial/mass")]
+    assert sum(masses) == pytest.approx(20.16662, abs=1e-5)
+    assert min(masses) > 0
+    link = model.find("link[@name='T1_1_x_link']/pose")
+    assert link.get("relative_to") == "T1_0_z_link"
+    np.testing.assert_allclose([float(x) for x in link.text.split()], [0, 0, 0.813 / 4, 0, 0, 0], atol=1e-12)
+
+
+def test_what_cannot_be_said_is_left_out_and_listed(tmp_path) -> None:
+    effects = {"hysteresis@T2.stiffness": 0.4, "hysteresis@T2.yield_angle": 0.1, "kelvin_voigt@T1.tau": 0.05}
+    effects |= {"junction_compliance@w_T1.compliance": 0.02, "joint_coulomb@left_e1.tau_c": 0.5}
+    coarse = load_config(None, ["model.object.links=1"], DIAGNOSIS_DEFAULT)
+    both = written_run(tmp_path / "both", effects, coarse)
+    said = replace(coarse, recordings=replace(coarse.recordings, held_out=(), estimate=()))
+    (both / "config.yaml").write_text(dump_config(said))
+    manifest = export_model(both, tmp_path / "both.xml")
+    assert {label: entry["status"] for label, entry in manifest["effects"].items()} == {
+        "hysteresis@T2": "not representable",
+        "kelvin_voigt@T1": "native",
+        "junction_compliance@w_T1": "not representable",
+        "joint_coulomb@left_e1": "emulated",
+    }
+    assert "memory" in manifest["effects"]["hysteresis@T2"]["how"]
+    assert manifest["parameters"]["hysteresis@T2.stiffness"]["status"] == "not representable"
+    assert manifest["gate"] == {"status": "not done", "reason": "the run has no recordings"}
+    text = (tmp_path / "both.xml").read_text()
+    kept = {name: value for name, value in effects.items() if name.startswith(("kelvin", "joint_coulomb"))}
+    less = written_run(tmp_path / "less", kept, coarse)
+    (less / "config.yaml").write_text(dump_config(said))
+    export_model(less, tmp_path / "less.xml")
+    assert text == (tmp_path / "less.xml").read_text()
+
+
+def test_a_configuration_that_starts_at_the_estimates(cli, pendulum, tmp_path) -> None:
+    config = pendulum.read_text() + "output: {report: false, discretisation: none}\n"
+    pendulum.write_text(config)
+    assert cli("solve", pendulum, "--out", "first").code == 0
+    first = json.loads((tmp_path / "first" / "result.json").read_text())
+    done = cli("export", "first", "--format", "yaml", "--out", "again.yaml", "--quiet")
+    assert (done.code, done.out) == (0, "again.yaml\n")
+    assert cli("solve", "again.yaml", "--out", "second").code == 0
+    second = json.loads((tmp_path / "second" / "result.json").read_text())
+    assert second["iterations"] <= 1 < first["iterations"]
+    for name, entry in second["parameters"].items():
+        if entry["free"]:
+            assert entry["initial"] == first["parameters"][name]["value"]
+            assert entry["value"] == pytest.approx(first["parameters"][name]["value"], rel=1e-5)
+
+
+def test_effects_that_were_found_come_back_free(found, tmp_path) -> None:
+    export_model(found, tmp_path / "again.yaml", "yaml")
+    run = load_config(tmp_path / "again.yaml")
+    assert [(e.kind, e.location, dict(e.values)) for e in run.model.effects] == [("kelvin_voigt", "T1", {"tau": 0.05})]
+    assert run.parameters["kelvin_voigt@T1.tau"].free
+    assert build_system(run).parameters["T1.bend"].value == run.parameters["T1.bend"].initial != 10.0
+
+
+def test_wrong_input_leaves_nothing(cli, found, pendulum_data, tmp_path) -> None:
+    recording = pendulum_data.folder / "estimate.h5"
+    broken = tmp_path / "broken"
+    shutil.copytree(found, broken)
+    (broken / "result.json").write_text("{")
+    before = set(tmp_path.rglob("*"))
+    for arguments, parts in (
+        ((found, "--format", "usd"), ["no format 'usd'", "allowed: mjcf", "UsdPhysics has no schema for cables"]),
+        ((found, "--format", "csv"), ["no table", "export a recording"]),
+        ((recording, "--format", "mjcf"), ["no run folder", "solve"]),
+        ((broken,), ["result.json", "run it again"]),
+        ((tmp_path,), ["no finished run"]),
+        ((tmp_path / "nothing",), ["nothing"]),
+        ((found, "--format", "urdf", "--out", tmp_path / "no" / "y.urdf"), ["folder to write to does not exist"]),
+    ):
+        done = cli("export", *arguments, *(() if "--out" in arguments else ("--out", tmp_path / "y.xml")))
+        assert done.code == 2, done.err
+        for part in parts:
+            assert part in done.err
+    assert set(tmp_path.rglob("*")) == before
+
+
+def test_no_model_without_its_manifest(cli, found, tmp_path) -> None:
+    manifest_file(tmp_path / "y.urdf").mkdir()
+    assert cli("export", found, "--format", "urdf", "--out", tmp_path / "y.urdf").code == 2
+    assert not (tmp_path / "y.urdf").exists()

@@ -1,0 +1,127 @@
+"""What of a model a format can say: for every parameter and effect native, emulated or not representable."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from yid_ocp.model.system import System
+from yid_ocp.virtual import mjcf
+from yid_ocp.virtual.terms import ASPECTS, Evaluator, description_aspects, effect_aspects
+
+Status = Literal["native", "emulated", "not representable"]
+_ORDER: tuple[Status, ...] = ("native", "emulated", "not representable")
+
+FORMAT = "yid-export/1"
+
+
+@dataclass(frozen=True)
+class Said:
+    """How a format takes something, and why not where it does not."""
+
+    status: Status
+    how: str
+
+    @staticmethod
+    def worst(parts: Iterable[Said]) -> Said:
+        """Of several things that belong together: the worst status, and the words of those that have it."""
+        known = list(parts)
+        status = max((part.status for part in known), key=_ORDER.index)
+        return Said(status, "; ".join(dict.fromkeys(part.how for part in known if part.status == status)))
+
+
+# what each format calls the aspects that it has; others it has not
+_MJCF = {
+    "stiffness": "stiffness of joints",
+    "rest": "springref of joints",
+    "damping": "damping of joints",
+    "geometry": "places of bodies and sites",
+    "inertia": "inertials",
+    "weight": "gravcomp of bodies",
+    "gravity": "gravity of the option",
+    "grasp": "equality constraints between sites",
+    "grasp_compliance": "a tendon without length, which damps along its pull alone",
+    "sprung_joint": "joints with stiffness and damping",
+    "armature": "armature of joints",
+    "dry_friction": "frictionloss of joints, which sticks at rest where the model creeps",
+    "cubic_stiffness": "polynomial stiffness of joints",
+    "torque_gain": "gainprm of actuators",
+    "torque_offset": "biasprm of actuators",
+    "torque_delay": "delay of actuators",
+    "torque_lag": "filterexact actuators",
+}
+_URDF = {
+    "damping": "damping of joints",
+    "geometry": "origins of joints",
+    "inertia": "inertials",
+    "dry_friction": "friction of joints, which engines take in ways of their own",
+}
+_SDF = {
+    **_URDF,
+    "stiffness": "spring_stiffness of axes",
+    "rest": "spring_reference of axes",
+    "geometry": "poses of links and frames",
+    "sprung_joint": "spring_stiffness and damping of axes",
+    "gravity": "gravity of the world",
+}
+TABLES: Mapping[str, Mapping[str, Said]] = {
+    name: {
+        aspect: Said("not representable", f"{name.upper()} has nothing for {words}")
+        if aspect not in table
+        else Said("emulated" if aspect in mjcf.EMULATED else "native", table[aspect])
+        for aspect, words in ASPECTS.items()
+    }
+    for name, table in (("mjcf", _MJCF), ("urdf", _URDF), ("sdf", _SDF))
+}
+"""By format and aspect."""
+
+_READING = Said("not representable", f"{ASPECTS['reading']}: correct the readings instead")
+_NEUTRAL = Said("native", "neutral: it changes nothing and is left out")
+_UNUSED = Said("native", "it enters nothing in this model")
+
+
+def said_of_effects(system: System, values: Mapping[str, float], form: str) -> dict[str, Said]:
+    """What a format makes of every effect of a system, by label.
+
+    Parameters
+    ----------
+    system : System
+    values : mapping of parameter name to value
+    form : str
+        `mjcf`, `urdf` or `sdf`.
+    """
+    value = Evaluator(system, values)
+    found: dict[str, Said] = {}
+    for effect in system.effects:
+        label = f"{effect.kind}@{effect.location}"
+        amplitudes = _neutral(effect)
+        theta = dict(zip(system.parameters.names, system.parameters.vector(values), strict=True))
+        if amplitudes and all(theta[name] == neutral for name, neutral in amplitudes.items()):
+            found[label] = _NEUTRAL
+            continue
+        _, aspects = effect_aspects(system, effect, value)
+        parts = {aspect: TABLES[form][aspect] for aspect in sorted(aspects)} | (
+            {"reading": _READING} if "reading" in aspects else {}
+        )
+        found[label] = Said.worst(parts.values())
+    return found
+
+
+def _neutral(effect: Any) -> dict[str, float]:
+    """Neutral value of the parameters whose neutral value makes an effect vanish."""
+    neutral: Mapping[str, float] = getattr(effect, "neutral", {})
+    return {name: neutral[name] for name in getattr(effect, "amplitudes", ())}
+
+
+def said_of_parameters(system: System, effects: Mapping[str, Said], form: str) -> dict[str, Said]:
+    """What a format makes of every parameter; of an effect's what it makes of the effect."""
+    found = {}
+    for entry in system.parameters:
+        owner = entry.name.rpartition(".")[0]
+        if owner in effects:
+            found[entry.name] = effects[owner]
+            continue
+        aspects = description_aspects(system, entry.symbol)
+        found[entry.name] = Said.worst(TABLES[form][aspect] for aspect in sorted(aspects)) if aspects else _UNUSED
+    return found

@@ -1,0 +1,212 @@
+"""A recording played again by a model in MuJoCo, with what the model then gets wrong."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter1d
+
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.errors import ModelError
+from yid_ocp.model.system import System
+from yid_ocp.virtual.engine import Controller, Scene, settle
+from yid_ocp.virtual.mjcf import compiled_model, mujoco_module
+
+Array = NDArray[np.float64]
+
+BANDWIDTH = 5.0
+"""Of what keeps driven joints from drifting away [rad/s]: slow, so that the recorded torque moves them."""
+_SMOOTHED = 2.0  # samples over which recorded angles are smoothed before they are followed
+_START = 5  # samples of which the first posture is the mean
+_INERTIA_EVERY = 20  # steps; an arm's inertia hardly changes meanwhile
+
+
+@dataclass(frozen=True)
+class Error:
+    """How far a model is from what was recorded, over one channel or group.
+
+    Attributes
+    ----------
+    rmse : float
+        Root mean square, of points that of the distance.
+    noise : float
+        What noise alone would give, zero where the recording does not say.
+    unit : str
+    """
+
+    rmse: float
+    noise: float
+    unit: str
+
+    @property
+    def beyond_noise(self) -> float:
+        """Root of the mean square that noise does not explain, zero where it explains all."""
+        return float(np.sqrt(max(self.rmse**2 - self.noise**2, 0.0)))
+
+
+def replay(text: str, system: System, recording: Recording) -> dict[str, Error]:
+    """Let a model that was exported play a recording.
+
+    Driven joints get the recorded torque as the control of their actuators, and beside it a weak pull to the recorded
+    angles (`BANDWIDTH`), without which any error of a torque lets an arm drift away. Prescribed joints follow the
+    recorded angles; the torque that this takes is compared with the recorded one.
+
+    Parameters
+    ----------
+    text : str
+        MJCF, from `mujoco_xml` with actuators.
+    system : System
+        Of the names in it.
+    recording : Recording
+
+    Returns
+    -------
+    dict of str to Error
+        `joints.position` of driven joints [rad] or `joints.effort` of prescribed ones [N m], all joints together, and
+        `GROUP.POINT` of every point of the model [m].
+
+    Raises
+    ------
+    ModelError
+        Nothing moves the model as recorded, it does not come to rest, or it diverges.
+    DataError
+        MuJoCo is not installed.
+    """
+    mujoco, model = mujoco_module(), compiled_model(text)
+    moved = system.driven or system.prescribed
+    joints = recording.joints
+    if joints is None or not moved or not set(moved) <= set(joints.names):
+        what = f"'{recording.name}' does not say how the joints moved"
+        raise ModelError(what, where="replay", allowed="recorded angles of all driven or prescribed joints")
+    columns = [joints.names.index(name) for name in moved]
+    if system.driven and joints.effort is None:
+        raise ModelError(f"'{recording.name}' has no torques", where="replay", allowed="recorded torques")
+    t, position = joints.t - joints.t[0], joints.position[:, columns]
+    effort = None if joints.effort is None else joints.effort[:, columns]
+    scene = Scene.of(system, mujoco, model)
+    scene.data.qpos[:] = model.qpos_spring
+    scene.data.qpos[scene.driven] = position[:_START].mean(axis=0)
+    balance = settle(scene, np.array(model.dof_damping))
+    path = _Path(moved, t, position)
+    played = _driven(scene, path, t, effort) if system.driven else _prescribed(scene, path, t, balance)
+    if not (np.isfinite(played.values).all() and np.isfinite(played.points).all()):
+        raise ModelError("the replay diverged", where=recording.name, hint="take a shorter time step")
+    return _errors(system, recording, joints, columns, played)
+
+
+class _Path:
+    """Recorded angles, smoothed, as a motion from the first of them."""
+
+    def __init__(self, joints: tuple[str, ...], t: Array, position: Array) -> None:
+        self.joints = joints
+        spline = CubicSpline(t, gaussian_filter1d(position, _SMOOTHED, axis=0))
+        self._values = [spline, spline.derivative(1), spline.derivative(2)]
+        self._start, self._last = position[:_START].mean(axis=0), float(t[-1])
+
+    def at(self, t: float) -> tuple[Array, Array, Array]:
+        """Offset from the start, velocity and acceleration at a time [s]."""
+        angle, velocity, acceleration = (np.asarray(value(min(t, self._last))) for value in self._values)
+        return angle - self._start, velocity, acceleration
+
+
+@dataclass(frozen=True)
+class _Played:
+    """Times of all steps, shape (K,), angles or torques of the moved joints (K, nj), points (K, np, 3)."""
+
+    t: Array
+    values: Array
+    points: Array
+
+
+def _driven(scene: Scene, path: _Path, t: Array, effort: Array | None) -> _Played:
+    assert effort is not None
+    mujoco, model, data, at = scene.mujoco, scene.model, scene.data, scene.driven
+    steps = round(t[-1] / model.opt.timestep)
+    start = np.array(data.qpos[at])
+    values, points = np.empty((steps, len(at))), np.empty((steps, len(scene.sites), 3))
+    if model.na:  # torques that follow are what they were before
+        data.act[:] = effort[0][np.array(model.actuator_actnum) > 0]
+    if hasattr(mujoco, "mj_initCtrlHistory"):
+        late = np.asarray(getattr(model, "actuator_delay", np.zeros(model.nu)))
+        for i in map(int, np.flatnonzero(late)):
+            before = np.full((int(model.actuator_history[i, 0]), 1), effort[0][i])
+            mujoco.mj_initCtrlHistory(model, data, i, None, before)
+    inertia = np.zeros((model.nv, model.nv))
+    last = np.searchsorted(t, np.arange(steps) * model.opt.timestep + 1e-9, side="right") - 1
+    for k in range(steps):
+        mujoco.mj_kinematics(model, data)
+        values[k], points[k] = data.qpos[at], data.site_xpos[scene.sites]
+        if k % _INERTIA_EVERY == 0:
+            mujoco.mj_forward(model, data)
+            _full_inertia(mujoco, model, data, inertia)
+            arm = inertia[np.ix_(at, at)]
+        offset, velocity, _ = path.at(k * model.opt.timestep)
+        demand = BANDWIDTH**2 * (start + offset - data.qpos[at]) + 2 * BANDWIDTH * (velocity - data.qvel[at])
+        data.ctrl[:] = effort[last[k]]
+        data.qfrc_applied[at] = arm @ demand
+        mujoco.mj_step(model, data)
+    return _Played(np.arange(steps) * model.opt.timestep, values, points)
+
+
+def _full_inertia(mujoco: Any, model: Any, data: Any, full: Array) -> None:
+    """The mass matrix; MuJoCo changed the order of the arguments."""
+    try:
+        mujoco.mj_fullM(model, data, full)
+    except TypeError:
+        mujoco.mj_fullM(model, full, data.qM)
+
+
+def _prescribed(scene: Scene, path: _Path, t: Array, balance: Array) -> _Played:
+    mujoco, model, data, at = scene.mujoco, scene.model, scene.data, scene.driven
+    steps = round(t[-1] / model.opt.timestep)
+    values, points = np.empty((steps, len(at))), np.empty((steps, len(scene.sites), 3))
+    controller = Controller(scene, path, balance)
+    for k in range(steps):
+        mujoco.mj_kinematics(model, data)
+        values[k], points[k] = controller.torque(k * model.opt.timestep), data.site_xpos[scene.sites]
+        data.qfrc_applied[at] = values[k]
+        mujoco.mj_step(model, data)
+    return _Played(np.arange(steps) * model.opt.timestep, values, points)
+
+
+def _errors(
+    system: System, recording: Recording, joints: JointGroup, columns: list[int], played: _Played
+) -> dict[str, Error]:
+    found: dict[str, Error] = {}
+    inside = joints.t - joints.t[0] <= played.t[-1] + 1e-9
+    said = joints.position if system.driven else joints.effort
+    noise = joints.position_std if system.driven else joints.effort_std
+    if said is not None:
+        model = _at(joints.t[inside] - joints.t[0], played.t, played.values)
+        error = float(np.sqrt(np.mean((model - said[inside][:, columns]) ** 2)))
+        level = np.zeros(1) if noise is None else np.broadcast_to(noise, (len(joints.names),))[columns]
+        unit = "rad" if system.driven else "N m"
+        name = "joints.position" if system.driven else "joints.effort"
+        found[name] = Error(error, float(np.sqrt(np.mean(level**2))), unit)
+    for group in recording.points:
+        for i, point in enumerate(group.names):
+            if point in system.points:
+                error_of = _point_error(group, i, joints.t[0], played, system.points.index(point))
+                if error_of is not None:
+                    found[f"{group.name}.{point}"] = error_of
+    return found
+
+
+def _point_error(group: PointGroup, i: int, start: float, played: _Played, column: int) -> Error | None:
+    t = group.t - start
+    seen = (t >= 0) & (t <= played.t[-1]) & np.isfinite(group.position[:, i]).all(axis=1)
+    if not seen.any():
+        return None
+    model = _at(t[seen], played.t, played.points[:, column])
+    square = np.sum((model - group.position[seen, i]) ** 2, axis=1)
+    noise = 0.0 if group.std is None else float(np.sqrt(np.nanmean(np.sum(group.std[seen, i] ** 2, axis=1))))
+    return Error(float(np.sqrt(square.mean())), noise, "m")
+
+
+def _at(t: Array, known: Array, values: Array) -> Array:
+    """Values at other times, linear in between, shape (len(t), width)."""
+    return np.stack([np.interp(t, known, column) for column in values.T], axis=1)

@@ -1,0 +1,279 @@
+"""What a system and its effects are in the terms of an engine for rigid bodies: springs, dampers, friction, actuators.
+
+Nothing here depends on a format. An effect is looked at through what it does to the description and through its
+equations, so that kinds from outside the package are treated like those of the library.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.model.kinematics import forward_kinematics
+from yid_ocp.model.system import Effect, MidpointState, RecordedEffect, System
+
+Array = NDArray[np.float64]
+
+ASPECTS: Mapping[str, str] = {
+    "stiffness": "stiffness of joints",
+    "rest": "angles at which springs are relaxed",
+    "damping": "viscous damping of joints",
+    "geometry": "places of joints and points",
+    "inertia": "masses and inertias",
+    "weight": "weight that is not mass times gravity",
+    "gravity": "the gravity vector",
+    "grasp": "where and how a grasp holds",
+    "grasp_compliance": "springs in place of a rigid grasp",
+    "sprung_joint": "joints with springs where the nominal model is rigid",
+    "armature": "rotor inertia at a joint",
+    "dry_friction": "dry friction at a joint",
+    "cubic_stiffness": "springs that stiffen with the cube of the angle",
+    "torque_gain": "true over recorded torque",
+    "torque_offset": "constant part of a recorded torque that does not act",
+    "torque_delay": "torque that acts later than recorded",
+    "torque_lag": "torque that follows its record",
+    "clock": "a clock that runs fast or slow",
+    "reading": "what a sensor reads; the motion does not depend on it",
+    "memory": "forces with a memory",
+    "force": "forces that no joint, spring or damper makes",
+}
+"""What an engine may be able to express or not, in words."""
+
+DRY_FRICTION: Mapping[str, str] = {"joint_coulomb": "tau_c", "joint_presliding": "tau_c"}
+"""Kinds that are dry friction up to a rounded corner, and their quantity of the friction [N m]."""
+
+_POINTS = 3  # at which equations are compared
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class JointTerms:
+    """What effects add at one joint, in SI units of its coordinate.
+
+    Attributes
+    ----------
+    stiffness, pull : float
+        Force -stiffness q + pull.
+    cubic, damping, armature, friction : float
+        Force -cubic q^3, force -damping v, inertia, dry friction.
+    """
+
+    stiffness: float = 0.0
+    pull: float = 0.0
+    cubic: float = 0.0
+    damping: float = 0.0
+    armature: float = 0.0
+    friction: float = 0.0
+
+    def __add__(self, other: JointTerms) -> JointTerms:
+        return JointTerms(*(getattr(self, name) + getattr(other, name) for name in vars(self)))
+
+
+@dataclass(frozen=True)
+class Actuation:
+    """Torque that acts at a driven joint: gain x recorded - offset, so late, following with a time constant [s]."""
+
+    gain: float = 1.0
+    offset: float = 0.0
+    delay: float = 0.0
+    lag: float = 0.0
+
+
+class Evaluator:
+    """Numbers of expressions in a system's parameters, each flattened column by column.
+
+    Parameters
+    ----------
+    system : System
+    values : mapping of str to float, optional
+        Parameter values by name; nominal where absent.
+    """
+
+    def __init__(self, system: System, values: Mapping[str, float] | None = None) -> None:
+        self._symbols, self._theta = system.parameters.symbols, system.parameters.vector(values)
+
+    def __call__(self, expression: ca.SX) -> Array:
+        """Values of an expression in nothing but parameters."""
+        return np.array(ca.densify(ca.Function("value", [self._symbols], [expression])(self._theta))).ravel(order="F")
+
+    def vanishes(self, expression: ca.SX) -> bool:
+        """Whether an expression, of other symbols as well, is zero whatever these are."""
+        return bool(ca.sparsify(self.numeric(expression)).is_zero())
+
+    def numeric(self, expression: ca.SX) -> ca.SX:
+        """An expression with numbers in place of parameters."""
+        return ca.substitute(expression, self._symbols, ca.DM(self._theta))
+
+
+def description_aspects(system: System, symbols: ca.SX) -> set[str]:
+    """What of the description some parameters enter, by the keys of `ASPECTS`."""
+    tree = system.mechanism
+    bodies = [body for joint in tree.joints for body in joint.bodies]
+    held = system.grasps
+    entered: Mapping[str, Iterable[ca.SX]] = {
+        "stiffness": (spring.stiffness for spring in system.elastic),
+        "rest": (spring.rest for spring in system.elastic),
+        "damping": (*(spring.damping for spring in system.elastic), *system.damping.values()),
+        "geometry": (
+            *(part for joint in tree.joints for part in (joint.placement.rotation, joint.placement.translation)),
+            *(
+                part
+                for frame in tree.frames.values()
+                for part in (frame.placement.rotation, frame.placement.translation)
+            ),
+        ),
+        "inertia": (part for body in bodies for part in (body.mass, body.com, body.about_com)),
+        "weight": (body.gravity_fraction for body in bodies if body.gravity_fraction is not None),
+        "gravity": (system.gravity,),
+        "grasp": (part for grasp in held for part in (grasp.rotation, grasp.offset, grasp.slip)),
+        "grasp_compliance": (
+            *(grasp.compliance for grasp in held),
+            *(grasp.relaxation for grasp in held if grasp.relaxation is not None),
+        ),
+        "sprung_joint": system.compliant.values(),
+        "clock": (system.time_scale,),
+    }
+    return {name for name, parts in entered.items() if any(_depends(part, symbols) for part in parts)}
+
+
+def effect_aspects(system: System, effect: Effect, value: Evaluator) -> tuple[dict[str, JointTerms], set[str]]:
+    """What an effect is in an engine's terms.
+
+    Parameters
+    ----------
+    system : System
+        That has the effect.
+    effect : Effect
+    value : Evaluator
+
+    Returns
+    -------
+    terms : dict of joint name to JointTerms
+        What its equations add at single joints.
+    aspects : set of str
+        Keys of `ASPECTS`, all that it does.
+    """
+    aspects = description_aspects(system, effect.parameters.symbols)
+    terms: dict[str, JointTerms] = {}
+    if effect.kind in DRY_FRICTION:
+        size = effect.parameters[f"{effect.kind}@{effect.location}.{DRY_FRICTION[effect.kind]}"].symbol
+        terms = {effect.location: JointTerms(friction=float(value(size)[0]))}
+        aspects.add("dry_friction")
+    elif effect.internal:
+        aspects.add("memory")
+    else:
+        found = _joint_terms(system, effect, value)
+        if found is None:
+            aspects.add("force")
+        else:
+            terms = found
+            for entry in terms.values():
+                sizes = {"cubic_stiffness": entry.cubic, "damping": entry.damping, "armature": entry.armature}
+                sizes |= {"stiffness": entry.stiffness, "rest": entry.pull}
+                aspects |= {name for name, size in sizes.items() if size}
+    for joint in system.driven:
+        own = _actuation(system, (effect,), joint, value)
+        changed = {"torque_gain": own.gain != 1, "torque_offset": own.offset != 0, "torque_lag": own.lag != 0}
+        changed |= {"torque_delay": own.delay > 0, "reading": own.delay < 0}
+        aspects |= {name for name, does in changed.items() if does}
+    return terms, aspects or {"reading"}
+
+
+def joint_terms(system: System, value: Evaluator) -> dict[str, JointTerms]:
+    """Springs, dampers, rotors and friction of every joint that has any: the description's and those of effects.
+
+    Effects that are more than that count as far as they are that; `effect_aspects` says which.
+    """
+    found: dict[str, JointTerms] = {}
+
+    def add(joint: str, own: JointTerms) -> None:
+        found[joint] = found.get(joint, JointTerms()) + own
+
+    for joint, coefficient in system.damping.items():
+        add(joint, JointTerms(damping=float(value(coefficient)[0])))
+    for spring in system.elastic:
+        stiffness, rest, damping = (float(value(x)[0]) for x in (spring.stiffness, spring.rest, spring.damping))
+        add(spring.joint, JointTerms(stiffness, stiffness * rest, damping=damping))
+    for joint, compliance in system.compliant.items():
+        if not value.vanishes(compliance):
+            stiffness = 1 / float(value(compliance)[0])
+            add(joint, JointTerms(stiffness, damping=system.relaxing.get(joint, 0.0) * stiffness))
+    for effect in system.effects:
+        for joint, own in effect_aspects(system, effect, value)[0].items():
+            add(joint, own)
+    return found
+
+
+def actuation(system: System, value: Evaluator) -> dict[str, Actuation]:
+    """What lies between the recorded torque of every driven joint and the torque that acts."""
+    return {joint: _actuation(system, system.effects, joint, value) for joint in system.driven}
+
+
+def _actuation(system: System, effects: Iterable[Effect], joint: str, value: Evaluator) -> Actuation:
+    """As the estimation has it: the last effect is the nearest to the reading."""
+    reading, known = ca.SX.sym("reading"), [e for e in effects if isinstance(e, RecordedEffect)]
+    true = reading
+    for effect in reversed(known):
+        true = effect.correct(f"joints.effort.{joint}", true, true)
+    late = sum((effect.delay(f"torque.{joint}", False) for effect in known), ca.SX(0))
+    lag = sum((effect.lag(f"torque.{joint}") for effect in known), ca.SX(0))
+    gain = ca.jacobian(true, reading)
+    numbers = [ca.substitute(part, reading, 0) for part in (gain, true)] + [late, lag]
+    one, none, delay, constant = (float(value(number)[0]) for number in numbers)
+    return Actuation(one, -none, delay, constant)
+
+
+def _joint_terms(system: System, effect: Effect, value: Evaluator) -> dict[str, JointTerms] | None:
+    """Springs, dampers and rotors that an effect's equations are, by joint; None where they are something else."""
+    n = system.size
+    q, v = ca.SX.sym("q", n), ca.SX.sym("v", n)
+    u, reaction = ca.SX.sym("u", len(system.driven)), ca.SX.sym("reaction", system.constraint_count)
+    none, h = ca.SX(0, 1), ca.SX.sym("h")
+    terms = effect.terms(
+        MidpointState(system, forward_kinematics(system.mechanism, q), q, v, none, none, u, reaction, {}, h)
+    )
+    energy = value.numeric(terms.lagrangian)
+    force = ca.gradient(energy, q)
+    for part in (terms.force, terms.viscous, None if terms.closed is None else terms.closed.force):
+        if part is not None:
+            force += value.numeric(ca.densify(part))
+    if ca.sparsify(ca.vertcat(energy, force)).is_zero():
+        return {}
+    momentum = ca.gradient(energy, v)
+    if _depends(ca.vertcat(force, momentum), ca.vertcat(u, reaction, h)):
+        return None
+    ones = ca.SX.ones(n)
+    by_q, by_v, inertia = ca.jacobian(force, q), ca.jacobian(force, v), ca.jacobian(momentum, v)
+    second = ca.jtimes(ca.diag(by_q), q, ones)
+    third = ca.jtimes(second, q, ones)
+    slopes = [ca.diag(by_v), ca.diag(inertia), third]
+    mixed = [ca.jacobian(momentum, q), *(full - ca.diag(ca.diag(full)) for full in (by_q, by_v, inertia))]
+    at = ca.Function("at", [q, v], [ca.densify(x) for x in (force, ca.diag(by_q), second, *slopes, *mixed)])
+    rng = np.random.default_rng(0)
+    found = [[np.array(x) for x in at(*rng.uniform(-1.0, 1.0, (2, n)))] for _ in range(_POINTS)]
+    rest = [np.array(x).ravel() for x in at(np.zeros(n), np.zeros(n))[:6]]
+    pull, slope, curve, damping, armature, twisted = rest
+    scale = _ROUNDING * max(1.0, *(float(np.abs(x).max(initial=0.0)) for x in rest))
+    constant = all(
+        np.abs(entry[3 + i].ravel() - rest[3 + i]).max() <= scale for entry in found for i in range(len(slopes))
+    )
+    apart = all(np.abs(x).max(initial=0.0) <= scale for entry in found for x in entry[6:])
+    springs = np.abs(curve).max() <= scale and damping.max() <= scale and armature.min() >= -scale
+    loose = (np.abs(slope) <= scale) & (np.abs(pull) > scale)  # a constant torque is no spring
+    if not (constant and apart and springs) or np.any(loose):
+        return None
+    joints = system.mechanism.joint_names
+    made = {
+        joint: JointTerms(-slope[i], pull[i], -twisted[i] / 6, -damping[i], armature[i])
+        for i, joint in enumerate(joints)
+        if np.any(np.abs([slope[i], pull[i], twisted[i], damping[i], armature[i]]) > scale)
+    }
+    return made
+
+
+def _depends(expression: ca.SX, symbols: ca.SX) -> bool:
+    return expression.numel() > 0 and symbols.numel() > 0 and bool(ca.depends_on(expression, symbols))
