@@ -153,6 +153,30 @@ def _importing(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--frame", metavar="TEXT", help="frame of reference of the points, of a table or C3D file")
 
 
+def _init(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("robot", metavar="ROBOT", help="URDF file, or package:NAME such as package:ur5")
+    text = "recordings of it, or files that `import` understands; several: the last ones are held out"
+    parser.add_argument("files", metavar="FILE", nargs="+", help=text)
+    parser.add_argument("--out", metavar="CONFIG.yaml", required=True, help="configuration to write")
+    parser.add_argument("--replace", action="store_true", help="write over files that are there")
+    kinds = ("cable", "beam", "tree", "y")
+    parser.add_argument("--object", choices=kinds, required=True, help="what is held; y is the foam Y of the paper")
+    for name, text in (("length", "[m]"), ("mass", "[kg]"), ("radius", "[m]")):
+        parser.add_argument(
+            f"--{name}", type=float, metavar="NUMBER", help=f"of the object, of each equal branch {text}"
+        )
+    parser.add_argument("--section", metavar="X,Y", help="extents of a rectangular cross section [m], not a radius")
+    parser.add_argument("--links", type=int, metavar="NUMBER", help="rigid links of each segment")
+    parser.add_argument("--branches", type=int, metavar="NUMBER", help="of a tree: equal ones, in a star")
+    text = "of a tree: NAME=LENGTH,MASS,RADIUS[,ROLL,PITCH,YAW]; NAME@PARENT grows on PARENT's end; may be repeated"
+    parser.add_argument("--branch", metavar="BRANCH", action="append", default=[], help=text)
+    parser.add_argument("--holder", metavar="FRAME", help="of the robot, that carries the object's root")
+    text = "what else holds it, such as right_gripper=w_cable; may be repeated"
+    parser.add_argument("--grasp", metavar="FRAME=POINT", action="append", default=[], help=text)
+    _importing(parser)
+    parser.add_argument("--quiet", action="store_true", help="print nothing but the configuration's path")
+
+
 def _export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("recording", metavar="RECORDING.h5", help="recording to write as CSV")
     parser.add_argument("--out", metavar="DIR", required=True, help="folder for the CSV files")
@@ -170,6 +194,7 @@ def _schema(parser: argparse.ArgumentParser) -> None:
 
 
 COMMANDS: tuple[Command, ...] = (
+    Command("init", "write a commented configuration from a robot and recordings of it", "init", _init),
     Command("solve", "estimate the free parameters from recordings", "solve", _doubting_or_embedded),
     Command("compare", "run several methods on one problem and say whether they agree", "compare", _doubting),
     Command(
