@@ -54,9 +54,7 @@ model:
   points: [w_b1, w_b2, w_b3, w_b4]
 parameters: {{{parameters}}}
 """
-PANDA_POSTURE = dict(
-    zip((f"panda_joint{i}" for i in range(1, 8)), (0.0, -0.4, 0.0, -2.0, 0.0, 1.6, 0.8), strict=True)
-)
+PANDA_POSTURE = dict(zip((f"panda_joint{i}" for i in range(1, 8)), (0.0, -0.4, 0.0, -2.0, 0.0, 1.6, 0.8), strict=True))
 PANDA_BENDS = {"b1": 0.10, "b2": 0.15, "b3": 0.20, "b4": 0.25}
 PANDA_POINTS = {f"w_b{i}": f"marker_{i}" for i in range(1, 5)}
 PANDA_TRUTH = {f"{name}.bend": value for name, value in PANDA_BENDS.items()}
@@ -118,7 +116,9 @@ def write_mcap(recording: Recording, folder: Path) -> Path:
     for group in recording.points:
         for t, row in zip(group.t, group.position, strict=True):
             for name, place in zip(group.names, row, strict=True):
-                point = types["geometry_msgs/msg/PointStamped"](header(t, "world"), types["geometry_msgs/msg/Point"](*place))
+                point = types["geometry_msgs/msg/PointStamped"](
+                    header(t, "world"), types["geometry_msgs/msg/Point"](*place)
+                )
                 messages.append((t, f"/mocap/{name}", "geometry_msgs/msg/PointStamped", point))
     messages.append((0.0, "/note", "std_msgs/msg/String", types["std_msgs/msg/String"]("hello")))
     with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:

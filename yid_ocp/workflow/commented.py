@@ -14,7 +14,7 @@ from yid_ocp.workflow.proposal import GRAVITY, Branch, Proposal
 PLAIN = re.compile(r"[A-Za-z_/][\w./@-]*")
 """Text that YAML reads as it stands."""
 TAKEN = ("true", "false", "null", "yes", "no", "on", "off")
-SOFTNESS = {"cable": 0.01, "beam": 0.3, "tree": 0.1}
+SOFTNESS = {"cable": 0.01, "beam": 1.0, "tree": 0.1}
 """Where the search for a bending rigidity starts, over weight times length squared."""
 DAMPING_TIME = 0.02
 """Damping over rigidity, where the search for it starts [s]."""
@@ -55,7 +55,7 @@ def configuration(
     """
     lines = [
         f"# yaml-language-server: $schema={schema}",
-        f"# Written by `yid-ocp init` {package_version()}. Everything in it may be changed; all keys stand in docs/settings.md.",
+        f"# Written by `yid-ocp init` {package_version()}. Everything may be changed; docs/settings.md has all keys.",
         "# What the recordings say stands beside each line. Next: `yid-ocp check` on this file, then `yid-ocp solve`.",
         _line("", "description", _text(f"A {item.kind} moved by {robot}."), "one sentence for the report"),
         "",
@@ -70,13 +70,14 @@ def configuration(
         *_grasps(proposal),
         *_damping(item),
         *_points(item, proposal),
+        *_offsets(proposal),
         "",
         *_recordings(recordings),
         *_imports(imports),
         "",
         *_sensors(proposal),
         "",
-        *_parameters(item),
+        *_parameters(item, proposal),
         "",
         "problem:",
         _line("  ", "time_step", f"{proposal.time_step:g}", "[s]; `check` says how far estimates move with half of it"),
@@ -213,6 +214,18 @@ def _points(item: Object, proposal: Proposal) -> list[str]:
     )
 
 
+def _by_effort(proposal: Proposal) -> bool:
+    """Whether efforts of arms that move as measured are all that shows the object."""
+    return proposal.mode == "prescribed" and not proposal.places
+
+
+def _offsets(proposal: Proposal) -> list[str]:
+    if not _by_effort(proposal):
+        return []
+    lines = ["  effects:                                  # the zero of every torque sensor, free below"]
+    return [*lines, *(f"    - {{kind: effort_offset, location: {_text(joint)}}}" for joint in proposal.joints)]
+
+
 # -- data -------------------------------------------------------------------------------------------------------------
 
 
@@ -252,7 +265,6 @@ def _value(value: Any) -> str:
 
 def _sensors(proposal: Proposal) -> list[str]:
     lines = ["sensors:"]
-    blind = not proposal.seen
     for group, noise in proposal.noise.items():
         entries = []
         said = f"{noise.std:.2g} {noise.unit}, {noise.why}" if noise.std is not None else f"noise: {noise.why}"
@@ -261,7 +273,7 @@ def _sensors(proposal: Proposal) -> list[str]:
         frames = {p.point: p.frame for p in proposal.places.get(group, ()) if p.frame and p.frame != p.point}
         if frames:
             entries.append(f"frames: {{{', '.join(f'{_text(p)}: {_text(f)}' for p, f in frames.items())}}}")
-        if group == "joints.effort" and proposal.mode == "prescribed" and not blind:
+        if group == "joints.effort" and proposal.mode == "prescribed" and not _by_effort(proposal):
             entries, said = ["use: false", *entries], "true once friction and payload of the arm are in the model"
         lines += _group(group, entries, said)
         lines += _group_places(group, proposal)
@@ -293,7 +305,7 @@ def _rigidity(branch: Branch, kind: str) -> float:
     return SOFTNESS[kind] * branch.mass * GRAVITY * branch.length**2
 
 
-def _parameters(item: Object) -> list[str]:
+def _parameters(item: Object, proposal: Proposal) -> list[str]:
     lines = ["parameters:                                 # `yid-ocp inspect` lists all that there are"]
     if item.kind == "y":
         names = [f"{tube}.{quantity}" for tube in ("T1", "T2", "T3") for quantity in ("bend", "twist")]
@@ -305,4 +317,11 @@ def _parameters(item: Object) -> list[str]:
         lines.append(_line("  ", f"{branch.name}.bend", said, "bending rigidity [N m^2], where the search starts"))
         said = f"{{free: true, initial: {_number(DAMPING_TIME * bend)}}}"
         lines.append(_line("  ", f"{branch.name}.damping", said, "[N m^2 s]"))
+    if _by_effort(proposal):
+        for joint in proposal.joints:
+            still = joint in proposal.still
+            said = "{initial: 0.1}" if still else "{free: true, initial: 0.1, bounds: [0.0, 50.0]}"
+            why = "it hardly turns" if still else "viscous friction of the arm [N m s/rad]"
+            lines.append(_line("  ", f"{joint}.damping", said, why))
+        lines.append(_line("  ", '"effort_offset@*"', "{free: true}", "zeros of the torque sensors [N m]"))
     return lines

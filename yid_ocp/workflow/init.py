@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from yid_ocp.config.reader import load_config
@@ -17,7 +18,7 @@ from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.command import DONE, print_lines
 from yid_ocp.workflow.commented import Object, configuration
 from yid_ocp.workflow.import_recording import given_options, imported
-from yid_ocp.workflow.proposal import Branch, Proposal, propose, relative
+from yid_ocp.workflow.proposal import Branch, Proposal, propose, relative, split_at_rest
 
 SCHEMA = "yid-ocp.schema.json"
 OWN = (".h5", ".hdf5")
@@ -34,14 +35,21 @@ def run(arguments: argparse.Namespace) -> int:
     read_urdf(arguments.robot)
     item = described(arguments)
     made = _recordings(arguments, out)
+    recordings = [recording or read_recording(file) for file, recording in made.items()]
+    proposal = propose(
+        arguments.robot,
+        recordings,
+        item.branches,
+        holder=arguments.holder,
+        grasps=_grasps(arguments.grasp),
+        standing=item.kind == "y",
+    )
+    made = _split(made, recordings, proposal, out)
     _refuse_existing([out, *(file for file, raw in made.items() if raw is not None)], arguments.replace)
-    options = {"holder": arguments.holder, "grasps": _grasps(arguments.grasp), "standing": item.kind == "y"}
-    recordings = {file: recording if recording else read_recording(file) for file, recording in made.items()}
-    proposal = propose(arguments.robot, list(recordings.values()), item.branches, **options)
     imports = given_options(arguments)
     robot = arguments.robot
     where = robot if robot.startswith("package:") else relative(robot, out.parent)
-    files = [relative(file, out.parent) for file in recordings]
+    files = [relative(file, out.parent) for file in made]
     text = configuration(where, item, proposal, files, imports, SCHEMA)
     _write(out, text, {file: raw for file, raw in made.items() if raw is not None})
     if not arguments.quiet:
@@ -74,7 +82,7 @@ def described(arguments: argparse.Namespace) -> Object:
     if arguments.branch:
         if kind != "tree":
             raise ConfigError(f"a {kind} has no branches", where="--branch", allowed="--object tree")
-        return Object(kind, tuple(_branch(text) for text in arguments.branch), links)
+        return Object(kind, _grown([_branch(text) for text in arguments.branch]), links)
     needed = ("length", "mass", "radius") if kind == "tree" and arguments.branches else NEEDED[kind]
     section = _numbers(arguments.section, 2, "--section") if arguments.section else None
     for name in needed:
@@ -107,6 +115,19 @@ def _star(count: int, length: float, mass: float, radius: float) -> tuple[Branch
         Branch(f"b{i + 1}", length, mass, radius, rpy=(0.0, quarter, round(4 * quarter * i / count, 7)))
         for i in range(count)
     )
+
+
+def _grown(branches: Sequence[Branch]) -> tuple[Branch, ...]:
+    """The branches, each with a name of its own and on one that comes before it."""
+    names: list[str] = []
+    for branch in branches:
+        if branch.name in names:
+            raise ConfigError(f"two branches are called '{branch.name}'", where="--branch", allowed="a name for each")
+        if branch.parent is not None and branch.parent not in names:
+            what = f"branch '{branch.name}' grows on '{branch.parent}', which does not come before it"
+            raise ConfigError(what, where="--branch", allowed=", ".join(names) or "the holder alone")
+        names.append(branch.name)
+    return tuple(branches)
 
 
 def _branch(text: str) -> Branch:
@@ -165,9 +186,30 @@ def _recordings(arguments: argparse.Namespace, out: Path) -> dict[Path, Recordin
     return made
 
 
-def _refuse_existing(files: Sequence[Path], replace_them: bool) -> None:
+def _split(
+    made: dict[Path, Recording | None], recordings: Sequence[Recording], proposal: Proposal, out: Path
+) -> dict[Path, Recording | None]:
+    """A single recording in two files where it comes to rest in between, the second one to be held out."""
+    if len(recordings) > 1:
+        return made
+    [whole] = recordings
+    time = split_at_rest(whole, proposal.joints)
+    if time is None:
+        return made
+    first, last = (min(g.t[0] for g in whole.groups), max(g.t[-1] for g in whole.groups))
+    note = f"of {whole.source or whole.name}, from {{:.6g}} s to {{:.6g}} s"
+    parts = {"estimate": (first, time), "held_out": (time, last)}
+    return {
+        out.parent / f"{whole.name}_{name}.h5": replace(
+            whole.slice(*span), name=f"{whole.name}_{name}", notes=(*whole.notes, note.format(*span))
+        )
+        for name, span in parts.items()
+    }
+
+
+def _refuse_existing(files: Sequence[Path], allowed: bool) -> None:
     for file in files:
-        if file.exists() and not replace_them:
+        if file.exists() and not allowed:
             raise OutputError("the file is there already", where=str(file), hint="choose another --out, or --replace")
 
 
@@ -189,7 +231,7 @@ def _write(out: Path, text: str, made: Mapping[Path, Recording]) -> None:
 
 def summary(proposal: Proposal, out: Path) -> list[str]:
     """Lines that tell a person what was found and what comes next."""
-    held = ", ".join([proposal.holder, *proposal.grasps])
+    held = ", ".join(dict.fromkeys([proposal.holder, *proposal.grasps]))
     lines = [
         f"joints: {', '.join(proposal.joints)}",
         f"held by: {held}",

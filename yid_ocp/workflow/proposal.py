@@ -28,9 +28,16 @@ SLOW_FRAMES = 0.05
 """Samples farther apart than this say nothing of their noise: the motion is as fast [s]."""
 CAMERA_STD, MARKER_STD = 5e-3, 1e-3
 """Of points whose noise cannot be seen in the data: of slow and of fast sensors [m]."""
-REST_SPEED = 0.02
-"""A joint that turns slower than this at the start is at rest [rad/s]."""
+REST_SPEED, POINT_REST_SPEED = 0.02, 0.03
+"""A joint [rad/s] or a point [m/s] slower than this is at rest."""
+REST_WINDOW = 0.1
+"""Over which the speed of a joint is taken, and a third of that of a point [s]."""
+STILL = 0.02
+"""A joint that turns less than this says nothing of its own friction [rad]."""
+MOVED = 0.1
+"""Joints that turn less than this together do not move [rad]."""
 GRAVITY = 9.81
+Y_TUBES = ("T1", "T2", "T3")
 SEEN_STEP = 5
 """Places along a segment are told apart in so many percent."""
 
@@ -96,6 +103,8 @@ class Proposal:
     time_step, cutoff : float
         [s], [Hz]
     clocks : mapping of group to text
+    still : tuple of str
+        Joints that hardly turn in any recording.
     """
 
     joints: tuple[str, ...]
@@ -113,6 +122,7 @@ class Proposal:
     time_step: float
     cutoff: float
     clocks: Mapping[str, str] = field(default_factory=dict)
+    still: tuple[str, ...] = ()
 
     @property
     def seen(self) -> tuple[str, ...]:
@@ -179,7 +189,7 @@ def propose(
     used = tuple(arm for arm in arms if set(arm.joints) & set(joints))
     mode, why = _mode(first, bool(held))
     start, start_why = _start(recordings, joints)
-    period = 1.0 / rate_of(first.joints.t)
+    period = float(np.median(np.diff(first.joints.t))) if len(first.joints.t) > 1 else LONGEST_STEP
     return Proposal(
         joints,
         tuple(name for name in first.joints.names if name not in joints),
@@ -196,6 +206,7 @@ def propose(
         _time_step(period),
         min(10.0, 0.2 / period),
         {name: _clock(group.t, group.clock) for name, group in _groups(first)},
+        tuple(name for name in joints if max(_travel(r, [name]) for r in recordings) < STILL),
     )
 
 
@@ -217,16 +228,19 @@ def _arms(tree: Mechanism) -> tuple[Arm, ...]:
     return tuple(arms)
 
 
-def _tool_rank(frame: str) -> int:
+def _tool_rank(frame: str) -> tuple[int, bool]:
     """How unlikely a frame is the one that holds something."""
-    return next((i for i, word in enumerate(TOOLS) if word in frame.lower()), len(TOOLS))
+    name = frame.lower()
+    rank = next((i for i, word in enumerate(TOOLS) if word in name), len(TOOLS))
+    return rank, rank < len(TOOLS) and not name.endswith(TOOLS[rank])
 
 
 def _travel(recording: Recording, joints: Sequence[str]) -> float:
     """How far the joints of an arm turn together [rad]."""
     group = recording.joints
-    assert group is not None
-    return float(sum(np.ptp(group.position[:, group.names.index(name)]) for name in joints))
+    if group is None:
+        return 0.0
+    return float(sum(np.ptp(group.position[:, group.names.index(name)]) for name in joints if name in group.names))
 
 
 def _holder(tree: Mechanism, arms: Sequence[Arm], frame: str | None, standing: bool) -> tuple[str, Arm]:
@@ -252,6 +266,13 @@ def _mode(recording: Recording, closed: bool) -> tuple[str, str]:
     joints = recording.joints
     assert joints is not None
     seen = ", ".join(group.name for group in recording.points)
+    if joints.effort is None and not seen:
+        raise ConfigError(
+            "nothing in the recording shows what the object does",
+            where=recording.name,
+            allowed="points on the object, or efforts of the joints that move it",
+            hint="import points too (`yid-ocp import FILE --preview` lists what there is)",
+        )
     if joints.effort is None:
         return "prescribed", "no efforts were recorded, so the arm moves as its encoders say"
     if closed:
@@ -264,18 +285,54 @@ def _mode(recording: Recording, closed: bool) -> tuple[str, str]:
 def _start(recordings: Sequence[Recording], joints: Sequence[str]) -> tuple[str, str]:
     """Whether every recording begins at rest."""
     for recording in recordings:
-        group = recording.joints
-        if group is None:
-            continue
-        at = [group.names.index(name) for name in joints if name in group.names]
-        early = group.t <= group.t[0] + 0.1
-        if early.sum() < 3 or not at:
-            continue
-        centred = group.t[early] - group.t[early].mean()
-        speed = np.abs(centred @ group.position[early][:, at]) / (centred @ centred)
-        if float(speed.max()) > REST_SPEED:
-            return "estimated", f"{recording.name} begins in motion, so its start is estimated along"
+        moving = moving_at(recording, joints, min(group.t[0] for group in recording.groups))
+        if moving:
+            return "estimated", f"{moving} of {recording.name} moves at the start, which is estimated along"
     return "equilibrium", "all recordings begin at rest"
+
+
+def moving_at(recording: Recording, joints: Sequence[str], time: float) -> str:
+    """A joint or point that moves just after a time, by a line through its first samples; nothing where all rest."""
+    group = recording.joints
+    if group is not None:
+        values = group.position[:, [group.names.index(name) for name in joints]]
+        speeds, noise = _speeds(group.t, values, time, REST_WINDOW)
+        fast = speeds > REST_SPEED + 4 * noise
+        if fast.any():
+            return f"joint {joints[int(np.argmax(fast))]}"
+    for seen in recording.points:
+        speeds, noise = _speeds(seen.t, seen.position.reshape(len(seen.t), -1), time, 3 * REST_WINDOW)
+        fast = speeds > POINT_REST_SPEED + 4 * noise
+        if fast.any():
+            return f"point {seen.names[int(np.argmax(fast)) // 3]}"
+    return ""
+
+
+def _speeds(t: Array, values: Array, time: float, window: float) -> tuple[Array, Array]:
+    """Slope of each channel over a window, and its standard deviation by what the line leaves; zeros where unknown."""
+    rows = (t >= time - 1e-9) & (t <= time + window)
+    zeros = np.zeros(values.shape[1])
+    if rows.sum() < 4:
+        return zeros, zeros
+    centred = t[rows] - t[rows].mean()
+    slope = centred @ (values[rows] - values[rows].mean(axis=0)) / (centred @ centred)
+    left = values[rows] - values[rows].mean(axis=0) - np.outer(centred, slope)
+    return np.nan_to_num(np.abs(slope)), np.nan_to_num(left.std(axis=0) / math.sqrt(centred @ centred))
+
+
+def split_at_rest(recording: Recording, joints: Sequence[str]) -> float | None:
+    """A time in the later part of a recording from which on everything rests for a while; None where there is none.
+
+    What comes after it can be predicted from rest, so that it shows, held out, whether a model is right.
+    """
+    first, duration = min(group.t[0] for group in recording.groups), recording.duration
+    for part in np.arange(0.75, 0.5, -0.01):
+        time = first + float(part) * duration
+        if not moving_at(recording, joints, time) and not moving_at(recording, joints, time + REST_WINDOW):
+            later = recording.slice(time, first + duration)
+            if later.joints is not None and _travel(later, joints) > MOVED:
+                return time
+    return None
 
 
 # -- points -----------------------------------------------------------------------------------------------------------
@@ -285,7 +342,7 @@ def _places(
     tree: Mechanism, recording: Recording, branches: Sequence[Branch], holder: str, standing: bool
 ) -> dict[str, tuple[Place, ...]]:
     """Where on the object every recorded point probably sits."""
-    frames = [f"w_{branch.name}" for branch in branches]
+    frames = [f"w_{name}" for name in (Y_TUBES if standing else [branch.name for branch in branches])]
     return {
         group.name: tuple(
             _named(point, frames, branches, tree)

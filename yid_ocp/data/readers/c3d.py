@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from yid_ocp.data.readers.base import PREVIEWS, READERS, Contents, Source, finished
 from yid_ocp.data.recording import Array, PointGroup, Recording
+from yid_ocp.data.trial import try_first
 from yid_ocp.errors import DataError
 from yid_ocp.files import file_sha256
 
@@ -114,6 +115,7 @@ def _markers(path: Path) -> _Markers:
         raise DataError(
             "reading C3D files needs the package ezc3d", where=str(path), hint="pip install 'yid-ocp[c3d]'"
         ) from error
+    try_first(path, _complaint, "C3D")
     try:
         file = ezc3d.c3d(str(path))
         parameters = file["parameters"]
@@ -124,13 +126,8 @@ def _markers(path: Path) -> _Markers:
         unit = str(next(iter(parameters["POINT"].get("UNITS", {}).get("value", [])), "")).strip().lower()
         analog = [label for label in _listed(parameters.get("ANALOG", {}), "LABELS") if label]
         computed = {label for key in _COMPUTED for label in _listed(parameters["POINT"], key) if label}
-    except (OSError, ValueError, KeyError, IndexError, RuntimeError, TypeError) as error:
-        raise DataError(
-            f"the C3D file cannot be read ({type(error).__name__}: {error})",
-            where=str(path),
-            allowed="a C3D file as Vicon, Qualisys or OptiTrack export it",
-            hint="export it again, with 3-D points",
-        ) from error
+    except (ValueError, KeyError, IndexError, TypeError) as error:
+        raise _unreadable(path, f"{type(error).__name__}: {error}") from error
     if not rate > 0 or not len(position) or not labels:
         what = "the C3D file has no markers" if not labels else "the C3D file has no frames, or no rate"
         raise DataError(what, where=str(path), allowed="labelled 3-D points and their rate")
@@ -160,6 +157,22 @@ def _markers(path: Path) -> _Markers:
     names = _short([labels[i] for i in kept])
     t = np.arange(len(position)) / rate
     return _Markers(names, t, position[:, kept], unit, tuple(others))
+
+
+def _complaint(path: Path) -> str:
+    """What the library says against a file; it may end its process, too."""
+    import ezc3d
+
+    try:
+        ezc3d.c3d(str(path))
+    except Exception as error:  # whatever stands in the way
+        return _unreadable(path, f"{type(error).__name__}: {error}").what
+    return ""
+
+
+def _unreadable(path: Path, why: str) -> DataError:
+    allowed = "a C3D file as Vicon, Qualisys or OptiTrack export it"
+    return DataError(f"the C3D file cannot be read ({why})", where=str(path), allowed=allowed, hint="export it again")
 
 
 def _listed(group: Mapping[str, Any], key: str) -> list[str]:
