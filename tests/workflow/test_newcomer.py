@@ -1,4 +1,4 @@
-"""A new user: a bag of an arm with something flexible in its hand, the commands in order, no edit of what they write."""
+"""A new user: a bag of an arm with something flexible in its hand, commands in order, no edit of what they write."""
 
 from __future__ import annotations
 
