@@ -144,9 +144,68 @@ def _inspect(parser: argparse.ArgumentParser) -> None:
 
 
 def _import(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("file", metavar="FILE", help="CSV file or folder, rosbag, MCAP, or a recording")
-    parser.add_argument("--out", metavar="RECORDING.h5", required=True, help="recording to write")
+    files = "CSV, C3D, MCAP, rosbag (file or folder), LeRobot dataset (folder), or a recording"
+    parser.add_argument("file", metavar="FILE", help=files)
+    parser.add_argument("--out", metavar="RECORDING.h5", help="recording to write; needed without --preview")
+    text = "show what there is, and the command that imports it, and write nothing"
+    parser.add_argument("--preview", action="store_true", help=text)
+    text = "its section `import` says how; a flag goes before what stands there"
+    parser.add_argument("--config", metavar="CONFIG.yaml", help=text)
+    _importing(parser)
     parser.add_argument("--quiet", action="store_true", help="print nothing but the recording's path")
+
+
+def _importing(parser: argparse.ArgumentParser) -> None:
+    """Flags that are keys of the section `import`; a list may be split by commas, and its flag repeated."""
+    group = parser.add_argument_group("how files of other tools are read")
+    listed = (
+        ("--joint-topic", "joint_topics", "TOPIC", "of a bag: topic of joint states; several are put on one clock"),
+        ("--joints", "joints", "NAME[=NEW]", "joints to keep, in this order, and what they are called in the URDF"),
+        ("--points", "points", "SOURCE=POINT", "topic, TOPIC:FRAME of /tf, marker or stem, and its point: cable:100%%"),
+        ("--columns", "columns", "COLUMN=MEANING", "of a table: t, CHANNEL:JOINT, AXIS:POINT or skip; or in order"),
+        ("--units", "units", "UNIT", "deg, mm, ms, or QUANTITY=UNIT, of what is not SI"),
+        ("--torque-constants", "torque_constants", "JOINT=N_M_PER_A", "where the efforts are currents; * is any text"),
+        ("--gears", "gears", "JOINT=RATIO", "turns of the motor per turn of the joint"),
+    )
+    for flag, key, shape, text in listed:
+        group.add_argument(flag, dest=key, metavar=f"{shape},...", action="append", default=[], help=text)
+    text = "of a bag: topic of joint states whose positions were asked for"
+    group.add_argument("--command-topic", metavar="TOPIC", help=text)
+    text = "of a bag: make points so far along the axes of every pose [m]"
+    group.add_argument("--pose-axes", type=float, metavar="METRES", help=text)
+    text = "of a table: its first row holds numbers"
+    group.add_argument("--no-header", dest="header", action="store_const", const=False, help=text)
+    text = "of a table: leave lines that are no numbers out, and count them"
+    group.add_argument("--skip-bad-lines", action="store_const", const=True, help=text)
+    group.add_argument("--delimiter", metavar="CHARACTER", help="of a table: between its cells")
+    group.add_argument("--episode", type=int, metavar="NUMBER", help="of a LeRobot dataset; 0 when absent")
+    group.add_argument("--clock", choices=("recorded", "nominal"), help="of a table: whether its times were measured")
+    group.add_argument("--sensor", metavar="TEXT", help="what saw the points")
+    group.add_argument("--frame", metavar="TEXT", help="frame of reference of the points, of a table or C3D file")
+
+
+def _init(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("robot", metavar="ROBOT", help="URDF file, or package:NAME such as package:ur5")
+    text = "recordings of it, or files that `import` understands; several: the last ones are held out"
+    parser.add_argument("files", metavar="FILE", nargs="+", help=text)
+    parser.add_argument("--out", metavar="CONFIG.yaml", required=True, help="configuration to write")
+    parser.add_argument("--replace", action="store_true", help="write over files that are there")
+    kinds = ("cable", "beam", "tree", "y")
+    parser.add_argument("--object", choices=kinds, required=True, help="what is held; y is the foam Y of the paper")
+    for name, text in (("length", "[m]"), ("mass", "[kg]"), ("radius", "[m]")):
+        parser.add_argument(
+            f"--{name}", type=float, metavar="NUMBER", help=f"of the object, of each equal branch {text}"
+        )
+    parser.add_argument("--section", metavar="X,Y", help="extents of a rectangular cross section [m], not a radius")
+    parser.add_argument("--links", type=int, metavar="NUMBER", help="rigid links of each segment")
+    parser.add_argument("--branches", type=int, metavar="NUMBER", help="of a tree: equal ones, in a star")
+    text = "of a tree: NAME=LENGTH,MASS,RADIUS[,ROLL,PITCH,YAW]; NAME@PARENT grows on PARENT's end; may be repeated"
+    parser.add_argument("--branch", metavar="BRANCH", action="append", default=[], help=text)
+    parser.add_argument("--holder", metavar="FRAME", help="of the robot, that carries the object's root")
+    text = "what else holds it, such as right_gripper=w_cable; may be repeated"
+    parser.add_argument("--grasp", metavar="FRAME=POINT", action="append", default=[], help=text)
+    _importing(parser)
+    parser.add_argument("--quiet", action="store_true", help="print nothing but the configuration's path")
 
 
 def _export(parser: argparse.ArgumentParser) -> None:
@@ -170,6 +229,7 @@ def _schema(parser: argparse.ArgumentParser) -> None:
 
 
 COMMANDS: tuple[Command, ...] = (
+    Command("init", "write a commented configuration from a robot and recordings of it", "init", _init),
     Command("solve", "estimate the free parameters from recordings", "solve", _doubting_or_embedded),
     Command("compare", "run several methods on one problem and say whether they agree", "compare", _doubting),
     Command(
@@ -197,7 +257,7 @@ COMMANDS: tuple[Command, ...] = (
     Command("check", "validate a configuration, its recordings and the model before a long run", "check", _doubting),
     Command("inspect", "show the model's equations: names, patterns, single entries, numbers", "inspect", _inspect),
     Command("track", "measure the object's points in the frames of a depth camera", "track", _doubting),
-    Command("import", "turn CSV, rosbag or MCAP into a recording", "import_recording", _import),
+    Command("import", "turn a file of another tool into a recording", "import_recording", _import),
     Command("export", "turn a recording into CSV, or a run's model into MJCF, URDF, SDF or YAML", "export", _export),
     Command("schema", "print the JSON Schema of configuration files, for editors", "schema", _schema),
 )

@@ -66,19 +66,22 @@ class Among:
 
 @dataclass(frozen=True)
 class Option:
-    """Type with its markers, and default; `MISSING` where there is none."""
+    """Type with its markers, default (`MISSING` where there is none), and the field of the dataclass that it fills."""
 
     hint: Any
     default: Any
+    field: str = ""
 
 
 @functools.cache
 def options_of(kind: type) -> Mapping[str, Option]:
-    """Fields of a dataclass that users may set, by name."""
+    """Fields of a dataclass that users may set, by key: the field's name, without the `_` behind a word of Python."""
     hints = get_type_hints(kind, include_extras=True)
     return {
-        entry.name: Option(
-            hints[entry.name], entry.default if entry.default_factory is MISSING else entry.default_factory()
+        entry.name.removesuffix("_"): Option(
+            hints[entry.name],
+            entry.default if entry.default_factory is MISSING else entry.default_factory(),
+            entry.name,
         )
         for entry in dataclasses.fields(kind)
         if any(isinstance(marker, About) for marker in stripped(hints[entry.name])[1])
@@ -156,7 +159,7 @@ def check(options: Any, where: str) -> None:
     """
     kind: Any = type(options)
     for name, option in options_of(kind).items():
-        value = getattr(options, name)
+        value = getattr(options, option.field)
         if not _within(option.hint, value):
             raise ConfigError(f"{name} = {value}", where=where, allowed=words(option.hint))
 

@@ -209,6 +209,8 @@ def test_refused_settings_over_the_file(setting, message):
 # Numbers that may have any value: places, angles, offsets.
 ANY_NUMBER = {
     "plan.posture.NAME",
+    "import.torque_constants.NAME",
+    "import.gears.NAME",
     "model.arms.locked.NAME",
     "model.springs.NAME.rest",
     "model.effects.values.NAME",

@@ -13,7 +13,7 @@ import pytest
 from recording_examples import joints_of
 
 from yid_ocp.data.hdf5 import write_recording
-from yid_ocp.data.readers import read_any
+from yid_ocp.data.readers import preview, read_any
 from yid_ocp.data.readers.bags import read_bag
 from yid_ocp.errors import DataError
 
@@ -22,6 +22,9 @@ SECOND = 10**9
 
 NO_ROSBAGS = "bags need rosbags: pip install 'yid-ocp[bags]'"
 JOINT_STATE, POINT = "sensor_msgs/msg/JointState", "geometry_msgs/msg/PointStamped"
+POSE, TREE, BOOL = "geometry_msgs/msg/PoseStamped", "tf2_msgs/msg/TFMessage", "std_msgs/msg/Bool"
+QUARTER = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))
+"""A quarter turn about z, as (x, y, z, w)."""
 START = 1_700_000_000 * SECOND
 FORMATS = ("bag", "mcap", "mcap folder", "db3", "db3 folder")
 
@@ -32,6 +35,18 @@ def joint_state(names: Sequence[str], stamp: int, **channels: Sequence[float]) -
 
 def point(stamp: int, xyz: Sequence[float], frame: str = "camera_link") -> tuple[str, dict[str, Any]]:
     return POINT, {"stamp": stamp, "frame_id": frame, "xyz": xyz}
+
+
+def pose(stamp: int, xyz: Sequence[float], turn: Sequence[float] = QUARTER) -> tuple[str, dict[str, Any]]:
+    return POSE, {"stamp": stamp, "frame_id": "map", "xyz": xyz, "turn": turn}
+
+
+def frame(stamp: int, child: str, xyz: Sequence[float]) -> tuple[str, dict[str, Any]]:
+    return TREE, {"stamp": stamp, "frame_id": "map", "child": child, "xyz": xyz, "turn": QUARTER}
+
+
+def note(text: str = "x") -> tuple[str, dict[str, Any]]:
+    return "std_msgs/msg/String", {"stamp": 0, "frame_id": "", "data": text}
 
 
 Messages = Sequence[tuple[str, int, tuple[str, dict[str, Any]]]]
@@ -67,6 +82,18 @@ def write_bag(folder: Path, kind: str, messages: Messages) -> Path:
                 message = types[JOINT_STATE](header, values["name"], *arrays)
             elif msgtype == POINT:
                 message = types[POINT](header, types["geometry_msgs/msg/Point"](*map(float, values["xyz"])))
+            elif msgtype == POSE:
+                place = types["geometry_msgs/msg/Point"](*map(float, values["xyz"]))
+                turn = types["geometry_msgs/msg/Quaternion"](*map(float, values["turn"]))
+                message = types[POSE](header, types["geometry_msgs/msg/Pose"](place, turn))
+            elif msgtype == TREE:
+                place = types["geometry_msgs/msg/Vector3"](*map(float, values["xyz"]))
+                turn = types["geometry_msgs/msg/Quaternion"](*map(float, values["turn"]))
+                transform = types["geometry_msgs/msg/Transform"](place, turn)
+                stamped = types["geometry_msgs/msg/TransformStamped"](header, values["child"], transform)
+                message = types[TREE]([stamped])
+            elif msgtype == BOOL:
+                message = types[BOOL](bool(values["data"]))
             else:
                 message = types[msgtype](values["data"])
             serialize = store.serialize_ros1 if kind == "bag" else store.serialize_cdr
@@ -124,7 +151,7 @@ def test_bag_with_different_sets_of_joints(tmp_path: Path) -> None:
     path = write_bag(tmp_path, "bag", [("/joint_states", START, arm), ("/joint_states", START, gripper)])
     with pytest.raises(DataError, match="2 different sets of joints") as caught:
         read_bag(path)
-    assert "joints=[...]" in caught.value.hint
+    assert "--joints" in caught.value.hint
     assert read_bag(path, joints=["b"]).joint_names == ("b",)
     with pytest.raises(DataError, match="no joint 'fingr'") as caught:
         read_bag(path, joints=["a", "fingr"])
@@ -133,15 +160,158 @@ def test_bag_with_different_sets_of_joints(tmp_path: Path) -> None:
         read_bag(path, joints=["a", "finger"])
 
 
+def two_arms(rate: int = 200, effort: bool = True) -> Messages:
+    """Left at 100 Hz, right at `rate` Hz from 5 ms on, its angle a straight line in time."""
+    messages: list[tuple[str, int, tuple[str, dict[str, Any]]]] = []
+    for k in range(20):
+        stamp = START + k * SECOND // 100
+        more = {"effort": [1.0]} if effort else {}
+        messages.append(("/left", stamp, joint_state(("a",), stamp, position=[0.01 * k], **more)))
+    for k in range(40):
+        stamp = START + k * SECOND // rate + SECOND // 200
+        values = {"position": [float(k) / rate], "effort": [2.0 * k]}
+        messages.append(("/right", stamp, joint_state(("b",), stamp, **values)))
+    return messages
+
+
 def test_bag_with_several_joint_topics(tmp_path: Path) -> None:
-    one, two = (joint_state((name,), START, position=[1.0]) for name in "ab")
-    path = write_bag(tmp_path, "bag", [("/left", START, one), ("/right", START, two)])
-    with pytest.raises(DataError, match="several topics"):
-        read_bag(path)
-    assert read_bag(path, joint_topic="/right").joint_names == ("b",)
+    path = write_bag(tmp_path, "mcap", two_arms())
+    recording = read_bag(path)
+    joints = joints_of(recording)
+    assert joints.names == ("a", "b")
+    # the faster topic is the clock, from where the slower one has samples on both sides
+    assert joints.t[0] == pytest.approx(0.005)
+    assert joints.t[-1] == pytest.approx(0.19)
+    assert np.allclose(joints.position[:, 0], joints.t)  # 0.01 rad every 10 ms, interpolated
+    assert np.allclose(joints.position[:, 1], joints.t - 0.005)
+    assert np.array_equal(joints.channels["effort"][:, 1], 2.0 * np.arange(len(joints.t)))
+    assert any("/left were interpolated to the times of /right" in note for note in recording.notes)
+    alone = read_bag(path, joint_topics=["/right"])
+    assert alone.joint_names == ("b",)
+    assert any(note.startswith("/left was left out") for note in alone.notes)
     with pytest.raises(DataError, match="on the topic '/rigth'") as caught:
-        read_bag(path, joint_topic="/rigth")
+        read_bag(path, joint_topics=["/rigth"])
     assert caught.value.hint == "did you mean '/right'?"
+
+
+def test_joint_topics_that_do_not_fit_together(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, "mcap", two_arms(effort=False))
+    with pytest.raises(DataError, match="/left has no effort, which another topic"):
+        read_bag(path)
+    (tmp_path / "twice").mkdir()
+    one = joint_state(("a",), START, position=[1.0])
+    path = write_bag(tmp_path / "twice", "mcap", [("/x", START, one), ("/y", START, one)])
+    with pytest.raises(DataError, match="joint 'a' is on /x and on /y") as caught:
+        read_bag(path)
+    assert "--joint-topic" in caught.value.hint
+
+
+def test_a_gap_of_one_topic_stays_a_gap(tmp_path: Path) -> None:
+    lost = [m for m in two_arms() if m[0] != "/left" or not 5 <= round(100 * (m[1] - START) / SECOND) < 15]
+    joints = joints_of(read_bag(write_bag(tmp_path, "mcap", lost)))
+    assert not ((joints.t > 0.041) & (joints.t < 0.149)).any()
+    assert np.allclose(joints.position[:, 0], joints.t)
+
+
+def test_commands_are_held_until_the_next(tmp_path: Path) -> None:
+    messages = list(two_arms())
+    for k in range(4):
+        stamp = START + (5 * k + 1) * SECOND // 100 + 1000
+        messages.append(("/command", stamp, joint_state(("a",), stamp, position=[10.0 + k])))
+    path = write_bag(tmp_path, "mcap", messages)
+    joints = joints_of(read_bag(path, joint_topics=["/left"], command_topic="/command"))
+    wanted = [10.0] * 7 + [11.0] * 5 + [12.0] * 5 + [13.0] * 3
+    assert np.array_equal(joints.channels["position_command"][:, 0], wanted)
+
+
+def twelve_topics() -> Messages:
+    """Two arms, a point, a pose and a transform's frame, and seven topics that say nothing of joints or points."""
+    messages = list(two_arms())
+    for k in range(10):
+        stamp = START + k * SECOND // 50 + SECOND // 200
+        messages.append(("/mocap/tip", stamp, point(stamp, (1.0, 0.0, 0.1 * k), "map")))
+        messages.append(("/vrpn/hand/pose", stamp, pose(stamp, (0.5, 0.0, 0.1 * k))))
+        messages.append(("/tf", stamp, frame(stamp, "middle", (0.0, 0.7, 0.1 * k))))
+        messages.append(("/gripper/closed", stamp, (BOOL, {"stamp": 0, "frame_id": "", "data": True})))
+    messages += [(f"/log/{name}", START, note()) for name in "abcdef"]
+    return messages
+
+
+def test_a_bag_of_twelve_topics(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, "mcap", twelve_topics())
+    recording = read_bag(
+        path, points={"/mocap/tip": "cable:100%", "/vrpn/hand/pose": "hand", "/tf:middle": "cable:50%"}
+    )
+    assert recording.joint_names == ("a", "b")
+    (points,) = recording.points
+    assert (points.names, points.frame) == (("cable:100%", "cable:50%", "hand"), "map")
+    assert np.allclose(points.position[3], [[1.0, 0.0, 0.3], [0.0, 0.7, 0.3], [0.5, 0.0, 0.3]])
+    left = [note for note in recording.notes if "was left out (" in note]
+    assert [note.split()[0] for note in left] == ["/gripper/closed", *(f"/log/{name}" for name in "abcdef")]
+    assert left[0].endswith("(std_msgs/msg/Bool, 10)")
+    assert any("orientations of /tf:middle, /vrpn/hand/pose" in note for note in recording.notes)
+    write_recording(recording, tmp_path / "all.h5")
+    assert read_any(tmp_path / "all.h5").notes == recording.notes
+    by_itself = read_bag(path)
+    assert by_itself.points[0].names == ("hand", "tip")
+    assert any(note.startswith("/tf was left out") for note in by_itself.notes)
+
+
+def test_the_preview_of_a_bag_proposes_what_imports_it(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, "mcap", twelve_topics())
+    contents = preview(path)
+    by_name = {source.name: source for source in contents.sources}
+    assert len(by_name) == 12
+    assert by_name["/left"].becomes == "joints a"
+    assert by_name["/left"].rate == pytest.approx(100.0)
+    assert by_name["/vrpn/hand/pose"].becomes == "point hand"
+    assert "middle: --points /tf:FRAME" in by_name["/tf"].note
+    assert sum(not source.becomes for source in contents.sources) == 8
+    assert contents.options["points"] == {"/mocap/tip": "tip", "/vrpn/hand/pose": "hand"}
+    assert read_any(path, **contents.options).joint_names == ("a", "b")
+
+
+def test_a_preview_says_what_looks_like_degrees_and_millimetres(tmp_path: Path) -> None:
+    messages = [("/j", START, joint_state(("a",), START, position=[170.0])), ("/p", START, point(START, (900.0, 0, 0)))]
+    path = write_bag(tmp_path, "mcap", messages)
+    contents = preview(path)
+    assert contents.options["units"] == {"position": "deg", "points": "mm"}
+    recording = read_any(path, **contents.options)
+    assert joints_of(recording).position[0, 0] == pytest.approx(math.radians(170))
+    assert recording.points[0].position[0, 0, 0] == pytest.approx(0.9)
+
+
+def test_an_orientation_becomes_points_on_the_axes(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, "mcap", [("/hand/pose", START, pose(START, (1.0, 2.0, 3.0)))])
+    (points,) = read_bag(path, pose_axes=0.1).points
+    assert points.names == ("hand", "hand_x", "hand_y", "hand_z")
+    # the quarter turn about z takes x to y and y to -x
+    assert np.allclose(points.position[0], [[1, 2, 3], [1, 2.1, 3], [0.9, 2, 3], [1, 2, 3.1]])
+    with pytest.raises(DataError, match="pose_axes = 0"):
+        read_bag(path, pose_axes=0.0)
+
+
+def test_currents_become_torques(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, "mcap", two_arms())
+    efforts = joints_of(read_bag(path)).channels["effort"]
+    options: dict[str, Any] = {
+        "units": {"effort": "mA"},
+        "torque_constants": {"*": 0.1, "b": 0.2},
+        "gears": {"b": 50.0},
+    }
+    torques = joints_of(read_bag(path, **options)).channels["effort"]
+    assert np.allclose(torques, 1e-3 * efforts * [0.1, 0.2 * 50])
+    with pytest.raises(DataError, match="effort of 'a' is a current, and its torque constant is not given"):
+        read_bag(path, units={"effort": "A"}, torque_constants={"b": 1.0})
+    with pytest.raises(DataError, match="but the efforts are no currents"):
+        read_bag(path, torque_constants={"*": 1.0})
+
+
+def test_joints_are_renamed(tmp_path: Path) -> None:
+    joints = joints_of(read_bag(write_bag(tmp_path, "mcap", two_arms()), joints=["b=elbow", "a"]))
+    assert set(joints.names) == {"elbow", "a"}
+    at = joints.names.index("elbow")
+    assert np.allclose(joints.position[:, at], joints.t - 0.005)
 
 
 @pytest.mark.parametrize("stamps", [(0, 0), (START - SECOND // 2, 0)])
@@ -171,7 +341,7 @@ def test_bag_points_of_two_frames(tmp_path: Path) -> None:
     path = write_bag(tmp_path, "bag", messages)
     with pytest.raises(DataError, match="points of the same name"):
         read_bag(path)
-    recording = read_bag(path, point_topics={"/a/tip": "tip", "/b/tip": "seen_tip"})
+    recording = read_bag(path, points={"/a/tip": "tip", "/b/tip": "seen_tip"})
     assert recording.joints is None
     assert [(g.name, g.frame, g.names) for g in recording.points] == [
         ("points_base_link", "base/link", ("tip",)),
@@ -179,7 +349,7 @@ def test_bag_points_of_two_frames(tmp_path: Path) -> None:
     ]
     assert recording.duration == 1.0
     with pytest.raises(DataError, match="no points on the topic '/c'"):
-        read_bag(path, point_topics={"/c": "tip"})
+        read_bag(path, points={"/c": "tip"})
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +8,7 @@ import numpy as np
 import pytest
 from recording_examples import joints_of, table
 
+from yid_ocp.data.readers import preview
 from yid_ocp.data.readers.csv import read_csv
 from yid_ocp.errors import DataError
 
@@ -52,13 +52,13 @@ def test_csv_units_are_converted(tmp_path: Path) -> None:
 
 def test_csv_columns_given(tmp_path: Path) -> None:
     path = table(tmp_path, "stamp;angle;label;X;Y;Z\n0;0.1;start;1;2;3\n1;0.2;;4;5;6\n")
-    columns: Mapping[str, Any] = {
+    columns = {
         "stamp": "t",
-        "angle": ("position", "elbow"),
-        "label": None,
-        "X": ["x", "tip"],
-        "Y": ["y", "tip"],
-        "Z": ["z", "tip"],
+        "angle": "position:elbow",
+        "label": "skip",
+        "X": "x:tip",
+        "Y": "y:tip",
+        "Z": "z:tip",
     }
     recording = read_csv(path, columns=columns, delimiter=";")
     assert recording.joint_names == ("elbow",)
@@ -93,12 +93,12 @@ CSV_ERRORS: dict[str, tuple[str, dict[str, Any], str, str]] = {
     "long delimiter": (GOOD, {"delimiter": "::"}, "the delimiter is '::'", ""),
     "repeated column": ("t,q_a,q_a\n0,1,1\n", {}, "two columns are called 'q_a'", ""),
     "same meaning": ("t,q_a,position_a\n0,1,1\n", {}, "'q_a' and 'position_a' mean the same, position a", ""),
-    "unknown column": ("t,q_a,label\n0,1,2\n", {}, "meaning of column 'label'", "columns={'label'"),
+    "unknown column": ("t,q_a,label\n0,1,2\n", {}, "meaning of column 'label'", "label=skip"),
     "bare prefix": ("t,q_\n0,1\n", {}, "meaning of column 'q_'", ""),
     "no time": ("q_a,q_b\n0,1\n", {}, "no column of times", ""),
-    "only time": ("t,label\n0,1\n", {"columns": {"label": None}}, "the recording has no group", ""),
-    "column not there": (GOOD, {"columns": {"q_b": None}}, "there is no column 'q_b'", "did you mean 'q_a'"),
-    "meaning of a column": (GOOD, {"columns": {"q_a": ("angle", "a")}}, "given the meaning", "known: "),
+    "only time": ("t,label\n0,1\n", {"columns": {"label": "skip"}}, "the recording has no group", ""),
+    "column not there": (GOOD, {"columns": {"q_b": "skip"}}, "there is no column 'q_b'", "did you mean 'q_a'"),
+    "meaning of a column": (GOOD, {"columns": {"q_a": "angle:a"}}, "given the meaning", "known: "),
     "meaning without joint": (GOOD, {"columns": {"q_a": "position"}}, "given the meaning 'position'", ""),
     "short row": ("t,q_a\n0,1\n1\n", {}, "the row has 1 cells", ""),
     "text": ("t,q_a\n0,1\n1,fast\n", {}, "column 'q_a' holds 'fast'", ""),
@@ -137,3 +137,76 @@ def test_csv_that_is_no_text(tmp_path: Path) -> None:
         read_csv(tmp_path)
     with pytest.raises(DataError, match="no such file"):
         read_csv(tmp_path / "absent.csv")
+
+
+# ------------------------------------------------------------------------------- no header, patterns, bad lines
+
+
+def test_a_table_without_a_header(tmp_path: Path) -> None:
+    path = table(tmp_path, "0,0.1,5\n1,0.2,6\n")
+    columns = {"1": "t", "2": "position:a", "3": "effort:a"}
+    joints = joints_of(read_csv(path, header=False, columns=columns))
+    assert np.array_equal(joints.position[:, 0], [0.1, 0.2])
+    assert np.array_equal(joints.channels["effort"][:, 0], [5, 6])
+    with pytest.raises(DataError, match="no header row") as caught:
+        read_csv(path, columns=columns)
+    assert "--no-header --columns t," in caught.value.hint
+
+
+def test_patterns_of_columns(tmp_path: Path) -> None:
+    path = table(tmp_path, "stamp,a_pos,b_pos,a_tau,b_tau,b_ref\n0,1,2,3,4,5\n1,6,7,8,9,10\n")
+    columns = {"stamp": "t", "*_pos": "position:*", "*_tau": "effort:*", "b_*": "skip", "b_pos": "position:elbow"}
+    with pytest.raises(DataError, match="no column for effort of 'elbow'"):
+        read_csv(path, columns=columns)
+    joints = joints_of(read_csv(path, columns={**columns, "b_tau": "effort:elbow"}))
+    assert joints.names == ("a", "elbow")
+    assert np.array_equal(joints.channels["effort"], [[3, 4], [8, 9]])
+
+
+def test_bad_lines_are_refused_or_skipped_and_counted(tmp_path: Path) -> None:
+    text = "t,q_a\n0,1\n1,fast\n2,3\n3,4,5\n4\n5,6\n6,7\n7,8\n"
+    path = table(tmp_path, text)
+    with pytest.raises(DataError, match="'fast'"):
+        read_csv(path)
+    recording = read_csv(path, skip_bad_lines=True)
+    assert np.array_equal(joints_of(recording).t, [0, 2, 5, 6, 7])
+    assert recording.notes == ("3 of 8 lines were bad and left out (line 3, 5, 6)",)
+    mostly = table(tmp_path, "t,q_a\n0,1\n1,fast\n2,slow\n")
+    with pytest.raises(DataError, match="2 of 3 lines are no rows of 2 numbers"):
+        read_csv(mostly, skip_bad_lines=True)
+
+
+def test_joints_and_points_are_chosen_and_renamed(tmp_path: Path) -> None:
+    path = table(tmp_path, "t,q_a,q_b,m1_x,m1_y,m1_z,m2_x,m2_y,m2_z\n0,1,2,3,3,3,4,4,4\n")
+    recording = read_csv(path, joints=["b=elbow"], points={"m2": "cable:100%"})
+    assert (recording.joint_names, recording.point_names) == (("elbow",), ("cable:100%",))
+    assert joints_of(recording).position[0, 0] == 2
+    assert recording.points[0].position[0, 0, 0] == 4
+
+
+@pytest.mark.parametrize(
+    ("text", "columns", "delimiter"),
+    [
+        ("t;q_a;label;tip_x;tip_y;tip_z\n" + "".join(f"{k};{k};x;1;2;3\n" for k in range(4)), {"label": "skip"}, ";"),
+        ("t,angle\n" + "".join(f"{k},{k}\n" for k in range(4)), {"angle": "CHANNEL:angle"}, ","),
+        ("".join(f"{k},1,2\n" for k in range(4)), {"1": "t", "2": "CHANNEL:JOINT", "3": "CHANNEL:JOINT"}, ","),
+    ],
+    ids=["text among it", "unknown name", "no header"],
+)
+def test_the_preview_of_a_table(text: str, columns: dict[str, str], delimiter: str, tmp_path: Path) -> None:
+    contents = preview(table(tmp_path, text))
+    assert contents.options["columns"] == columns
+    assert contents.options.get("delimiter", ",") == delimiter
+    assert ("header" in contents.options) == text.startswith("0")
+
+
+def test_the_preview_counts_bad_lines_and_guesses_units(tmp_path: Path) -> None:
+    rows = "".join(f"{10 * k},{90 + k},500,500,500\n" for k in range(8))
+    path = table(tmp_path, "t,q_a,tip_x,tip_y,tip_z\n" + rows + "80,broken,1,1,1\n")
+    contents = preview(path)
+    assert contents.options["units"] == {"position": "deg", "points": "mm", "t": "ms"}
+    assert contents.options["skip_bad_lines"] is True
+    assert contents.notes[0] == "1 of 9 lines are no rows of numbers"
+    joints = joints_of(read_csv(path, **contents.options))
+    assert joints.t[1] == pytest.approx(0.01)
+    assert joints.position[0, 0] == pytest.approx(math.pi / 2)

@@ -280,7 +280,7 @@ class _Reader:
         values: dict[str, Any] = {}
         for name, option in options_of(kind).items():
             if name in raw:
-                values[name] = self.build(option.hint, raw[name], (*path, name))
+                values[option.field] = self.build(option.hint, raw[name], (*path, name))
             elif option.default is MISSING:
                 raise ConfigError(f"the key '{name}' is missing", where=self.where(path), allowed=words(option.hint))
         return kind(**values)

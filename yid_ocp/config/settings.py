@@ -16,6 +16,7 @@ from annotated_types import Ge, Gt, Le, Len, Lt
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedSeq
 
+from yid_ocp.data.recording import Clock
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import ConfigError
 from yid_ocp.integrator.discrete import ConstraintForce, ForceSplit
@@ -235,6 +236,53 @@ class RecordingSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ImportSettings:
+    """How `import` makes a recording of a file of another tool; a flag of the command line goes before its key here."""
+
+    joint_topics: Annotated[
+        tuple[str, ...] | None, About("of a bag: topics of joint states, put on one clock; all when absent")
+    ] = None
+    command_topic: Annotated[
+        str | None, About("of a bag: topic of joint states whose positions were asked for, not measured")
+    ] = None
+    joints: Annotated[
+        tuple[str, ...] | None, About("joints to keep, NAME or RECORDED=NAME, in this order; all when absent")
+    ] = None
+    points: Annotated[
+        Mapping[str, str] | None,
+        About("topic, TOPIC:FRAME of /tf, marker or stem of columns, and the point that it is, such as cable:40%"),
+    ] = None
+    pose_axes: Annotated[
+        float | None, Gt(0), Le(10), About("how far along a pose's axes points NAME_x, NAME_y, NAME_z are made", "m")
+    ] = None
+    columns: Annotated[
+        Mapping[str, str] | None,
+        About("of a table: column, or pattern such as *_pos, and t, CHANNEL:JOINT, AXIS:POINT or skip"),
+    ] = None
+    header: Annotated[bool | None, About("of a table: whether its first row has names, else 1, 2 and so on")] = None
+    skip_bad_lines: Annotated[bool | None, About("of a table: whether lines that are no numbers are left out")] = None
+    delimiter: Annotated[str | None, About("of a table: one character between cells; a comma when absent")] = None
+    units: Annotated[
+        Mapping[str, str] | None,
+        About(
+            "of t (s, ms, us, ns), position (rad, deg, rev), velocity (rad/s, deg/s, rpm), effort (N m, N mm, A, mA), "
+            "points (m, cm, mm) and so on, where they are not SI"
+        ),
+    ] = None
+    torque_constants: Annotated[
+        Mapping[str, float] | None, About("by joint or pattern, where effort is a motor's current", "N m/A")
+    ] = None
+    gears: Annotated[
+        Mapping[str, float] | None,
+        About("turns of the motor per turn of the joint, by joint or pattern; 1 when absent"),
+    ] = None
+    episode: Annotated[int | None, Ge(0), About("of a LeRobot dataset: which one; the first when absent")] = None
+    clock: Annotated[Clock | None, About("of a table: whether its times were measured")] = None
+    sensor: Annotated[str | None, About("what saw the points, in words")] = None
+    frame: Annotated[str | None, About("frame of reference of the points, of a table or C3D file")] = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class ParameterSettings:
     """What is known of one parameter, or of all that a pattern such as T*.bend names."""
 
@@ -391,6 +439,9 @@ class Run:
     plugins: Annotated[tuple[FilePath, ...], About("Python files that register effects or sensors; they are run")] = ()
     model: Annotated[ModelSettings, About("what the world is made of")] = field(default_factory=ModelSettings)
     recordings: Annotated[RecordingSettings, About("the data")] = field(default_factory=RecordingSettings)
+    import_: Annotated[ImportSettings, About("how files of other tools become recordings")] = field(
+        default_factory=ImportSettings
+    )
     sensors: Annotated[Mapping[str, SensorOptions], About("by group of the recordings: points, joints.effort")] = field(
         default_factory=dict
     )
@@ -436,7 +487,7 @@ def _plain(value: Any) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         result: dict[str, Any] = {}
         for name, option in options_of(type(value)).items():
-            item = getattr(value, name)
+            item = getattr(value, option.field)
             if item is not None or option.default is not None:
                 chosen = any(isinstance(marker, Among) for marker in stripped(option.hint)[1])
                 result[name] = {"name": item.name, **_plain(item)} if chosen else _plain(item)

@@ -86,6 +86,8 @@ def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
     validate(recording, allow_nan_effort=True)
     with new_hdf5(path) as file:
         file.attrs.update(format=FORMAT, description=recording.description, source=recording.source)
+        if recording.notes:
+            file.attrs["notes"] = json.dumps(recording.notes)
         if recording.truth:
             file.attrs["truth"] = json.dumps({key: float(value) for key, value in recording.truth.items()})
         if recording.joints is not None:
@@ -113,7 +115,7 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
     origin = str(path)
     texts = {
         key: _text(file.attrs[key], f"{origin}, attribute {key}") if key in file.attrs else ""
-        for key in ("format", "description", "source", "truth")
+        for key in ("format", "description", "source", "truth", "notes")
     }
     what = f"the format of the file is '{texts['format']}'" if texts["format"] else "the file does not say its format"
     require(texts["format"] == FORMAT, what, f"{origin}, attribute format", FORMAT)
@@ -137,7 +139,10 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
             values = _read_group(file[name], where, _POINT_UNITS, _POINT_ATTRIBUTES, required)
             points.append(PointGroup(name=name, **values))
     truth = _truth(texts["truth"], f"{origin}, attribute truth") if texts["truth"] else {}
-    return Recording(joints, tuple(points), texts["description"], texts["source"], path.stem, digest, truth, straight)
+    notes = _notes(texts["notes"], f"{origin}, attribute notes") if texts["notes"] else ()
+    return Recording(
+        joints, tuple(points), texts["description"], texts["source"], path.stem, digest, truth, straight, notes
+    )
 
 
 def _read_group(
@@ -189,11 +194,22 @@ def _text(value: object, where: str) -> str:
     return str(value)
 
 
-def _truth(text: str, where: str) -> dict[str, float]:
+def _json(text: str, where: str) -> Any:
     try:
-        truth = json.loads(text)
+        return json.loads(text)
     except (ValueError, RecursionError) as error:
         raise DataError(f"the text is not JSON ({error})", where=where) from error
+
+
+def _notes(text: str, where: str) -> tuple[str, ...]:
+    notes = _json(text, where)
+    if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
+        raise DataError("the JSON text is not a list of text", where=where, allowed='["sentence", ...]')
+    return tuple(notes)
+
+
+def _truth(text: str, where: str) -> dict[str, float]:
+    truth = _json(text, where)
     if not isinstance(truth, dict):
         raise DataError("the JSON text is not an object", where=where, allowed='{"name": number, ...}')
     return truth

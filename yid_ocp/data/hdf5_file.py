@@ -7,21 +7,15 @@ links into other files for its own. None of this can be caught, so it is kept aw
 from __future__ import annotations
 
 import contextlib
-import faulthandler
 import os
-import select
-import signal
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
 import h5py
 
+from yid_ocp.data.trial import try_first
 from yid_ocp.errors import DataError
 from yid_ocp.files import new_file, reason
-
-TRIAL_TIME = 10.0
-"""How long reading a whole file may take [s]."""
 
 DEPTH = 10
 """How deep groups may stand in one another."""
@@ -71,10 +65,10 @@ def open_hdf5(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
     Raises
     ------
     DataError
-        The file is damaged, holds more than `LARGEST`, takes longer than `TRIAL_TIME` to read, or refers to other
+        The file is damaged, holds more than `LARGEST`, takes too long to read, or refers to other
         files, whose contents no hash of this one covers; errors of the library in the block, too.
     """
-    _try(Path(path))
+    try_first(Path(path), _complaint, "HDF5")
     try:
         with h5py.File(path, "r") as file:
             yield file
@@ -83,44 +77,8 @@ def open_hdf5(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
         raise DataError(what, where=str(path), hint="copy or record it again") from error
 
 
-def _try(path: Path) -> None:
-    """Read a file in another process, a fork: a new one would take a second, and one of a pool may have no children."""
-    if not hasattr(os, "fork"):
-        return
-    here, there = os.pipe()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # of threads, none of which the fork needs
-        child = os.fork()
-    if child == 0:
-        try:
-            os.write(there, f".{_complaint(path)}".encode(errors="replace")[:2000])
-        finally:
-            os._exit(0)
-    os.close(there)
-    try:
-        ready, _, _ = select.select([here], [], [], TRIAL_TIME)
-        said = os.read(here, 4000).decode(errors="replace") if ready else None
-    finally:
-        os.close(here)
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(child, signal.SIGKILL)
-        _, status = os.waitpid(child, 0)
-    if said is None:
-        what = f"the HDF5 file cannot be read within {TRIAL_TIME:g} s: it is damaged, or far too large"
-    elif not said:
-        number = os.WTERMSIG(status) if os.WIFSIGNALED(status) else 0
-        how = signal.Signals(number).name if number else "an exit"
-        what = f"the HDF5 file is damaged (it ends the HDF5 library with {how})"
-    else:
-        what = said[1:]
-    if what:
-        raise DataError(what, where=str(path), hint="copy or record it again, as one file of its own")
-
-
 def _complaint(path: Path) -> str:
     """What stands against reading a file; nothing where all of it can be read."""
-    faulthandler.disable()
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # allocators print before they abort
     try:
         with h5py.File(path, "r") as file:
             complaint = _foreign(file) or _excess(file)

@@ -190,6 +190,8 @@ class Recording:
         The parameter values of a virtual experiment, in the parameters' own units; empty for a real one.
     straight : ndarray, shape (np, 3), or None
         Positions of the points of the first group while the object was held straight, in that group's frame [m].
+    notes : tuple of str
+        What an import left out or changed, in words.
     """
 
     joints: JointGroup | None = None
@@ -200,10 +202,12 @@ class Recording:
     sha256: str | None = None
     truth: Mapping[str, float] = field(default_factory=dict)
     straight: Array | None = None
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "points", tuple(self.points))
         object.__setattr__(self, "truth", dict(self.truth))
+        object.__setattr__(self, "notes", tuple(self.notes))
         if self.straight is not None:
             object.__setattr__(self, "straight", read_only(self.straight, "straight"))
 
@@ -321,7 +325,7 @@ def validate(recording: Recording, *, allow_nan_effort: bool = False, where: str
     """
     origin = where or f"recording '{recording.name}'"
     require(bool(recording.groups), "the recording has no group", origin, "joints, points, points_<name>")
-    _check_text(origin, recording.description, recording.source)
+    _check_text(origin, recording.description, recording.source, *recording.notes)
     for key, value in recording.truth.items():
         good = isinstance(value, numbers.Real) and not isinstance(value, bool) and bool(np.isfinite(value))
         require(good, f"the true value of '{key}' is {value!r}", f"{origin}: truth", "finite numbers")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from yid_ocp.data import Recording
+from yid_ocp.data.readers import Contents
 from yid_ocp.report.earlier import (
     baseline_rows,
     counterfactual_rows,
@@ -516,7 +518,17 @@ def recording_summary(recording: Recording) -> list[str]:
     rows: Rows = [("group", "samples", "names")]
     for group in recording.groups:
         rows.append((getattr(group, "name", "joints"), str(len(group.t)), ", ".join(group.names)))
-    return [*table(rows), "", f"{recording.duration:g} s"]
+    notes = ["", *(f"note: {note}" for note in recording.notes)] if recording.notes else []
+    return [*table(rows), "", f"{recording.duration:g} s", *notes]
+
+
+def contents_summary(contents: Contents) -> list[str]:
+    """Lines that tell a person what a file of another tool holds."""
+    rows: Rows = [("source", "type", "count", "Hz", "becomes", "note")]
+    for source in contents.sources:
+        rate = f"{source.rate:.4g}" if math.isfinite(source.rate) else ""
+        rows.append((source.name, source.kind, str(source.count), rate, source.becomes or "-", source.note))
+    return [*table(rows), *(["", *(f"note: {note}" for note in contents.notes)] if contents.notes else [])]
 
 
 def table(rows: Rows) -> list[str]:

@@ -1,19 +1,132 @@
-"""The command `import`: CSV, rosbag or MCAP as a recording."""
+"""The command `import`: files of other tools as a recording, or what there is in them."""
 
 from __future__ import annotations
 
 import argparse
+import shlex
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
 
-from yid_ocp.data import read_any, write_recording
-from yid_ocp.report.terminal import recording_summary
+from yid_ocp.config.reader import load_config
+from yid_ocp.config.settings import ImportSettings
+from yid_ocp.data import Recording, preview, read_any, write_recording
+from yid_ocp.data.readers.base import units_of
+from yid_ocp.errors import ConfigError
+from yid_ocp.report.terminal import contents_summary, recording_summary
 from yid_ocp.workflow.command import DONE, print_lines
+
+_LISTS = {"joint_topics": "--joint-topic", "joints": "--joints"}
+_MAPPINGS: Mapping[str, tuple[str, Callable[[str], Any]]] = {
+    "points": ("--points", str),
+    "columns": ("--columns", str),
+    "torque_constants": ("--torque-constants", float),
+    "gears": ("--gears", float),
+}
+_SINGLE = ("command_topic", "pose_axes", "header", "skip_bad_lines", "delimiter", "episode", "clock", "sensor", "frame")
+_SWITCHES = {("header", False): "--no-header", ("skip_bad_lines", True): "--skip-bad-lines"}
 
 
 def run(arguments: argparse.Namespace) -> int:
     """The command."""
-    recording = read_any(arguments.file)
+    if arguments.preview:
+        contents = preview(arguments.file)
+        options = {**contents.options, **given_options(arguments)}
+        lines = contents_summary(contents)
+        print_lines([*lines, "", "to import it:", f"  {command_line(arguments.file, options)}"])
+        return DONE
+    if arguments.out is None:
+        allowed = "--out RECORDING.h5, or --preview to look only"
+        raise ConfigError("nothing says where to write the recording", where="--out", allowed=allowed)
+    settings = load_config(arguments.config).import_ if arguments.config else ImportSettings()
+    recording = imported(arguments.file, options_of_settings(settings) | given_options(arguments))
     write_recording(recording, arguments.out)
     if not arguments.quiet:
         print_lines(recording_summary(recording))
     print(arguments.out if arguments.quiet else f"recording: {arguments.out}")
     return DONE
+
+
+def imported(file: str | Path, options: Mapping[str, Any]) -> Recording:
+    """A recording of a file of another tool, whose `source` says the file's hash.
+
+    Parameters
+    ----------
+    file : str or Path
+    options : mapping of str to object
+        Named options of its reader.
+
+    Raises
+    ------
+    DataError
+        As `read_any`.
+    """
+    recording = read_any(file, **options)
+    if recording.sha256 is None or Path(file).suffix.lower() in (".h5", ".hdf5"):
+        return recording
+    return replace(recording, source=f"{recording.source} (SHA-256 {recording.sha256})")
+
+
+def options_of_settings(settings: ImportSettings) -> dict[str, Any]:
+    """What a section `import` says, as named options of a reader."""
+    said = ((entry.name, getattr(settings, entry.name)) for entry in fields(settings))
+    return {name: value for name, value in said if value is not None}
+
+
+def given_options(arguments: argparse.Namespace) -> dict[str, Any]:
+    """What flags of the command line say, as named options of a reader.
+
+    Raises
+    ------
+    ConfigError, DataError
+        A flag that cannot be understood.
+    """
+    options = {name: getattr(arguments, name) for name in _SINGLE if getattr(arguments, name) is not None}
+    for key in _LISTS:
+        entries = _split(getattr(arguments, key))
+        if entries:
+            options[key] = tuple(entries)
+    for key, (flag, kind) in _MAPPINGS.items():
+        entries = _split(getattr(arguments, key))
+        if entries:
+            options[key] = _pairs(entries, flag, kind, numbered=key == "columns")
+    units = units_of(_split(arguments.units))
+    return options | ({"units": units} if units else {})
+
+
+def _split(given: Sequence[str]) -> list[str]:
+    return [part.strip() for entry in given for part in entry.split(",") if part.strip()]
+
+
+def _pairs(entries: Sequence[str], flag: str, kind: Callable[[str], Any], numbered: bool) -> dict[str, Any]:
+    """`KEY=VALUE` each; of columns also values alone, in their order."""
+    if numbered and not any("=" in entry for entry in entries):
+        return {str(i + 1): entry for i, entry in enumerate(entries)}
+    pairs: dict[str, Any] = {}
+    for entry in entries:
+        key, equals, value = (part.strip() for part in entry.rpartition("="))
+        try:
+            pairs[key] = kind(value)
+        except ValueError as error:
+            raise ConfigError(f"'{value}' is no number", where=f"{flag} {entry}", allowed="KEY=NUMBER") from error
+        if not (key and equals and value):
+            raise ConfigError(f"'{entry}' is no pair", where=flag, allowed="KEY=VALUE,KEY=VALUE", hint="quote it whole")
+    return pairs
+
+
+def command_line(file: str | Path, options: Mapping[str, Any]) -> str:
+    """The command that imports a file with these options of its reader, to be pasted into a shell."""
+    words = ["yid-ocp", "import", str(file)]
+    for key, value in options.items():
+        if isinstance(value, bool):
+            words += [_SWITCHES[key, value]] if (key, value) in _SWITCHES else []
+        elif key in _LISTS:
+            words += [_LISTS[key], ",".join(value)]
+        elif key == "columns" and options.get("header") is False:
+            words += ["--columns", ",".join(value[name] for name in sorted(value, key=int))]
+        elif isinstance(value, Mapping):
+            words += [f"--{key.replace('_', '-')}", ",".join(f"{name}={entry}" for name, entry in value.items())]
+        else:
+            words += [f"--{key.replace('_', '-')}", str(value)]
+    return shlex.join([*words, "--out", f"{Path(file).stem}.h5"])

@@ -10,7 +10,9 @@ from pkgutil import iter_modules
 from typing import Any
 
 from yid_ocp.data.hdf5 import read_recording
+from yid_ocp.data.readers.base import PREVIEWS as PREVIEWS
 from yid_ocp.data.readers.base import READERS as READERS
+from yid_ocp.data.readers.base import Contents, Source, rate_of
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError, nearest
 
@@ -27,7 +29,7 @@ def read_any(path: str | os.PathLike[str], **options: Any) -> Recording:
     Parameters
     ----------
     path : path-like
-        An HDF5 recording, a CSV file, a rosbag, an MCAP file or a ROS 2 bag folder.
+        An HDF5 recording, a CSV file, a rosbag, an MCAP file, a ROS 2 bag folder, a C3D file or a LeRobot dataset.
     **options
         Named options of the reader in `READERS`.
 
@@ -42,22 +44,63 @@ def read_any(path: str | os.PathLike[str], **options: Any) -> Recording:
         If the format or an option is not known, or the reader refuses the file.
     """
     path = Path(path)
-    suffix = "folder" if path.is_dir() else path.suffix.lower()
-    if suffix not in READERS:
-        raise DataError(
-            f"there is no reader for '{suffix}' files",
-            where=str(path),
-            allowed=", ".join(READERS),
-            hint=nearest(suffix, READERS),
-        )
-    reader = READERS[suffix]
+    known_as = _format_of(path)
+    reader = READERS[known_as]
     known = [name for name in inspect.signature(reader).parameters if name != "path"]
     for name in options:
         if name not in known:
             raise DataError(
-                f"the reader of '{suffix}' files has no option '{name}'",
+                f"the reader of '{known_as}' files has no option '{name}'",
                 where=str(path),
-                allowed=", ".join(known),
+                allowed=", ".join(known) or "none",
                 hint=nearest(name, known),
             )
     return reader(path, **options)
+
+
+def preview(path: str | os.PathLike[str]) -> Contents:
+    """Look into a file of any known format: what it holds, and the options with which `read_any` makes a recording.
+
+    Parameters
+    ----------
+    path : path-like
+        As `read_any`.
+
+    Returns
+    -------
+    Contents
+
+    Raises
+    ------
+    DataError
+        If the format is not known or the file cannot be read.
+    """
+    path = Path(path)
+    known_as = _format_of(path)
+    if known_as in PREVIEWS:
+        return PREVIEWS[known_as](path)
+    recording = read_any(path)
+    sources = (
+        Source(getattr(g, "name", "joints"), "group", len(g.t), rate_of(g.t), ", ".join(g.names))
+        for g in recording.groups
+    )
+    return Contents(tuple(sources), {}, ("a recording already", *recording.notes))
+
+
+def _format_of(path: Path) -> str:
+    """Key of the reader of a file or folder."""
+    if not path.suffix and not path.exists():
+        near = [entry.name for entry in path.parent.iterdir()] if path.parent.is_dir() else []
+        hint = nearest(path.name, near) if near else "check the path"
+        raise DataError("there is no such file", where=str(path), hint=hint)
+    key = path.suffix.lower()
+    if path.is_dir():
+        key = "LeRobot dataset" if (path / "meta" / "info.json").is_file() else "folder"
+    if key not in READERS:
+        raise DataError(
+            f"there is no reader for '{key}' files",
+            where=str(path),
+            allowed=", ".join(READERS),
+            hint=nearest(key, READERS),
+        )
+    return key

@@ -1,23 +1,75 @@
-"""Bags of ROS 1 and ROS 2, and MCAP files: joint states and stamped points."""
+"""Bags of ROS 1 and ROS 2, and MCAP files: joint states, stamped points and poses."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
-from yid_ocp.data.readers.base import READERS
-from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate
+from yid_ocp.data.joined import held, joined
+from yid_ocp.data.readers.base import (
+    PREVIEWS,
+    READERS,
+    Contents,
+    Source,
+    check_point_names,
+    finished,
+    guessed_units,
+    renamings,
+)
+from yid_ocp.data.recording import Array, JointGroup, PointGroup, Recording
 from yid_ocp.errors import DataError, nearest
 from yid_ocp.files import file_sha256
 
 _JOINT_STATE = "sensor_msgs/msg/JointState"
 _POINT_STAMPED = "geometry_msgs/msg/PointStamped"
+_POSES = (
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "geometry_msgs/msg/TransformStamped",
+)
+_TREES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+_PLACES = (_POINT_STAMPED, *_POSES)
+_KNOWN = (_JOINT_STATE, *_PLACES)
+_PLAIN_WORDS = ("pose", "point", "position", "transform", "odom")
+"""Last parts of topics that say what a message is, not what was seen."""
+
+
+@dataclass(frozen=True)
+class _Message:
+    """One message of a bag: source, time of recording and header stamp [ns], and the decoded contents."""
+
+    source: str
+    logged: int
+    stamp: int
+    content: Any
+
+
+@dataclass(frozen=True)
+class _Topic:
+    """A topic of a bag with its type, number of messages, and the reason why it cannot be used, if it cannot."""
+
+    name: str
+    kind: str
+    count: int
+
+
+@dataclass(frozen=True)
+class _Bag:
+    """What a bag holds: its topics, the messages that can be used, in the order of their topics' types, and seconds."""
+
+    topics: tuple[_Topic, ...]
+    states: tuple[_Message, ...]
+    places: tuple[_Message, ...]
+
+    def of(self, kind: str) -> list[str]:
+        """Topics of a type."""
+        return [topic.name for topic in self.topics if topic.kind == kind]
 
 
 @READERS.register(".bag")
@@ -27,29 +79,43 @@ _POINT_STAMPED = "geometry_msgs/msg/PointStamped"
 def read_bag(
     path: str | os.PathLike[str],
     *,
-    joint_topic: str | None = None,
+    joint_topics: Sequence[str] | None = None,
+    command_topic: str | None = None,
     joints: Sequence[str] | None = None,
-    point_topics: Mapping[str, str] | None = None,
+    points: Mapping[str, str] | None = None,
+    pose_axes: float | None = None,
+    units: Mapping[str, str] | None = None,
+    torque_constants: Mapping[str, float] | None = None,
+    gears: Mapping[str, float] | None = None,
     sensor: str = "unknown",
     description: str = "",
 ) -> Recording:
     """Read a ROS 1 bag, a ROS 2 bag folder or an MCAP file.
 
-    `sensor_msgs/JointState` becomes the joints; `geometry_msgs/PointStamped` becomes points, one group per frame of
-    reference. Times are the headers' stamps (the times of recording if a message has none), from the first message
-    on. A joint channel that is empty, or NaN throughout, was not measured and is left out.
+    `sensor_msgs/JointState` becomes the joints, of several topics on one clock (`yid_ocp.data.joined`); stamped points,
+    poses and transforms of `geometry_msgs`, and frames of `/tf`, become points, one group per frame of reference. Times
+    are the headers' stamps (the times of recording if a message has none), from the first message on. A joint channel
+    that is empty, or NaN throughout, was not measured and is left out. Topics that are not used are in `notes`.
 
     Parameters
     ----------
     path : path-like
         The bag.
-    joint_topic : str, optional
-        Topic of the joint states, needed where there are several.
+    joint_topics : sequence of str, optional
+        Topics of the joint states; all that there are when absent.
+    command_topic : str, optional
+        Topic of joint states whose positions are what the controller asked for: `position_command`, held in between.
     joints : sequence of str, optional
-        Joints to keep, in this order; messages that lack one of them are skipped. Needed where the messages of the
-        topic do not all have the same joints.
-    point_topics : mapping of str to str, optional
-        Topic to name of the point; all topics of that type under the last part of their names where absent.
+        Joints to keep, `name` or `recorded=name`, in this order; messages that lack one of them are skipped. Needed
+        where the messages of a topic do not all have the same joints.
+    points : mapping of str to str, optional
+        Topic, or `TOPIC:CHILD` for a frame of `/tf`, to name of the point; all topics of points, poses and transforms
+        under the last telling part of their names where absent, and none of `/tf`.
+    pose_axes : float, optional
+        Distance from a pose's origin [m] at which NAME_x, NAME_y and NAME_z on its axes become points too, so that
+        its orientation is kept.
+    units, torque_constants, gears
+        As `yid_ocp.data.readers.base.finished`.
     sensor : str
         What saw the points.
     description : str
@@ -68,45 +134,85 @@ def read_bag(
     """
     path = Path(path)
     digest = file_sha256(path)
-    messages, others = _bag_messages(path)
-    joint_topic, names, states = _joint_states(messages[_JOINT_STATE], joint_topic, joints, str(path))
-    seen = _stamped_points(messages[_POINT_STAMPED], point_topics, str(path))
-    if not states and not seen:
+    if pose_axes is not None and not 0 < pose_axes < float("inf"):
+        raise DataError(f"pose_axes = {pose_axes:g}", where=str(path), allowed="a distance above 0 [m]")
+    trees = tuple(source for source in points or () if ":" in source)
+    bag = _bag(path, trees)
+    groups, notes, used = _joints(bag, joint_topics, command_topic, joints, str(path))
+    seen = _named_places(bag, points, str(path))
+    if not groups and not seen:
         raise DataError(
             "the bag has no joint states and no points",
             where=str(path),
-            allowed=f"topics of the types {_JOINT_STATE}, {_POINT_STAMPED}",
-            hint="it holds " + (", ".join(others) or "no topics at all"),
+            allowed=f"topics of the types {', '.join((*_KNOWN, _TREES[0]))}",
+            hint="it holds "
+            + (", ".join(f"{topic.name} ({topic.kind})" for topic in bag.topics) or "no topics at all"),
         )
-    used = [*states, *(message for entries in seen.values() for _, message in entries)]
-    # one message without a stamp makes the two clocks incomparable, so then no stamp is used
-    stamped = all(message.stamp > 0 for message in used)
-    origin = min(message.stamp if stamped else message.logged for message in used)
-
-    def seconds(message: _Message) -> float:
-        # integers first: nanoseconds since 1970 do not fit into a float
-        return ((message.stamp if stamped else message.logged) - origin) * 1e-9
-
-    groups = []
+    messages = [*(m for entry in groups for m in entry.messages), *(m for entries in seen.values() for _, m in entries)]
+    seconds = _clock(messages)
+    joint_group, more = _on_one_clock(groups, seconds, str(path))
+    found = []
     for frame, entries in seen.items():
         name = "points" if len(seen) == 1 else "points_" + frame.replace("/", "_")
-        groups.append(_point_group(name, frame, sensor, entries, seconds, str(path)))
-    joint_group = _joint_group(names, states, seconds, f"{path}: {joint_topic}") if states else None
-    return validate(Recording(joint_group, tuple(groups), description, path.name, path.stem, digest))
+        found.append(_point_group(name, frame, sensor, _with_axes(entries, pose_axes), seconds, str(path)))
+    used |= {message.source.partition(":")[0] for entries in seen.values() for _, message in entries}
+    turned = {m.source for entries in seen.values() for _, m in entries if m.content.axes is not None}
+    if turned and pose_axes is None:
+        more = (*more, f"orientations of {', '.join(sorted(turned))} were left out (pose_axes keeps them)")
+    left = [
+        f"{topic.name} was left out ({topic.kind}, {topic.count})" for topic in bag.topics if topic.name not in used
+    ]
+    raw = Recording(joint_group, tuple(found), description, path.name, path.stem, digest, notes=(*notes, *more, *left))
+    return finished(raw, str(path), units=units, torque_constants=torque_constants, gears=gears)
 
 
-@dataclass(frozen=True)
-class _Message:
-    """One message of a bag: topic, time of recording and header stamp [ns], and the decoded contents."""
+@PREVIEWS.register(".bag")
+@PREVIEWS.register(".mcap")
+@PREVIEWS.register(".db3")
+@PREVIEWS.register("folder")
+def preview_bag(path: str | os.PathLike[str]) -> Contents:
+    """What a bag holds: its topics, what they would become, and units that their values look like.
 
-    topic: str
-    logged: int
-    stamp: int
-    content: Any
+    Raises
+    ------
+    DataError
+        If `rosbags` is not installed or the bag cannot be read.
+    """
+    path = Path(path)
+    file_sha256(path)
+    bag = _bag(path, None)
+    names = _names_of(bag)
+    options: dict[str, Any] = {}
+    notes: list[str] = []
+    sources = [_preview_source(topic, bag, names) for topic in bag.topics]
+    states = bag.of(_JOINT_STATE)
+    owners: dict[str, list[str]] = {}
+    for message in bag.states:
+        for joint in message.content.name:
+            if message.source not in owners.setdefault(joint, []):
+                owners[joint].append(message.source)
+    shared = {topic for topics in owners.values() if len(topics) > 1 for topic in topics}
+    if shared:
+        options["joint_topics"] = [states[0], *(topic for topic in states[1:] if topic not in shared)]
+        notes.append(f"{', '.join(sorted(shared))} have joints in common: choose one of them")
+    elif len(states) > 1:
+        options["joint_topics"] = states
+    if names:
+        options["points"] = names
+    if any(message.content.axes is not None for message in bag.places if ":" not in message.source):
+        notes.append("poses have orientations: --pose-axes 0.1 keeps them as points 0.1 m along the axes")
+    raw = _for_guess(bag)
+    units, why = guessed_units(raw) if raw is not None else ({}, ())
+    if units:
+        options["units"] = units
+    return Contents(tuple(sources), options, (*notes, *why))
 
 
-def _bag_messages(path: Path) -> tuple[dict[str, list[_Message]], list[str]]:
-    """Decode the joint states and points of a bag, by type, and list what else is in it."""
+# -- reading ----------------------------------------------------------------------------------------------------------
+
+
+def _bag(path: Path, trees: Sequence[str] | None) -> _Bag:
+    """Decode what can be used of a bag; of trees of transforms the named frames, all of them for None."""
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -114,18 +220,27 @@ def _bag_messages(path: Path) -> tuple[dict[str, list[_Message]], list[str]]:
         raise DataError(
             "reading bags needs the package rosbags", where=str(path), hint="pip install 'yid-ocp[bags]'"
         ) from error
-    messages: dict[str, list[_Message]] = {_JOINT_STATE: [], _POINT_STAMPED: []}
+    states: list[_Message] = []
+    places: list[_Message] = []
+    wanted_kinds = _KNOWN if trees is not None and not trees else (*_KNOWN, *_TREES)
     try:
-        # older ROS 2 bags do not hold the definitions of their messages; these two have not changed since
+        # older ROS 2 bags do not hold the definitions of their messages; these have not changed since
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-            others = sorted({f"{c.topic} ({c.msgtype})" for c in reader.connections if c.msgtype not in messages})
-            wanted = [connection for connection in reader.connections if connection.msgtype in messages]
+            counted: dict[tuple[str, str], int] = {}
+            for c in reader.connections:
+                key = (c.topic, c.msgtype)
+                counted[key] = counted.get(key, 0) + c.msgcount
+            wanted = [connection for connection in reader.connections if connection.msgtype in wanted_kinds]
             # an empty selection would mean all topics, images included
             for connection, logged, data in reader.messages(wanted) if wanted else ():
                 content: Any = reader.deserialize(data, connection.msgtype)
-                stamp = content.header.stamp.sec * 10**9 + content.header.stamp.nanosec
-                plain = _plain(content, connection.msgtype)
-                messages[connection.msgtype].append(_Message(connection.topic, int(logged), int(stamp), plain))
+                if connection.msgtype in _TREES:
+                    places += [
+                        m for m in _tree(connection.topic, logged, content) if trees is None or m.source in trees
+                    ]
+                    continue
+                message = _Message(connection.topic, int(logged), _stamp(content), _plain(content, connection.msgtype))
+                (states if connection.msgtype == _JOINT_STATE else places).append(message)
     except Exception as error:  # rosbags lets through whatever a damaged file makes struct, sqlite3 or zstd raise
         raise DataError(
             f"the bag cannot be read ({type(error).__name__}: {error})",
@@ -133,59 +248,145 @@ def _bag_messages(path: Path) -> tuple[dict[str, list[_Message]], list[str]]:
             allowed="a ROS 1 .bag, a ROS 2 folder with metadata.yaml, or an .mcap or .db3 file of ROS 2",
             hint="check with `ros2 bag info` or `rosbag info`; a bag cut off by a crash needs `ros2 bag reindex`",
         ) from error
-    return messages, others
+    topics = tuple(_Topic(topic, kind, count) for (topic, kind), count in sorted(counted.items()))
+    return _Bag(topics, tuple(states), tuple(places))
+
+
+def _stamp(content: Any) -> int:
+    return int(content.header.stamp.sec) * 10**9 + int(content.header.stamp.nanosec)
+
+
+def _tree(topic: str, logged: int, content: Any) -> Iterator[_Message]:
+    for transform in content.transforms:
+        plain = _plain(transform, _POSES[2])
+        yield _Message(f"{topic}:{transform.child_frame_id.strip('/')}", int(logged), _stamp(transform), plain)
 
 
 def _plain(content: Any, kind: str) -> SimpleNamespace:
     """What is needed of a message, in Python's types: a bag brings definitions of its own, which may be damaged."""
     frame = str(content.header.frame_id)
+    if kind == _JOINT_STATE:
+        names = [str(name) for name in content.name]
+        values = {key: np.asarray(getattr(content, key), float).ravel() for key in ("position", "velocity", "effort")}
+        return SimpleNamespace(frame=frame, name=names, **values)
     if kind == _POINT_STAMPED:
-        x, y, z = (float(getattr(content.point, axis)) for axis in "xyz")
-        return SimpleNamespace(frame=frame, point=(x, y, z))
-    names = [str(name) for name in content.name]
-    values = {key: np.asarray(getattr(content, key), float).ravel() for key in ("position", "velocity", "effort")}
-    return SimpleNamespace(frame=frame, name=names, **values)
+        return SimpleNamespace(frame=frame, point=_triple(content.point), axes=None)
+    if kind == _POSES[2]:
+        place, turn = content.transform.translation, content.transform.rotation
+    else:
+        pose = content.pose.pose if kind == _POSES[1] else content.pose
+        place, turn = pose.position, pose.orientation
+    return SimpleNamespace(frame=frame, point=_triple(place), axes=tuple(float(getattr(turn, k)) for k in "xyzw"))
 
 
-def _joint_states(
-    messages: Sequence[_Message], topic: str | None, joints: Sequence[str] | None, where: str
-) -> tuple[str | None, tuple[str, ...], list[_Message]]:
-    """Choose the topic, the joints and the messages that have them."""
-    topics = sorted({message.topic for message in messages})
-    if topic is not None and topic not in topics:
-        what = f"there are no joint states on the topic '{topic}'"
-        raise DataError(what, where=where, allowed=", ".join(topics), hint=nearest(topic, topics))
-    if topic is None and len(topics) > 1:
-        what = "there are joint states on several topics"
-        raise DataError(what, where=where, allowed=", ".join(topics), hint=f"choose one: joint_topic='{topics[0]}'")
-    states = [message for message in messages if topic in (None, message.topic)]
-    sets = {tuple(sorted(message.content.name)): tuple(message.content.name) for message in states}
-    if joints is None:
-        if len(sets) > 1:
+def _triple(content: Any) -> tuple[float, float, float]:
+    x, y, z = (float(getattr(content, axis)) for axis in "xyz")
+    return x, y, z
+
+
+def _clock(messages: Sequence[_Message]) -> Callable[[_Message], float]:
+    """Seconds of a message since the first one."""
+    # one message without a stamp makes the two clocks incomparable, so then no stamp is used
+    stamped = all(message.stamp > 0 for message in messages)
+    origin = min((message.stamp if stamped else message.logged for message in messages), default=0)
+
+    def seconds(message: _Message) -> float:
+        # integers first: nanoseconds since 1970 do not fit into a float
+        return ((message.stamp if stamped else message.logged) - origin) * 1e-9
+
+    return seconds
+
+
+# -- joints -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _States:
+    """Joint states of one topic: names recorded and wanted, and the messages; whether they are commands."""
+
+    topic: str
+    names: tuple[str, ...]
+    wanted: tuple[str, ...]
+    messages: tuple[_Message, ...]
+    command: bool = False
+
+
+def _joints(
+    bag: _Bag, topics: Sequence[str] | None, command: str | None, joints: Sequence[str] | None, where: str
+) -> tuple[list[_States], tuple[str, ...], set[str]]:
+    """Choose topics, joints and the messages that have them; with what was left out and the topics used."""
+    known = bag.of(_JOINT_STATE)
+    for topic in (*(topics or ()), *((command,) if command else ())):
+        if topic not in known:
+            what = f"there are no joint states on the topic '{topic}'"
+            raise DataError(what, where=where, allowed=", ".join(known), hint=nearest(topic, known))
+    chosen = [topic for topic in (known if topics is None else topics) if topic != command]
+    wanted = None if joints is None else renamings(joints, "joint", where)
+    found, notes = [], []
+    if wanted is not None:
+        _check_together(bag, chosen, wanted, where)
+    for topic in chosen:
+        messages = [message for message in bag.states if message.source == topic]
+        sets = {tuple(sorted(message.content.name)): tuple(message.content.name) for message in messages}
+        if wanted is None and len(sets) > 1:
             raise DataError(
                 f"the messages have {len(sets)} different sets of joints",
-                where=f"{where}: {topic or topics[0]}",
+                where=f"{where}: {topic}",
                 allowed="; ".join(", ".join(names) for names in sets.values()),
-                hint="choose joints that come together: joints=[...]",
+                hint="choose joints that come together: --joints NAME,NAME",
             )
-        joints = next(iter(sets.values()), ())
-    elif not any(set(joints) <= set(names) for names in sets):
-        known = sorted({name for names in sets for name in names})
-        missing = [name for name in joints if name not in known]
-        raise DataError(
-            f"there is no joint '{missing[0]}'" if missing else "the joints never come in one message",
-            where=where,
-            allowed="; ".join(", ".join(names) for names in sets.values()) or "no joints were recorded",
-            hint=nearest(missing[0], known) if missing and known else "",
-        )
-    kept = [message for message in states if set(joints) <= set(message.content.name)]
-    return topic or next(iter(topics), None), tuple(joints), kept
+        names = next(iter(sets.values()), ()) if wanted is None else _own(wanted, sets.values())
+        kept = [message for message in messages if names and set(names) <= set(message.content.name)]
+        if len(kept) < len(messages) and names:
+            notes.append(f"{len(messages) - len(kept)} of {len(messages)} messages of {topic} lack a joint")
+        if kept:
+            renamed = names if wanted is None else tuple(wanted[name] for name in names)
+            found.append(_States(topic, names, renamed, tuple(kept)))
+    if command is not None:
+        messages = [message for message in bag.states if message.source == command]
+        names = tuple(name for entry in found for name in entry.names)
+        kept = [message for message in messages if set(names) <= set(message.content.name)]
+        if not kept or not names:
+            what = f"no message of '{command}' has all joints"
+            raise DataError(what, where=where, allowed=", ".join(names) or "joints of another topic")
+        found.append(_States(command, names, tuple(n for entry in found for n in entry.wanted), tuple(kept), True))
+    return found, tuple(notes), {entry.topic for entry in found}
 
 
-def _joint_group(
-    names: tuple[str, ...], states: Sequence[_Message], seconds: Callable[[_Message], float], where: str
-) -> JointGroup:
-    states = sorted(states, key=seconds)
+def _own(wanted: Mapping[str, str], sets: Iterable[Sequence[str]]) -> tuple[str, ...]:
+    """Wanted joints that come together in messages of one topic, the most that do."""
+    return max((tuple(name for name in wanted if name in names) for names in sets), key=len, default=())
+
+
+def _check_together(bag: _Bag, topics: Sequence[str], wanted: Mapping[str, str], where: str) -> None:
+    sets = {tuple(message.content.name): message.source for message in bag.states if message.source in topics}
+    known = sorted({name for names in sets for name in names})
+    allowed = "; ".join(dict.fromkeys(", ".join(names) for names in sets)) or "no joints were recorded"
+    for name in wanted:
+        if name not in known:
+            hint = nearest(name, known) if known else ""
+            raise DataError(f"there is no joint '{name}'", where=where, allowed=allowed, hint=hint)
+    got = {name for topic in topics for name in _own(wanted, [n for n, source in sets.items() if source == topic])}
+    if got != set(wanted):
+        what = "the joints never come in one message"
+        raise DataError(what, where=where, allowed=allowed, hint="choose joints that come together")
+
+
+def _on_one_clock(
+    groups: Sequence[_States], seconds: Callable[[_Message], float], where: str
+) -> tuple[JointGroup | None, tuple[str, ...]]:
+    if not groups:
+        return None, ()
+    made = [(entry.topic, _joint_group(entry, seconds, f"{where}: {entry.topic}")) for entry in groups]
+    together, notes = joined([pair for pair, e in zip(made, groups, strict=True) if not e.command], where)
+    for entry, (_, group) in zip(groups, made, strict=True):
+        if entry.command:
+            together = replace(together, position_command=held(group, together.t))
+    return together, notes
+
+
+def _joint_group(entry: _States, seconds: Callable[[_Message], float], where: str) -> JointGroup:
+    states = sorted(entry.messages, key=seconds)
     t = np.array([seconds(message) for message in states])
     channels: dict[str, Any] = {}
     for channel in ("position", "velocity", "effort"):
@@ -193,7 +394,7 @@ def _joint_group(
         for message in states:
             values, own = getattr(message.content, channel), message.content.name
             if len(values) == len(own):
-                rows.append([values[own.index(name)] for name in names])
+                rows.append([values[own.index(name)] for name in entry.names])
             elif len(values):
                 what = f"a message has {len(values)} values of '{channel}' for {len(own)} joints"
                 raise DataError(what, where=where, allowed="one for each joint, or none")
@@ -203,29 +404,69 @@ def _joint_group(
             channels[channel] = np.array(rows)
     if "position" not in channels:
         raise DataError("the joint states have no positions", where=where)
-    return JointGroup(names, t, **channels)
+    return JointGroup(entry.wanted, t, **channels)
 
 
-def _stamped_points(
-    messages: Sequence[_Message], topics: Mapping[str, str] | None, where: str
-) -> dict[str, list[tuple[str, _Message]]]:
+# -- points -----------------------------------------------------------------------------------------------------------
+
+
+Places = dict[str, list[tuple[str, _Message]]]
+
+
+def _names_of(bag: _Bag) -> dict[str, str]:
+    """Topics that become points by themselves, and the last part of each that says what was seen."""
+    names = {}
+    for topic in (topic.name for topic in bag.topics if topic.kind in _PLACES):
+        parts = [part for part in topic.split("/") if part]
+        telling = [part for part in parts if part.lower() not in _PLAIN_WORDS]
+        names[topic] = (telling or parts)[-1]
+    return names
+
+
+def _named_places(bag: _Bag, points: Mapping[str, str] | None, where: str) -> Places:
     """Sort the points by frame of reference, each with its name."""
-    present = sorted({message.topic for message in messages})
-    names = {topic: topic.rpartition("/")[2] for topic in present} if topics is None else dict(topics)
-    for topic in names:
-        if topic not in present:
-            what = f"there are no points on the topic '{topic}'"
-            raise DataError(what, where=where, allowed=", ".join(present), hint=nearest(topic, present))
-    shared = [topic for topic, name in names.items() if list(names.values()).count(name) > 1]
-    if shared:
-        what = f"the topics {', '.join(shared)} give points of the same name"
-        raise DataError(what, where=where, hint="name them: point_topics={'topic': 'point', ...}")
-    groups: dict[str, list[tuple[str, _Message]]] = {}
-    for message in messages:
-        if message.topic in names:
+    present = sorted({message.source for message in bag.places})
+    names = _names_of(bag) if points is None else dict(points)
+    for source in names:
+        if source not in present and points is not None:
+            trees = [topic.name for topic in bag.topics if topic.kind in _TREES]
+            listed = ", ".join([*present, *(f"{tree}:FRAME" for tree in trees)])
+            what = f"there are no points on the topic '{source}'"
+            raise DataError(what, where=where, allowed=listed or "none", hint=nearest(source, present))
+    check_point_names(names, where)
+    groups: Places = {}
+    for message in bag.places:
+        if message.source in names:
             frame = message.content.frame.strip("/") or "unknown"
-            groups.setdefault(frame, []).append((names[message.topic], message))
+            groups.setdefault(frame, []).append((names[message.source], message))
     return groups
+
+
+def _with_axes(entries: Iterable[tuple[str, _Message]], distance: float | None) -> Iterator[tuple[str, _Message]]:
+    """The points, and of poses three more along the axes where a distance is given."""
+    for name, message in entries:
+        yield name, message
+        turn = message.content.axes
+        if turn is None or distance is None:
+            continue
+        for axis, direction in zip("xyz", _matrix(turn).T, strict=True):
+            place = tuple(np.array(message.content.point) + distance * direction)
+            yield (
+                f"{name}_{axis}",
+                replace(message, content=SimpleNamespace(**{**vars(message.content), "point": place})),
+            )
+
+
+def _matrix(quaternion: Sequence[float]) -> Array:
+    """Rotation of a quaternion (x, y, z, w); NaN for one of no length."""
+    x, y, z, w = np.array(quaternion) / (float(np.linalg.norm(quaternion)) or np.nan)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
 
 
 def _point_group(
@@ -240,7 +481,7 @@ def _point_group(
     for point, message in entries:
         key, position = (seconds(message), point), message.content.point
         if key in seen:
-            raise DataError(f"point '{point}' comes twice at {key[0]:g} s", where=f"{where}: {message.topic}")
+            raise DataError(f"point '{point}' comes twice at {key[0]:g} s", where=f"{where}: {message.source}")
         seen[key] = position
     times, names = sorted({time for time, _ in seen}), sorted({point for _, point in seen})
     rows, columns = ({key: index for index, key in enumerate(keys)} for keys in (times, names))
@@ -248,3 +489,33 @@ def _point_group(
     for (time, point), coordinates in seen.items():
         array[rows[time], columns[point]] = coordinates
     return PointGroup(name, tuple(names), np.array(times), array, None, sensor, frame)
+
+
+# -- preview ----------------------------------------------------------------------------------------------------------
+
+
+def _preview_source(topic: _Topic, bag: _Bag, names: Mapping[str, str]) -> Source:
+    own = [m for m in (*bag.states, *bag.places) if m.source.partition(":")[0] == topic.name]
+    logged = [message.logged for message in own]
+    span = 1e-9 * (max(logged) - min(logged)) if logged else 0.0
+    rate = (topic.count - 1) / span if span > 0 else float("nan")
+    becomes, note = "", "not a type that is understood"
+    if topic.kind == _JOINT_STATE:
+        joints = list(dict.fromkeys(joint for message in own for joint in message.content.name))
+        becomes, note = f"joints {', '.join(joints)}", ""
+    elif topic.name in names:
+        frames = ", ".join(dict.fromkeys(message.content.frame for message in own))
+        becomes, note = f"point {names[topic.name]}", f"in {frames}" if frames else ""
+    elif topic.kind in _TREES:
+        children = sorted({message.source.partition(":")[2] for message in own})
+        note = f"frames {', '.join(children)}: --points {topic.name}:FRAME=POINT"
+    return Source(topic.name, topic.kind, topic.count, rate, becomes, note if topic.count else "no messages")
+
+
+def _for_guess(bag: _Bag) -> Recording | None:
+    """Angles and points as they stand in a bag, whatever joints they are of, to see what units they have."""
+    widest = [float(np.nanmax(np.abs(m.content.position), initial=0.0)) for m in bag.states]
+    joints = JointGroup(("any",), np.arange(float(len(widest))) * 1e-3, np.array(widest)[:, None]) if widest else None
+    own = np.array([m.content.point for m in bag.places if ":" not in m.source], float).reshape(-1, 1, 3)
+    points = (PointGroup("points", ("any",), np.arange(float(len(own))) * 1e-3, own),) if len(own) else ()
+    return Recording(joints, points) if joints is not None or points else None

@@ -1,13 +1,326 @@
-"""The table of readers: formats of other tools that become a recording."""
+"""The tables of readers and previews, and what all readers share: choosing, renaming, units, torques from currents."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import fnmatch
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
-from yid_ocp.data.recording import Recording
+import numpy as np
+
+from yid_ocp.data.recording import JOINT_CHANNELS, Array, JointGroup, PointGroup, Recording, validate
+from yid_ocp.errors import DataError, nearest
 from yid_ocp.registry import Registry
 
 Reader = Callable[..., Recording]
 
+
+@dataclass(frozen=True)
+class Source:
+    """One thing that a file of another tool holds: a topic, a column, a marker.
+
+    Attributes
+    ----------
+    name, kind : str
+        What the file calls it, and its type.
+    count : int
+        Messages or values.
+    rate : float
+        Mean rate [Hz]; NaN where it has none.
+    becomes : str
+        What an import makes of it, empty where it is left out.
+    note : str
+        Why it is left out, or what should be looked at.
+    """
+
+    name: str
+    kind: str
+    count: int
+    rate: float
+    becomes: str = ""
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What a file of another tool holds, and the options with which its reader makes a recording of it.
+
+    Attributes
+    ----------
+    sources : tuple of Source
+    options : mapping of str to object
+        Named options of the reader.
+    notes : tuple of str
+        What else should be known, such as guesses of units.
+    """
+
+    sources: tuple[Source, ...]
+    options: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
 READERS: Registry[Reader] = Registry("recording format")
-"""Readers by file suffix, and `folder` for what is stored as a folder; each takes a path, then named options."""
+"""Readers by file suffix, and by word for what is stored as a folder; each takes a path, then named options."""
+
+PREVIEWS: Registry[Callable[..., Contents]] = Registry("recording format with a preview")
+"""What looks into a file without importing it, by the same keys; each takes a path."""
+
+SKIP = "skip"
+"""What a column is said to mean that is left out."""
+
+_TO_SI: Mapping[str, Mapping[str, float]] = {
+    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
+    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
+    "rad": {"rad": 1.0, "deg": math.pi / 180, "rev": 2 * math.pi},
+    "rad/s": {"rad/s": 1.0, "deg/s": math.pi / 180, "rpm": 2 * math.pi / 60},
+    "N m": {"N m": 1.0, "N mm": 1e-3, "mN m": 1e-3, "A": 1.0, "mA": 1e-3},
+}
+_CURRENTS = ("A", "mA")
+_QUANTITIES: Mapping[str, str] = {"t": "s", **JOINT_CHANNELS, "points": "m"}
+LARGEST_PLAUSIBLE = {"position": 2.1 * math.pi, "points": 20.0}
+"""Beyond this, values in a preview look like degrees [rad] or millimetres [m]."""
+
+
+def units_of(words: Iterable[str]) -> dict[str, str]:
+    """Quantities and their units from `quantity=unit`, or from a unit alone, for every quantity that it measures.
+
+    Parameters
+    ----------
+    words : iterable of str
+        `deg`, `mm`, `velocity=rpm`.
+
+    Returns
+    -------
+    dict of quantity to unit
+
+    Raises
+    ------
+    DataError
+        A unit that measures nothing here.
+    """
+    units: dict[str, str] = {}
+    for word in words:
+        quantity, equals, unit = word.partition("=")
+        if equals:
+            units[quantity.strip()] = unit.strip()
+            continue
+        of = next((si for si, known in _TO_SI.items() if _spaceless(word) in map(_spaceless, known)), None)
+        if of is None:
+            known = [unit for table in _TO_SI.values() for unit in table]
+            raise DataError(f"'{word}' is no unit", where="units", allowed=", ".join(known), hint=nearest(word, known))
+        units |= {quantity: word for quantity, si in _QUANTITIES.items() if si == of}
+    return units
+
+
+def _spaceless(unit: str) -> str:
+    return unit.replace(" ", "")
+
+
+def _factors(units: Mapping[str, str], where: str) -> dict[str, float]:
+    """Factor to SI of every quantity; of a current to ampere."""
+    factors = dict.fromkeys(_QUANTITIES, 1.0)
+    for quantity, unit in units.items():
+        if quantity not in _QUANTITIES:
+            raise DataError(
+                f"a unit is given for '{quantity}', which is no quantity",
+                where=where,
+                allowed=", ".join(_QUANTITIES),
+                hint=nearest(quantity, _QUANTITIES),
+            )
+        known = {_spaceless(name): factor for name, factor in _TO_SI[_QUANTITIES[quantity]].items()}
+        if _spaceless(unit) not in known:
+            what, names = f"'{unit}' is not a unit of '{quantity}'", tuple(_TO_SI[_QUANTITIES[quantity]])
+            raise DataError(what, where=where, allowed=", ".join(names), hint=nearest(unit, names))
+        factors[quantity] = known[_spaceless(unit)]
+    return factors
+
+
+def renamings(entries: Iterable[str], noun: str, where: str) -> dict[str, str]:
+    """Recorded name to name in the recording, from `name` or `recorded=name` each.
+
+    Raises
+    ------
+    DataError
+        An empty name, or one that is given twice.
+    """
+    found: dict[str, str] = {}
+    for entry in entries:
+        recorded, equals, name = (part.strip() for part in entry.partition("="))
+        name = name if equals else recorded
+        if not recorded or not name:
+            raise DataError(f"'{entry}' names no {noun}", where=where, allowed=f"NAME, or RECORDED=NAME of a {noun}")
+        if recorded in found or name in found.values():
+            raise DataError(f"the {noun} '{name}' is chosen twice", where=where, hint="name it once")
+        found[recorded] = name
+    return found
+
+
+def finished(
+    raw: Recording,
+    where: str,
+    *,
+    joints: Sequence[str] | None = None,
+    points: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
+    torque_constants: Mapping[str, float] | None = None,
+    gears: Mapping[str, float] | None = None,
+) -> Recording:
+    """A checked recording in SI units from what a file holds.
+
+    Parameters
+    ----------
+    raw : Recording
+        As it stands in the file.
+    where : str
+        What errors call it.
+    joints : sequence of str, optional
+        Joints to keep, `name` or `recorded=name`, in this order; all of them when absent.
+    points : mapping of recorded name to name, optional
+        Points to keep; all of them when absent.
+    units : mapping of quantity to unit, optional
+        Of `t`, a joint channel or `points`, where it is not SI.
+    torque_constants, gears : mapping of joint or pattern to float, optional
+        Where `effort` is a motor's current: torque per current [N m/A], and turns of the motor per turn of the joint
+        (1 where a joint has none).
+
+    Raises
+    ------
+    DataError
+        A joint, point, quantity or unit that is not known, a current without torque constants, or as `validate`.
+    """
+    factors = _factors(units or {}, where)
+    group = raw.joints
+    if group is not None and joints is not None:
+        group = _chosen_joints(group, renamings(joints, "joint", where), where)
+    seen = raw.points if points is None else _chosen_points(raw.points, points, where)
+    if group is not None:
+        channels: dict[str, Any] = {name: factors[name] * values for name, values in group.channels.items()}
+        if "effort" in channels:
+            current = _spaceless((units or {}).get("effort", "")) in _CURRENTS
+            channels["effort"] = channels["effort"] * _torque_factors(
+                group.names, current, torque_constants or {}, gears or {}, where
+            )
+        group = replace(group, t=factors["t"] * group.t, **channels)
+    seen = tuple(
+        replace(
+            entry,
+            t=factors["t"] * entry.t,
+            position=factors["points"] * entry.position,
+            std=None if entry.std is None else factors["points"] * entry.std,
+        )
+        for entry in seen
+    )
+    return validate(replace(raw, joints=group, points=seen), where=where)
+
+
+def _chosen_joints(group: JointGroup, chosen: Mapping[str, str], where: str) -> JointGroup:
+    for name in chosen:
+        if name not in group.names:
+            raise DataError(
+                f"there is no joint '{name}'",
+                where=where,
+                allowed=", ".join(group.names),
+                hint=nearest(name, group.names),
+            )
+    at = [group.names.index(name) for name in chosen]
+    channels: dict[str, Any] = {name: values[:, at] for name, values in group.channels.items()}
+    return replace(group, names=tuple(chosen.values()), **channels)
+
+
+def _chosen_points(groups: Sequence[PointGroup], chosen: Mapping[str, str], where: str) -> tuple[PointGroup, ...]:
+    known = [name for group in groups for name in group.names]
+    for name in chosen:
+        if name not in known:
+            raise DataError(
+                f"there is no point '{name}'", where=where, allowed=", ".join(known), hint=nearest(name, known)
+            )
+    check_point_names(chosen, where)
+    kept = []
+    for group in groups:
+        own = [name for name in chosen if name in group.names]
+        at = [group.names.index(name) for name in own]
+        if own:
+            std = None if group.std is None else group.std[:, at]
+            names = tuple(chosen[name] for name in own)
+            kept.append(replace(group, names=names, position=group.position[:, at], std=std))
+    return tuple(kept)
+
+
+def check_point_names(chosen: Mapping[str, str], where: str) -> None:
+    """Refuse sources that give points of the same name."""
+    names = list(chosen.values())
+    shared = [source for source, name in chosen.items() if names.count(name) > 1]
+    if shared:
+        what = f"{', '.join(shared)} give points of the same name"
+        raise DataError(what, where=where, allowed="a name for each", hint=f"name them: points {shared[0]}=NAME, ...")
+
+
+def _torque_factors(
+    names: Sequence[str], current: bool, constants: Mapping[str, float], gears: Mapping[str, float], where: str
+) -> Array:
+    """N m per recorded number of every joint, shape (nj,)."""
+    for word, given in (("torque_constants", constants), ("gears", gears)):
+        for pattern, value in given.items():
+            if not fnmatch.filter(names, pattern):
+                raise DataError(
+                    f"{word} is given for '{pattern}', which is no joint",
+                    where=where,
+                    allowed=", ".join(names),
+                    hint=nearest(pattern, names),
+                )
+            if not (math.isfinite(value) and value != 0):
+                raise DataError(f"{word} of '{pattern}' is {value:g}", where=where, allowed="a number that is not zero")
+    if not current:
+        if constants or gears:
+            raise DataError(
+                "torque constants or gears are given, but the efforts are no currents",
+                where=where,
+                allowed="units effort=A or effort=mA beside them",
+                hint="set the unit of effort to A",
+            )
+        return np.ones(len(names))
+    factors = np.ones(len(names))
+    for j, name in enumerate(names):
+        own = [value for pattern, value in constants.items() if fnmatch.fnmatchcase(name, pattern)]
+        if not own:
+            raise DataError(
+                f"the effort of '{name}' is a current, and its torque constant is not given",
+                where=where,
+                allowed="torque_constants for every joint [N m/A]",
+                hint=f"--torque-constants {name}=0.1, or '*=0.1' for all",
+            )
+        ratio = [value for pattern, value in gears.items() if fnmatch.fnmatchcase(name, pattern)]
+        factors[j] = own[-1] * (ratio[-1] if ratio else 1.0)
+    return factors
+
+
+def rate_of(t: Array) -> float:
+    """Mean rate of samples [Hz]; NaN for fewer than two."""
+    span = float(t[-1] - t[0]) if len(t) > 1 else 0.0
+    return (len(t) - 1) / span if span > 0 else math.nan
+
+
+def guessed_units(recording: Recording) -> tuple[dict[str, str], tuple[str, ...]]:
+    """Units that the values of a raw recording look like where they cannot be SI, and why, in words."""
+    units: dict[str, str] = {}
+    notes = []
+    joints = recording.joints
+    if joints is not None and joints.position.size:
+        widest = float(np.nanmax(np.abs(joints.position), initial=0.0))
+        if widest > LARGEST_PLAUSIBLE["position"]:
+            units["position"] = "deg"
+            notes.append(f"angles reach {widest:.3g}: they look like degrees")
+    farthest = max((float(np.nanmax(np.abs(g.position), initial=0.0)) for g in recording.points), default=0.0)
+    if farthest > LARGEST_PLAUSIBLE["points"]:
+        units["points"] = "mm"
+        notes.append(f"points reach {farthest:.3g}: they look like millimetres")
+    for group in recording.groups:
+        period = float(np.median(np.diff(group.t))) if len(group.t) > 1 else 0.0
+        unit = next((unit for unit, least in (("ns", 1e4), ("us", 200.0), ("ms", 0.5)) if period > least), "")
+        slow = isinstance(group, PointGroup) and unit == "ms" and period < 30  # a slow camera, in seconds
+        if unit and not slow and "t" not in units:
+            units["t"] = unit
+            notes.append(f"samples come every {period:.3g}: the times look like {unit}")
+    return units, tuple(notes)

@@ -1,54 +1,58 @@
-"""Tables of text (CSV): one header row, one row per time."""
+"""Tables of text (CSV): one row per time, with a header row or without."""
 
 from __future__ import annotations
 
 import csv
 import math
 import os
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from yid_ocp.data.readers.base import READERS
-from yid_ocp.data.recording import (
-    JOINT_CHANNELS,
-    Array,
-    Clock,
-    JointGroup,
-    PointGroup,
-    Recording,
-    validate,
+from yid_ocp.data.readers.base import (
+    PREVIEWS,
+    READERS,
+    SKIP,
+    Contents,
+    Source,
+    finished,
+    guessed_units,
+    rate_of,
 )
+from yid_ocp.data.recording import JOINT_CHANNELS, Array, Clock, JointGroup, PointGroup, Recording
 from yid_ocp.errors import DataError, nearest
 from yid_ocp.files import file_sha256
 
-_TO_SI: Mapping[str, Mapping[str, float]] = {
-    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
-    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
-    "rad": {"rad": 1.0, "deg": math.pi / 180},
-    "rad/s": {"rad/s": 1.0, "deg/s": math.pi / 180, "rpm": 2 * math.pi / 60},
-    "N m": {"N m": 1.0, "N mm": 1e-3, "mN m": 1e-3},
-}
-_QUANTITIES: Mapping[str, str] = {"t": "s", **JOINT_CHANNELS, "points": "m"}
 _PREFIXES = {"q_": "position", **{f"{channel}_": channel for channel in JOINT_CHANNELS}}
 _AXES = ("x", "y", "z")
+_MOST_BAD = 0.5
+"""Part of a table's lines that may be bad; beyond it the table is not understood at all."""
+_LISTED = 5
+"""Numbers of bad lines that a note lists."""
 
 
 @READERS.register(".csv")
 def read_csv(
     path: str | os.PathLike[str],
     *,
-    columns: Mapping[str, str | Sequence[str] | None] | None = None,
+    columns: Mapping[str, str] | None = None,
+    header: bool = True,
+    skip_bad_lines: bool = False,
+    delimiter: str = ",",
+    joints: Sequence[str] | None = None,
+    points: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
+    torque_constants: Mapping[str, float] | None = None,
+    gears: Mapping[str, float] | None = None,
     clock: Clock = "recorded",
     sensor: str = "unknown",
     frame: str = "world",
-    delimiter: str = ",",
     description: str = "",
 ) -> Recording:
-    """Read a table with one header row and one row per time.
+    """Read a table with one row per time.
 
     Columns are understood by their names: `t` or `time`; a channel and a joint, `q_<joint>`, `position_<joint>`,
     `velocity_<joint>`, `effort_<joint>` and so on; else a point and an axis, `<point>_x`, `<point>_y`, `<point>_z`. An
@@ -59,18 +63,21 @@ def read_csv(
     ----------
     path : path-like
         The table.
-    columns : mapping, optional
-        Column to its meaning, where its name does not say: `"t"`, (channel, joint), (axis, point), or None to leave
-        it out.
-    units : mapping, optional
-        Unit of `t`, of a joint channel or of `points`, where it is not SI: s, ms, us, ns; rad, deg; rad/s, deg/s, rpm;
-        N m, N mm, mN m; m, cm, mm. Converted here and nowhere else.
+    columns : mapping of column to meaning, optional
+        Where its name does not say it: `t`, `channel:joint`, `axis:point`, or `skip`. A `*` in a column's name stands
+        for any text, which a `*` in the meaning repeats: `*_pos` is `position:*`.
+    header : bool
+        Whether the first row has names; where not, columns are called `1`, `2` and so on.
+    skip_bad_lines : bool
+        Whether a line with another number of cells, or a cell that is no number, is left out and counted in `notes`.
+    delimiter : str
+        One character between cells.
+    joints, points, units, torque_constants, gears
+        As `yid_ocp.data.readers.base.finished`.
     clock : {'recorded', 'nominal'}
         Whether the times were measured.
     sensor, frame : str
         What saw the points, and their frame of reference.
-    delimiter : str
-        One character between cells.
     description : str
         What was recorded.
 
@@ -86,88 +93,203 @@ def read_csv(
     """
     path = Path(path)
     digest = file_sha256(path)
-    factors = _factors(units or {}, str(path))
-    meanings, table = _read_table(path, delimiter, columns or {})
-    t = factors["t"] * table[:, meanings.index(("t", ""))]
-    joint_names, channels = _joint_columns(meanings, table, str(path))
-    point_names, position = _point_columns(meanings, table, str(path))
+    meanings, table, notes = _read_table(path, delimiter, columns or {}, header, skip_bad_lines)
+    raw = _raw(meanings, table, str(path), clock, sensor, frame)
+    made = Recording(raw.joints, raw.points, description, path.name, path.stem, digest, notes=notes)
+    return finished(
+        made,
+        str(path),
+        joints=joints,
+        points=points,
+        units=units,
+        torque_constants=torque_constants,
+        gears=gears,
+    )
+
+
+def _raw(
+    meanings: Sequence[tuple[str, str]],
+    table: Array,
+    where: str,
+    clock: Clock = "recorded",
+    sensor: str = "unknown",
+    frame: str = "world",
+) -> Recording:
+    """The table's joints and points in its own units."""
+    t = table[:, meanings.index(("t", ""))]
+    joint_names, channels = _joint_columns(meanings, table, where)
+    point_names, position = _point_columns(meanings, table, where)
     joint_rows = point_rows = np.arange(len(t))
     if joint_names and point_names:
         joint_rows = np.flatnonzero(~np.isnan(np.hstack(list(channels.values()))).all(axis=1))
         point_rows = np.flatnonzero(~np.isnan(position).all(axis=(1, 2)))
-    joints, points = None, []
+    group, seen = None, []
     if joint_names:
-        si: dict[str, Any] = {name: factors[name] * values[joint_rows] for name, values in channels.items()}
-        joints = JointGroup(joint_names, t[joint_rows], clock=clock, **si)
+        own: dict[str, Any] = {name: values[joint_rows] for name, values in channels.items()}
+        group = JointGroup(joint_names, t[joint_rows], clock=clock, **own)
     if point_names:
-        seen = factors["points"] * position[point_rows]
-        points = [PointGroup("points", point_names, t[point_rows], seen, None, sensor, frame, None, clock)]
-    return validate(Recording(joints, tuple(points), description, path.name, path.stem, digest))
+        at = t[point_rows]
+        seen = [PointGroup("points", point_names, at, position[point_rows], None, sensor, frame, None, clock)]
+    return Recording(group, tuple(seen))
 
 
-def _factors(units: Mapping[str, str], where: str) -> dict[str, float]:
-    factors = dict.fromkeys(_QUANTITIES, 1.0)
-    for quantity, unit in units.items():
-        if quantity not in _QUANTITIES:
-            raise DataError(
-                f"a unit is given for '{quantity}', which is no quantity",
-                where=where,
-                allowed=", ".join(_QUANTITIES),
-                hint=nearest(quantity, _QUANTITIES),
-            )
-        known = _TO_SI[_QUANTITIES[quantity]]
-        if unit not in known:
-            what = f"'{unit}' is not a unit of '{quantity}'"
-            raise DataError(what, where=where, allowed=", ".join(known), hint=nearest(unit, known))
-        factors[quantity] = known[unit]
-    return factors
+@PREVIEWS.register(".csv")
+def preview_csv(path: str | os.PathLike[str]) -> Contents:
+    """What a table holds: columns, what their names say, and units that its values look like.
+
+    Raises
+    ------
+    DataError
+        If it is no table of text.
+    """
+    path = Path(path)
+    file_sha256(path)
+    options: dict[str, Any] = {}
+    first = next(_rows(path, ","), (1, []))[1]
+    if len(first) == 1:
+        mark = next((mark for mark in ";\t " if mark in first[0].strip()), ",")
+        if mark != ",":
+            options["delimiter"] = mark
+    rows = list(_rows(path, options.get("delimiter", ",")))
+    if not rows or not any(cell.strip() for cell in rows[0][1]):
+        raise DataError("the table is empty", where=str(path), allowed=_ALLOWED)
+    names = [cell.strip() for cell in rows[0][1]]
+    if all(_is_number(cell) for cell in names):
+        options["header"] = False
+        names = [str(i + 1) for i in range(len(names))]
+    else:
+        rows = rows[1:]
+    good = [[_number(cell) for cell in cells] for _, cells in rows if len(cells) == len(names)]
+    table = np.array(good, float).reshape(len(good), len(names))
+    numeric = np.isfinite(table).mean(axis=0) > _MOST_BAD if len(table) else np.zeros(len(names), bool)
+    empty = np.array([[not cell.strip() for cell in cells] for _, cells in rows if len(cells) == len(names)])
+    text = ~np.isfinite(table) & ~empty.reshape(table.shape)
+    bad = int(np.sum(text[:, numeric].any(axis=1))) + len(rows) - len(good)
+    if bad:
+        options["skip_bad_lines"] = True
+    meanings = [_conventional_meaning(name) for name in names]
+    if "header" in options and len(table) > 1 and np.all(np.diff(table[:, 0]) > 0):
+        meanings[0] = ("t", "")
+    unknown = {name: _proposed(name, bool(ok)) for name, m, ok in zip(names, meanings, numeric, strict=True) if not m}
+    if "header" in options and meanings[0]:
+        unknown = {names[0]: "t", **unknown}
+    if unknown:
+        options["columns"] = unknown
+    known = [(m, i) for i, m in enumerate(meanings) if m and numeric[i]]
+    t = table[:, next((i for m, i in known if m == ("t", "")), 0)]
+    sources = tuple(
+        Source(
+            name,
+            "numbers" if ok else "text",
+            int(np.isfinite(column).sum()),
+            rate_of(t) if ok and len(t) > 1 else math.nan,
+            ":".join(part for part in (meaning or ()) if part),
+            "" if meaning else "its name does not say what it is",
+        )
+        for name, meaning, ok, column in zip(names, meanings, numeric, table.T, strict=True)
+    )
+    notes = [f"{bad} of {len(rows)} lines are no rows of numbers"] if bad else []
+    clean = table[np.isfinite(t)]
+    try:
+        units, why = guessed_units(_raw([m for m, _ in known], clean[:, [i for _, i in known]], str(path)))
+    except (DataError, ValueError):  # a channel that is not complete: its meaning has to be given first
+        units, why = {}, ()
+    if units:
+        options["units"] = units
+    return Contents(sources, options, (*notes, *why))
 
 
-def _read_table(
-    path: Path, delimiter: str, columns: Mapping[str, str | Sequence[str] | None]
-) -> tuple[list[tuple[str, str]], Array]:
-    """Read the columns that mean something: their meanings and the table, shape (rows, columns), in its own units."""
+def _proposed(name: str, numeric: bool) -> str:
+    """A meaning to be filled in for a column whose name does not say it."""
+    if not numeric:
+        return SKIP
+    return "CHANNEL:JOINT" if name.isdecimal() else f"CHANNEL:{name}"
+
+
+_ALLOWED = "one header row with names such as t, q_<joint>, effort_<joint>, <point>_x"
+
+
+def _rows(path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
+    """Line number and cells of every line that is not empty."""
     if len(delimiter) != 1:
         raise DataError(f"the delimiter is {delimiter!r}", where=str(path), allowed="one character")
-    rows: list[list[float]] = []
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             lines = csv.reader(file, delimiter=delimiter, skipinitialspace=True)
-            header = [cell.strip() for cell in next(lines, [])]
-            _check_header(header, path, delimiter)
-            meanings = _meanings(header, columns, f"{path}, line 1")
             for cells in lines:
                 if cells:
-                    rows.append(_numbers(cells, header, meanings, f"{path}, line {lines.line_num}"))
+                    yield lines.line_num, cells
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         what = f"the file is not a table of text ({error})"
         raise DataError(what, where=str(path), allowed="CSV with one header row, in UTF-8") from error
+
+
+def _read_table(
+    path: Path, delimiter: str, columns: Mapping[str, str], header: bool, skip_bad_lines: bool
+) -> tuple[list[tuple[str, str]], Array, tuple[str, ...]]:
+    """The columns that mean something: meanings, table, shape (rows, columns), in its own units, and what was bad."""
+    lines = _rows(path, delimiter)
+    number, first = next(lines, (1, []))
+    names = [cell.strip() for cell in first]
+    _check_header(names, path, delimiter, header)
+    rows: list[list[float]] = []
+    bad: list[int] = []
+    if not header:
+        names = [str(i + 1) for i in range(len(first))]
+    meanings = _meanings(names, columns, f"{path}, line {number}")
+
+    def read(line: int, cells: Sequence[str]) -> None:
+        try:
+            rows.append(_numbers(cells, names, meanings, f"{path}, line {line}"))
+        except DataError:
+            if not skip_bad_lines:
+                raise
+            bad.append(line)
+
+    if not header:
+        read(number, first)
+    for line, cells in lines:
+        read(line, cells)
     if not rows:
         raise DataError("the table has no rows", where=str(path), allowed="one header row, then one row per time")
-    return [meaning for meaning in meanings if meaning], np.array(rows)
+    if len(bad) > _MOST_BAD * (len(rows) + len(bad)):
+        raise DataError(
+            f"{len(bad)} of {len(rows) + len(bad)} lines are no rows of {len(names)} numbers",
+            where=f"{path}, line {bad[0]}",
+            allowed="a table most of whose lines are rows of numbers",
+            hint="look at it with --preview; set the delimiter or leave columns of text out",
+        )
+    notes: tuple[str, ...] = ()
+    if bad:
+        listed = ", ".join(map(str, bad[:_LISTED])) + (", ..." if len(bad) > _LISTED else "")
+        notes = (f"{len(bad)} of {len(rows) + len(bad)} lines were bad and left out (line {listed})",)
+    return [meaning for meaning in meanings if meaning], np.array(rows), notes
 
 
-def _check_header(header: Sequence[str], path: Path, delimiter: str) -> None:
-    allowed = "one header row with names such as t, q_<joint>, effort_<joint>, <point>_x"
+def _check_header(header: Sequence[str], path: Path, delimiter: str, named: bool) -> None:
     if not any(header):
-        raise DataError("the table is empty", where=str(path), allowed=allowed)
-    if all(_is_number(cell) for cell in header):
-        raise DataError("the table has no header row", where=f"{path}, line 1", allowed=allowed)
+        raise DataError("the table is empty", where=str(path), allowed=_ALLOWED)
+    if named and all(_is_number(cell) for cell in header):
+        hint = "say so: --no-header --columns t,position:JOINT,..., one meaning for every column"
+        raise DataError("the table has no header row", where=f"{path}, line 1", allowed=_ALLOWED, hint=hint)
     if len(header) == 1:
         others = [repr(mark) for mark in ";\t, " if mark in header[0] and mark != delimiter]
         hint = f"set delimiter={others[0]}" if others else ""
-        raise DataError(f"the table has one column, '{header[0]}'", where=str(path), allowed=allowed, hint=hint)
-    repeated = [name for name in header if header.count(name) > 1]
+        raise DataError(f"the table has one column, '{header[0]}'", where=str(path), allowed=_ALLOWED, hint=hint)
+    repeated = [name for name in header if header.count(name) > 1] if named else []
     if repeated:
         raise DataError(f"two columns are called '{repeated[0]}'", where=f"{path}, line 1")
 
 
 def _is_number(cell: str) -> bool:
+    return math.isfinite(_number(cell)) or cell.strip().lower() in ("nan", "inf", "-inf")
+
+
+def _number(cell: str) -> float:
     try:
-        float(cell)
+        return float(cell)
     except ValueError:
-        return False
-    return True
+        return math.nan
 
 
 def _numbers(
@@ -186,34 +308,35 @@ def _numbers(
     return numbers
 
 
-def _meanings(
-    header: Sequence[str], columns: Mapping[str, str | Sequence[str] | None], where: str
-) -> list[tuple[str, str] | None]:
+def _meanings(header: Sequence[str], columns: Mapping[str, str], where: str) -> list[tuple[str, str] | None]:
     """Say for each column: ("t", ""), (channel, joint), (axis, point), or None for one to leave out."""
-    for name in columns:
-        if name not in header:
-            what = f"there is no column '{name}'"
-            raise DataError(what, where=where, allowed=", ".join(header), hint=nearest(name, header))
+    given: dict[str, str] = {}
+    for key, meaning in sorted(columns.items(), key=lambda item: "*" not in item[0]):  # what is exact overrides
+        pattern = re.escape(key).replace(r"\*", "(.*)")
+        found = {name: match for name in header if (match := re.fullmatch(pattern, name))}
+        if not found:
+            what = f"there is no column '{key}'"
+            raise DataError(what, where=where, allowed=", ".join(header), hint=nearest(key, header))
+        for name, match in found.items():
+            given[name] = meaning.replace("*", match.group(1)) if "*" in key else meaning
     meanings: list[tuple[str, str] | None] = []
     for name in header:
-        meaning = _given_meaning(name, columns[name], where) if name in columns else _conventional_meaning(name)
-        if meaning is None and name not in columns:
+        own = _given_meaning(name, given[name], where) if name in given else _conventional_meaning(name)
+        if own is None and name not in given:
             raise DataError(
                 f"the meaning of column '{name}' is not known",
                 where=where,
                 allowed="t, "
                 + ", ".join(f"{prefix}<joint>" for prefix in _PREFIXES)
                 + ", <point>_x, <point>_y, <point>_z",
-                hint=f"rename it, or set columns={{'{name}': ('position', 'joint')}}, or None to leave it out",
+                hint=f"rename it, or say what it is: columns {name}=position:JOINT, or {name}={SKIP} to leave it out",
             )
-        if meaning and meaning in meanings:
-            other = header[meanings.index(meaning)]
-            raise DataError(f"columns '{other}' and '{name}' mean the same, {' '.join(meaning).strip()}", where=where)
-        meanings.append(meaning)
+        if own and own in meanings:
+            other = header[meanings.index(own)]
+            raise DataError(f"columns '{other}' and '{name}' mean the same, {' '.join(own).strip()}", where=where)
+        meanings.append(own)
     if ("t", "") not in meanings:
-        raise DataError(
-            "the table has no column of times", where=where, allowed="t or time", hint="columns={'...': 't'}"
-        )
+        raise DataError("the table has no column of times", where=where, allowed="t or time", hint="columns NAME=t")
     return meanings
 
 
@@ -227,21 +350,21 @@ def _conventional_meaning(column: str) -> tuple[str, str] | None:
     return (axis, point) if point and axis in _AXES else None
 
 
-def _given_meaning(column: str, given: str | Sequence[str] | None, where: str) -> tuple[str, str] | None:
-    if given is None:
+def _given_meaning(column: str, given: str, where: str) -> tuple[str, str] | None:
+    if given == SKIP:
         return None
-    words = (given, "") if isinstance(given, str) else tuple(given)
-    if words == ("t", ""):
+    if given == "t":
         return "t", ""
+    kind, _, name = given.partition(":")
     known = (*JOINT_CHANNELS, *_AXES)
-    if len(words) != 2 or not words[1] or words[0] not in known:
+    if not name or kind not in known:
         raise DataError(
-            f"column '{column}' is given the meaning {given!r}",
+            f"column '{column}' is given the meaning '{given}'",
             where=where,
-            allowed=f"'t', or a pair of one of {', '.join(known)} and the name of the joint or point, or None",
-            hint=nearest(str(words[0]), known) if words and words[0] not in known else "",
+            allowed=f"t, {SKIP}, or KIND:NAME with a joint's or a point's name and one of {', '.join(known)}",
+            hint=nearest(kind, known) if kind not in known else f"{kind}:NAME",
         )
-    return str(words[0]), str(words[1])
+    return kind, name
 
 
 def _joint_columns(

@@ -1,0 +1,91 @@
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from yid_ocp.data.readers import preview, read_any
+from yid_ocp.data.readers.c3d import read_c3d
+from yid_ocp.errors import DataError
+
+LABELS = ("Cable:base", "Cable:tip", "*3", "LKneeAngles", "gone")
+
+
+def write_c3d(path: Path, labels: tuple[str, ...] = LABELS, unit: str = "mm", frames: int = 6) -> np.ndarray:
+    """A file at 200 Hz whose markers go up; the tip is hidden in frame 2. What was written, (N, 2, 3) in its unit."""
+    ezc3d: Any = pytest.importorskip("ezc3d", reason="C3D needs ezc3d: pip install 'yid-ocp[c3d]'")
+    file = ezc3d.c3d()
+    point = file["parameters"]["POINT"]
+    point["LABELS"]["value"], point["UNITS"]["value"], point["RATE"]["value"] = labels, [unit], [200.0]
+    file.add_parameter("POINT", "ANGLES", ["LKneeAngles"])
+    values = np.ones((4, len(labels), frames))
+    values[:3] = 100.0 * (1 + np.arange(len(labels)))[None, :, None] + np.arange(frames)
+    if len(labels) == len(LABELS):
+        values[:3, 1, 2] = np.nan
+        values[:3, 4] = 0.0
+    file["data"]["points"] = values
+    file["parameters"]["ANALOG"]["LABELS"]["value"] = ["force"]
+    file["parameters"]["ANALOG"]["RATE"]["value"] = [200.0]
+    file["data"]["analogs"] = np.zeros((1, 1, frames))
+    file.write(str(path))
+    return np.asarray(values[:3, :2].transpose(2, 1, 0))
+
+
+def test_markers_of_a_file(tmp_path: Path) -> None:
+    written = write_c3d(tmp_path / "run.c3d")
+    recording = read_any(tmp_path / "run.c3d", frame="lab")
+    (points,) = recording.points
+    assert (points.names, points.frame, points.clock) == (("base", "tip"), "lab", "nominal")
+    assert np.allclose(points.t, np.arange(6) / 200)
+    assert np.allclose(points.position, 1e-3 * written, equal_nan=True)
+    assert np.isnan(points.position[2, 1]).all()
+    assert sorted(recording.notes) == [
+        "*3 was left out (it has no label)",
+        "LKneeAngles was left out (computed by a model, no place)",
+        "force was left out (an analog channel)",
+        "gone was left out (never seen)",
+    ]
+
+
+def test_markers_are_named_and_chosen(tmp_path: Path) -> None:
+    write_c3d(tmp_path / "run.c3d")
+    assert read_c3d(tmp_path / "run.c3d", points={"tip": "cable:100%"}).point_names == ("cable:100%",)
+    with pytest.raises(DataError, match="no point 'tp'") as caught:
+        read_c3d(tmp_path / "run.c3d", points={"tp": "a"})
+    assert caught.value.hint == "did you mean 'tip'?"
+
+
+def test_subjects_stay_where_names_would_be_the_same(tmp_path: Path) -> None:
+    write_c3d(tmp_path / "run.c3d", ("A:tip", "B:tip"), "m", 3)
+    with pytest.raises(DataError, match="reaches 202 m"):
+        read_c3d(tmp_path / "run.c3d")  # 200 m are millimetres whose unit the file says wrongly
+    assert read_c3d(tmp_path / "run.c3d", units={"points": "mm"}).point_names == ("A:tip", "B:tip")
+
+
+def test_the_preview_lists_markers_and_the_rest(tmp_path: Path) -> None:
+    write_c3d(tmp_path / "run.c3d")
+    contents = preview(tmp_path / "run.c3d")
+    assert [source.becomes for source in contents.sources[:2]] == ["point base", "point tip"]
+    assert contents.sources[1].note == "seen in 83% of the frames"
+    assert contents.sources[0].rate == pytest.approx(200.0)
+    assert read_any(tmp_path / "run.c3d", **contents.options).point_names == ("base", "tip")
+
+
+def test_files_that_are_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_c3d(tmp_path / "run.c3d")
+    contents = (tmp_path / "run.c3d").read_bytes()
+    for name, text in {"text": b"no markers at all" * 100, "short": contents[:600], "empty": b""}.items():
+        (tmp_path / f"{name}.c3d").write_bytes(text)
+        with pytest.raises(DataError, match="C3D file") as caught:
+            read_c3d(tmp_path / f"{name}.c3d")
+        assert f"{name}.c3d" in caught.value.where
+    write_c3d(tmp_path / "inch.c3d", unit="inch")
+    with pytest.raises(DataError, match="unit of the markers is 'inch'"):
+        read_c3d(tmp_path / "inch.c3d")
+    monkeypatch.setitem(sys.modules, "ezc3d", None)
+    with pytest.raises(DataError, match="needs the package ezc3d") as caught:
+        read_c3d(tmp_path / "run.c3d")
+    assert caught.value.hint == "pip install 'yid-ocp[c3d]'"

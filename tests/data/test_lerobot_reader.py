@@ -1,0 +1,132 @@
+from __future__ import annotations
+
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from recording_examples import joints_of
+
+from yid_ocp.data.readers import preview, read_any
+from yid_ocp.data.readers.lerobot import read_lerobot
+from yid_ocp.errors import DataError
+
+NAMES = ["shoulder_pan.pos", "elbow_flex.pos", "gripper.pos"]
+PATHS = {
+    "v2.0": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
+    "v2.1": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
+    "v3.0": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+}
+
+
+def write_dataset(folder: Path, version: str, names: Any = NAMES, **more: Any) -> Path:
+    """Two episodes of four frames at 30 Hz; degrees 100 * episode + 10 * frame + joint, actions one degree more."""
+    pyarrow: Any = pytest.importorskip("pyarrow", reason="LeRobot needs pyarrow: pip install 'yid-ocp[lerobot]'")
+    from pyarrow import parquet
+
+    shape = {"dtype": "float32", "shape": [3], "names": names}
+    features = {
+        "action": shape,
+        "observation.state": shape,
+        "observation.images.top": {"dtype": "video", "shape": [480, 640, 3], "names": ["height", "width", "channel"]},
+        **{name: {"dtype": "int64", "shape": [1], "names": None} for name in ("frame_index", "episode_index", "index")},
+    }
+    info = {"codebase_version": version, "fps": 30, "features": features, "total_episodes": 2, "robot_type": "so101"}
+    info |= {"data_path": PATHS.get(version, ""), "chunks_size": 1000} | more
+    (folder / "meta").mkdir(parents=True)
+    (folder / "meta" / "info.json").write_text(json.dumps(info))
+    tables = []
+    for episode in range(2):
+        state = [[100.0 * episode + 10.0 * k + j for j in range(3)] for k in range(4)]
+        columns = {
+            "observation.state": state,
+            "action": [[value + 1 for value in row] for row in state],
+            "frame_index": list(range(4)),
+            "episode_index": [episode] * 4,
+        }
+        tables.append(pyarrow.table(columns))
+    chunk = folder / "data" / "chunk-000"
+    chunk.mkdir(parents=True)
+    if version == "v3.0":
+        parquet.write_table(pyarrow.concat_tables(tables), chunk / "file-000.parquet")
+    else:
+        for episode, table in enumerate(tables):
+            parquet.write_table(table, chunk / f"episode_{episode:06d}.parquet")
+    return folder
+
+
+@pytest.mark.parametrize("version", PATHS)
+def test_state_and_action_of_an_episode(version: str, tmp_path: Path) -> None:
+    path = write_dataset(tmp_path / "arm", version)
+    units = {"position": "deg", "position_command": "deg"}
+    recording = read_any(path, episode=1, joints=["elbow_flex=elbow", "shoulder_pan"], units=units)
+    joints = joints_of(recording)
+    assert (joints.names, joints.clock) == (("elbow", "shoulder_pan"), "nominal")
+    assert np.allclose(joints.t, np.arange(4) / 30)
+    assert np.allclose(joints.position, np.radians([[101, 100], [111, 110], [121, 120], [131, 130]]))
+    assert np.allclose(joints.channels["position_command"] - joints.position, math.radians(1))
+    assert recording.notes == ("observation.images.top was left out (a video feature that is not understood)",)
+    assert (recording.name, recording.source) == ("arm_000001", "arm, episode 1")
+
+
+@pytest.mark.parametrize("names", [{"motors": ["a", "b", "c"]}, None], ids=["by kind", "none"])
+def test_names_of_older_datasets(names: Any, tmp_path: Path) -> None:
+    path = write_dataset(tmp_path / "arm", "v2.0", names)
+    expected = ("a", "b", "c") if names else ("joint_0", "joint_1", "joint_2")
+    assert read_lerobot(path, units={"position": "deg", "position_command": "deg"}).joint_names == expected
+
+
+def test_velocities_and_currents_among_the_state(tmp_path: Path) -> None:
+    path = write_dataset(tmp_path / "arm", "v3.0", ["a.pos", "a.vel", "a.current"])
+    joints = joints_of(read_lerobot(path, units={"position": "deg", "position_command": "deg", "effort": "mA"},
+                                    torque_constants={"a": 2.0}, gears={"a": 100.0}))  # fmt: skip
+    assert joints.names == ("a",)
+    assert np.array_equal(joints.channels["velocity"][:, 0], [1, 11, 21, 31])
+    assert np.allclose(joints.channels["effort"][:, 0], 0.2 * np.array([2, 12, 22, 32]))
+
+
+def test_the_preview_proposes_degrees(tmp_path: Path) -> None:
+    path = write_dataset(tmp_path / "arm", "v3.0")
+    contents = preview(path)
+    assert contents.options["units"]["position"] == "deg"
+    assert "2 episodes at 30 Hz, v3.0, recorded on so101" in contents.notes[0]
+    by_name = {source.name: source for source in contents.sources}
+    assert by_name["action"].becomes == "position_command"
+    assert not by_name["observation.images.top"].becomes
+    assert read_any(path, **contents.options).joint_names == ("shoulder_pan", "elbow_flex", "gripper")
+
+
+@pytest.mark.parametrize(
+    ("more", "options", "message"),
+    [
+        ({}, {"episode": 2}, "there is no episode 2"),
+        ({}, {"episode": -1}, "there is no episode -1"),
+        ({"total_episodes": 9}, {"episode": 5}, "no table has the episode"),
+        ({"codebase_version": "v1.6"}, {}, "of version v1.6"),
+        ({"fps": 0}, {}, "0 frames a second"),
+        ({"fps": "fast"}, {}, "is not understood"),
+        ({"features": {"action": {}}}, {}, "no observation.state"),
+        ({}, {"joints": ["elbow"]}, "no joint 'elbow'"),
+        ({}, {"episode": 1}, "reaches 132 rad"),
+    ],
+    ids=["beyond", "negative", "lost", "version", "rate", "text", "state", "joint", "degrees"],
+)
+def test_datasets_that_are_refused(more: Any, options: Any, message: str, tmp_path: Path) -> None:
+    path = write_dataset(tmp_path / "arm", "v3.0", **more)
+    with pytest.raises(DataError, match=message) as caught:
+        read_lerobot(path, **options)
+    assert "arm" in caught.value.where
+
+
+def test_a_damaged_table_and_a_missing_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_dataset(tmp_path / "arm", "v2.1")
+    (path / "data" / "chunk-000" / "episode_000000.parquet").write_bytes(b"PAR1 and no more")
+    with pytest.raises(DataError, match="table of the episode cannot be read"):
+        read_lerobot(path)
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(DataError, match="needs pyarrow") as caught:
+        read_lerobot(path)
+    assert caught.value.hint == "pip install 'yid-ocp[lerobot]'"

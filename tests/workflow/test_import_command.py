@@ -1,0 +1,157 @@
+"""The command `import`: flags, the section of a configuration, the preview, and what is refused."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from yid_ocp.cli import main, parser
+from yid_ocp.data import read_recording
+from yid_ocp.files import file_sha256
+
+ROWS = "".join(f"{10 * k},{k},{2 * k},{100 + k},200,300\n" for k in range(20))
+ODD = "stamp,j1,j2,mx,my,mz\n" + ROWS
+FLAGS = [
+    "--columns", "stamp=t,j1=position:shoulder,j2=position:elbow", "--columns", "mx=x:tip,my=y:tip,mz=z:tip",
+    "--units", "deg,mm,ms", "--points", "tip=cable:100%",
+]  # fmt: skip
+
+
+@pytest.fixture
+def odd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run.csv").write_text(ODD)
+    return tmp_path
+
+
+def check_odd(file: Path, source: Path) -> None:
+    recording = read_recording(file)
+    assert recording.joints is not None
+    assert recording.joints.names == ("shoulder", "elbow")
+    assert np.allclose(recording.joints.t, 0.01 * np.arange(20))
+    assert np.allclose(recording.joints.position[:, 1], np.radians(2 * np.arange(20)))
+    assert recording.point_names == ("cable:100%",)
+    assert np.allclose(recording.points[0].position[0, 0], [0.1, 0.2, 0.3])
+    assert file_sha256(source) in recording.source
+
+
+def test_flags_say_what_columns_and_units_mean(odd: Path) -> None:
+    assert main(["import", "run.csv", "--out", "run.h5", *FLAGS]) == 0
+    check_odd(odd / "run.h5", odd / "run.csv")
+
+
+def test_a_section_of_a_configuration_does_the_same_and_flags_go_before_it(odd: Path) -> None:
+    (odd / "run.yaml").write_text(
+        """\
+import:
+  columns: {stamp: t, j1: "position:shoulder", j2: "position:elbow", mx: "x:tip", my: "y:tip", mz: "z:tip"}
+  units: {t: ms, position: deg, points: mm}
+  points: {tip: "cable:100%"}
+"""
+    )
+    assert main(["import", "run.csv", "--out", "run.h5", "--config", "run.yaml"]) == 0
+    check_odd(odd / "run.h5", odd / "run.csv")
+    assert main(["import", "run.csv", "--out", "run.h5", "--config", "run.yaml", "--points", "tip=other"]) == 0
+    assert read_recording(odd / "run.h5").point_names == ("other",)
+
+
+def test_what_the_preview_proposes_imports_the_file(odd: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (odd / "plain.csv").write_text("t;q_a;tip_x;tip_y;tip_z\n" + "".join(f"{k};90;900;0;0\n" for k in range(9)))
+    assert main(["import", "plain.csv", "--preview"]) == 0
+    *_, said = capsys.readouterr().out.strip().splitlines()
+    assert not (odd / "plain.h5").exists()
+    program, *words = shlex.split(said)
+    assert program == "yid-ocp"
+    assert main(words) == 0
+    recording = read_recording(odd / "plain.h5")
+    assert recording.joints is not None
+    assert recording.joints.position[0, 0] == pytest.approx(math.pi / 2)
+    assert recording.points[0].position[0, 0, 0] == pytest.approx(0.9)
+    # a recording of our own is shown, too
+    assert main(["import", "plain.h5", "--preview"]) == 0
+    assert "joints" in capsys.readouterr().out
+
+
+def test_left_out_lines_are_told(odd: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (odd / "bad.csv").write_text("t,q_a\n0,0\n1,x\n2,0\n")
+    assert main(["import", "bad.csv", "--out", "bad.h5", "--skip-bad-lines"]) == 0
+    assert "note: 1 of 3 lines were bad and left out (line 3)" in capsys.readouterr().out
+
+
+GOOD = "t,q_a,tip_x,tip_y,tip_z\n0,0.1,1,1,1\n1,0.2,1,1,1\n"
+TWO = "t,tip_x,tip_y,tip_z,m_x,m_y,m_z\n0,1,1,1,2,2,2\n"
+BAD: dict[str, tuple[str, str | None, str, str]] = {
+    # file, its text (None: there is no such file), flags, what is said
+    "no such file": ("run.csv", None, "", "no such file"),
+    "no such folder": ("bag", None, "", "no such file"),
+    "an unknown format": ("run.xlsx", "x", "", "no reader for '.xlsx' files"),
+    "no name to write to": ("run.csv", GOOD, "--out", "nothing says where"),
+    "a folder that is no bag": (".", None, "", "the bag cannot be read"),
+    "an MCAP that is none": ("run.mcap", "x" * 99, "", "the bag cannot be read"),
+    "a bag that is none": ("run.bag", "x" * 99, "", "the bag cannot be read"),
+    "a database that is none": ("run.db3", "x" * 99, "", "the bag cannot be read"),
+    "a C3D that is none": ("run.c3d", "x" * 99, "", "C3D file cannot be read"),
+    "an HDF5 that is none": ("run.h5", "x" * 99, "", "not an HDF5 file"),
+    "an empty table": ("run.csv", "", "", "the table is empty"),
+    "a header alone": ("run.csv", "t,q_a\n", "", "no rows"),
+    "no header": ("run.csv", "0,1\n1,2\n", "", "no header row"),
+    "columns without a meaning": ("run.csv", "t,angle\n0,1\n", "", "meaning of column 'angle'"),
+    "a column that is not there": ("run.csv", GOOD, "--columns q_b=skip", "no column 'q_b'"),
+    "a pattern that fits nothing": ("run.csv", GOOD, "--columns *_deg=position:*", "no column '*_deg'"),
+    "a meaning that is none": ("run.csv", GOOD, "--columns q_a=angle:a", "given the meaning 'angle:a'"),
+    "fewer meanings than columns": ("run.csv", "0,1\n", "--no-header --columns t", "meaning of column '2'"),
+    "more meanings than columns": ("run.csv", "0,1\n", "--no-header --columns t,position:a,skip", "no column '3'"),
+    "a bad line": ("run.csv", "t,q_a\n0,x\n", "", "column 'q_a' holds 'x'"),
+    "bad lines alone": ("run.csv", "t,q_a\n0,x\n", "--skip-bad-lines", "no rows"),
+    "times that go back": ("run.csv", "t,q_a\n1,1\n0,1\n", "", "from index 0 to 1"),
+    "a unit that is none": ("run.csv", GOOD, "--units furlong", "'furlong' is no unit"),
+    "a unit of nothing": ("run.csv", GOOD, "--units angle=deg", "unit is given for 'angle'"),
+    "a unit of another quantity": ("run.csv", GOOD, "--units position=mm", "'mm' is not a unit of 'position'"),
+    "degrees that nobody said": ("run.csv", "t,q_a\n0,90\n", "", "reaches 90 rad"),
+    "a joint that is not there": ("run.csv", GOOD, "--joints b", "no joint 'b'"),
+    "a joint twice": ("run.csv", GOOD, "--joints a,a", "chosen twice"),
+    "a point that is not there": ("run.csv", GOOD, "--points tp=tip", "no point 'tp'"),
+    "a pair that is none": ("run.csv", GOOD, "--points tip", "'tip' is no pair"),
+    "two points of one name": ("run.csv", TWO, "--points tip=a,m=a", "points of the same name"),
+    "a number that is none": ("run.csv", GOOD, "--gears a=fast", "'fast' is no number"),
+    "a current without a constant": ("run.csv", "t,q_a,effort_a\n0,0,1\n", "--units A", "torque constant is not given"),
+    "a constant without a current": ("run.csv", "t,q_a,effort_a\n0,0,1\n", "--torque-constants a=1", "no currents"),
+    "an option of another format": ("run.csv", GOOD, "--joint-topic /j", "no option 'joint_topics'"),
+    "a long delimiter": ("run.csv", GOOD, "--delimiter ::", "the delimiter is '::'"),
+    "a section that is none": ("run.csv", GOOD, "--config wrong.yaml", "there is no key 'colums'"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_bad_import_says_what_is_wrong_and_writes_nothing(
+    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name, text, flags, said = BAD[case]
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "wrong.yaml").write_text("import: {colums: {q_a: skip}}\n")
+    if text is not None:
+        (tmp_path / name).write_text(text)
+    before = sorted(entry.name for entry in tmp_path.iterdir())
+    words = ["import", name] if flags == "--out" else ["import", name, "--out", "made.h5", *flags.split()]
+    assert main(words) == 2
+    told = capsys.readouterr().err
+    first, *more = told.strip().splitlines()
+    assert first.startswith("error: ")
+    assert said in first
+    assert any(line.startswith(("  where: ", "  allowed: ", "  try: ")) for line in more)
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == before
+
+
+def test_every_flag_is_a_key_of_the_section() -> None:
+    from yid_ocp.config.settings import ImportSettings
+    from yid_ocp.options import options_of
+
+    known: Callable[..., object] = parser().parse_args
+    given = vars(known(["import", "x"]))
+    others = {"command", "module", "file", "out", "preview", "config", "quiet"}
+    assert set(given) - others == set(options_of(ImportSettings))

@@ -1,0 +1,238 @@
+"""The command `init` on made recordings: what it reads from them, what it writes, what it asks for and refuses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+from made_cross import URDF
+from ruamel.yaml import YAML
+
+from yid_ocp.cli import main
+from yid_ocp.config.reader import load_config
+from yid_ocp.config.schema import schema
+from yid_ocp.data import JointGroup, PointGroup, Recording, read_recording, write_recording
+from yid_ocp.workflow.build import build_system
+
+RATE = 125.0
+LENGTH = 0.5
+CABLE = ("--object", "cable", "--length", "0.5", "--mass", "0.05", "--radius", "0.004")
+
+
+def turned(axis: int, angle: np.ndarray) -> np.ndarray:
+    """Rotations about x or y, shape (N, 3, 3)."""
+    c, s, one, zero = np.cos(angle), np.sin(angle), np.ones_like(angle), np.zeros_like(angle)
+    rows = ([one, zero, zero, zero, c, -s, zero, s, c], [c, zero, s, zero, one, zero, -s, zero, c])[axis]
+    return np.stack(rows, axis=1).reshape(-1, 3, 3)
+
+
+def moved(
+    t: np.ndarray,
+    parts: Sequence[float] = (0.5, 1.0),
+    rest: tuple[float, float] | None = None,
+    effort: bool = False,
+    moving: bool = False,
+    far: float = 0.0,
+    seed: int = 1,
+) -> Recording:
+    """A wrist that turns a straight stick, seen where it says; it rests at the start and in an interval."""
+    rng = np.random.default_rng(seed)
+    phase = np.ones_like(t) if moving else np.clip(t / 0.5 - 0.4, 0, 1) ** 2
+    if rest is not None:
+        phase = phase * np.where(
+            t < rest[0], np.clip((rest[0] - t) / 0.3, 0, 1) ** 2, np.clip((t - rest[1]) / 0.3, 0, 1) ** 2
+        )
+    angles = np.stack([0.4 * np.sin(3 * t) * phase, 0.3 * np.sin(2 * t) * phase], axis=1)
+    along = (turned(0, angles[:, 0]) @ turned(1, angles[:, 1]))[:, :, 2]
+    points = np.array(parts)[None, :, None] * LENGTH * along[:, None] + far
+    points = points + 2e-4 * rng.standard_normal(points.shape)
+    names = tuple(f"m{i + 1}" for i in range(len(parts)))
+    efforts = rng.standard_normal((len(t), 2)) if effort else None
+    joints = JointGroup(("roll", "pitch"), t, angles + 1e-4 * rng.standard_normal(angles.shape), effort=efforts)
+    groups = (PointGroup("points", names, t, points, None, "mocap"),) if parts else ()
+    return Recording(joints, groups, source="made", name="made")
+
+
+@pytest.fixture
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a wrist and a recording of it, in which the command is run."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "wrist.urdf").write_text(URDF)
+    write_recording(moved(np.arange(0, 4, 1 / RATE)), tmp_path / "one.h5")
+    return tmp_path
+
+
+def init(*words: str, files: Sequence[str] = ("one.h5",)) -> int:
+    return main(["init", "wrist.urdf", *files, "--out", "run.yaml", *words])
+
+
+def test_the_file_loads_and_says_what_was_recorded(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert init(*CABLE) == 0
+    assert "m1 at cable:50%" in capsys.readouterr().out
+    run = load_config("run.yaml")
+    assert run.model.arms.mode == "prescribed"
+    assert run.model.arms.joints == ("roll", "pitch")
+    assert run.problem.time_step == pytest.approx(0.008)
+    assert run.problem.initial_state == "equilibrium"
+    assert run.sensors["points"].frames == {"m1": "cable:50%", "m2": "w_cable"}
+    # white noise from differences of a smooth motion, within a fifth
+    assert run.sensors["points"].std == pytest.approx(2e-4, rel=0.2)
+    assert run.sensors["joints.position"].std == pytest.approx(1e-4, rel=0.2)
+    system = build_system(run)
+    assert system.prescribed == ("roll", "pitch")
+    assert {"cable:50%", "w_cable"} <= set(system.points)
+    text = (bench / "run.yaml").read_text()
+    assert text.startswith("# yaml-language-server: $schema=yid-ocp.schema.json\n")
+    jsonschema.validate(YAML(typ="safe").load(text), schema())
+    assert (bench / "yid-ocp.schema.json").is_file()
+    keys = [line for line in text.splitlines() if line.strip() and not line.strip().startswith(("#", "joints:"))]
+    bare = [line for line in keys if "#" not in line and not line.rstrip().endswith(":")]
+    assert len(bare) <= 6, bare  # what has no comment is said by the line above it
+
+
+def test_several_recordings_are_split_and_a_rest_splits_one(bench: Path) -> None:
+    names = []
+    for i in range(4):
+        write_recording(moved(np.arange(0, 2, 1 / RATE), seed=i), bench / f"run_{i}.h5")
+        names.append(f"run_{i}.h5")
+    assert init(*CABLE, files=names) == 0
+    recordings = load_config("run.yaml").recordings
+    assert [Path(p).name for p in recordings.estimate] == names[:3]
+    assert [Path(p).name for p in recordings.held_out] == names[3:]
+    write_recording(moved(np.arange(0, 6, 1 / RATE), rest=(3.4, 4.4)), bench / "long.h5")
+    assert init(*CABLE, "--replace", files=["long.h5"]) == 0
+    recordings = load_config("run.yaml").recordings
+    first, second = (read_recording(path) for path in (*recordings.estimate, *recordings.held_out))
+    assert first.joints is not None
+    assert second.joints is not None
+    assert 3.4 < second.joints.t[0] < 4.4
+    assert first.joints.t[-1] == pytest.approx(second.joints.t[0], abs=1.1 / RATE)
+    assert np.abs(np.diff(second.joints.position[:10], axis=0)).max() < 1e-3
+    assert "of made" in second.notes[0]
+
+
+def test_a_start_in_motion_is_estimated(bench: Path) -> None:
+    write_recording(moved(np.arange(0, 2, 1 / RATE), moving=True), bench / "one.h5")
+    assert init(*CABLE) == 0
+    assert load_config("run.yaml").problem.initial_state == "estimated"
+
+
+def test_efforts_alone_bring_zeros_and_friction_of_the_arm(bench: Path) -> None:
+    write_recording(moved(np.arange(0, 2, 1 / RATE), parts=(), effort=True), bench / "one.h5")
+    assert init("--object", "beam", "--length", "0.5", "--mass", "0.1", "--section", "0.001,0.05") == 0
+    run = load_config("run.yaml")
+    assert [effect.kind for effect in run.model.effects] == ["effort_offset"] * 2
+    assert run.parameters["roll.damping"].free
+    assert run.sensors["joints.effort"].std == pytest.approx(1.0, rel=0.2)
+    item = build_system(run)
+    assert item.prescribed == ("roll", "pitch")
+    assert "effort_offset@roll.offset" in item.parameters
+
+
+def test_efforts_beside_points_are_left_alone(bench: Path) -> None:
+    write_recording(moved(np.arange(0, 2, 1 / RATE), effort=True), bench / "one.h5")
+    assert init(*CABLE) == 0
+    run = load_config("run.yaml")
+    assert run.sensors["joints.effort"].use is False
+    assert not run.model.effects
+
+
+def test_a_tree_gets_its_markers_where_they_are(bench: Path) -> None:
+    write_recording(moved(np.arange(0, 2, 1 / RATE), parts=(0.4, 1.0)), bench / "one.h5")
+    assert init("--object", "tree", "--branch", "up=0.5,0.05,0.004", "--branch", "side=0.3,0.03,0.004,0,1.57,0") == 0
+    run = load_config("run.yaml")
+    assert run.sensors["points"].frames == {"m1": "up:40%", "m2": "w_up"}
+    assert {"w_up", "w_side", "up:40%"} == set(build_system(run).points)
+
+
+def test_a_file_of_another_tool_is_imported_along(bench: Path) -> None:
+    recording = moved(np.arange(0, 2, 1 / RATE))
+    assert recording.joints is not None
+    columns = ["t,r,p,ax,ay,az"]
+    for t, q, x in zip(recording.joints.t, recording.joints.position, recording.points[0].position, strict=True):
+        columns.append(",".join(repr(float(v)) for v in (t, *np.degrees(q), *(1e3 * x[1]))))
+    (bench / "bag.csv").write_text("\n".join(columns) + "\n")
+    flags = ["--columns", "r=position:roll,p=position:pitch,ax=x:tip,ay=y:tip,az=z:tip", "--units", "deg,mm"]
+    assert init(*CABLE, *flags, "--points", "tip=cable:100%", files=["bag.csv"]) == 0
+    run = load_config("run.yaml")
+    made = read_recording(run.recordings.estimate[0])
+    assert made.joints is not None
+    assert np.allclose(made.joints.position, recording.joints.position)
+    assert made.point_names == ("cable:100%",)
+    # the section repeats the import
+    assert run.import_.columns == {
+        "r": "position:roll",
+        "p": "position:pitch",
+        "ax": "x:tip",
+        "ay": "y:tip",
+        "az": "z:tip",
+    }
+    assert main(["import", "bag.csv", "--out", "again.h5", "--config", "run.yaml"]) == 0
+    assert np.array_equal(read_recording("again.h5").points[0].position, made.points[0].position)
+
+
+ONE = ("--length", "1", "--mass", "1")
+TREE = ("--object", "tree", "--branch", "a=1,1,1")
+REFUSED: dict[str, tuple[Sequence[str], str, str]] = {
+    "cable without a length": (("--object", "cable"), "a cable needs a length", "--length"),
+    "cable without a mass": (("--object", "cable", *ONE[:2]), "a cable needs a mass", "--mass"),
+    "cable without a radius": (("--object", "cable", *ONE), "a cable needs a radius", "--radius"),
+    "beam without a section": (("--object", "beam", *ONE), "radius or a section", "--section"),
+    "tree without branches": (("--object", "tree"), "a tree needs branches", "--branches"),
+    "equal branches without a mass": (("--object", "tree", "--branches", "4", *ONE[:2]), "needs a mass", "--mass"),
+    "branch of two numbers": (("--object", "tree", "--branch", "a=1,2"), "describes no branch", "NAME=LENGTH"),
+    "branch of no size": (("--object", "tree", "--branch", "a=1,0,1"), "not above 0", "--branch"),
+    "branches of a cable": ((*CABLE, "--branch", "a=1,1,1"), "a cable has no branches", "--object tree"),
+    "branch on nothing": (("--object", "tree", "--branch", "a@b=1,1,1"), "grows on 'b', which", "--branch"),
+    "branches of one name": ((*TREE, "--branch", "a=1,1,1"), "two branches are called 'a'", "--branch"),
+    "negative length": ((*CABLE, "--length", "-1"), "the length is -1", "--length"),
+    "too many links": ((*CABLE, "--links", "99"), "99 links", "--links"),
+    "unknown holder": ((*CABLE, "--holder", "hup"), "no frame 'hup'", "did you mean 'hub'?"),
+    "unknown grasp": ((*CABLE, "--grasp", "hup=w_cable"), "no frame 'hup'", "did you mean 'hub'?"),
+    "grasp of no point": ((*CABLE, "--grasp", "hub"), "is no grasp", "FRAME=POINT"),
+    "import flags of a recording": ((*CABLE, "--units", "deg"), "a recording already", "leave"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_is_missing_is_named_and_nothing_is_written(
+    case: str, bench: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words, said, where = REFUSED[case]
+    before = sorted(bench.iterdir())
+    assert init(*words) == 2
+    told = capsys.readouterr().err
+    assert said in told
+    assert where in told
+    assert sorted(bench.iterdir()) == before
+
+
+def test_recordings_that_do_not_fit_are_refused(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    recording = moved(np.arange(0, 2, 1 / RATE), parts=())
+    write_recording(recording, bench / "one.h5")
+    assert init(*CABLE) == 2
+    assert "nothing in the recording shows what the object does" in capsys.readouterr().err
+    (bench / "bag.csv").write_text("t,q_shoulder,tip_x,tip_y,tip_z\n" + "".join(f"{k},0.1,0,0,0.5\n" for k in range(9)))
+    assert init(*CABLE, files=["bag.csv"]) == 2
+    told = capsys.readouterr().err
+    assert "none of the recorded joints is in the URDF: shoulder" in told
+    assert "--joints shoulder=roll" in told
+    assert not (bench / "bag.h5").exists()
+    (bench / "run.yaml").write_text("kept: true\n")
+    write_recording(moved(np.arange(0, 2, 1 / RATE)), bench / "one.h5")
+    assert init(*CABLE) == 2
+    assert "is there already" in capsys.readouterr().err
+    assert (bench / "run.yaml").read_text() == "kept: true\n"
+
+
+def test_points_in_another_frame_are_not_placed(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_recording(moved(np.arange(0, 2, 1 / RATE), far=3.0), bench / "one.h5")
+    assert init(*CABLE) == 0
+    assert "is it in the same frame?" in capsys.readouterr().out
+    assert not load_config("run.yaml").sensors["points"].frames
+    # and `check` says what is missing
+    assert main(["check", "run.yaml"]) == 2
+    assert "none of the points of group 'points' is a frame of the model" in capsys.readouterr().err

@@ -1,0 +1,193 @@
+"""C3D files of motion capture (Vicon, Qualisys, OptiTrack): markers as points."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.data.readers.base import PREVIEWS, READERS, Contents, Source, finished
+from yid_ocp.data.recording import Array, PointGroup, Recording
+from yid_ocp.data.trial import try_first
+from yid_ocp.errors import DataError
+from yid_ocp.files import file_sha256
+
+_COMPUTED = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS")
+"""Lists of `points` that are no places, as models of a body write them."""
+_UNITS = ("m", "cm", "mm")
+
+
+@dataclass(frozen=True)
+class _Markers:
+    """Markers of a file in its own unit: names, times, positions (N, np, 3), NaN where unseen; what else there is."""
+
+    names: tuple[str, ...]
+    t: Array
+    position: Array
+    unit: str
+    others: tuple[Source, ...]
+
+
+@READERS.register(".c3d")
+def read_c3d(
+    path: str | os.PathLike[str],
+    *,
+    points: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
+    sensor: str = "motion capture",
+    frame: str = "world",
+    description: str = "",
+) -> Recording:
+    """Read the markers of a C3D file.
+
+    The file says its rate and its unit. A marker that was not seen in a frame (residual -1, NaN, or exactly the origin)
+    is NaN. A subject in front of the name (`Subject:tip`) is left out where the rest is unique. In `notes` are markers
+    without a label, what a model of a body has computed (angles, forces, moments, powers) and analog channels.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    points : mapping of marker to name, optional
+        Markers to keep; all labelled ones that were ever seen when absent.
+    units : mapping of quantity to unit, optional
+        Unit of `points`, where the file does not say it or says it wrongly.
+    sensor, frame : str
+        What saw the points, and their frame of reference.
+    description : str
+        What was recorded.
+
+    Returns
+    -------
+    Recording
+        The checked recording, its points in one group called `points`, on a nominal clock from zero on.
+
+    Raises
+    ------
+    DataError
+        If `ezc3d` is not installed, the file cannot be read or has no markers, or as `validate`.
+    """
+    path = Path(path)
+    digest = file_sha256(path)
+    found = _markers(path)
+    own = {"points": found.unit} if found.unit else {}
+    group = PointGroup("points", found.names, found.t, found.position, None, sensor, frame, None, "nominal")
+    notes = tuple(f"{entry.name} was left out ({entry.note})" for entry in found.others)
+    raw = Recording(None, (group,), description, path.name, path.stem, digest, notes=notes)
+    return finished(raw, str(path), points=points, units={**own, **(units or {})})
+
+
+@PREVIEWS.register(".c3d")
+def preview_c3d(path: str | os.PathLike[str]) -> Contents:
+    """What a C3D file holds; errors as `read_c3d`."""
+    path = Path(path)
+    file_sha256(path)
+    found = _markers(path)
+    rate = 1.0 / float(found.t[1] - found.t[0]) if len(found.t) > 1 else math.nan
+    seen: NDArray[np.bool_] = np.asarray(np.isfinite(found.position).all(axis=2))
+    sources = [
+        Source(
+            name,
+            "marker",
+            int(seen[:, i].sum()),
+            rate,
+            f"point {name}",
+            "" if seen[:, i].all() else f"seen in {seen[:, i].mean():.0%} of the frames",
+        )
+        for i, name in enumerate(found.names)
+    ]
+    notes = [f"the file says that its unit is {found.unit}"] if found.unit else ["the file says no unit: --units mm?"]
+    options = {"points": {name: name for name in found.names}}
+    return Contents((*sources, *found.others), options, tuple(notes))
+
+
+def _markers(path: Path) -> _Markers:
+    try:
+        import ezc3d
+    except ImportError as error:
+        raise DataError(
+            "reading C3D files needs the package ezc3d", where=str(path), hint="pip install 'yid-ocp[c3d]'"
+        ) from error
+    try_first(path, _complaint, "C3D")
+    try:
+        file = ezc3d.c3d(str(path))
+        parameters = file["parameters"]
+        labels = _listed(parameters["POINT"], "LABELS")
+        position: Array = np.array(file["data"]["points"][:3].transpose(2, 1, 0), float)
+        residuals = np.array(file["data"]["meta_points"]["residuals"][0].T, float)
+        rate = float(np.ravel(parameters["POINT"]["RATE"]["value"])[0])
+        unit = str(next(iter(parameters["POINT"].get("UNITS", {}).get("value", [])), "")).strip().lower()
+        analog = [label for label in _listed(parameters.get("ANALOG", {}), "LABELS") if label]
+        computed = {label for key in _COMPUTED for label in _listed(parameters["POINT"], key) if label}
+    except (ValueError, KeyError, IndexError, TypeError) as error:
+        raise _unreadable(path, f"{type(error).__name__}: {error}") from error
+    if not rate > 0 or not len(position) or not labels:
+        what = "the C3D file has no markers" if not labels else "the C3D file has no frames, or no rate"
+        raise DataError(what, where=str(path), allowed="labelled 3-D points and their rate")
+    if unit and unit not in _UNITS:
+        raise DataError(f"the unit of the markers is '{unit}'", where=str(path), allowed=", ".join(_UNITS))
+    position = position[:, : len(labels)]
+    unseen: NDArray[np.bool_] = np.asarray(
+        (residuals[:, : len(labels)] < 0) | (position == 0).all(axis=2) | ~np.isfinite(position).all(axis=2)
+    )
+    position[unseen] = np.nan
+    why = {}
+    for i, label in enumerate(labels):
+        if label in computed:
+            why[i] = "computed by a model, no place"
+        elif not label or label.startswith("*"):
+            why[i] = "it has no label"
+        elif unseen[:, i].all():
+            why[i] = "never seen"
+    kept = [i for i in range(len(labels)) if i not in why]
+    if not kept:
+        what = "no labelled marker of the C3D file was ever seen"
+        raise DataError(what, where=str(path), allowed="labelled 3-D points", hint="label them and export it again")
+    others = [
+        Source(labels[i] or f"marker {i + 1}", "marker", int((~unseen[:, i]).sum()), rate, "", why[i]) for i in why
+    ]
+    others += [Source(name, "analog", 0, math.nan, "", "an analog channel") for name in analog]
+    names = _short([labels[i] for i in kept])
+    t = np.arange(len(position)) / rate
+    return _Markers(names, t, position[:, kept], unit, tuple(others))
+
+
+def _complaint(path: Path) -> str:
+    """What the library says against a file; it may end its process, too."""
+    import ezc3d
+
+    try:
+        ezc3d.c3d(str(path))
+    except Exception as error:  # whatever stands in the way
+        return _unreadable(path, f"{type(error).__name__}: {error}").what
+    return ""
+
+
+def _unreadable(path: Path, why: str) -> DataError:
+    allowed = "a C3D file as Vicon, Qualisys or OptiTrack export it"
+    return DataError(f"the C3D file cannot be read ({why})", where=str(path), allowed=allowed, hint="export it again")
+
+
+def _listed(group: Mapping[str, Any], key: str) -> list[str]:
+    """A list of a group of parameters with its continuations (`LABELS2` and so on), of more than 255 entries."""
+    found: list[str] = []
+    name, count = key, 1
+    while name in group:
+        found += [str(label).strip() for label in group[name]["value"]]
+        count += 1
+        name = f"{key}{count}"
+    return found
+
+
+def _short(labels: list[str]) -> tuple[str, ...]:
+    """Labels without their subjects where that leaves them unique."""
+    last = [label.rpartition(":")[2] for label in labels]
+    counts = Counter(last)
+    return tuple(short if short and counts[short] == 1 else label for label, short in zip(labels, last, strict=True))

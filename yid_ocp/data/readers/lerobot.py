@@ -1,0 +1,244 @@
+"""LeRobot datasets (versions 2.0, 2.1 and 3.0): state and action of one episode as joints."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from yid_ocp.data.readers.base import PREVIEWS, READERS, Contents, Source, finished, guessed_units
+from yid_ocp.data.recording import Array, JointGroup, Recording
+from yid_ocp.errors import DataError, nearest
+from yid_ocp.files import file_sha256
+
+_STATE, _ACTION = "observation.state", "action"
+_CHANNELS = {
+    "observation.velocity": "velocity",
+    "observation.effort": "effort",
+    "observation.state.velocity": "velocity",
+    "observation.state.effort": "effort",
+}
+"""Features beside state and action that some robots record, one number for each joint of the state."""
+_SUFFIXES = {"pos": "position", "vel": "velocity", "torque": "effort", "effort": "effort", "current": "effort"}
+_VERSIONS = ("v2.0", "v2.1", "v3.0")
+
+
+@dataclass(frozen=True)
+class _Dataset:
+    """What `meta/info.json` says: frames a second, features by name, number of episodes, and the whole text's data."""
+
+    folder: Path
+    rate: float
+    features: Mapping[str, Mapping[str, Any]]
+    episodes: int
+    info: Mapping[str, Any]
+
+
+@READERS.register("LeRobot dataset")
+def read_lerobot(
+    path: str | os.PathLike[str],
+    *,
+    episode: int = 0,
+    joints: Sequence[str] | None = None,
+    units: Mapping[str, str] | None = None,
+    torque_constants: Mapping[str, float] | None = None,
+    gears: Mapping[str, float] | None = None,
+    description: str = "",
+) -> Recording:
+    """Read one episode of a LeRobot dataset.
+
+    `observation.state` is the measured position of the joints, or position, velocity and effort where the names of its
+    entries end in `.pos`, `.vel` and `.torque`, `.effort` or `.current`; `action` is the commanded position. Times are
+    frame numbers over the frames a second, a nominal clock. Images and other features are in `notes`.
+
+    Parameters
+    ----------
+    path : path-like
+        Folder of the dataset, with `meta/info.json`.
+    episode : int
+        Which one, from zero on.
+    joints : sequence of str, optional
+        Joints to keep, `name` or `recorded=name`, in this order: a gripper that is not in the model is left out so.
+    units, torque_constants, gears
+        As `yid_ocp.data.readers.base.finished`. Many of these robots record degrees.
+    description : str
+        What was recorded.
+
+    Returns
+    -------
+    Recording
+        The checked recording.
+
+    Raises
+    ------
+    DataError
+        If `pyarrow` is not installed, the dataset is not understood or has no such episode, or as `validate`.
+    """
+    dataset = _dataset(Path(path))
+    table, file = _episode(dataset, episode)
+    names, channels, left = _channels(dataset, table)
+    t = np.asarray(table["frame_index"], float) / dataset.rate
+    raw = Recording(
+        JointGroup(names, t - t[0], clock="nominal", **channels),
+        (),
+        description,
+        f"{dataset.folder.name}, episode {episode}",
+        f"{dataset.folder.name}_{episode:06d}",
+        file_sha256(file),
+        notes=tuple(f"{name} was left out ({why})" for name, why in left),
+    )
+    where = f"{dataset.folder}, episode {episode}"
+    return finished(raw, where, joints=joints, units=units, torque_constants=torque_constants, gears=gears)
+
+
+@PREVIEWS.register("LeRobot dataset")
+def preview_lerobot(path: str | os.PathLike[str]) -> Contents:
+    """What a LeRobot dataset holds, by its first episode; errors as `read_lerobot`."""
+    dataset = _dataset(Path(path))
+    table, _ = _episode(dataset, 0)
+    names, channels, left = _channels(dataset, table)
+    group = JointGroup(names, np.asarray(table["frame_index"], float) / dataset.rate, clock="nominal", **channels)
+    why, count = dict(left), len(group.t)
+    sources = tuple(
+        Source(
+            name,
+            str(feature.get("dtype", "")),
+            count,
+            dataset.rate,
+            "" if name in why else ("position_command" if name == _ACTION else f"joints {', '.join(names)}"),
+            why.get(name, ""),
+        )
+        for name, feature in dataset.features.items()
+    )
+    units, guesses = guessed_units(Recording(group))
+    options: dict[str, Any] = {"episode": 0, "joints": list(names)}
+    if units:
+        options["units"] = units | ({"position_command": units["position"]} if "position" in units else {})
+    said = f"{dataset.episodes} episodes at {dataset.rate:g} Hz, {dataset.info.get('codebase_version', 'no version')}"
+    robot = dataset.info.get("robot_type")
+    return Contents(sources, options, (said + (f", recorded on {robot}" if robot else ""), *guesses))
+
+
+def _dataset(folder: Path) -> _Dataset:
+    file = folder / "meta" / "info.json"
+    where = str(file)
+    try:
+        info = json.loads(file.read_text(encoding="utf-8"))
+        version = str(info["codebase_version"])
+        rate, features = float(info["fps"]), dict(info["features"])
+        episodes = int(info.get("total_episodes", 0))
+    except FileNotFoundError as error:
+        raise DataError("the dataset has no meta/info.json", where=where, allowed="a LeRobot dataset") from error
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        what = f"the description of the dataset is not understood ({type(error).__name__}: {error})"
+        raise DataError(what, where=where, allowed="codebase_version, fps and features in JSON") from error
+    if version not in _VERSIONS:
+        hint = "convert it with the tools of LeRobot"
+        raise DataError(f"the dataset is of version {version}", where=where, allowed=", ".join(_VERSIONS), hint=hint)
+    if not (math.isfinite(rate) and rate > 0):
+        raise DataError(f"the dataset has {rate:g} frames a second", where=where, allowed="a number above 0")
+    if _STATE not in features:
+        hint = nearest(_STATE, features)
+        raise DataError(f"the dataset has no {_STATE}", where=where, allowed=", ".join(features), hint=hint)
+    return _Dataset(folder, rate, features, episodes, info)
+
+
+def _episode(dataset: _Dataset, episode: int) -> tuple[Mapping[str, Any], Path]:
+    """Columns of one episode, and the file in which it stands."""
+    try:
+        from pyarrow import ArrowException, parquet
+    except ImportError as error:
+        hint = "pip install 'yid-ocp[lerobot]'"
+        raise DataError("reading LeRobot datasets needs pyarrow", where=str(dataset.folder), hint=hint) from error
+    where = f"{dataset.folder}, episode {episode}"
+    allowed = f"0 to {dataset.episodes - 1}" if dataset.episodes else "an episode that was recorded"
+    if episode < 0 or (dataset.episodes and episode >= dataset.episodes):
+        raise DataError(f"there is no episode {episode}", where=str(dataset.folder), allowed=allowed)
+    files = _files(dataset, episode)
+    wanted = [name for name in (_STATE, _ACTION, *_CHANNELS) if name in dataset.features]
+    columns = [*wanted, "frame_index", "episode_index"]
+    for file in files:
+        try:
+            table = parquet.read_table(file, columns=columns, filters=[("episode_index", "=", episode)])
+            found = {name: table[name].to_pylist() for name in columns}
+        except (ArrowException, OSError, KeyError, ValueError) as error:
+            what = f"the table of the episode cannot be read ({type(error).__name__}: {error})"
+            raise DataError(what, where=str(file), allowed=f"a parquet file with {', '.join(columns)}") from error
+        if found["frame_index"]:
+            return found, file
+    raise DataError("no table has the episode", where=where, allowed=allowed, hint="download the whole dataset")
+
+
+def _files(dataset: _Dataset, episode: int) -> list[Path]:
+    """Tables in which an episode may stand: its own one in version 2, any in version 3."""
+    pattern = str(dataset.info.get("data_path", ""))
+    size = dataset.info.get("chunks_size") or 1000
+    if "episode_index" in pattern:
+        try:
+            return [dataset.folder / pattern.format(episode_chunk=episode // int(size), episode_index=episode)]
+        except (KeyError, ValueError, IndexError, TypeError) as error:
+            where = str(dataset.folder / "meta" / "info.json")
+            raise DataError(f"data_path is '{pattern}'", where=where, allowed="episode_chunk, episode_index") from error
+    return sorted(dataset.folder.glob("data/*/*.parquet"))
+
+
+def _channels(
+    dataset: _Dataset, table: Mapping[str, Any]
+) -> tuple[tuple[str, ...], dict[str, Any], list[tuple[str, str]]]:
+    """Joints, their channels, and the features that are left out, with the reason."""
+    state = _matrix(table[_STATE], _STATE, dataset.folder)
+    entries = [_entry(name) for name in _names(dataset, _STATE, state.shape[1])]
+    joints = tuple(dict.fromkeys(joint for joint, channel in entries if channel == "position"))
+    channels: dict[str, Any] = {}
+    for channel in dict.fromkeys(channel for _, channel in entries):
+        at = [entries.index((joint, channel)) for joint in joints if (joint, channel) in entries]
+        if len(at) < len(joints):
+            what = f"{_STATE} has the {channel} of {len(at)} of {len(joints)} joints"
+            raise DataError(what, where=str(dataset.folder), allowed="every channel for all joints")
+        channels[channel] = state[:, at]
+    left = []
+    for name in dataset.features:
+        if name in (_STATE, "timestamp", "frame_index", "episode_index", "index", "task_index"):
+            continue
+        target = "position_command" if name == _ACTION else _CHANNELS.get(name)
+        if target is None:
+            left.append((name, f"a {dataset.features[name].get('dtype', 'feature')} feature that is not understood"))
+            continue
+        values = _matrix(table[name], name, dataset.folder)
+        named = [_entry(entry)[0] for entry in _names(dataset, name, values.shape[1])]
+        if set(joints) <= set(named):
+            channels.setdefault(target, values[:, [named.index(joint) for joint in joints]])
+        else:
+            left.append((name, f"its {len(named)} entries are not those of {_STATE}"))
+    return joints, channels, left
+
+
+def _matrix(rows: Sequence[Any], name: str, folder: Path) -> Array:
+    try:
+        matrix = np.array(rows, float)
+    except (TypeError, ValueError) as error:
+        what = f"{name} is not a list of as many numbers in every frame"
+        raise DataError(what, where=str(folder), allowed="numbers") from error
+    return matrix[:, None] if matrix.ndim == 1 else matrix.reshape(len(matrix), -1)
+
+
+def _names(dataset: _Dataset, feature: str, count: int) -> list[str]:
+    """Names of a feature's entries: a list, lists by kind of motor, or numbers where there are none."""
+    said = dataset.features[feature].get("names")
+    if isinstance(said, Mapping):
+        parts = [list(part) if isinstance(part, (list, tuple)) else [key] for key, part in said.items()]
+        said = [name for part in parts for name in part]
+    names = [str(name) for name in said] if isinstance(said, (list, tuple)) else []
+    return names if len(names) == count and len(set(names)) == count else [f"joint_{i}" for i in range(count)]
+
+
+def _entry(name: str) -> tuple[str, str]:
+    """Joint and channel of an entry's name."""
+    joint, _, suffix = name.rpartition(".")
+    return (joint, _SUFFIXES[suffix]) if joint and suffix in _SUFFIXES else (name, "position")

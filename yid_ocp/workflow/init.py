@@ -1,0 +1,244 @@
+"""The command `init`: a commented configuration from a robot, recordings of it and a few numbers of the object."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from yid_ocp.config.reader import load_config
+from yid_ocp.config.schema import schema
+from yid_ocp.data import Recording, read_recording, write_recording
+from yid_ocp.errors import ConfigError, DataError, OutputError
+from yid_ocp.files import new_file, write_text
+from yid_ocp.model.urdf import read_urdf
+from yid_ocp.workflow.build import build_system
+from yid_ocp.workflow.command import DONE, print_lines
+from yid_ocp.workflow.commented import Object, configuration
+from yid_ocp.workflow.import_recording import given_options, imported
+from yid_ocp.workflow.proposal import Branch, Proposal, propose, relative, split_at_rest
+
+SCHEMA = "yid-ocp.schema.json"
+OWN = (".h5", ".hdf5")
+LINKS = {"cable": 8, "beam": 6, "tree": 4, "y": 4}
+NEEDED = {"cable": ("length", "mass", "radius"), "beam": ("length", "mass"), "tree": (), "y": ()}
+MEANING = {"length": "its length [m]", "mass": "its mass [kg]", "radius": "its radius [m]"}
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """The command."""
+    out = Path(arguments.out)
+    if out.suffix not in (".yaml", ".yml"):
+        raise ConfigError(f"the configuration is called '{out.name}'", where="--out", allowed="NAME.yaml")
+    read_urdf(arguments.robot)
+    item = described(arguments)
+    made = _recordings(arguments, out)
+    recordings = [recording or read_recording(file) for file, recording in made.items()]
+    proposal = propose(
+        arguments.robot,
+        recordings,
+        item.branches,
+        holder=arguments.holder,
+        grasps=_grasps(arguments.grasp),
+        standing=item.kind == "y",
+    )
+    made = _split(made, recordings, proposal, out)
+    _refuse_existing([out, *(file for file, raw in made.items() if raw is not None)], arguments.replace)
+    imports = given_options(arguments)
+    robot = arguments.robot
+    where = robot if robot.startswith("package:") else relative(robot, out.parent)
+    files = [relative(file, out.parent) for file in made]
+    text = configuration(where, item, proposal, files, imports, SCHEMA)
+    _write(out, text, {file: raw for file, raw in made.items() if raw is not None})
+    if not arguments.quiet:
+        print_lines(summary(proposal, out))
+    print(out if arguments.quiet else f"configuration: {out}")
+    return DONE
+
+
+# -- what was asked ---------------------------------------------------------------------------------------------------
+
+
+def described(arguments: argparse.Namespace) -> Object:
+    """The object that the options of the command describe.
+
+    Raises
+    ------
+    ConfigError
+        A number that is missing or impossible; the error names its option.
+    """
+    kind = arguments.object
+    links = LINKS[kind] if arguments.links is None else arguments.links
+    if not 1 <= links <= 64:
+        raise ConfigError(f"the object has {links} links", where="--links", allowed="1 to 64")
+    if kind == "y":
+        return Object(kind, (), links)
+    for name in ("length", "mass", "radius"):
+        value = getattr(arguments, name)
+        if value is not None and not 0 < value < float("inf"):
+            raise ConfigError(f"the {name} is {value:g}", where=f"--{name}", allowed="a number above 0")
+    if arguments.branch:
+        if kind != "tree":
+            raise ConfigError(f"a {kind} has no branches", where="--branch", allowed="--object tree")
+        return Object(kind, _grown([_branch(text) for text in arguments.branch]), links)
+    needed = ("length", "mass", "radius") if kind == "tree" and arguments.branches else NEEDED[kind]
+    section = _numbers(arguments.section, 2, "--section") if arguments.section else None
+    for name in needed:
+        if getattr(arguments, name) is None:
+            what = f"each branch of a tree needs a {name}" if kind == "tree" else f"a {kind} needs a {name}"
+            raise ConfigError(what, where=f"--{name}", allowed=MEANING[name], hint=f"add --{name} NUMBER")
+    if kind == "tree" and not arguments.branches:
+        raise ConfigError(
+            "a tree needs branches",
+            where="--branch",
+            allowed="--branch NAME=LENGTH,MASS,RADIUS[,ROLL,PITCH,YAW] for each, or --branches NUMBER of equal ones",
+            hint="--branches 4 --length 0.4 --mass 0.03 --radius 0.008",
+        )
+    if kind == "beam" and section is None and arguments.radius is None:
+        hint = "add --radius NUMBER, or --section WIDTH,HEIGHT"
+        raise ConfigError("a beam needs a radius or a section", where="--radius", allowed=MEANING["radius"], hint=hint)
+    size = None if section is None else (section[0], section[1])
+    if kind != "tree":
+        radius = None if size else arguments.radius
+        return Object(kind, (Branch(kind, arguments.length, arguments.mass, radius, size),), links)
+    return Object(kind, _star(arguments.branches, arguments.length, arguments.mass, arguments.radius), links)
+
+
+def _star(count: int, length: float, mass: float, radius: float) -> tuple[Branch, ...]:
+    """Equal branches across the z axis of what holds them, the first one along its x axis."""
+    if not 1 <= count <= 16:
+        raise ConfigError(f"the tree has {count} branches", where="--branches", allowed="1 to 16")
+    quarter = 1.5707963
+    return tuple(
+        Branch(f"b{i + 1}", length, mass, radius, rpy=(0.0, quarter, round(4 * quarter * i / count, 7)))
+        for i in range(count)
+    )
+
+
+def _grown(branches: Sequence[Branch]) -> tuple[Branch, ...]:
+    """The branches, each with a name of its own and on one that comes before it."""
+    names: list[str] = []
+    for branch in branches:
+        if branch.name in names:
+            raise ConfigError(f"two branches are called '{branch.name}'", where="--branch", allowed="a name for each")
+        if branch.parent is not None and branch.parent not in names:
+            what = f"branch '{branch.name}' grows on '{branch.parent}', which does not come before it"
+            raise ConfigError(what, where="--branch", allowed=", ".join(names) or "the holder alone")
+        names.append(branch.name)
+    return tuple(branches)
+
+
+def _branch(text: str) -> Branch:
+    said, equals, numbers = text.partition("=")
+    name, at, parent = said.partition("@")
+    shape = "NAME=LENGTH,MASS,RADIUS, or with ROLL,PITCH,YAW; NAME@PARENT grows on the end of PARENT"
+    count = len(numbers.split(","))
+    if not (name and equals) or (at and not parent) or count not in (3, 6):
+        raise ConfigError(f"'{text}' describes no branch", where="--branch", allowed=shape)
+    values = _numbers(numbers, count, "--branch")
+    if min(values[:3]) <= 0:
+        raise ConfigError(f"'{text}' has a size that is not above 0", where="--branch", allowed=shape)
+    turn = (values[3], values[4], values[5]) if count == 6 else (0.0, 0.0, 0.0)
+    return Branch(name, values[0], values[1], values[2], rpy=turn, parent=parent or None)
+
+
+def _numbers(text: str, count: int, flag: str) -> list[float]:
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != count or not all(abs(value) < float("inf") for value in values):
+        raise ConfigError(f"'{text}' is not {count} numbers", where=flag, allowed=f"{count} numbers with commas")
+    return values
+
+
+def _grasps(given: Sequence[str]) -> dict[str, str]:
+    grasps = {}
+    for text in given:
+        frame, equals, point = text.partition("=")
+        if not (frame and equals and point):
+            raise ConfigError(f"'{text}' is no grasp", where="--grasp", allowed="FRAME=POINT, such as tool0=w_cable")
+        grasps[frame] = point
+    return grasps
+
+
+# -- files ------------------------------------------------------------------------------------------------------------
+
+
+def _recordings(arguments: argparse.Namespace, out: Path) -> dict[Path, Recording | None]:
+    """Files of the recordings; with what is to be written there where they are of another tool."""
+    options = given_options(arguments)
+    made: dict[Path, Recording | None] = {}
+    for name in arguments.files:
+        file = Path(name)
+        if file.suffix.lower() in OWN:
+            if options:
+                flags = ", ".join(options)
+                raise ConfigError(f"{file.name} is a recording already", where=flags, hint="leave these options out")
+            made[file] = None
+        else:
+            recording = imported(file, options)
+            made[out.parent / f"{recording.name}.h5"] = recording
+    if len(made) < len(arguments.files):
+        raise DataError("two of the files would become one recording", where=", ".join(arguments.files))
+    return made
+
+
+def _split(
+    made: dict[Path, Recording | None], recordings: Sequence[Recording], proposal: Proposal, out: Path
+) -> dict[Path, Recording | None]:
+    """A single recording in two files where it comes to rest in between, the second one to be held out."""
+    if len(recordings) > 1:
+        return made
+    [whole] = recordings
+    time = split_at_rest(whole, proposal.joints)
+    if time is None:
+        return made
+    first, last = (min(g.t[0] for g in whole.groups), max(g.t[-1] for g in whole.groups))
+    note = f"of {whole.source or whole.name}, from {{:.6g}} s to {{:.6g}} s"
+    parts = {"estimate": (first, time), "held_out": (time, last)}
+    return {
+        out.parent / f"{whole.name}_{name}.h5": replace(
+            whole.slice(*span), name=f"{whole.name}_{name}", notes=(*whole.notes, note.format(*span))
+        )
+        for name, span in parts.items()
+    }
+
+
+def _refuse_existing(files: Sequence[Path], allowed: bool) -> None:
+    for file in files:
+        if file.exists() and not allowed:
+            raise OutputError("the file is there already", where=str(file), hint="choose another --out, or --replace")
+
+
+def _write(out: Path, text: str, made: Mapping[Path, Recording]) -> None:
+    """The recordings, the configuration, which is loaded before it gets its name, and its schema; all or nothing."""
+    before = {file for file in made if file.exists()}
+    try:
+        for file, recording in made.items():
+            write_recording(recording, file)
+        with new_file(out) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+            build_system(load_config(temporary))
+    except BaseException:
+        for file in set(made) - before:
+            file.unlink(missing_ok=True)
+        raise
+    write_text(out.parent / SCHEMA, json.dumps(schema(), indent=1) + "\n")
+
+
+def summary(proposal: Proposal, out: Path) -> list[str]:
+    """Lines that tell a person what was found and what comes next."""
+    held = ", ".join(dict.fromkeys([proposal.holder, *proposal.grasps]))
+    lines = [
+        f"joints: {', '.join(proposal.joints)}",
+        f"held by: {held}",
+        f"mode: {proposal.mode}: {proposal.mode_why}",
+        f"start: {proposal.start}: {proposal.start_why}",
+    ]
+    for group, places in proposal.places.items():
+        lines += [f"{group}: {place.point} at {place.frame or '?'}, {place.why}" for place in places]
+    lines += ["", f"next: yid-ocp check {out}, then yid-ocp solve {out}", ""]
+    return lines
