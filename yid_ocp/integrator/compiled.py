@@ -13,6 +13,7 @@ from yid_ocp.errors import ModelError
 from yid_ocp.integrator import codegen, compiler
 from yid_ocp.integrator.step_model import (
     ITERATION_LIMIT,
+    REST_ITERATION_LIMIT,
     Directions,
     Feedback,
     Gradient,
@@ -231,6 +232,19 @@ class CompiledKernel:
         )
         self._check(code, outcome)
         return out
+
+    def rest(
+        self, theta: Array, unknowns: Array, given: Array, held: Array, stiffness: float, tolerance: float
+    ) -> tuple[Array, float, bool]:
+        """See `Kernel.rest`."""
+        nu, driven = len(held), np.array(self._model.system.driven_indices, np.int32)
+        hold = _filled(_Feedback, nu, driven, stiffness * np.eye(nu), _doubles(given[:nu])) if nu else None
+        inputs = (_doubles(theta), _doubles(held), _doubles(given[nu:]))
+        motion = _filled(_Motion, 1, REST_ITERATION_LIMIT, self._model.time_step, tolerance, *inputs, hold, None)
+        w, outcome = np.array(unknowns, float), _Outcome()
+        code = self._library.yid_rest(ctypes.byref(motion), ctypes.c_void_p(w.ctypes.data), ctypes.byref(outcome))
+        self._check(code, outcome)
+        return w, outcome.error, code == StepCode.OK
 
     def _motion(
         self,

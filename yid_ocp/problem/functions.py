@@ -5,7 +5,7 @@ A problem that frees part of it takes the columns that it needs, so that any num
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,9 +88,8 @@ class ModelFunctions:
     def rest(
         self, posture: Array, theta: Array, torque: Array | None, guess: Array | None, wanted: tuple[str, ...]
     ) -> Rest:
-        """The equilibrium at a posture, differentiated by some of `names`; see `Statics.solve`."""
-        rest = self.statics.solve(posture, theta, torque, guess, self.names if wanted else ())
-        return replace(rest, by_theta=rest.by_theta[:, list(self.columns(wanted))]) if wanted else rest
+        """The equilibrium at a posture, differentiated by named parameters; see `Statics.solve`."""
+        return self.statics.solve(posture, theta, torque, guess, wanted)
 
     def columns(self, wanted: tuple[str, ...]) -> tuple[int, ...]:
         """Places of some of `names`."""
