@@ -164,11 +164,14 @@ class _Update:
 
 def _filter(model: Linear, variance: Array, smooth: bool) -> _Pass:
     """Run through one recording with given variances of the unknowns, shape (nd,)."""
+    # without smoothing nobody asks for the scores of unknowns that are known to be zero
+    used = np.flatnonzero(variance > 0) if not smooth else np.arange(len(variance))
+    variance = variance[used]
     ns, nd = len(model.loose), len(variance)
     size, columns = ns + nd, model.intervals[0].observed.shape[1]
     fresh = np.zeros((size, size))
     fresh[ns:, ns:] = (1 - model.decay**2) * np.diag(variance)
-    begin = np.vstack([model.at_rest, np.eye(nd)])
+    begin = np.vstack([model.at_rest[:, used], np.eye(nd)])
     p = (begin * variance) @ begin.T
     p[np.arange(ns), np.arange(ns)] += model.loose**2
     mean = np.zeros((size, columns))
@@ -176,7 +179,7 @@ def _filter(model: Linear, variance: Array, smooth: bool) -> _Pass:
     empty = np.zeros(0)
     updates: list[_Update] = []
     for interval in model.intervals:
-        design = np.hstack([interval.by_state, interval.by_unknown])
+        design = np.hstack([interval.by_state, interval.by_unknown[:, used]])
         products += interval.rest
         cross = p @ design.T
         innovation = interval.observed - design @ mean
@@ -188,7 +191,7 @@ def _filter(model: Linear, variance: Array, smooth: bool) -> _Pass:
         products += white.T @ white
         log_determinant += 2 * float(np.sum(np.log(np.diag(factor))))
         move = np.zeros((size, size))
-        move[:ns, :ns], move[:ns, ns:] = interval.transition, interval.drive
+        move[:ns, :ns], move[:ns, ns:] = interval.transition, interval.drive[:, used]
         move[ns:, ns:] = model.decay * np.eye(nd)
         if smooth:
             updates.append(_Update(mean, p, factor, white, shaped, move))

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.integrator.lqr import MomentumShift
+from yid_ocp.integrator.lqr import MomentumShift, arms_alone
 from yid_ocp.integrator.mapped import Mapped
 from yid_ocp.integrator.statics import Rest, Statics
 from yid_ocp.integrator.step import Step
@@ -61,6 +61,7 @@ class ModelFunctions:
         self._start_parameters = start_parameters
         self._statics: Once[None, Statics] = Once(lambda _: Statics(step))
         self._start_fit: Once[None, StartFit] = Once(lambda _: StartFit(step, start_parameters))
+        self._arms: Once[None, Step] = Once(lambda _: arms_alone(step))
         self._momentum: Once[None, MomentumShift] = Once(lambda _: MomentumShift(step))
         self._sensors: Once[tuple[Sensor, bool], Mapped] = Once(self._compiled)
 
@@ -73,6 +74,11 @@ class ModelFunctions:
     def start_fit(self) -> StartFit:
         """The fit of a start to points."""
         return self._start_fit(None)
+
+    @property
+    def arms(self) -> Step:
+        """The step of the driven joints alone, about which the tracking filter is worked out."""
+        return self._arms(None)
 
     @property
     def momentum_shift(self) -> MomentumShift:
