@@ -232,13 +232,12 @@ def _backwards(
         done = updates[j]
         if j + 1 < count:
             score[j + 1], information[j + 1] = gain * r[ns:], gain**2 * np.diag(n)[ns:]
-        pull = done.white - done.shaped @ (done.p @ (done.move.T @ r))
+        pull = done.white - done.half @ (done.move.T @ r)
         left.append(scipy.linalg.solve_triangular(done.factor, pull, lower=True, trans="T", check_finite=False))
         # L = T (I - P H' S^-1 H)
-        square = done.shaped.T @ done.shaped
-        loop = done.move - (done.move @ done.p) @ square
+        loop = done.move - (done.move @ done.half.T) @ done.shaped
         r = done.shaped.T @ done.white + loop.T @ r
-        n = square + loop.T @ n @ loop
+        n = done.shaped.T @ done.shaped + loop.T @ n @ loop
         n = (n + n.T) / 2
         smoothed[j] = (done.mean + done.p @ r)[ns:]
         own = done.p[ns:]
