@@ -148,6 +148,12 @@ class CompiledKernel:
         self._library = library
         self._theta_columns: Once[tuple[str, ...], _ThetaColumns] = Once(lambda names: _theta_columns(model, names))
 
+    def of(self, model: StepModel) -> CompiledKernel:
+        """See `Kernel.of`."""
+        other = CompiledKernel(model, self._library)
+        other._theta_columns = self._theta_columns
+        return other
+
     def rollout(
         self,
         theta: Array,
@@ -284,7 +290,7 @@ def _theta_columns(model: StepModel, names: tuple[str, ...]) -> _ThetaColumns:
     shapes = [function.size_out(i) for i in range(function.n_out())]
     if shapes != [(count, len(names)) for count in rows]:
         raise ValueError(f"derivatives by {len(names)} parameters have the shapes {shapes}, not the rows {rows}")
-    library = compiler.compile_library(codegen.functions_source(function.name(), (function,)), straight_line=True)
+    library = compiler.compile_library(codegen.functions_source(function.name(), (function,)))
     if library is None:
         raise ModelError("the compiler worked for the step but not for its derivatives", hint="set CC=none")
     address = ctypes.cast(library.by_theta, ctypes.c_void_p).value

@@ -57,6 +57,12 @@ class InterpretedKernel:
         self._residual = np.concatenate([free, np.arange(sizes["n"], self._rows)])
         self._p1, self._effort = slice(self._rows, self._rows + sizes["n"]), slice(self._rows + sizes["n"], None)
 
+    def of(self, model: StepModel) -> InterpretedKernel:
+        """See `Kernel.of`."""
+        other = InterpretedKernel(model)
+        other._functions, other._rest = self._functions, self._rest
+        return other
+
     def _evaluators(self) -> list[Evaluator]:
         """Outputs at a point, the slope of the residual by the unknowns, and that of the outputs by the point."""
         return [_evaluator(function) for function in self._functions(None)]

@@ -77,8 +77,13 @@ def step_model(
         "ntheta": e.theta.numel(),
     }
     if tolerance is None:
-        tolerance = max(ROUNDING, min(TOLERANCE, RATE_TOLERANCE * time_step))
+        tolerance = newton_tolerance(time_step)
     return StepModel(system, e, functions, codegen.structure(functions), sizes, float(time_step), tolerance)
+
+
+def newton_tolerance(time_step: float) -> float:
+    """Newton's tolerance on the coordinates [rad or m] for a step of so many seconds."""
+    return max(ROUNDING, min(TOLERANCE, RATE_TOLERANCE * time_step))
 
 
 class StepCode(IntEnum):
@@ -287,6 +292,10 @@ class StepLinearization:
 
 class Kernel(Protocol):
     """What the compiled and the interpreted implementation have in common."""
+
+    def of(self, model: StepModel) -> Kernel:
+        """The kernel of the same equations at another length of the step."""
+        ...
 
     def rollout(
         self,
