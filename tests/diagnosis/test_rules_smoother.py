@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -202,14 +203,20 @@ def test_variances_stay_within_their_range():
 
 
 def test_the_best_variance_of_a_group_is_searched_over_all_sizes():
-    models = [made(3, size=np.array([30.0, 0.0, 0.0]))]
-    evidence, size = smoother._largest_evidence(models, NOTHING, FORCE)
+    models = [made(3, size=np.array([30.0, 0.0, 0.0])), made(4, size=np.array([20.0, 0.0, 0.0]))]
+    evidence, size = smoother._largest_evidence(smoother._bases(models, NOTHING), FORCE)
     assert evidence == pytest.approx(Dense(models, NOTHING | {FORCE: size}).evidence, rel=1e-9)
     assert evidence > Dense(models, NOTHING | {FORCE: 4 * size}).evidence
     assert evidence > Dense(models, NOTHING | {FORCE: size / 4}).evidence
     base = NOTHING | {OTHER_FORCE: 1.0}
-    more, at = smoother._largest_evidence(models, base, FORCE)
+    more, at = smoother._largest_evidence(smoother._bases(models, base), FORCE)
     assert more == pytest.approx(Dense(models, base | {FORCE: at}).evidence, rel=1e-9)
+    # a group may hold several unknowns, and some of them errors that are known
+    both = [replace(model, sources=(FORCE, FORCE, BIAS), known=np.array([0.0, 0.4, 0.0])) for model in models]
+    some = {FORCE: 0.0, BIAS: 0.3}
+    most, here = smoother._largest_evidence(smoother._bases(both, some), FORCE)
+    assert most == pytest.approx(smoother._run(both, some | {FORCE: here}, smooth=False).evidence, rel=1e-9)
+    assert most > smoother._run(both, some, smooth=False).evidence + 1
 
 
 @pytest.mark.parametrize("column", [0, 1, 2])

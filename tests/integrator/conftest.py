@@ -108,7 +108,10 @@ def creeping_grasp(grasp: str, rate: float) -> Added:
     def add(effect, state):
         held = next(g.held for g in state.system.grasps if g.name == grasp)
         load = ca.dot(state.kinematics.pose(held).rotation[:, 2], state.constraint_force[:3])
-        return Terms(internal={name: state.z_rate[state.internal[name]] - effect.parameters.symbols[0] * load})
+        row, rate = state.internal[name], effect.parameters.symbols[0]
+        # where it has long stood, as far as the load would have it creep in a second
+        at_rest = {name: state.z[row] - rate * load}
+        return Terms(internal={name: state.z_rate[row] - rate * load}, at_rest=at_rest)
 
     return Added("creep", grasp, parameters, internal, change, add)
 

@@ -47,6 +47,9 @@ def test_no_memory_is_said_by_every_entry_point(poor, step, parts, urdf_folder):
     )
     trajectory = (case.theta, plain.state, plain.multipliers, plain.torque, names, True)
     assert poor.grants_needed(lambda: kernel.linearize(*trajectory)) == 3
+    given = np.concatenate([case.start[list(case.step.system.driven_indices)], case.path[0]])
+    unknowns = np.zeros(sum(model.sizes[key] for key in ("n", "nz", "m")) - model.sizes["nc"])
+    assert poor.grants_needed(lambda: kernel.rest(case.theta, unknowns, given, case.torque[0], 1e3, 1e-9)) == 4
 
     poor.grants.value = 100
     again = kernel.rollout(*arguments, directions)

@@ -34,8 +34,8 @@ def test_values_at_every_point(use_compiler):
 def test_no_memory(poor, monkeypatch):
     libraries = []
 
-    def poor_library(source, straight_line=False):
-        libraries.append(compiler.compile_library(poor.source + source, straight_line))
+    def poor_library(source):
+        libraries.append(compiler.compile_library(poor.source + source))
         return libraries[-1]
 
     monkeypatch.setattr(mapped, "compile_library", poor_library)
@@ -50,8 +50,8 @@ def test_no_memory(poor, monkeypatch):
 
 @needs_compiler
 def test_a_function_that_fails_gives_no_result(monkeypatch):
-    def failing_library(source, straight_line=False):
-        return compiler.compile_library(source.replace("if (fail_it(", "if (1 || fail_it("), straight_line)
+    def failing_library(source):
+        return compiler.compile_library(source.replace("if (fail_it(", "if (1 || fail_it("))
 
     monkeypatch.setattr(mapped, "compile_library", failing_library)
     x = ca.SX.sym("x")

@@ -8,7 +8,7 @@ import pytest
 
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.statics import HOLD_STIFFNESS, Statics, relaxed
-from yid_ocp.integrator.step import compile_step
+from yid_ocp.integrator.step import compile_alike, compile_step
 from yid_ocp.model import Grasp, Segment, System, flexible_object, forward_kinematics
 from yid_ocp.model.rotations import roll_pitch_yaw
 from yid_ocp.model.system import Spring, floating_clamp
@@ -89,6 +89,23 @@ def test_derivatives_of_an_equilibrium(arm):
         assert np.max(np.abs(expected)) > 1e-3
     np.testing.assert_allclose(rest.by_posture[:, 0], slope(lambda e: (posture + e, theta, torque)), atol=1e-8)
     np.testing.assert_allclose(rest.by_torque[:, 0], slope(lambda e: (posture, theta, torque + e)), atol=1e-8)
+
+
+def test_compiled_and_interpreted_equilibria_are_one(case):
+    """Of every feature of a step; those without a spring have nowhere to rest."""
+    system, names = case.step.system, case.step.system.parameters.names
+    fixed = list(system.prescribed_indices)
+    given = np.concatenate([case.start[list(system.driven_indices)], case.path[0]])
+    torque = 0.3 * case.torque[0] if len(system.driven) else None
+    guess = case.start[: system.size].copy()
+    guess[fixed] = case.path[0]
+    steps = case.step, compile_alike(case.step, system, use_compiler=False)
+    fast, slow = (Statics(step).solve(given, case.theta, torque, guess, names) for step in steps)
+    assert fast.converged == slow.converged == bool(system.elastic), fast.message
+    slopes = ("by_theta", "by_posture", "by_torque") if fast.converged else ()
+    for name in ("state", "torque", "constraint_force", *slopes):
+        expected = getattr(slow, name)
+        np.testing.assert_allclose(getattr(fast, name), expected, rtol=1e-7, atol=1e-8, err_msg=name)
 
 
 def test_a_measured_torque_that_fits_takes_the_load_off_the_holding_spring(arm):

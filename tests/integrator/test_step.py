@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.errors import ConfigError, ModelError
-from yid_ocp.integrator.step import compile_step
+from yid_ocp.integrator.step import at_time_step, compile_step
 from yid_ocp.integrator.step_model import StepCode
 from yid_ocp.model import Grasp, Parameters, Segment, System, Terms, flexible_object, forward_kinematics
 from yid_ocp.model.urdf import read_urdf, robot_description_file
@@ -388,3 +388,25 @@ def test_an_unknown_constraint_force(hinge):
         compile_step(hinge(), 0.01, constraint_force="end")
     assert "constraint_force = 'end'" in str(caught.value)
     assert "node, midpoint" in str(caught.value)
+
+
+@pytest.mark.parametrize("use_compiler", [True, False])
+def test_a_step_of_another_length_is_one_compiled_for_it(parts, use_compiler):
+    system = parts.cable()
+    coarse, expected = (compile_step(system, h, use_compiler=use_compiler) for h in (4e-3, 1e-4))
+    fine = at_time_step(coarse, 1e-4)
+    assert fine.model.tolerance == expected.model.tolerance < coarse.model.tolerance
+    state, theta = np.concatenate([BENT, np.zeros(9)]), system.parameters.vector()
+    names = ("C.bend", "C.twist")
+    for step in (fine, expected):
+        assert step.time_step == 1e-4
+    made, again = (
+        [*step(state[:9], state[9:], [], theta)[:2], *step.jacobians(state[:9], state[9:], [], theta, names=names)]
+        for step in (fine, expected)
+    )
+    for one, other in zip(made, again, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert coarse.time_step == 4e-3
+    assert np.max(np.abs(coarse(state[:9], state[9:], [], theta)[0] - made[0])) > 1e-6
+    with pytest.raises(ModelError, match="time_step = 0"):
+        at_time_step(coarse, 0.0)

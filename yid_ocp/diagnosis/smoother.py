@@ -151,7 +151,8 @@ class _Update:
     """One interval of the filter, as its backward pass needs it.
 
     Prediction `mean` (ns + nd, 1 + ntheta) and covariance `p` of states and unknowns, the lower `factor` of the
-    innovations' covariance, innovations `white` and design `shaped` divided by it, and the `move` to the next interval.
+    innovations' covariance, innovations `white` and design `shaped` divided by it, `half` = `shaped` `p`, and the
+    `move` to the next interval.
     """
 
     mean: Array
@@ -159,46 +160,59 @@ class _Update:
     factor: Array
     white: Array
     shaped: Array
+    half: Array
     move: Array
 
 
 def _filter(model: Linear, variance: Array, smooth: bool) -> _Pass:
     """Run through one recording with given variances of the unknowns, shape (nd,)."""
+    updates: list[_Update] = []
+    products, log_determinant, begin = _forwards(model, variance, updates if smooth else None)
+    if not updates or math.isinf(log_determinant):
+        empty = np.zeros(0)
+        return _Pass(products, log_determinant, empty, empty, empty, empty, ())
+    return _Pass(products, log_determinant, *_backwards(model, begin, updates))
+
+
+def _forwards(model: Linear, variance: Array, updates: list[_Update] | None) -> tuple[Array, float, Array]:
+    """`products` and `log_determinant` of `_Pass`, and `begin` of `_backwards`; keeps its updates where they are asked.
+
+    The determinant is infinite where variances are so large that rounding shows: they are never the best.
+    """
+    # nobody asks for the scores of unknowns that are known to be zero
+    used = np.flatnonzero(variance > 0) if updates is None else np.arange(len(variance))
+    variance = variance[used]
     ns, nd = len(model.loose), len(variance)
     size, columns = ns + nd, model.intervals[0].observed.shape[1]
     fresh = np.zeros((size, size))
     fresh[ns:, ns:] = (1 - model.decay**2) * np.diag(variance)
-    begin = np.vstack([model.at_rest, np.eye(nd)])
+    begin = np.vstack([model.at_rest[:, used], np.eye(nd)])
     p = (begin * variance) @ begin.T
     p[np.arange(ns), np.arange(ns)] += model.loose**2
     mean = np.zeros((size, columns))
     products, log_determinant = np.zeros((columns, columns)), 0.0
-    empty = np.zeros(0)
-    updates: list[_Update] = []
     for interval in model.intervals:
-        design = np.hstack([interval.by_state, interval.by_unknown])
+        design = np.hstack([interval.by_state, interval.by_unknown[:, used]])
         products += interval.rest
         cross = p @ design.T
         innovation = interval.observed - design @ mean
         factor, failed = scipy.linalg.lapack.dpotrf(design @ cross + np.eye(len(design)), lower=1)
-        if failed:  # variances so large that rounding shows: never the best
-            return _Pass(products, np.inf, empty, empty, empty, empty, ())
+        if failed:
+            return products, math.inf, begin
         white = scipy.linalg.solve_triangular(factor, innovation, lower=True, check_finite=False)
         shaped = scipy.linalg.solve_triangular(factor, design, lower=True, check_finite=False)
         products += white.T @ white
         log_determinant += 2 * float(np.sum(np.log(np.diag(factor))))
         move = np.zeros((size, size))
-        move[:ns, :ns], move[:ns, ns:] = interval.transition, interval.drive
+        move[:ns, :ns], move[:ns, ns:] = interval.transition, interval.drive[:, used]
         move[ns:, ns:] = model.decay * np.eye(nd)
-        if smooth:
-            updates.append(_Update(mean, p, factor, white, shaped, move))
         half = shaped @ p
+        if updates is not None:
+            updates.append(_Update(mean, p, factor, white, shaped, half, move))
         mean = move @ (mean + half.T @ white)
         p = move @ (p - half.T @ half) @ move.T + fresh
         p = (p + p.T) / 2
-    if not smooth:
-        return _Pass(products, log_determinant, empty, empty, empty, empty, ())
-    return _Pass(products, log_determinant, *_backwards(model, begin, updates))
+    return products, log_determinant, begin
 
 
 def _backwards(
@@ -218,13 +232,12 @@ def _backwards(
         done = updates[j]
         if j + 1 < count:
             score[j + 1], information[j + 1] = gain * r[ns:], gain**2 * np.diag(n)[ns:]
-        pull = done.white - done.shaped @ (done.p @ (done.move.T @ r))
+        pull = done.white - done.half @ (done.move.T @ r)
         left.append(scipy.linalg.solve_triangular(done.factor, pull, lower=True, trans="T", check_finite=False))
         # L = T (I - P H' S^-1 H)
-        square = done.shaped.T @ done.shaped
-        loop = done.move - (done.move @ done.p) @ square
+        loop = done.move - (done.move @ done.half.T) @ done.shaped
         r = done.shaped.T @ done.white + loop.T @ r
-        n = square + loop.T @ n @ loop
+        n = done.shaped.T @ done.shaped + loop.T @ n @ loop
         n = (n + n.T) / 2
         smoothed[j] = (done.mean + done.p @ r)[ns:]
         own = done.p[ns:]
@@ -258,17 +271,19 @@ def _run(models: Sequence[Linear], variance: Mapping[Source, float], smooth: boo
 
     passes = tuple(map_threads(passed, models))
     products = np.sum([p.products for p in passes], axis=0)
-    count = len(products) - 1
+    evidence, shift, information = _judged(products, sum(p.log_determinant for p in passes))
+    return _State(passes, shift, scipy.linalg.cho_solve(information, np.eye(len(shift))), evidence)
+
+
+def _judged(products: Array, log_determinant: float) -> tuple[float, Array, tuple[Array, bool]]:
+    """Log evidence, the parameters' step, and its information as a Cholesky factor, from the sums over recordings."""
     # a parameter may move by several times its size: the prior only keeps unseen ones in place
-    precision = np.full(count, 1.0 / 9.0)
-    information = products[1:, 1:] + np.diag(precision)
-    factor = scipy.linalg.cho_factor(information, lower=True)
+    precision = np.full(len(products) - 1, 1.0 / 9.0)
+    factor = scipy.linalg.cho_factor(products[1:, 1:] + np.diag(precision), lower=True)
     shift = scipy.linalg.cho_solve(factor, products[1:, 0])
     quadratic = float(products[0, 0] - products[0, 1:] @ shift)
-    determinant = sum(p.log_determinant for p in passes)
-    determinant += 2 * float(np.sum(np.log(np.diag(factor[0])))) - float(np.sum(np.log(precision)))
-    spread = scipy.linalg.cho_solve(factor, np.eye(count))
-    return _State(passes, shift, spread, -0.5 * (quadratic + determinant))
+    determinant = 2 * float(np.sum(np.log(np.diag(factor[0])))) - float(np.sum(np.log(precision)))
+    return -0.5 * (quadratic + log_determinant + determinant), shift, factor
 
 
 def _scores(models: Sequence[Linear], state: _State) -> dict[Source, tuple[float, float]]:
@@ -316,8 +331,10 @@ def _selected(
         if any(variance.values()):
             promising = promising[:LATER]
 
-        def tried(source: Source, base: dict[Source, float] = variance) -> tuple[float, float]:
-            return _largest_evidence(models, base, source)
+        bases = _bases(models, variance) if promising else ()
+
+        def tried(source: Source, bases: Sequence[_Base] = bases) -> tuple[float, float]:
+            return _largest_evidence(bases, source)
 
         outcomes = map_threads(tried, promising)
         if not outcomes:
@@ -329,13 +346,75 @@ def _selected(
     return variance, state
 
 
-def _largest_evidence(
-    models: Sequence[Linear], variance: Mapping[Source, float], source: Source
-) -> tuple[float, float]:
-    """The largest log evidence over one group's variance, and that variance."""
+@dataclass(frozen=True)
+class _Base:
+    """The filter of one recording at variances to which one group's is to be added."""
+
+    model: Linear
+    products: Array
+    log_determinant: float
+    updates: Sequence[_Update]
+
+
+def _bases(models: Sequence[Linear], variance: Mapping[Source, float]) -> tuple[_Base, ...]:
+    """All recordings at given variances."""
+
+    def passed(model: Linear) -> _Base:
+        updates: list[_Update] = []
+        own = np.array([variance[s] for s in model.sources]) + model.known
+        products, log_determinant, _ = _forwards(model, own, updates)
+        return _Base(model, products, log_determinant, updates)
+
+    return tuple(map_threads(passed, models))
+
+
+def _responses(base: _Base, chosen: NDArray[np.int64]) -> Array:
+    """Innovations by disturbances of unit variance of some unknowns, shape (rows of all intervals, u J).
+
+    The filter follows a disturbance as far as its own unknowns let it; those without variance stay at zero.
+    """
+    model, updates = base.model, base.updates
+    ns, count, u = len(model.loose), len(updates), len(chosen)
+    kept = np.concatenate([np.arange(ns), ns + np.flatnonzero(np.diag(updates[0].p)[ns:] > 0)])
+    # what the filter has not followed yet, and the disturbed unknowns themselves, by the interval of the disturbance
+    behind, unknown = np.zeros((len(kept), u, count)), np.zeros((u, count))
+    behind[:ns, :, 0] = model.at_rest[:, chosen]
+    found = []
+    for k, update in enumerate(updates):
+        unknown[:, :k] *= model.decay
+        unknown[:, k] = math.sqrt(1 - model.decay**2) if k else 1.0
+        left = behind.reshape(len(kept), -1)
+        rows = update.shaped[:, kept] @ left
+        rows += (update.shaped[:, ns + chosen][:, :, None] * unknown).reshape(len(rows), -1)
+        found.append(rows)
+        left = update.move[np.ix_(kept, kept)] @ (left - update.half[:, kept].T @ rows)
+        behind = left.reshape(behind.shape)
+        behind[:ns] += update.move[:ns, ns + chosen][:, :, None] * unknown
+    return np.vstack(found)
+
+
+def _largest_evidence(bases: Sequence[_Base], source: Source) -> tuple[float, float]:
+    """The largest log evidence over the variance that one group gets on top, and that variance.
+
+    With W the innovations by its disturbances, those of the base have the covariance I + s^2 W W', whose inverse and
+    determinant follow for every s from the eigenvalues of W' W (Woodbury).
+    """
+    products, log_determinant = np.sum([b.products for b in bases], axis=0), sum(b.log_determinant for b in bases)
+    if math.isinf(log_determinant):
+        return -math.inf, VARIANCES[0]
+    values, pulls = [], []
+    for base in bases:
+        chosen = np.flatnonzero([own == source for own in base.model.sources])
+        rows = _responses(base, chosen)
+        value, vectors = np.linalg.eigh(rows.T @ rows)
+        values.append(np.maximum(value, 0.0))
+        pulls.append(vectors.T @ (rows.T @ np.vstack([update.white for update in base.updates])))
+    value, pull = np.concatenate(values), np.vstack(pulls)
 
     def cost(exponent: float) -> float:
-        return -_run(models, {**variance, source: 10.0**exponent}, smooth=False).evidence
+        variance = 10.0**exponent
+        closed = pull.T @ ((variance / (1 + variance * value))[:, None] * pull)
+        return -_judged(products - closed, log_determinant + float(np.sum(np.log1p(variance * value))))[0]
 
     low, high = np.log10(VARIANCES)
     outcome = scipy.optimize.minimize_scalar(cost, bounds=(low, high), method="bounded", options={"xatol": 0.4})
@@ -487,10 +566,12 @@ def _instead(
         others = [s for s, v in variance.items() if not v and scores[s][0] > scores[s][1]]
         others.sort(key=lambda s: -scores[s][0] / max(scores[s][1], 1e-300))
 
-        def tried(other: Source, less: dict[Source, float] = less) -> float:
-            return _largest_evidence(models, less, other)[0]
-
         asked = others[:LATER]
+        bases = _bases(models, less) if asked else ()
+
+        def tried(other: Source, bases: Sequence[_Base] = bases) -> float:
+            return _largest_evidence(bases, other)[0]
+
         lost = max(limits.worth, (1 - limits.as_well) * weight[source])
         reached = zip(asked, map_threads(tried, asked), strict=True)
         found[source] = tuple(other for other, reach in reached if reach >= evidence - lost)

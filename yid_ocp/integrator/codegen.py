@@ -28,8 +28,9 @@ class StepFunctions:
     ending : share of Dphi(q_{k+1}) in p1
     pull : (derivative of the pull of `matrix` by (q_k, z_k), that of `ending` by q_{k+1})
     scales : (row scale, h)
+    resting : (equations of the internal coordinates at rest, their derivative by (q, z, lam, u), nodes being one)
     patterns : sparsity of rest, rest of p1, constraint Jacobian, matrix (also of the other shares of Dphi), pull,
-        curvature and that at the end
+        curvature and that at the end, derivative at rest
 
     What is at the midpoint and after it is empty where the constraints pull at the node.
     """
@@ -41,12 +42,13 @@ class StepFunctions:
     ending: ca.Function
     pull: ca.Function
     scales: ca.Function
+    resting: ca.Function
     patterns: dict[str, ca.Sparsity]
 
     @property
     def all(self) -> tuple[ca.Function, ...]:
         """Every function, in the order of generation."""
-        return self.residual, self.linear, self.matrix, self.ending, self.pull, self.scales
+        return self.residual, self.linear, self.matrix, self.ending, self.pull, self.scales, self.resting
 
 
 def step_functions(equations: DiscreteEquations) -> StepFunctions:
@@ -65,6 +67,9 @@ def step_functions(equations: DiscreteEquations) -> StepFunctions:
     by_z = ca.jacobian(pulls.before.T @ e.lam, e.z0)
     pull = ca.sparsify(pulls.share_0 * ca.horzcat(pulls.before_by_q, by_z))
     moving = [pulls.middle, pulls.after, pulls.middle_by_q / 2, pulls.after_by_q]
+    by_node = [[ca.jacobian(e.internal_at_rest, x) for x in pair] for pair in ((e.q0, e.q1), (e.z0, e.z1))]
+    by_held = [ca.jacobian(e.internal_at_rest, x) for x in (e.lam, e.u)]
+    at_rest = ca.sparsify(ca.horzcat(*(first + second for first, second in by_node), *by_held))
     middle, after, curve, after_curve = (pulls.share_m * x if pulls.share_m else ca.SX(*x.shape) for x in moving)
 
     def function(name: str, *outputs: ca.SX) -> ca.Function:
@@ -82,6 +87,7 @@ def step_functions(equations: DiscreteEquations) -> StepFunctions:
         function("ending", nonzeros(after)),
         function("pull", nonzeros(pull), nonzeros(after_curve)),
         function("scales", e.row_scale, e.h),
+        function("resting", e.internal_at_rest, nonzeros(at_rest)),
         {
             "rest": rest.sparsity(),
             "rest_p": rest_p.sparsity(),
@@ -90,6 +96,7 @@ def step_functions(equations: DiscreteEquations) -> StepFunctions:
             "pull": pull.sparsity(),
             "curve": curve.sparsity(),
             "after_curve": after_curve.sparsity(),
+            "resting": at_rest.sparsity(),
         },
     )
 
@@ -247,6 +254,7 @@ def kernel_source(functions: StepFunctions, tables: Structure) -> str:
         "NNZ_PULL": patterns["pull"].nnz(),
         "NNZ_CURVE": patterns["curve"].nnz(),
         "NNZ_AFTER_CURVE": patterns["after_curve"].nnz(),
+        "NNZ_RESTING": patterns["resting"].nnz(),
         "SZ_W": max(f.sz_w() for f in functions.all),
         "SZ_IW": max(f.sz_iw() for f in functions.all),
         "ROW_SCALED": int(bool(system.compliant)),
@@ -283,7 +291,7 @@ def kernel_source(functions: StepFunctions, tables: Structure) -> str:
     ragged("rows_old", tables.rows_old)
     ragged("p1_old", tables.p1_old)
     ragged("p1_new", tables.p1_new)
-    for key in ("rest", "rest_p", "constraint", "matrix", "pull", "curve", "after_curve"):
+    for key in ("rest", "rest_p", "constraint", "matrix", "pull", "curve", "after_curve", "resting"):
         row, column = triplet(patterns[key])
         table(f"{key}_row", row)
         table(f"{key}_col", column)

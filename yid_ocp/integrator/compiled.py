@@ -13,6 +13,7 @@ from yid_ocp.errors import ModelError
 from yid_ocp.integrator import codegen, compiler
 from yid_ocp.integrator.step_model import (
     ITERATION_LIMIT,
+    REST_ITERATION_LIMIT,
     Directions,
     Feedback,
     Gradient,
@@ -147,6 +148,12 @@ class CompiledKernel:
         self._library = library
         self._theta_columns: Once[tuple[str, ...], _ThetaColumns] = Once(lambda names: _theta_columns(model, names))
 
+    def of(self, model: StepModel) -> CompiledKernel:
+        """See `Kernel.of`."""
+        other = CompiledKernel(model, self._library)
+        other._theta_columns = self._theta_columns
+        return other
+
     def rollout(
         self,
         theta: Array,
@@ -232,6 +239,19 @@ class CompiledKernel:
         self._check(code, outcome)
         return out
 
+    def rest(
+        self, theta: Array, unknowns: Array, given: Array, held: Array, stiffness: float, tolerance: float
+    ) -> tuple[Array, float, bool]:
+        """See `Kernel.rest`."""
+        nu, driven = len(held), np.array(self._model.system.driven_indices, np.int32)
+        hold = _filled(_Feedback, nu, driven, stiffness * np.eye(nu), _doubles(given[:nu])) if nu else None
+        inputs = (_doubles(theta), _doubles(held), _doubles(given[nu:]))
+        motion = _filled(_Motion, 1, REST_ITERATION_LIMIT, self._model.time_step, tolerance, *inputs, hold, None)
+        w, outcome = np.array(unknowns, float), _Outcome()
+        code = self._library.yid_rest(ctypes.byref(motion), ctypes.c_void_p(w.ctypes.data), ctypes.byref(outcome))
+        self._check(code, outcome)
+        return w, outcome.error, code == StepCode.OK
+
     def _motion(
         self,
         steps: int,
@@ -270,7 +290,7 @@ def _theta_columns(model: StepModel, names: tuple[str, ...]) -> _ThetaColumns:
     shapes = [function.size_out(i) for i in range(function.n_out())]
     if shapes != [(count, len(names)) for count in rows]:
         raise ValueError(f"derivatives by {len(names)} parameters have the shapes {shapes}, not the rows {rows}")
-    library = compiler.compile_library(codegen.functions_source(function.name(), (function,)), straight_line=True)
+    library = compiler.compile_library(codegen.functions_source(function.name(), (function,)))
     if library is None:
         raise ModelError("the compiler worked for the step but not for its derivatives", hint="set CC=none")
     address = ctypes.cast(library.by_theta, ctypes.c_void_p).value

@@ -26,8 +26,9 @@ log = logging.getLogger(__name__)
 FLAGS = ("-ftree-vectorize", "-ffp-contract=fast", "-fopenmp-simd", "-fPIC", "-shared")
 NATIVE = ("-march=native",)
 
-# -O2 takes minutes on single functions of tens of thousands of lines, for a gain of some 10 %.
-SHORT, LONG, LONG_FROM = "-O2", "-O1", 45_000
+# -O2 takes 1.7 times as long on a step of 43 variables, for a gain of 2 to 4 %, and minutes on single functions of tens
+# of thousands of lines.
+LEVEL = "-O1"
 # What runs for seconds in all and is new for every model is worth no more: -O1 takes a minute on 70 000 lines, this
 # three seconds, for code that is still two or three times as fast as CasADi's own machine.
 QUICK = "-O0"
@@ -104,17 +105,15 @@ def _machine() -> str:
     return f"{version}|{platform.system()}|{processor}"
 
 
-def compile_library(source: str, straight_line: bool = False) -> ctypes.CDLL | None:
+def compile_library(source: str) -> ctypes.CDLL | None:
     """Shared library of a C source, from the cache where it is there; None where nothing can compile it.
 
     Parameters
     ----------
     source : str
         C text. The cache key is the hash of this text, the flags, the compiler, the processor and CasADi's version.
-    straight_line : bool
-        Whether the text is one long function without loops, on which the compiler should not dwell.
     """
-    target = _library_file(source, LONG if straight_line or source.count("\n") > LONG_FROM else SHORT)
+    target = _library_file(source, LEVEL)
     if target is None:
         return None
     try:

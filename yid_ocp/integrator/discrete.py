@@ -454,3 +454,44 @@ def _grasped(system: System, grasp: Grasp, side: str) -> Frame:
     frame = system.mechanism.frame(grasp.held)
     back = Placement(ca.SX(ca.DM.eye(3)), ca.vertcat(0, 0, -grasp.slip))
     return Frame(frame.joint, frame.placement @ back)
+
+
+@dataclass(frozen=True)
+class RestEquations:
+    """A system at rest at a posture: driven joints held by torques and springs, prescribed ones given.
+
+    Attributes
+    ----------
+    inputs : list of casadi.SX
+        (unknowns: free coordinates, internal ones, forces of constraints), known coordinates (driven, then prescribed),
+        held torque, holding spring's stiffness, theta, time step.
+    residual : casadi.SX
+        Zero at rest: balance of the free coordinates [N m], internal equations, constraints [m].
+    state : casadi.SX, shape (nx, 1)
+        (q, p, z) at rest.
+    """
+
+    inputs: list[ca.SX]
+    residual: ca.SX
+    state: ca.SX
+
+
+def rest_equations(e: DiscreteEquations) -> RestEquations:
+    """The equations of a step from a configuration to itself, with p such that it comes out again."""
+    system, h, nu = e.system, e.h, e.u.numel()
+    free, fixed, driven = (list(i) for i in (system.free_indices, system.prescribed_indices, system.driven_indices))
+    given, sought = ca.SX.sym("given", nu + len(fixed)), ca.SX.sym("sought", len(free))
+    z, force = ca.SX.sym("z", e.z0.numel()), ca.SX.sym("force", e.lam.numel())
+    held, stiffness = ca.SX.sym("held", nu), ca.SX.sym("stiffness")
+    q = ca.SX(ca.DM.zeros(system.size))
+    for indices, values in ((fixed, given[nu:]), (free, sought)):
+        for row, index in enumerate(indices):
+            q[index] = values[row]
+    u = held + stiffness * (given[:nu] - q[driven]) if nu else held
+    old, now = [e.q0, e.q1, e.z0, e.z1, e.lam, e.u], [q, q, z, z, h * force, u]
+    rows = ca.substitute([e.p1, e.momentum_balance, e.internal_at_rest, e.constraint], old, now)
+    p, balance, internal, constraint = (ca.densify(x) for x in rows)
+    balance = ca.substitute(balance, e.p0, p) / h
+    inputs = [ca.vertcat(sought, z, force), given, held, stiffness, e.theta, e.time_step]
+    residual = ca.vertcat(balance[free, 0], internal, constraint)
+    return RestEquations(inputs, residual, ca.densify(ca.vertcat(q, p, z)))

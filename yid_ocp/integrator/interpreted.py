@@ -14,8 +14,10 @@ import numpy as np
 import scipy.linalg.lapack
 from numpy.typing import NDArray
 
+from yid_ocp.integrator.discrete import rest_equations
 from yid_ocp.integrator.step_model import (
     ITERATION_LIMIT,
+    REST_ITERATION_LIMIT,
     Directions,
     Feedback,
     Gradient,
@@ -43,6 +45,7 @@ class InterpretedKernel:
     def __init__(self, model: StepModel) -> None:
         self._model = model
         self._functions: Once[None, list[ca.Function]] = Once(self._made)
+        self._rest: Once[None, ca.Function] = Once(self._rest_made)
         system, sizes = model.system, model.sizes
         names = ("q0", "q1", "p0", "z0", "z1", "lam", "u", "theta", "time_step")
         ends = np.cumsum([0, *(argument.numel() for argument in model.equations.arguments)])
@@ -53,6 +56,12 @@ class InterpretedKernel:
         self._rows = sizes["n"] + sizes["nz"] + sizes["m"]
         self._residual = np.concatenate([free, np.arange(sizes["n"], self._rows)])
         self._p1, self._effort = slice(self._rows, self._rows + sizes["n"]), slice(self._rows + sizes["n"], None)
+
+    def of(self, model: StepModel) -> InterpretedKernel:
+        """See `Kernel.of`."""
+        other = InterpretedKernel(model)
+        other._functions, other._rest = self._functions, self._rest
+        return other
 
     def _evaluators(self) -> list[Evaluator]:
         """Outputs at a point, the slope of the residual by the unknowns, and that of the outputs by the point."""
@@ -65,6 +74,10 @@ class InterpretedKernel:
         slope = ca.jacobian(outputs[self._residual.tolist()], e.unknowns)
         wanted = (outputs, slope, ca.jacobian(outputs, point))
         return [ca.Function("f", [point], [ca.densify(x)]) for x in wanted]
+
+    def _rest_made(self, _: None) -> ca.Function:
+        e = rest_equations(self._model.equations)
+        return ca.Function("rest", e.inputs, [e.residual, ca.jacobian(e.residual, e.inputs[0])])
 
     def _point(self, theta: Array, before: Array, after: Array, lam: Array, u: Array) -> Array:
         n = self._model.sizes["n"]
@@ -238,6 +251,69 @@ class InterpretedKernel:
                     getattr(out, f"rows_{key}")[k] = jacobian[: self._rows, index]
                     getattr(out, f"p1_{key}")[k] = jacobian[self._p1, index]
         return out
+
+    def rest(
+        self, theta: Array, unknowns: Array, given: Array, held: Array, stiffness: float, tolerance: float
+    ) -> tuple[Array, float, bool]:
+        """See `Kernel.rest`."""
+        function, known = self._rest(None), (given, held, stiffness, theta, self._model.time_step)
+        return damped_newton(lambda w: function.call([w, *known]), unknowns, tolerance)
+
+
+def damped_newton(
+    function: Callable[[Array], Sequence[ca.DM]], w: Array, tolerance: float
+) -> tuple[Array, float, bool]:
+    """Newton with step control: the natural monotonicity test (Deuflhard 2011, section 3.3) or a smaller residual.
+
+    Parameters
+    ----------
+    function : callable
+        Residual and its Jacobian at a point.
+    w : ndarray, shape (n,)
+        Where it begins.
+    tolerance : float
+
+    Returns
+    -------
+    w : ndarray, shape (n,)
+    error : float
+        Largest residual there.
+    converged : bool
+    """
+    if len(w) == 0:
+        return w, 0.0, True
+
+    def evaluate(x: Array) -> tuple[Array, Array]:
+        residual, jacobian = function(x)
+        return np.array(residual).ravel(), np.array(ca.densify(jacobian))
+
+    residual, jacobian = evaluate(w)
+    error = float(np.max(np.abs(residual)))
+    for _ in range(REST_ITERATION_LIMIT):
+        if error <= tolerance or not math.isfinite(error):
+            return w, error, error <= tolerance
+        factors = _factorised(jacobian)
+        if factors is None:
+            return w, error, False
+        delta = -_solved(factors, residual)
+        scale = np.maximum(np.abs(w), 1.0)
+        size = float(np.max(np.abs(delta / scale)))
+        if not math.isfinite(size):
+            return w, error, False
+        factor = min(1.0, 0.3 / size) if size else 1.0
+        while True:
+            trial = w + factor * delta
+            new_residual, new_jacobian = evaluate(trial)
+            if np.all(np.isfinite(new_residual)):
+                shrunk = float(np.max(np.abs(_solved(factors, new_residual)) / scale))
+                if shrunk <= (1 - factor / 4) * size or np.max(np.abs(new_residual)) <= (1 - factor / 4) * error:
+                    break
+            factor *= 0.5
+            if factor < 1e-6:
+                return w, error, error < 1e2 * tolerance
+        w, residual, jacobian = trial, new_residual, new_jacobian
+        error = float(np.max(np.abs(residual)))
+    return w, error, False
 
 
 def _evaluator(function: Any) -> Evaluator:

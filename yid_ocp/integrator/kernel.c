@@ -3,10 +3,10 @@
  * The generated part before this text defines the sizes N, NZ, M, NU, NC, NF, NY and NT, counts of nonzeros (NNZ_...),
  * sizes of CasADi's work arrays (SZ_W, SZ_IW), what the system needs (ROW_SCALED, MIDDLE, CLOSED, CLOSED_LEFT,
  * CLOSED_RIGHT),
- * the index tables and the CasADi functions residual, linear, matrix, ending, pull and scales; see codegen.py.
+ * the index tables and the CasADi functions residual, linear, matrix, ending, pull, scales and resting; see codegen.py.
  *   N coordinates, NZ internal ones, M constraints, NU inputs, NC prescribed and NF free coordinates,
  *   NT = N + NZ + M rows, NY = NF + NZ + M unknowns of a step, NX = 2 N + NZ state (q, p, z).
- * All matrices are row-major. compiled.py declares the structs of the three entry points at the end once more.
+ * All matrices are row-major. compiled.py declares the structs of the entry points at the end once more.
  */
 #include <math.h>
 #include <stdlib.h>
@@ -515,8 +515,8 @@ typedef struct {
     const double *gain, *reference;
 } Feedback;
 
-/* What the three entry points are asked about; feedback and directions may be NULL. The nominal torque (steps, NU), the
- * path (steps + 1, NC) and Newton's tolerance and limit matter to a rollout only. */
+/* What the entry points are asked about; feedback and directions may be NULL. The nominal torque (steps, NU), the path
+ * (steps + 1, NC) and Newton's tolerance and limit matter to a rollout and, as those of one node, to a rest. */
 typedef struct {
     int steps, limit;
     double time_step, tolerance;
@@ -897,4 +897,173 @@ int yid_linearize(const Motion *motion, const Trajectory *along, const Lineariza
     }
     work_free(k);
     return OK;
+}
+
+/* What a rest works on: its equations are those of a step from q to q, with p such that it comes out again. */
+typedef struct {
+    double x[ONE(NX)], q[ONE(N)], z[ONE(NZ)], lam[ONE(M)], u[ONE(NU)];
+    double inner[ONE(NZ)], slopes_nz[ONE(NNZ_RESTING)], full[ONE(NT)][ONE(NT)];
+    int pivot[ONE(NY)];
+} Resting;
+
+/* Put unknowns (free coordinates, internal ones, forces of the constraints) in their places; a point of the step. */
+static Point rest_point(const Work *k, Resting *s, const Motion *motion, const double *w) {
+    for (int i = 0; i < NF; i++) s->q[free_index[i]] = w[i];
+    for (int i = 0; i < NC; i++) s->q[prescribed_index[i]] = motion->path[i];
+    for (int i = 0; i < NZ; i++) s->z[i] = w[NF + i];
+    for (int i = 0; i < M; i++) s->lam[i] = k->h * w[NF + NZ + i];
+    memcpy(s->x, s->q, sizeof(double) * N);
+    memset(s->x + N, 0, sizeof(double) * N);
+    if (NU) {
+        memcpy(s->u, motion->torque, sizeof(double) * NU);
+        if (motion->feedback) apply_feedback(motion->feedback, 0, s->x, motion->torque, s->u);
+    }
+    const Point a = {s->x, s->x + N, s->z, s->u, motion->theta, &motion->time_step, s->q, s->z, s->lam};
+    return a;
+}
+
+/* Imbalance of the free coordinates [N m], internal equations at rest, constraints; returns the largest, or NaN. */
+static double rest_rows(Work *k, Resting *s, const Point *a, double *r) {
+    const double *args[9];
+    double *res[2] = {s->inner, s->slopes_nz};
+    double largest = 0;
+    constraint_matrix(k, a);
+    evaluate(k, a);
+    finish(k, a);
+    for (int i = 0; i < NF; i++) r[i] = (k->balance[free_index[i]] + k->p1[free_index[i]]) / k->h;
+    for (int i = 0; i < M; i++) r[NF + NZ + i] = k->constraint[i];
+    if (NZ) {
+        arguments(a, args);
+        resting(args, res, k->iw, k->w, 0);
+        memcpy(r + NF, s->inner, sizeof(double) * NZ);
+    }
+    for (int i = 0; i < NY; i++) {
+        if (!isfinite(r[i])) return NAN;
+        largest = fmax(largest, fabs(r[i]));
+    }
+    return largest;
+}
+
+/* Slopes of `rest_rows` at the point of its last call, into k->A. */
+static void rest_slopes(Work *k, Resting *s, const Point *a, const Feedback *hold) {
+    linearise(k, a, 1);
+    for (int i = 0; i < NT; i++) {
+        double *row = s->full[i];
+        const int inner = i >= N && i < N + NZ;
+        memset(row, 0, sizeof(double) * NT);
+        if (inner) continue;
+        for (int j = 0; j < NT; j++) row[j] = k->R1[i][j];
+        for (int j = 0; j < NQZ; j++) row[j] += k->R0[i][j];
+        if (i < N) {
+            for (int j = 0; j < NT; j++) row[j] += k->P1[i][j];
+            for (int j = 0; j < NQZ; j++) row[j] += k->P0[i][j];
+            for (int v = 0; hold && v < NU; v++)
+                for (int c = 0; c < hold->count; c++)
+                    row[hold->index[c]] -= (k->Ru[i][v] + k->Pu[i][v]) * hold->gain[v * hold->count + c];
+            for (int j = 0; j < NQZ; j++) row[j] /= k->h;
+        } else
+            for (int j = NQZ; j < NT; j++) row[j] *= k->h;
+    }
+    for (int e = 0; e < NNZ_RESTING; e++) {
+        double *row = s->full[N + resting_row[e]];
+        const int column = resting_col[e], input = column - NT;
+        if (column < NT) row[column] += s->slopes_nz[e] * (column < NQZ ? 1.0 : k->h);
+        for (int c = 0; hold && input >= 0 && c < hold->count; c++)
+            row[hold->index[c]] -= s->slopes_nz[e] * hold->gain[input * hold->count + c];
+    }
+    for (int b = 0; b < NY; b++)
+        for (int c = 0; c < NY; c++) k->A[b][c] = s->full[unknown_row[b]][unknown_row[c]];
+}
+
+/* LU of k->A with partial pivoting: forces of constraints have no diagonal, and an equilibrium may be unstable. */
+static int factorise_pivoted(Work *k, int *pivot) {
+    for (int p = 0; p < NY; p++) {
+        int best = p;
+        for (int i = p + 1; i < NY; i++)
+            if (fabs(k->A[i][p]) > fabs(k->A[best][p])) best = i;
+        pivot[p] = best;
+        if (!(fabs(k->A[best][p]) > 0) || !isfinite(k->A[best][p])) return SINGULAR;
+        for (int c = 0; best != p && c < NY; c++) {
+            const double kept = k->A[p][c];
+            k->A[p][c] = k->A[best][c];
+            k->A[best][c] = kept;
+        }
+        const double inverse = k->inverse[p] = 1.0 / k->A[p][p];
+        const double *source = k->A[p];
+        for (int i = p + 1; i < NY; i++) {
+            double *target = k->A[i];
+            const double factor = target[p] *= inverse;
+            if (factor == 0.0) continue;
+#pragma omp simd
+            for (int c = p + 1; c < NY; c++) target[c] -= factor * source[c];
+        }
+    }
+    return OK;
+}
+
+/* x = -A^-1 b; the largest of x in parts of max(|w|, 1), or NaN. */
+static double rest_change(const Work *k, const int *pivot, const double *b, const double *w, double *x) {
+    double size = 0;
+    for (int i = 0; i < NY; i++) x[i] = -b[i];
+    for (int p = 0; p < NY; p++) {
+        const double value = x[pivot[p]];
+        x[pivot[p]] = x[p];
+        x[p] = value;
+    }
+    for (int p = 0; p < NY; p++)
+        for (int i = p + 1; i < NY; i++) x[i] -= k->A[i][p] * x[p];
+    for (int p = NY - 1; p >= 0; p--) {
+        double sum = x[p];
+        for (int c = p + 1; c < NY; c++) sum -= k->A[p][c] * x[c];
+        x[p] = sum * k->inverse[p];
+    }
+    for (int i = 0; i < NY; i++) {
+        if (!isfinite(x[i])) return NAN;
+        size = fmax(size, fabs(x[i]) / fmax(fabs(w[i]), 1.0));
+    }
+    return size;
+}
+
+static int rest_search(Work *k, Resting *s, const Motion *motion, double *w, double *error) {
+    const double tolerance = motion->tolerance;
+    double r[ONE(NY)], delta[ONE(NY)], trial[ONE(NY)], further[ONE(NY)];
+    Point a = rest_point(k, s, motion, w);
+    *error = rest_rows(k, s, &a, r);
+    for (int it = 0; it < motion->limit; it++) {
+        if (isnan(*error)) return NOT_FINITE;
+        if (*error <= tolerance) return OK;
+        k->iterations++;
+        rest_slopes(k, s, &a, motion->feedback);
+        if (factorise_pivoted(k, s->pivot)) return SINGULAR;
+        const double size = rest_change(k, s->pivot, r, w, delta);
+        if (isnan(size)) return NOT_FINITE;
+        for (double factor = fmin(1.0, 0.3 / size);; factor *= 0.5) {
+            if (factor < 1e-6) return *error < 1e2 * tolerance ? OK : NOT_CONVERGED;
+            for (int i = 0; i < NY; i++) trial[i] = w[i] + factor * delta[i];
+            a = rest_point(k, s, motion, trial);
+            const double left = rest_rows(k, s, &a, r);
+            if (isnan(left)) continue;
+            const double enough = 1.0 - factor / 4;
+            if (left > enough * *error && !(rest_change(k, s->pivot, r, w, further) <= enough * size)) continue;
+            *error = left;
+            break;
+        }
+        memcpy(w, trial, sizeof trial);
+    }
+    return *error <= tolerance ? OK : NOT_CONVERGED;
+}
+
+/* Search a static equilibrium from the unknowns w, which are overwritten, where prescribed coordinates are at the path's
+ * first node, and torques follow the first step's feedback; a status. Newton with step control: the natural monotonicity
+ * test (Deuflhard 2011, section 3.3) or a smaller residual. */
+int yid_rest(const Motion *motion, double *w, Outcome *outcome) {
+    Work *k;
+    double *buffer;
+    if (!room_for((sizeof(Resting) + sizeof(double) - 1) / sizeof(double), &k, &buffer, outcome)) return OUT_OF_MEMORY;
+    prepare(k, motion->theta, &motion->time_step);
+    const int status = rest_search(k, (Resting *)buffer, motion, w, &outcome->error);
+    outcome->iterations = k->iterations;
+    YID_FREE(buffer);
+    work_free(k);
+    return status;
 }

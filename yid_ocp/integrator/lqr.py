@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from yid_ocp.errors import ModelError
 from yid_ocp.integrator.mapped import Mapped
 from yid_ocp.integrator.step import Step, compile_alike
-from yid_ocp.integrator.step_model import Feedback
+from yid_ocp.integrator.step_model import ITERATION_LIMIT, Feedback
 from yid_ocp.model.system import Effect, System
 
 Array = NDArray[np.float64]
@@ -56,6 +56,7 @@ def lqr_filter(
     angle_std: ArrayLike = 0.02,
     rate_std: float = 0.3,
     torque_std: ArrayLike = 1.0,
+    arms: Step | None = None,
 ) -> Feedback:
     """Finite-horizon LQR of the driven arms, linearised about their measured motion.
 
@@ -73,6 +74,8 @@ def lqr_filter(
     theta : array_like, shape (ntheta,)
     angle_std, rate_std, torque_std : float or array_like
         Standard deviations that weigh the same [rad], [rad/s], [N m].
+    arms : Step, optional
+        From `arms_alone`; made when absent.
 
     References
     ----------
@@ -80,10 +83,10 @@ def lqr_filter(
     """
     reference, torques = np.asarray(measured, float), np.asarray(torque, float)
     system = step.system
-    arms = _arms_only(system)
-    arm_step = compile_alike(step, arms)
+    arm_step = arms_alone(step) if arms is None else arms
     values = dict(zip(system.parameters.names, np.asarray(theta, float), strict=True))
-    arm_theta = arms.parameters.vector({name: values[name] for name in arms.parameters.names})
+    parameters = arm_step.system.parameters
+    arm_theta = parameters.vector({name: values[name] for name in parameters.names})
     nu = len(system.driven)
     momenta = _reference_momentum(arm_step, reference, torques, arm_theta)
     steps = len(reference) - 1
@@ -92,8 +95,10 @@ def lqr_filter(
     weight_q = np.diag(1.0 / np.broadcast_to(np.asarray(angle_std, float), (nu,)) ** 2)
     gain = np.zeros((steps, nu, 2 * nu))
     cost: Array | None = None
+    states = np.hstack([reference, momenta])[:-1]
+    by_state, by_torque = _one_step_each(arm_step, states, torques, reference[1:], arm_theta)
     for k in reversed(range(steps)):
-        a, b, _ = arm_step.jacobians(reference[k], momenta[k], torques[k], arm_theta, names=())
+        a, b = by_state[k], by_torque[k]
         rate = a[:nu, nu:] / step.time_step
         stage = scipy.linalg.block_diag(weight_q, rate.T @ rate / rate_std**2)
         cost = stage if cost is None else cost
@@ -183,8 +188,18 @@ def _neutral(effect: Effect) -> Mapping[str, float]:
     return dict(getattr(effect, "neutral", {}))
 
 
+def arms_alone(step: Step) -> Step:
+    """The step of the driven joints alone: everything hung on them or beside them taken away.
+
+    Raises
+    ------
+    ModelError
+        The driven joints do not come first in the configuration.
+    """
+    return compile_alike(step, _arms_only(step.system))
+
+
 def _arms_only(system: System) -> System:
-    """The driven joints alone: everything hung on them or beside them taken away."""
     mechanism = system.mechanism
     keep = [mechanism.joint_index(name) for name in system.driven]
     if sorted(keep) != list(range(len(keep))):
@@ -212,15 +227,37 @@ def _arms_only(system: System) -> System:
 
 def _reference_momentum(arm_step: Step, measured: Array, torque: Array, theta: Array) -> Array:
     """p_k = D2 L_d(q_{k-1}, q_k) + f+ of the measured motion, shape (N + 1, nu); the first from a standing start."""
-    functions = arm_step.functions
-    sizes = arm_step.sizes
-    momenta = np.zeros_like(measured)
-    none = np.zeros(0)
-    for k in range(len(measured)):
-        before = measured[max(k - 1, 0)]
-        u = torque[min(max(k - 1, 0), len(torque) - 1)]
-        out = functions.residual(
-            before, measured[k], np.zeros(sizes["n"]), none, none, none, u, theta, arm_step.time_step
+    angles, torques = np.vstack([measured[:1], measured]), np.vstack([torque[:1], torque])
+    state = np.hstack([angles, np.zeros_like(angles)])
+    none = np.zeros((len(torques), 0))
+    return arm_step.kernel.linearize(theta, state, none, torques, (), False).p1
+
+
+def _one_step_each(arm_step: Step, start: Array, torque: Array, guess: Array, theta: Array) -> tuple[Array, Array]:
+    """A_k (N, 2 nu, 2 nu) and B_k (N, 2 nu, nu) of one step from each state, by Newton's iteration of all at once.
+
+    `guess` (N, nu) says where about the steps lead; NaN where that has no answer.
+    """
+    count, nu = torque.shape
+    # the kernel takes states in a row: each start and what follows it; the steps between them mean nothing
+    state, torques = np.repeat(start, 2, axis=0), np.repeat(torque, 2, axis=0)[:-1]
+    state[1::2, :nu] = guess
+    none, own = np.zeros((2 * count - 1, 0)), slice(None, None, 2)
+    try:
+        for _ in range(ITERATION_LIMIT):
+            found = arm_step.kernel.linearize(theta, state, none, torques, (), True)
+            change = np.linalg.solve(found.rows_new[own], found.rows[own, :, None])[:, :, 0]
+            if not np.max(np.abs(change), initial=0.0) > arm_step.model.tolerance:
+                break
+            state[1::2, :nu] -= change
+        else:
+            raise np.linalg.LinAlgError
+        known = np.broadcast_to(np.eye(nu), (count, nu, nu))
+        moved = -np.linalg.solve(
+            found.rows_new[own], np.concatenate([found.rows_old[own], known, found.rows_input[own]], axis=2)
         )
-        momenta[k] = np.array(out[3]).ravel()
-    return momenta
+    except np.linalg.LinAlgError:
+        return np.full((count, 2 * nu, 2 * nu), np.nan), np.full((count, 2 * nu, nu), np.nan)
+    momenta = np.concatenate([found.p1_old[own], 0 * known, found.p1_input[own]], axis=2)
+    after = np.concatenate([moved, found.p1_new[own] @ moved + momenta], axis=1)
+    return after[:, :, : 2 * nu], after[:, :, 2 * nu :]

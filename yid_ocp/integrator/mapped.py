@@ -32,7 +32,7 @@ class Mapped:
         self.shared = frozenset(shared)
         self._inputs = [function.numel_in(i) for i in range(function.n_in())]
         self._outputs = [function.nnz_out(i) for i in range(function.n_out())]
-        self._library = compile_library(self._source(), straight_line=True) if use_compiler else None
+        self._library = compile_library(self._source()) if use_compiler else None
 
     def _source(self) -> str:
         name, f = self.function.name(), self.function

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 import numpy as np
-import scipy.linalg
 import scipy.linalg.lapack
 from numpy.typing import ArrayLike, NDArray
 
+from yid_ocp.integrator.codegen import triplet
+from yid_ocp.integrator.discrete import RestEquations, rest_equations
+from yid_ocp.integrator.interpreted import damped_newton
 from yid_ocp.integrator.step import Step, check_shape
+from yid_ocp.model.system import System
 from yid_ocp.parallel import SYMBOLIC, Once
 
 Array = NDArray[np.float64]
@@ -62,6 +64,8 @@ HOLD_STIFFNESS_WITH_TORQUE = 1e3
 
 MOST_ITERATIONS = 300  # of the search for the lowest energy
 
+SINGULAR = 1e-14  # reciprocal of the condition beyond which equations have no solution of their own
+
 # A holding spring that gives by more than this means that the posture does not fit the grasp [rad].
 HOLD_LIMIT = 0.02
 
@@ -77,50 +81,24 @@ class Statics:
     ----------
     known, unknown : tuple of int
         Coordinates that are given (driven, then prescribed), and those that are sought.
-    inputs : list of casadi.SX
-        (sought, internal, forces), given coordinates, held torque, holding spring's stiffness, theta, time step.
-    residual : casadi.SX
-        Zero at rest: balance of the coordinates sought [N m], internal equations, constraints [m].
-    state : casadi.SX, shape (nx, 1)
-        (q, p, z) at rest.
     """
 
     def __init__(self, step: Step) -> None:
         self.step = step
-        system = step.system
+        system, e = step.system, step.equations
         self.known = (*system.driven_indices, *system.prescribed_indices)
         self.unknown = system.free_indices
-        e = step.equations
-        h = e.h
-        nu = e.u.numel()
-        given, sought = ca.SX.sym("given", len(self.known)), ca.SX.sym("sought", len(self.unknown))
-        z, force = ca.SX.sym("z", e.z0.numel()), ca.SX.sym("force", e.lam.numel())
-        q = ca.SX(ca.DM.zeros(system.size))
-        for row, index in enumerate(system.prescribed_indices):
-            q[index] = given[nu + row]
-        for row, index in enumerate(self.unknown):
-            q[index] = sought[row]
-        held, stiffness = ca.SX.sym("held", nu), ca.SX.sym("stiffness")
-        give = given[:nu] - q[list(system.driven_indices)] if nu else ca.SX(0, 1)
-        u = held + stiffness * give
+        self._equations: Once[None, RestEquations] = Once(lambda _: rest_equations(e))
+        self._inner_slopes: Once[None, ca.Function] = Once(
+            lambda _: ca.Function("inner", e.arguments, [ca.jacobian(e.internal_at_rest, e.theta)])
+        )
+        potential = system.elastic_energy(e.q0) + e.rigid.potential
+        self._potential = ca.Function("potential", [e.q0, e.q1, e.z0, e.z1, e.theta], [potential])
 
-        def at_rest(*expressions: ca.SX) -> list[ca.SX]:
-            old = [e.q0, e.q1, e.z0, e.z1, e.lam, e.u]
-            return [ca.densify(x) for x in ca.substitute(list(expressions), old, [q, q, z, z, h * force, u])]
-
-        p_rest, balance, internal, constraint = at_rest(e.p1, e.momentum_balance, e.internal_at_rest, e.constraint)
-        balance = ca.substitute(balance, e.p0, p_rest) / h
-        w = ca.vertcat(sought, z, force)
-        residual = ca.vertcat(balance[list(self.unknown), 0], internal, constraint)
-        inputs = [w, given, held, stiffness, e.theta, e.time_step]
-        weight = ca.substitute(e.rigid.potential, ca.vertcat(e.q0, e.q1), ca.vertcat(q, q))
-        potential = system.elastic_energy(q) + weight
-        potential += stiffness / 2 * ca.sumsqr(give) + ca.dot(held, give) if nu else 0
-        state = ca.densify(ca.vertcat(q, p_rest, z))
-        self._residual = ca.Function("rest", inputs, [residual, ca.jacobian(residual, w)])
-        self._outcome = ca.Function("outcome", inputs, [state, u, potential, give])
-        self.inputs, self.residual, self.state = inputs, residual, state
-        self._derivatives: Once[tuple[str, ...], ca.Function] = Once(self._derivative)
+    @property
+    def equations(self) -> RestEquations:
+        """The equations as expressions."""
+        return self._equations(None)
 
     def solve(
         self,
@@ -157,11 +135,12 @@ class Statics:
         theta = check_shape("theta", theta, (len(system.parameters),))
         stiffness = HOLD_STIFFNESS if torque is None else HOLD_STIFFNESS_WITH_TORQUE
         held = np.zeros(step.sizes["nu"]) if torque is None else check_shape("torque", torque, (step.sizes["nu"],))
-        arguments: list[Array | float] = [given, held, stiffness, theta, step.time_step]
+        hold = _Hold(given, held, stiffness)
         best: tuple[bool, float, float, Array] | None = None
         for start in self._guesses(given, guess):
-            w, error, converged = _damped_newton(lambda x: self._residual.call([x, *arguments]), start, tolerance)
-            energy = float(self._outcome(w, *arguments)[2])
+            w, error, converged = step.kernel.rest(theta, start, given, held, stiffness, tolerance)
+            inner = w[len(self.unknown) : len(self.unknown) + step.sizes["nz"]]
+            energy = float(self._energy(ca.DM(self._configuration(w, given)), inner, hold, theta))
             found = (not converged, energy if converged else error, error, w)
             if best is None or found[:2] < best[:2]:
                 best = found
@@ -170,11 +149,12 @@ class Statics:
         assert best is not None
         failed, _, error, w = best
         if failed and guess is None:
-            lowest = self._lowest_energy(given, arguments)
+            lowest = self._lowest_energy(theta, hold)
             if lowest is not None:
                 return self.solve(posture, theta, torque, lowest, names, tolerance)
-        state, holding, _, give = (np.array(x).ravel() for x in self._outcome(w, *arguments))
-        by_theta, by_posture = self._differentiate(w, arguments, tuple(names))
+        q = self._configuration(w, given)
+        give = hold.give(q, system)
+        state, by_theta, by_posture = self._differentiate(w, q, theta, hold, tuple(names))
         message = self._explain(state, theta, error) if failed else "at rest"
         if not failed and np.max(np.abs(give), initial=0.0) > HOLD_LIMIT:
             joint = int(np.argmax(np.abs(give)))
@@ -187,7 +167,9 @@ class Statics:
         count = len(self.unknown) + step.sizes["nz"]
         # torque and posture enter together, as the torque plus the holding spring's stiffness times the posture
         by_torque = by_posture[:, : step.sizes["nu"]] / stiffness
-        return Rest(state, holding, w[count:], by_theta, by_posture, by_torque, not failed, error, message)
+        return Rest(
+            state, held + stiffness * give, w[count:], by_theta, by_posture, by_torque, not failed, error, message
+        )
 
     def _guesses(self, given: Array, guess: ArrayLike | None) -> list[Array]:
         """Starts of the search: the given configuration or the undeformed object, then small bends of it.
@@ -211,7 +193,22 @@ class Statics:
             starts.append(bent)
         return starts
 
-    def _lowest_energy(self, given: Array, arguments: list[Array | float]) -> Array | None:
+    def _configuration(self, w: Array, given: Array) -> Array:
+        """All coordinates, shape (n,); driven ones are where the holding spring lets them be."""
+        q = np.zeros(self.step.system.size)
+        q[list(self.known)] = given
+        q[list(self.unknown)] = w[: len(self.unknown)]
+        return q
+
+    def _energy(self, q: Any, z: Array, hold: _Hold, theta: Array) -> Any:
+        """Potential energy of a configuration, that of the holding springs included."""
+        energy = self._potential(q, q, z, z, theta)
+        if not len(hold.held):
+            return energy
+        give = hold.give(q, self.step.system)
+        return energy + hold.stiffness / 2 * ca.sumsqr(give) + ca.dot(hold.held, give)
+
+    def _lowest_energy(self, theta: Array, hold: _Hold) -> Array | None:
         """A configuration of lowest potential energy within the constraints, shape (n,); None where there is none.
 
         Newton's iteration leaves an object that is held far from its undeformed shape, as a cable between two clamps.
@@ -220,38 +217,87 @@ class Statics:
         ----------
         Waechter and Biegler (2006), Math. Programming 106:25, doi:10.1007/s10107-004-0559-y.
         """
-        size, m = len(self.unknown), self.step.sizes["m"]
+        size, m, given = len(self.unknown), self.step.sizes["m"], hold.given
         if not size or not m:
             return None
         with SYMBOLIC:
+            function = ca.Function("rest", self.equations.inputs, [self.equations.residual])
+            known = (given, hold.held, hold.stiffness, theta, self.step.time_step)
             x = ca.SX.sym("x", size)
-            w = ca.vertcat(x, ca.SX(self.step.sizes["nz"] + m, 1))
-            residual, _ = self._residual(w, *arguments)
-            _, _, energy, _ = self._outcome(w, *arguments)
-            scale = 1.0 / max(float(ca.norm_inf(self._residual(0, *arguments)[0])), 1e-6)
+            residual = function(ca.vertcat(x, ca.SX(self.step.sizes["nz"] + m, 1)), *known)
+            q = ca.SX(ca.DM(self._configuration(np.zeros(size), given)))
+            q[list(self.unknown)] = x
+            scale = 1.0 / max(float(ca.norm_inf(function(0, *known))), 1e-6)
             search = {"print_level": 0, "sb": "yes", "max_iter": MOST_ITERATIONS, "tol": 1e-8}
             options: dict[str, Any] = {"print_time": False, "error_on_fail": False, "ipopt": search}
-            program = {"x": x, "f": scale * energy, "g": residual[-m:]}
+            program = {
+                "x": x,
+                "f": scale * self._energy(q, np.zeros(self.step.sizes["nz"]), hold, theta),
+                "g": residual[-m:],
+            }
             solver = ca.nlpsol("lowest", "ipopt", program, options)
         for start in self._guesses(given, None):
             found = np.array(solver(x0=start[:size], lbg=0.0, ubg=0.0)["x"]).ravel()
             if solver.stats()["success"]:
-                q = np.zeros(self.step.system.size)
-                q[list(self.known)], q[list(self.unknown)] = given, found
-                return q
+                return self._configuration(found, given)
         return None
 
-    def _differentiate(self, w: Array, arguments: list, names: tuple[str, ...]) -> tuple[Array, Array]:
-        r_w, r_o, s_w, s_o = (np.array(ca.densify(x)) for x in self._derivatives(names)(w, *arguments))
-        change = -np.linalg.lstsq(r_w, r_o, rcond=None)[0] if len(w) else np.zeros((0, r_o.shape[1]))
-        total = s_w @ change + s_o
-        return total[:, : len(names)], total[:, len(names) :]
+    def _differentiate(
+        self, w: Array, q: Array, theta: Array, hold: _Hold, names: tuple[str, ...]
+    ) -> tuple[Array, Array, Array]:
+        """State (q, p, z) at rest, and its derivatives by named parameters and by the known coordinates.
 
-    def _derivative(self, names: tuple[str, ...]) -> ca.Function:
-        inputs, residual, state = self.inputs, self.residual, self.state
-        other = ca.vertcat(*(self.step.system.parameters[name].symbol for name in names), inputs[1])
-        outputs = [ca.jacobian(f, x) for f in (residual, state) for x in (inputs[0], other)]
-        return ca.Function("by", inputs, outputs)
+        At rest the equations are those of a step from a configuration to itself, with p such that it comes out again.
+        """
+        step = self.step
+        n, nz, m, nu = (step.sizes[key] for key in ("n", "nz", "m", "nu"))
+        free, driven, fixed = len(self.unknown), list(step.system.driven_indices), list(step.system.prescribed_indices)
+        z, u = w[free : free + nz], hold.held + hold.stiffness * hold.give(q, step.system)
+        none = np.zeros(n)
+        h = float(step.functions.scales(q, q, none, z, z, np.zeros(m), u, theta, step.time_step)[1])
+        lam = h * w[free + nz :]
+        before = np.concatenate([q, none, z])
+        found = step.kernel.linearize(theta, np.stack([before, before]), lam[None], u[None], names, True)
+
+        def by_point(new: Array, old: Array, push: Array) -> Array:
+            """By (q, z, lam), both nodes together and torques as they follow the angles."""
+            whole = new[0].copy()
+            whole[:, : n + nz] += old[0]
+            whole[:, driven] -= hold.stiffness * push[0]
+            return whole
+
+        rows = by_point(found.rows_new, found.rows_old, found.rows_input)
+        p = by_point(found.p1_new, found.p1_old, found.p1_input)
+        push, push_p = found.rows_input[0].copy(), found.p1_input[0]
+        others, others_p = found.rows_theta[0].copy(), found.p1_theta[0]
+        rows[:n] += p
+        push[:n] += push_p
+        others[:n] += others_p
+        if nz:
+            inner = slice(n, n + nz)
+            at = (q, q, none, z, z, lam, u, theta, step.time_step)
+            slopes = np.zeros((nz, n + nz + m + nu))
+            row, column = triplet(step.functions.patterns["resting"])
+            slopes[row, column] = np.array(step.functions.resting(*at)[1]).ravel()
+            rows[inner], push[inner] = slopes[:, : n + nz + m], slopes[:, n + nz + m :]
+            rows[inner, driven] -= hold.stiffness * push[inner]
+            chosen = [step.system.parameters.index(name) for name in names]
+            others[inner] = np.array(ca.densify(self._inner_slopes(None)(*at)))[:, chosen]
+        rows[:n] /= h
+        push[:n] /= h
+        others[:n] /= h
+        rows[:, n + nz :] *= h
+        p[:, n + nz :] *= h
+        sought = [*self.unknown, *range(n, n + nz + m)]
+        by_other = np.hstack([others, hold.stiffness * push, rows[:, fixed]])[sought]
+        change = -_solved(rows[np.ix_(sought, sought)], by_other)
+        state = np.concatenate([q, found.p1[0], z])
+        total = np.zeros((len(state), by_other.shape[1]))
+        total[list(self.unknown)] = change[:free]
+        total[fixed, len(names) + nu + np.arange(len(fixed))] = 1.0
+        total[n : 2 * n] = p[:, sought] @ change + np.hstack([others_p, hold.stiffness * push_p, p[:, fixed]])
+        total[2 * n :] = change[free : free + nz]
+        return state, total[:, : len(names)], total[:, len(names) :]
 
     def _explain(self, state: Array, theta: Array, error: float) -> str:
         system, step = self.step.system, self.step
@@ -271,46 +317,28 @@ class Statics:
         return text
 
 
-def _damped_newton(
-    function: Callable[[Array], Sequence[ca.DM]], w: Array, tolerance: float
-) -> tuple[Array, float, bool]:
-    """Newton with step control: the natural monotonicity test (Deuflhard 2011, section 3.3) or a smaller residual."""
-    if len(w) == 0:
-        return w, 0.0, True
+@dataclass(frozen=True)
+class _Hold:
+    """Known coordinates, and the torque and spring that hold the driven ones of them."""
 
-    def evaluate(x: Array) -> tuple[Array, Array]:
-        residual, jacobian = function(x)
-        return np.array(residual).ravel(), np.array(ca.densify(jacobian))
+    given: Array
+    held: Array
+    stiffness: float
 
-    residual, jacobian = evaluate(w)
-    error = float(np.max(np.abs(residual)))
-    for _ in range(100):
-        if error <= tolerance or not math.isfinite(error):
-            return w, error, error <= tolerance
-        # LAPACK itself: SciPy's wrapper prints a warning where a trial point is singular
-        triangles, pivots, info = scipy.linalg.lapack.dgetrf(jacobian)
-        if info != 0:
-            return w, error, False
-        factors = (triangles, pivots)
-        delta = -scipy.linalg.lu_solve(factors, residual)
-        scale = np.maximum(np.abs(w), 1.0)
-        size = float(np.max(np.abs(delta / scale)))
-        if not math.isfinite(size):
-            return w, error, False
-        factor = min(1.0, 0.3 / size)
-        while True:
-            trial = w + factor * delta
-            new_residual, new_jacobian = evaluate(trial)
-            if np.all(np.isfinite(new_residual)):
-                shrunk = float(np.max(np.abs(scipy.linalg.lu_solve(factors, new_residual) / scale)))
-                if shrunk <= (1 - factor / 4) * size or np.max(np.abs(new_residual)) <= (1 - factor / 4) * error:
-                    break
-            factor *= 0.5
-            if factor < 1e-6:
-                return w, error, error < 1e2 * tolerance
-        w, residual, jacobian = trial, new_residual, new_jacobian
-        error = float(np.max(np.abs(residual)))
-    return w, error, False
+    def give(self, q: Any, system: System) -> Any:
+        """By how much the driven joints are away from where they should be."""
+        return self.given[: len(self.held)] - q[list(system.driven_indices)]
+
+
+def _solved(matrix: Array, right: Array) -> Array:
+    """The solution; of least squares where redundant grasps leave forces open."""
+    if not right.size:
+        return np.zeros((matrix.shape[1], right.shape[1]))
+    factors, pivots, info = scipy.linalg.lapack.dgetrf(matrix)
+    norm = float(np.max(np.sum(np.abs(matrix), axis=0)))
+    if info == 0 and scipy.linalg.lapack.dgecon(factors, norm)[0] > SINGULAR:
+        return np.asarray(scipy.linalg.lapack.dgetrs(factors, pivots, right)[0])
+    return np.asarray(np.linalg.lstsq(matrix, right, rcond=None)[0])
 
 
 def relaxed(step: Step, q: ArrayLike, theta: ArrayLike) -> Array:
@@ -326,4 +354,4 @@ def relaxed(step: Step, q: ArrayLike, theta: ArrayLike) -> Array:
         residual = ca.substitute(e.internal_at_rest, old, still)
         function = ca.Function("relaxed", [z, at, e.theta, e.time_step], [residual, ca.jacobian(residual, z)])
     arguments = (np.asarray(q, float), np.asarray(theta, float), step.time_step)
-    return _damped_newton(lambda x: function(x, *arguments), np.zeros(nz), 1e-12)[0]
+    return damped_newton(lambda x: function(x, *arguments), np.zeros(nz), 1e-12)[0]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,7 +16,7 @@ from yid_ocp.integrator.discrete import ConstraintForce, DiscreteEquations, Forc
 from yid_ocp.integrator.interpreted import InterpretedKernel
 from yid_ocp.integrator.step_model import Directions as Directions
 from yid_ocp.integrator.step_model import Feedback as Feedback
-from yid_ocp.integrator.step_model import Kernel, StepModel, StepStatus, step_model
+from yid_ocp.integrator.step_model import Kernel, StepModel, StepStatus, newton_tolerance, step_model
 from yid_ocp.integrator.step_model import Rollout as Rollout
 from yid_ocp.model.system import System
 
@@ -208,9 +208,7 @@ def compile_step(
     ModelError
         Time step not positive, unknown force split or constraint force.
     """
-    if not (math.isfinite(time_step) and time_step > 0):
-        raise ModelError(f"time_step = {time_step}", allowed="a positive number of seconds")
-    model = step_model(system, time_step, force_split, constraint_force, tolerance)
+    model = step_model(system, _positive(time_step), force_split, constraint_force, tolerance)
     source = codegen.kernel_source(model.functions, model.structure) if use_compiler else None
     library = None if source is None else compiler.compile_library(source)
     if library is None:
@@ -218,10 +216,28 @@ def compile_step(
     return Step(model, CompiledKernel(model, library), compiled=True)
 
 
+def at_time_step(step: Step, time_step: float) -> Step:
+    """The same step of another length [s], from the same equations and compiled code.
+
+    Raises
+    ------
+    ModelError
+        Time step not positive.
+    """
+    model = replace(step.model, time_step=_positive(time_step), tolerance=newton_tolerance(time_step))
+    return Step(model, step.kernel.of(model), step.compiled)
+
+
 def compile_alike(step: Step, system: System, *, use_compiler: bool | None = None) -> Step:
     """The step of another system by the same rules, with the same kind of kernel where nothing else is said."""
     compiled = step.compiled if use_compiler is None else use_compiler
     return compile_step(system, step.time_step, step.force_split, step.constraint_force, use_compiler=compiled)
+
+
+def _positive(time_step: float) -> float:
+    if not (math.isfinite(time_step) and time_step > 0):
+        raise ModelError(f"time_step = {time_step}", allowed="a positive number of seconds")
+    return time_step
 
 
 def check_shape(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:

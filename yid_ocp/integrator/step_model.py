@@ -21,6 +21,9 @@ Array = NDArray[np.float64]
 # Newton iterations of one step before it is given up.
 ITERATION_LIMIT = 60
 
+# The same of an equilibrium, which is looked for from far away.
+REST_ITERATION_LIMIT = 100
+
 # Newton stops when a correction of the coordinates is below TOLERANCE [rad or m], with short time steps below
 # RATE_TOLERANCE times the step: what is left undone is momentum lost in every step, mass times correction over step.
 TOLERANCE, RATE_TOLERANCE, ROUNDING = 1e-12, 1e-10, 1e-15
@@ -74,8 +77,13 @@ def step_model(
         "ntheta": e.theta.numel(),
     }
     if tolerance is None:
-        tolerance = max(ROUNDING, min(TOLERANCE, RATE_TOLERANCE * time_step))
+        tolerance = newton_tolerance(time_step)
     return StepModel(system, e, functions, codegen.structure(functions), sizes, float(time_step), tolerance)
+
+
+def newton_tolerance(time_step: float) -> float:
+    """Newton's tolerance on the coordinates [rad or m] for a step of so many seconds."""
+    return max(ROUNDING, min(TOLERANCE, RATE_TOLERANCE * time_step))
 
 
 class StepCode(IntEnum):
@@ -285,6 +293,10 @@ class StepLinearization:
 class Kernel(Protocol):
     """What the compiled and the interpreted implementation have in common."""
 
+    def of(self, model: StepModel) -> Kernel:
+        """The kernel of the same equations at another length of the step."""
+        ...
+
     def rollout(
         self,
         theta: Array,
@@ -320,6 +332,32 @@ class Kernel(Protocol):
         derivatives: bool,
     ) -> StepLinearization:
         """Equations of len(torque) steps along a trajectory, with their Jacobians where asked for."""
+        ...
+
+    def rest(
+        self, theta: Array, unknowns: Array, given: Array, held: Array, stiffness: float, tolerance: float
+    ) -> tuple[Array, float, bool]:
+        """Search an equilibrium by Newton's iteration; see `RestEquations`.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (ntheta,)
+        unknowns : ndarray, shape (ny,)
+            Where it begins.
+        given : ndarray, shape (nu + nc,)
+        held : ndarray, shape (nu,)
+        stiffness : float
+        tolerance : float
+            Largest imbalance [N m] and constraint violation [m] that counts as rest.
+
+        Returns
+        -------
+        unknowns : ndarray, shape (ny,)
+            The last point.
+        error : float
+            Largest imbalance or violation there.
+        converged : bool
+        """
         ...
 
 

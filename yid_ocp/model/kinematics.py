@@ -102,7 +102,7 @@ class RigidBody:
 
 def cross(a: ca.SX, b: ca.SX) -> ca.SX:
     """Vector product of two (3, 1) expressions."""
-    return ca.vertcat(a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+    return ca.cross(a, b)
 
 
 def motion_cross(a: ca.SX, b: ca.SX) -> ca.SX:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal
 
 import casadi as ca
@@ -180,7 +181,7 @@ class Mechanism:
     parameters: Parameters = field(default_factory=Parameters)
     lines: Mapping[str, Line] = field(default_factory=dict)
 
-    @property
+    @cached_property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the joints, in configuration order."""
         return tuple(joint.name for joint in self.joints)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal, Protocol, runtime_checkable
 
 import casadi as ca
@@ -442,21 +443,20 @@ class System:
         """m, the number of scalar constraints."""
         return sum(grasp.equations for grasp in self.grasps)
 
-    @property
+    @cached_property
     def driven_indices(self) -> tuple[int, ...]:
         """Configuration index of each input."""
         return tuple(self.mechanism.joint_index(name) for name in self.driven)
 
-    @property
+    @cached_property
     def prescribed_indices(self) -> tuple[int, ...]:
         """Configuration index of each prescribed coordinate."""
         return tuple(self.mechanism.joint_index(name) for name in self.prescribed)
 
-    @property
+    @cached_property
     def free_indices(self) -> tuple[int, ...]:
         """Configuration indices that are not prescribed."""
-        known = set(self.prescribed_indices)
-        return tuple(i for i in range(self.size) if i not in known)
+        return tuple(i for i in range(self.size) if i not in self.prescribed_indices)
 
     @property
     def internal(self) -> dict[str, ca.SX]:

@@ -148,7 +148,8 @@ def _tracked(episode: Episode, functions: ModelFunctions, options: ProblemOption
     if options.feedback == "proportional":
         return replace(episode, feedback=proportional_filter(step, episode.measured_arm, options.gains))
     plain = functions.momentum_shift.without(theta)
-    return replace(episode, feedback=lqr_filter(step, episode.smooth_arm, episode.torque, plain))
+    loop = lqr_filter(step, episode.smooth_arm, episode.torque, plain, arms=functions.arms)
+    return replace(episode, feedback=loop)
 
 
 def beginning(episode: Episode, steps: int) -> Episode:

@@ -5,12 +5,12 @@ A problem that frees part of it takes the columns that it needs, so that any num
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.integrator.lqr import MomentumShift
+from yid_ocp.integrator.lqr import MomentumShift, arms_alone
 from yid_ocp.integrator.mapped import Mapped
 from yid_ocp.integrator.statics import Rest, Statics
 from yid_ocp.integrator.step import Step
@@ -61,6 +61,7 @@ class ModelFunctions:
         self._start_parameters = start_parameters
         self._statics: Once[None, Statics] = Once(lambda _: Statics(step))
         self._start_fit: Once[None, StartFit] = Once(lambda _: StartFit(step, start_parameters))
+        self._arms: Once[None, Step] = Once(lambda _: arms_alone(step))
         self._momentum: Once[None, MomentumShift] = Once(lambda _: MomentumShift(step))
         self._sensors: Once[tuple[Sensor, bool], Mapped] = Once(self._compiled)
 
@@ -73,6 +74,11 @@ class ModelFunctions:
     def start_fit(self) -> StartFit:
         """The fit of a start to points."""
         return self._start_fit(None)
+
+    @property
+    def arms(self) -> Step:
+        """The step of the driven joints alone, about which the tracking filter is worked out."""
+        return self._arms(None)
 
     @property
     def momentum_shift(self) -> MomentumShift:
@@ -88,9 +94,8 @@ class ModelFunctions:
     def rest(
         self, posture: Array, theta: Array, torque: Array | None, guess: Array | None, wanted: tuple[str, ...]
     ) -> Rest:
-        """The equilibrium at a posture, differentiated by some of `names`; see `Statics.solve`."""
-        rest = self.statics.solve(posture, theta, torque, guess, self.names if wanted else ())
-        return replace(rest, by_theta=rest.by_theta[:, list(self.columns(wanted))]) if wanted else rest
+        """The equilibrium at a posture, differentiated by named parameters; see `Statics.solve`."""
+        return self.statics.solve(posture, theta, torque, guess, wanted)
 
     def columns(self, wanted: tuple[str, ...]) -> tuple[int, ...]:
         """Places of some of `names`."""

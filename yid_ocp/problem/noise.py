@@ -35,7 +35,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-import scipy.linalg
+import scipy.linalg.lapack
 from numpy.typing import NDArray
 
 from yid_ocp.data.recording import Recording
@@ -171,10 +171,8 @@ class _FilterStep:
         Of the prediction a step later.
     ahead : ndarray, shape (r, nu)
         Rows by a known correction of the torque over the step.
-    by_state : ndarray, shape (ns, ns)
-        A_k, less B_k K_k where the tracking filter is part of the model.
-    by_torque : ndarray, shape (ns, nu)
-        B_k
+    move : ndarray, shape (ns, na)
+        d after the step by (d, w, b): A_k, less B_k K_k where the tracking filter is part of the model, and B_k twice.
     held : bool
         Whether w stays what it is.
     """
@@ -184,35 +182,36 @@ class _FilterStep:
     whiten: Array
     gain: Array
     ahead: Array
-    by_state: Array
-    by_torque: Array
+    move: Array
     held: bool
 
     def over(self, mean: Array, own: Array, push: Array | None) -> tuple[Array, Array]:
         """What the rows say beyond the prediction, and the prediction a step later.
 
-        Only A_k is as large as (d, w, b) squared, so that the whole is not kept as one matrix.
+        Only what d becomes is as large as (d, w, b) squared, so that the whole is not kept as one matrix.
         """
-        (ns, nu), gap = self.by_torque.shape, own - self.observe @ mean
-        error = mean[ns : ns + nu] + mean[ns + nu :]
+        ns, kept, gap = len(self.move), self._kept, own - self.observe @ mean
         if push is not None:
             gap -= self.ahead @ push
-            error = error + push
         later = self.gain @ gap
-        later[:ns] += self.by_state @ mean[:ns] + self.by_torque @ error
-        if self.held:
-            later[ns : ns + nu] += mean[ns : ns + nu]
-        later[ns + nu :] += mean[ns + nu :]
+        later[:ns] += self.move @ mean
+        later[kept:] += mean[kept:]
+        if push is not None:
+            later[:ns] += self.move[:, ns : ns + len(push)] @ push
         return gap, later
 
     def back(self, costate: Array) -> Array:
         """The transposed map of (d, w, b) over the step, without what the rows tell."""
-        ns, nu = self.by_torque.shape
-        earlier, pulled = np.zeros_like(costate), self.by_torque.T @ costate[:ns]
-        earlier[:ns] = self.by_state.T @ costate[:ns]
-        earlier[ns : ns + nu] = pulled + costate[ns : ns + nu] * self.held
-        earlier[ns + nu :] = pulled + costate[ns + nu :]
+        ns, kept = len(self.move), self._kept
+        earlier = self.move.T @ costate[:ns]
+        earlier[kept:] += costate[kept:]
         return earlier
+
+    @property
+    def _kept(self) -> int:
+        """Where in (d, w, b) that begins which stays what it is."""
+        ns, na = self.move.shape
+        return ns if self.held else (ns + na) // 2
 
 
 @dataclass(frozen=True)
@@ -399,12 +398,16 @@ def innovations(course: Course, errors: InputErrors) -> Innovations:
         except np.linalg.LinAlgError:
             # rounding beside covariances that differ by many decades
             factor = np.diag(np.sqrt(1.0 + np.maximum(np.sum(cross * observe, axis=1), 0.0)))
-        whiten = scipy.linalg.solve_triangular(factor, np.eye(len(rows)), lower=True)
+        whiten = scipy.linalg.lapack.dtrtri(factor, lower=1)[0] if len(rows) else factor
         known = whiten @ cross
-        transition = turn.transition
-        gain = transition @ known.T @ whiten
-        made.append(_FilterStep(rows, observe, whiten, gain, ahead, turn.by_state, turn.by_torque, not turn.fresh))
-        covariance = transition @ (covariance - known.T @ known) @ transition.T + turn.noise
+        gain = turn.over(known.T @ whiten)
+        made.append(_FilterStep(rows, observe, whiten, gain, ahead, turn.move, not turn.fresh))
+        covariance = turn.over(turn.over(covariance - known.T @ known).T)
+        if turn.shaken is not None:
+            covariance[: len(kept), : len(kept)] += turn.shaken @ turn.shaken.T
+        if turn.fresh:
+            torque = np.arange(len(kept), len(kept) + nu)
+            covariance[torque, torque] += errors.torque_std**2
         covariance = 0.5 * (covariance + covariance.T)
     spread = np.sqrt(np.maximum(np.diag(covariance)[len(kept) + nu :], 0.0))
     return Innovations(tuple(made), errors, first, live, spread)
@@ -416,56 +419,47 @@ class _Turn:
 
     Attributes
     ----------
-    by_state : ndarray, shape (ns, ns)
-    by_torque : ndarray, shape (ns, nu)
+    move : ndarray, shape (ns, na)
+        d after it.
     fresh : bool
         Whether w is another one after it.
-    noise : ndarray, shape (na, na)
-        Covariance that comes in.
+    shaken : ndarray, shape (ns, s), or None
+        By unit noises of its own that come to d.
     effort : ndarray, shape (nc, na), or None
-        Of prescribed coordinates at the node before; None after the last step.
+        Of prescribed coordinates at the node before; None after the last step, and where there are none.
     """
 
-    by_state: Array
-    by_torque: Array
+    move: Array
     fresh: bool
-    noise: Array
+    shaken: Array | None
     effort: Array | None
 
-    @property
-    def transition(self) -> Array:
-        """The whole of it, shape (na, na)."""
-        ns, nu = self.by_torque.shape
-        whole = np.eye(ns + 2 * nu)
-        whole[:ns] = np.hstack([self.by_state, self.by_torque, self.by_torque])
+    def over(self, columns: Array) -> Array:
+        """Columns (na, c) after the step."""
+        (ns, na), later = self.move.shape, columns.copy()
+        later[:ns] = self.move @ columns
         if self.fresh:
-            torque = np.arange(ns, ns + nu)
-            whole[torque, torque] = 0.0
-        return whole
+            later[ns : (ns + na) // 2] = 0.0
+        return later
 
 
 def _last_turn(ns: int, nu: int) -> _Turn:
-    none = np.zeros((ns, nu))
-    return _Turn(np.eye(ns), none, False, np.zeros((ns + 2 * nu, ns + 2 * nu)), None)
+    return _Turn(np.eye(ns, ns + 2 * nu), False, None, None)
 
 
 def _turn(here: LinearStep, kept: Rows, feedback: Feedback | None, errors: InputErrors, k: int, fresh: bool) -> _Turn:
-    by_state, by_torque, ns = here.by_state, here.by_torque[kept], len(kept)
-    nu = by_torque.shape[1]
-    effort_by_state = here.effort_by_state
-    noise = np.zeros((ns + 2 * nu, ns + 2 * nu))
+    by_state, by_torque, effort_by_state, shaken = here.by_state, here.by_torque[kept], here.effort_by_state, None
     if feedback is not None and not errors.encoders:
         by_state, effort_by_state = by_state.copy(), effort_by_state.copy()
         by_state[:, feedback.index] -= here.by_torque @ feedback.gain[k]
         effort_by_state[:, feedback.index] -= here.effort_by_torque @ feedback.gain[k]
         # an error of the angles that the filter follows; that of the momenta, their slope, averages out
-        angles = by_torque @ feedback.gain[k][:, :nu] * errors.angle_std * np.sqrt(errors.spread)
-        noise[:ns, :ns] = angles @ angles.T
-    if fresh:
-        torque = np.arange(ns, ns + nu)
-        noise[torque, torque] = errors.torque_std**2
-    effort = np.hstack([effort_by_state[:, kept], here.effort_by_torque, here.effort_by_torque])
-    return _Turn(by_state[np.ix_(kept, kept)], by_torque, fresh, noise, effort)
+        nu = by_torque.shape[1]
+        shaken = by_torque @ feedback.gain[k][:, :nu] * errors.angle_std * np.sqrt(errors.spread)
+    effort = None
+    if len(effort_by_state):
+        effort = np.hstack([effort_by_state[:, kept], here.effort_by_torque, here.effort_by_torque])
+    return _Turn(np.hstack([by_state[np.ix_(kept, kept)], by_torque, by_torque]), fresh, shaken, effort)
 
 
 @dataclass(frozen=True)
@@ -533,8 +527,10 @@ class _Readings:
         """Rows of node k, their slopes by (d, w, b), and by a known correction of the torque over the step."""
         rows = self.order[self.first[k] : self.first[k + 1]]
         before, after = self.before[rows], self.after[rows]
-        ahead = after @ turn.by_torque
-        observe = np.hstack([before + after @ turn.by_state, ahead, ahead])
+        observe = after @ turn.move
+        ns, na = turn.move.shape
+        ahead = observe[:, ns : (ns + na) // 2].copy()
+        observe[:, :ns] += before
         if turn.effort is not None:
             observe += self.effort[rows] @ turn.effort
         return rows, observe, ahead

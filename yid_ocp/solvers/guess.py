@@ -116,7 +116,7 @@ def _tracking(problem: EstimationProblem, episode: Episode, theta: Array) -> Fee
     feedback = episode.feedback
     if feedback is None and problem.system.driven:
         smooth = LowPass(problem.options.path_cutoff)(episode.grid.times, episode.measured_arm)
-        return lqr_filter(problem.step, smooth, episode.torque, theta)
+        return lqr_filter(problem.step, smooth, episode.torque, theta, arms=problem.functions.arms)
     return feedback
 
 

@@ -372,12 +372,13 @@ class _Maker:
             at, data, shared = places.state[:1], given.T, np.zeros(0, np.int64)
         else:
             statics = problem.functions.statics
-            sought, held = statics.inputs[0], statics.inputs[2]
+            rest = statics.equations
+            sought, held = rest.inputs[0], rest.inputs[2]
             stiffness = HOLD_STIFFNESS_WITH_TORQUE if problem.system.driven else HOLD_STIFFNESS
-            symbols = [statics.inputs[3], statics.inputs[4], statics.inputs[5]]
+            symbols = rest.inputs[3:]
             values = [ca.SX(stiffness), self._freed.theta, ca.SX(self._step.time_step)]
-            balance, state = ca.substitute([statics.residual, statics.state], symbols, values)
-            posture, nu = statics.inputs[1], held.numel()
+            balance, state = ca.substitute([rest.residual, rest.state], symbols, values)
+            posture, nu = rest.inputs[1], held.numel()
             errors = ca.SX.sym("errors", 3 * len(places.first))
             if len(places.first):
                 # (of the first angles, w of the first step, b)

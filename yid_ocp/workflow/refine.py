@@ -14,6 +14,7 @@ from yid_ocp.analysis.discretisation import Moves, Refined, counting, divided_jo
 from yid_ocp.analysis.stability import growth_of_fit
 from yid_ocp.config.settings import Run, SegmentedObject, YObject
 from yid_ocp.errors import YidError
+from yid_ocp.integrator.step import at_time_step
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.solvers import Solution, Status
@@ -96,7 +97,7 @@ def discretisation(
             continue
         progress.stage(f"trying {words}")
         try:
-            refined = _with_twice_the_links(run, problem) if key == "links" else _with_half_the_step(run, problem)
+            refined = _with_twice_the_links(run, problem) if key == "links" else _with_half_the_step(problem)
             own = moves(refined, problem, x, at_x, models_alone=models_alone)
         except YidError as error:
             own = error.what
@@ -128,9 +129,8 @@ def _with_twice_the_links(run: Run, problem: EstimationProblem) -> Refined:
     return Refined(made, factors, divided_joints(problem.system, system))
 
 
-def _with_half_the_step(run: Run, problem: EstimationProblem) -> Refined:
-    said = replace(run.problem, time_step=run.problem.time_step / 2, compiler=problem.step.compiled)
-    step = build_step(replace(run, problem=said))
+def _with_half_the_step(problem: EstimationProblem) -> Refined:
+    step = at_time_step(problem.step, problem.step.time_step / 2)
     recordings = [episode.recording for episode in problem.episodes]
     return Refined(EstimationProblem(step, recordings, problem.free, problem.options))
 

@@ -17,6 +17,7 @@ from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.model.kinematics import forward_kinematics, rigid_body
 from yid_ocp.model.mechanism import Joint
 from yid_ocp.model.system import System
+from yid_ocp.parallel import Once
 from yid_ocp.problem.low_pass import LowPass
 
 Array = NDArray[np.float64]
@@ -99,11 +100,7 @@ class Arm:
             [m]
         ndarray, shape (N, nf, 3, k)
         """
-        known = ca.SX.sym("q", len(self.names))
-        kinematics = forward_kinematics(self.system.mechanism, self._placed(known))
-        at = self._numbers(ca.vertcat(*(kinematics.position(frame) for frame in frames)))
-        function = ca.Function("places", [known], [ca.densify(at), ca.densify(ca.jacobian(at, known))])
-        place, slope = (np.array(ca.densify(x)) for x in function.map(len(q)).call([q.T]))
+        place, slope = (np.array(ca.densify(x)) for x in self._places(frames).map(len(q)).call([q.T]))
         count, width = len(frames), len(self.names)
         by_angle = slope.reshape(3 * count, len(q), width).transpose(1, 0, 2)
         return place.T.reshape(len(q), count, 3), by_angle.reshape(len(q), count, 3, width)
@@ -111,6 +108,16 @@ class Arm:
     def inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
         """Efforts that the bodies alone need, without dampers, springs and grasps, shape (N, k) [N m]."""
         return np.array(self._effort.map(len(q)).call([q.T, v.T, a.T])[0]).T
+
+    @cached_property
+    def _places(self) -> Once[tuple[str, ...], ca.Function]:
+        return Once(self._place_function)
+
+    def _place_function(self, frames: tuple[str, ...]) -> ca.Function:
+        known = ca.SX.sym("q", len(self.names))
+        kinematics = forward_kinematics(self.system.mechanism, self._placed(known))
+        at = self._numbers(ca.vertcat(*(kinematics.position(frame) for frame in frames)))
+        return ca.Function("places", [known], [ca.densify(at), ca.densify(ca.jacobian(at, known))])
 
     @cached_property
     def _effort(self) -> ca.Function:
