@@ -15,7 +15,7 @@ LABELS = ("Cable:base", "Cable:tip", "*3", "LKneeAngles", "gone")
 
 
 def write_c3d(path: Path, labels: tuple[str, ...] = LABELS, unit: str = "mm", frames: int = 6) -> np.ndarray:
-    """A file at 200 Hz whose markers go up; the tip is hidden in frame 2. What was written, (N, 2, 3) in its unit."""
+    """A file at 200 Hz whose markers go up; frame 2 hides the tip, frame 4 the base. What was written, (N, 2, 3)."""
     ezc3d: Any = pytest.importorskip("ezc3d", reason="C3D needs ezc3d: pip install 'yid-ocp[c3d]'")
     file = ezc3d.c3d()
     point = file["parameters"]["POINT"]
@@ -25,12 +25,13 @@ def write_c3d(path: Path, labels: tuple[str, ...] = LABELS, unit: str = "mm", fr
     values[:3] = 100.0 * (1 + np.arange(len(labels)))[None, :, None] + np.arange(frames)
     if len(labels) == len(LABELS):
         values[:3, 1, 2] = np.nan
-        values[:3, 4] = 0.0
+        values[:3, 4] = values[:3, 0, 4] = 0.0
     file["data"]["points"] = values
     file["parameters"]["ANALOG"]["LABELS"]["value"] = ["force"]
     file["parameters"]["ANALOG"]["RATE"]["value"] = [200.0]
     file["data"]["analogs"] = np.zeros((1, 1, frames))
     file.write(str(path))
+    values[values == 0] = np.nan
     return np.asarray(values[:3, :2].transpose(2, 1, 0))
 
 
@@ -41,7 +42,7 @@ def test_markers_of_a_file(tmp_path: Path) -> None:
     assert (points.names, points.frame, points.clock) == (("base", "tip"), "lab", "nominal")
     assert np.allclose(points.t, np.arange(6) / 200)
     assert np.allclose(points.position, 1e-3 * written, equal_nan=True)
-    assert np.isnan(points.position[2, 1]).all()
+    assert np.argwhere(np.isnan(points.position).all(axis=2)).tolist() == [[2, 1], [4, 0]]
     assert sorted(recording.notes) == [
         "*3 was left out (it has no label)",
         "LKneeAngles was left out (computed by a model, no place)",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -95,7 +95,7 @@ def simulated(
 
 
 def write_mcap(recording: Recording, folder: Path) -> Path:
-    """A bag with the joints on two topics in turn of one clock, every point on a topic, and a topic nobody needs."""
+    """A bag with the joints on one topic, every point on one of its own, and a topic that nobody needs."""
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -128,12 +128,3 @@ def write_mcap(recording: Recording, folder: Path) -> Path:
                 connections[topic] = writer.add_connection(topic, kind, typestore=store)
             writer.write(connections[topic], START + round(1e9 * t), store.serialize_cdr(message, kind))
     return folder / f"{folder.name}.mcap"
-
-
-def edited(file: Path, edits: Sequence[tuple[str, str]]) -> None:
-    """Replace text of a file, each of which has to be there once."""
-    text = file.read_text()
-    for old, new in edits:
-        assert text.count(old) == 1, old
-        text = text.replace(old, new)
-    file.write_text(text)

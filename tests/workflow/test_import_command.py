@@ -74,7 +74,9 @@ def test_what_the_preview_proposes_imports_the_file(odd: Path, capsys: pytest.Ca
     assert recording.points[0].position[0, 0, 0] == pytest.approx(0.9)
     # a recording of our own is shown, too
     assert main(["import", "plain.h5", "--preview"]) == 0
-    assert "joints" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "note: a recording already" in told
+    assert "to import it" not in told
 
 
 def test_left_out_lines_are_told(odd: Path, capsys: pytest.CaptureFixture[str]) -> None:

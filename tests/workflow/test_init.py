@@ -114,8 +114,10 @@ def test_several_recordings_are_split_and_a_rest_splits_one(bench: Path) -> None
     assert "of made" in second.notes[0]
 
 
-def test_a_start_in_motion_is_estimated(bench: Path) -> None:
-    write_recording(moved(np.arange(0, 2, 1 / RATE), moving=True), bench / "one.h5")
+@pytest.mark.parametrize("parts", [(0.5, 1.0), ()], ids=["joints and points", "joints alone"])
+def test_a_start_in_motion_is_estimated(parts: Sequence[float], bench: Path) -> None:
+    recording = moved(np.arange(0, 2, 1 / RATE), parts=parts, effort=True, moving=True)
+    write_recording(recording, bench / "one.h5")
     assert init(*CABLE) == 0
     assert load_config("run.yaml").problem.initial_state == "estimated"
 

@@ -34,7 +34,9 @@ def run(arguments: argparse.Namespace) -> int:
         contents = preview(arguments.file)
         options = {**contents.options, **given_options(arguments)}
         lines = contents_summary(contents)
-        print_lines([*lines, "", "to import it:", f"  {command_line(arguments.file, options)}"])
+        if not own(arguments.file):
+            lines += ["", "to import it:", f"  {command_line(arguments.file, options)}"]
+        print_lines(lines)
         return DONE
     if arguments.out is None:
         allowed = "--out RECORDING.h5, or --preview to look only"
@@ -63,9 +65,14 @@ def imported(file: str | Path, options: Mapping[str, Any]) -> Recording:
         As `read_any`.
     """
     recording = read_any(file, **options)
-    if recording.sha256 is None or Path(file).suffix.lower() in (".h5", ".hdf5"):
+    if recording.sha256 is None or own(file):
         return recording
     return replace(recording, source=f"{recording.source} (SHA-256 {recording.sha256})")
+
+
+def own(file: str | Path) -> bool:
+    """Whether a file is a recording already, by its name."""
+    return Path(file).suffix.lower() in (".h5", ".hdf5")
 
 
 def options_of_settings(settings: ImportSettings) -> dict[str, Any]:

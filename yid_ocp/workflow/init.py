@@ -17,11 +17,10 @@ from yid_ocp.model.urdf import read_urdf
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.command import DONE, print_lines
 from yid_ocp.workflow.commented import Object, configuration
-from yid_ocp.workflow.import_recording import given_options, imported
+from yid_ocp.workflow.import_recording import given_options, imported, own
 from yid_ocp.workflow.proposal import Branch, Proposal, propose, relative, split_at_rest
 
 SCHEMA = "yid-ocp.schema.json"
-OWN = (".h5", ".hdf5")
 LINKS = {"cable": 8, "beam": 6, "tree": 4, "y": 4}
 NEEDED = {"cable": ("length", "mass", "radius"), "beam": ("length", "mass"), "tree": (), "y": ()}
 MEANING = {"length": "its length [m]", "mass": "its mass [kg]", "radius": "its radius [m]"}
@@ -173,7 +172,7 @@ def _recordings(arguments: argparse.Namespace, out: Path) -> dict[Path, Recordin
     made: dict[Path, Recording | None] = {}
     for name in arguments.files:
         file = Path(name)
-        if file.suffix.lower() in OWN:
+        if own(file):
             if options:
                 flags = ", ".join(options)
                 raise ConfigError(f"{file.name} is a recording already", where=flags, hint="leave these options out")

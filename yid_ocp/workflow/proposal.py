@@ -31,7 +31,7 @@ CAMERA_STD, MARKER_STD = 5e-3, 1e-3
 REST_SPEED, POINT_REST_SPEED = 0.02, 0.03
 """A joint [rad/s] or a point [m/s] slower than this is at rest."""
 REST_WINDOW = 0.1
-"""Over which the speed of a joint is taken, and a third of that of a point [s]."""
+"""Over which speeds are taken [s]; up to twice that of slow sensors."""
 STILL = 0.02
 """A joint that turns less than this says nothing of its own friction [rad]."""
 MOVED = 0.1
@@ -301,7 +301,7 @@ def moving_at(recording: Recording, joints: Sequence[str], time: float) -> str:
         if fast.any():
             return f"joint {joints[int(np.argmax(fast))]}"
     for seen in recording.points:
-        speeds, noise = _speeds(seen.t, seen.position.reshape(len(seen.t), -1), time, 3 * REST_WINDOW)
+        speeds, noise = _speeds(seen.t, seen.position.reshape(len(seen.t), -1), time, REST_WINDOW)
         fast = speeds > POINT_REST_SPEED + 4 * noise
         if fast.any():
             return f"point {seen.names[int(np.argmax(fast)) // 3]}"
@@ -310,6 +310,9 @@ def moving_at(recording: Recording, joints: Sequence[str], time: float) -> str:
 
 def _speeds(t: Array, values: Array, time: float, window: float) -> tuple[Array, Array]:
     """Slope of each channel over a window, and its standard deviation by what the line leaves; zeros where unknown."""
+    period = float(np.median(np.diff(t))) if len(t) > 1 else math.inf
+    # a slow camera says nothing: what moves within five of its frames may well have rested at the first
+    window = max(window, min(5 * period, 2 * window))
     rows = (t >= time - 1e-9) & (t <= time + window)
     zeros = np.zeros(values.shape[1])
     if rows.sum() < 4:
