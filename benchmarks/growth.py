@@ -101,7 +101,7 @@ def screening(settings: Sequence[str], count: int) -> dict[str, float]:
     recording = problem.episodes[0].recording
     effects = chosen_effects(problem.system, [recording], "all")[:count]
     before = peak()
-    composed = CandidateProblem.of(problem, effects, [recording])
+    composed = CandidateProblem.of(problem, effects)
     nominal = nominal_fit(problem, composed)
     linearise(composed, (), nominal.values, DEFAULTS.shape_values)  # compiles
     begun = time.process_time()
@@ -239,6 +239,7 @@ def report(found: Mapping[str, Sequence[Mapping[str, float]]], slopes: Mapping[s
             rows = [(by, "CPU [s]", "memory [MiB]")]
             rows += [(f"{p[by]:g}", f"{p['cpu']:.3g}", f"{p['memory']:.3g}") for p in points]
             rows.append(("slope", *(f"{slopes[axis][of]:.2f}" for of in ("cpu", "memory"))))
+            rows.append(("at the end", *(f"{slope(points[-2:], by, of):.2f}" for of in ("cpu", "memory"))))
         lines += [*table(rows), ""]
     return lines
 
