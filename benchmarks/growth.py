@@ -1,6 +1,6 @@
 """How cost and memory grow: with variables, horizon, recordings, candidates, and what a second worker is worth.
 
-    python benchmarks/growth.py [AXIS ...] [--quick] [--json FILE] [--workers 1 2] [--cases 24]
+    python benchmarks/growth.py [AXIS ...] [--quick] [--largest N] [--json FILE] [--workers 1 2] [--cases 24]
 
 Every point is measured in a process of its own: processor time of one evaluation with its derivatives (residual and
 Jacobian by six stiffnesses, what an iteration of Gauss-Newton costs in the main), and by how much the process grew
@@ -101,7 +101,7 @@ def screening(settings: Sequence[str], count: int) -> dict[str, float]:
     recording = problem.episodes[0].recording
     effects = chosen_effects(problem.system, [recording], "all")[:count]
     before = peak()
-    composed = CandidateProblem.of(problem, effects, [recording])
+    composed = CandidateProblem.of(problem, effects)
     nominal = nominal_fit(problem, composed)
     linearise(composed, (), nominal.values, DEFAULTS.shape_values)  # compiles
     begun = time.process_time()
@@ -134,32 +134,31 @@ def alone(function: Callable[..., dict[str, float]], *arguments: Any) -> dict[st
         return pool.submit(function, *arguments).result()
 
 
-def variables(quick: bool) -> list[dict[str, float]]:
-    sizes = VARIABLES[quick]
+def variables(sizes: Sequence[int], quick: bool) -> list[dict[str, float]]:
     return [alone(evaluation, settings_of((n - ARM) // (TUBES * JOINTS), quick)) for n in sizes]
 
 
-def horizon(quick: bool) -> list[dict[str, float]]:
+def horizon(sizes: Sequence[int], quick: bool) -> list[dict[str, float]]:
     """More steps by finer ones: the recording is the same."""
     found = []
-    for steps in HORIZONS[quick]:
+    for steps in sizes:
         step = (0.1 if quick else DURATION) / steps
         found.append(alone(evaluation, settings_of(1 if quick else 4, quick, step=step)))
     return found
 
 
-def recordings(quick: bool) -> list[dict[str, float]]:
+def recordings(sizes: Sequence[int], quick: bool) -> list[dict[str, float]]:
     found = []
     with tempfile.TemporaryDirectory() as folder:
-        files = [_another(i, Path(folder)) for i in range(max(RECORDINGS[quick]))]
-        for count in RECORDINGS[quick]:
+        files = [_another(i, Path(folder)) for i in range(max(sizes))]
+        for count in sizes:
             point = alone(evaluation, settings_of(1 if quick else 4, quick, files[:count]))
             found.append(point | {"recordings": count})
     return found
 
 
-def candidates(quick: bool) -> list[dict[str, float]]:
-    return [alone(screening, settings_of(1 if quick else 4, quick), count) for count in CANDIDATES[quick]]
+def candidates(sizes: Sequence[int], quick: bool) -> list[dict[str, float]]:
+    return [alone(screening, settings_of(1 if quick else 4, quick), count) for count in sizes]
 
 
 def _another(number: int, folder: Path) -> Path:
@@ -173,13 +172,14 @@ def _another(number: int, folder: Path) -> Path:
     return path
 
 
-AXES: Mapping[str, tuple[Callable[[bool], list[dict[str, float]]], str]] = {
-    "variables": (variables, "variables"),
-    "horizon": (horizon, "steps"),
-    "recordings": (recordings, "recordings"),
-    "candidates": (candidates, "candidates"),
+Measure = Callable[[Sequence[int], bool], list[dict[str, float]]]
+AXES: Mapping[str, tuple[Measure, str, Mapping[bool, tuple[int, ...]]]] = {
+    "variables": (variables, "variables", VARIABLES),
+    "horizon": (horizon, "steps", HORIZONS),
+    "recordings": (recordings, "recordings", RECORDINGS),
+    "candidates": (candidates, "candidates", CANDIDATES),
 }
-"""What is measured along every axis, and by which key it goes."""
+"""What measures every axis, by which key it goes, and its points, those of `--quick` as well."""
 
 
 def slope(points: Sequence[Mapping[str, float]], by: str, of: str) -> float:
@@ -239,6 +239,7 @@ def report(found: Mapping[str, Sequence[Mapping[str, float]]], slopes: Mapping[s
             rows = [(by, "CPU [s]", "memory [MiB]")]
             rows += [(f"{p[by]:g}", f"{p['cpu']:.3g}", f"{p['memory']:.3g}") for p in points]
             rows.append(("slope", *(f"{slopes[axis][of]:.2f}" for of in ("cpu", "memory"))))
+            rows.append(("at the end", *(f"{slope(points[-2:], by, of):.2f}" for of in ("cpu", "memory"))))
         lines += [*table(rows), ""]
     return lines
 
@@ -249,6 +250,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     known = [*AXES, "workers"]
     parser.add_argument("axes", nargs="*", metavar="AXIS", help=f"of {', '.join(known)}; all when absent")
     parser.add_argument("--quick", action="store_true", help="small models without a compiler: whether it runs at all")
+    parser.add_argument("--largest", type=float, default=math.inf, help="leave larger points of an axis out")
     parser.add_argument("--json", type=Path, metavar="FILE", help="store points and slopes")
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2], help="numbers of processes to compare")
     parser.add_argument("--cases", type=int, help=f"that they share ({CASES[False]}; {CASES[True]} where quick)")
@@ -263,8 +265,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if axis == "workers":
             found[axis] = efficiency(chosen.workers, chosen.cases or CASES[chosen.quick], chosen.quick)
             continue
-        measure, by = AXES[axis]
-        found[axis] = measure(chosen.quick)
+        measure, by, sizes = AXES[axis]
+        found[axis] = measure([size for size in sizes[chosen.quick] if size <= chosen.largest], chosen.quick)
         slopes[axis] = {of: slope(found[axis], by, of) for of in ("cpu", "memory")}
     if chosen.json is not None:
         kept = {axis: {of: value for of, value in own.items() if math.isfinite(value)} for axis, own in slopes.items()}

@@ -27,8 +27,8 @@ def test_a_slope_is_that_of_logarithms(growth: ModuleType) -> None:
 
 def test_points_are_measured_stored_and_shown(growth: ModuleType, tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(growth, "alone", lambda function, *arguments: function(*arguments))
-    monkeypatch.setitem(growth.HORIZONS, True, (5, 10))
-    assert growth.main(["horizon", "--quick", "--json", str(tmp_path / "growth.json")]) == 0
+    monkeypatch.setitem(growth.HORIZONS, True, (5, 10, 40))
+    assert growth.main(["horizon", "--quick", "--largest", "10", "--json", str(tmp_path / "growth.json")]) == 0
     found = json.loads((tmp_path / "growth.json").read_text())
     assert [(point["variables"], point["steps"]) for point in found["points"]["horizon"]] == [(16, 5), (16, 10)]
     assert all(point["cpu"] > 0 for point in found["points"]["horizon"])

@@ -144,6 +144,13 @@ def test_a_recording_says_nothing_of_what_is_in_it(drawn):
     assert [motion["seed"], made["seed"]] == [int(rng.integers(2**31)) for _ in range(2)]
 
 
+def test_several_arms_on_one_object_go_less_far(drawn):
+    together = system()
+    together.grasps = ("left", "right")
+    drawn(of=together).record({}, (), np.random.default_rng(1), "case")
+    assert drawn.made[0]["motion"]["excitation"] == Excitation(travel=0.08)
+
+
 def test_a_camera_looks_on_where_one_did(drawn):
     drawn(pose=np.eye(4)).record({}, (), np.random.default_rng(1), "case")
     assert drawn.made[0]["camera"] == PointCamera()

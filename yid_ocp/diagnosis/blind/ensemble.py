@@ -52,8 +52,8 @@ OUTSIDE_SIZES: Mapping[str, tuple[str, float, float, str]] = {
     "one_way_damping": ("segment", 0.3, 1.0, ""),
 }
 """Of effects outside the library: where they sit, their least and largest size, and what of it they are parts of."""
-TRAVEL = 0.15
-"""How far the grippers go [m]."""
+TRAVEL, TRAVEL_TOGETHER = 0.15, 0.08
+"""How far the grippers go, one alone and several on one object, which they soon bring to snap [m]."""
 
 
 @dataclass(frozen=True)
@@ -435,7 +435,8 @@ def recorded(
         Of motion and noise.
     conditions : Conditions
     """
-    excitation = Excitation(travel=TRAVEL, duration=conditions.simulation.duration)
+    travel = TRAVEL if len(nominal.grasps) < 2 else TRAVEL_TOGETHER
+    excitation = Excitation(travel=travel, duration=conditions.simulation.duration)
     motion = multisine(nominal, truth, seed=int(rng.integers(2**31)), posture=posture, excitation=excitation)
     experiment = VirtualExperiment(
         motion=motion,
