@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import casadi as ca
@@ -209,3 +210,12 @@ def test_dry_friction_is_friction_of_the_joint(system: System) -> None:
     assert joint_terms(changed, Evaluator(changed))["elbow"].friction == 0.4
     model = compiled_model(mujoco_xml(changed, emulate=True))
     assert model.dof_frictionloss[model.joint("elbow").id] == 0.4
+
+
+def test_the_page_lists_what_is_native(repository) -> None:
+    text = (repository / "docs" / "export.md").read_text(encoding="utf-8")
+    rows = re.search(r"\| effect \| in MJCF \|\n(.*?)\n\n", text, re.DOTALL)
+    assert rows is not None
+    listed = {kind for row in rows[1].splitlines()[1:] for kind in re.findall(r"`(\w+)`", row.split("|")[1])}
+    native = {kind for kind, (*_, status) in OTHERS.items() if status == "native"} - {"junction_compliance"}
+    assert listed == native | set(MECHANICAL)

@@ -200,3 +200,12 @@ def test_no_model_without_its_manifest(cli, found, tmp_path) -> None:
     manifest_file(tmp_path / "y.urdf").mkdir()
     assert cli("export", found, "--format", "urdf", "--out", tmp_path / "y.urdf").code == 2
     assert not (tmp_path / "y.urdf").exists()
+
+
+def test_prescribed_joints_are_moved_as_recorded(cli, pendulum, tmp_path) -> None:
+    assert cli("solve", pendulum, "--out", "run", "--set", "output.report=false").code == 0
+    manifest = export_model("run", tmp_path / "pendulum.xml")
+    [(name, entry)] = manifest["gate"]["channels"].items()
+    assert (name, entry["unit"]) == ("joints.effort", "N m")
+    assert entry["after"] < 0.3 * entry["before"]
+    assert manifest["parameters"]["shoulder.stiffness"]["how"] == "stiffness of joints"

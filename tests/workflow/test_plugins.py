@@ -109,6 +109,8 @@ def test_distributions_are_found_by_their_entry_point(kinds, pendulum, monkeypat
     assert used_versions()["entry point constant"] == "my-effects 1.2"
     build_system(load_config(pendulum))
     assert "constant" in EFFECTS
+    plugins._loaded.clear()  # as if a script had imported it before
+    build_system(load_config(pendulum))
     broken = replace_dist(metadata.EntryPoint("gone", "no_such_module", plugins.GROUP), found.dist)
     monkeypatch.setattr(plugins, "_installed", lambda: [broken])
     with pytest.raises(ConfigError, match=r"entry point gone raised ModuleNotFoundError(.|\n)*my-effects 1.2"):

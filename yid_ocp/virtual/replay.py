@@ -22,6 +22,7 @@ BANDWIDTH = 5.0
 """Of what keeps driven joints from drifting away [rad/s]: slow, so that the recorded torque moves them."""
 _SMOOTHED = 2.0  # samples over which recorded angles are smoothed before they are followed
 _START = 5  # samples of which the first posture is the mean
+_AT_ENDS = 0.2  # of a recording in which what moves prescribed joints is not compared [s]: it begins anew there
 _INERTIA_EVERY = 20  # steps; an arm's inertia hardly changes meanwhile
 
 
@@ -91,7 +92,8 @@ def replay(text: str, system: System, recording: Recording) -> dict[str, Error]:
     scene.data.qpos[:] = model.qpos_spring
     scene.data.qpos[scene.driven] = position[:_START].mean(axis=0)
     balance = settle(scene, np.array(model.dof_damping))
-    path = _Path(moved, t, position)
+    noisy = joints.position_std is not None and bool(np.any(np.asarray(joints.position_std) > 0))
+    path = _Path(moved, t, position, _SMOOTHED if noisy else 0.0)
     played = _driven(scene, path, t, effort) if system.driven else _prescribed(scene, path, t, balance)
     if not (np.isfinite(played.values).all() and np.isfinite(played.points).all()):
         raise ModelError("the replay diverged", where=recording.name, hint="take a shorter time step")
@@ -99,11 +101,11 @@ def replay(text: str, system: System, recording: Recording) -> dict[str, Error]:
 
 
 class _Path:
-    """Recorded angles, smoothed, as a motion from the first of them."""
+    """Recorded angles, smoothed over some samples, as a motion from the first of them."""
 
-    def __init__(self, joints: tuple[str, ...], t: Array, position: Array) -> None:
+    def __init__(self, joints: tuple[str, ...], t: Array, position: Array, smoothed: float) -> None:
         self.joints = joints
-        spline = CubicSpline(t, gaussian_filter1d(position, _SMOOTHED, axis=0))
+        spline = CubicSpline(t, gaussian_filter1d(position, smoothed, axis=0) if smoothed else position)
         self._values = [spline, spline.derivative(1), spline.derivative(2)]
         self._start, self._last = position[:_START].mean(axis=0), float(t[-1])
 
@@ -165,6 +167,7 @@ def _prescribed(scene: Scene, path: _Path, t: Array, balance: Array) -> _Played:
     steps = round(t[-1] / model.opt.timestep)
     values, points = np.empty((steps, len(at))), np.empty((steps, len(scene.sites), 3))
     controller = Controller(scene, path, balance)
+    data.qvel[at] = path.at(0.0)[1]  # a recording may begin in motion
     for k in range(steps):
         mujoco.mj_kinematics(model, data)
         values[k], points[k] = controller.torque(k * model.opt.timestep), data.site_xpos[scene.sites]
@@ -177,11 +180,14 @@ def _errors(
     system: System, recording: Recording, joints: JointGroup, columns: list[int], played: _Played
 ) -> dict[str, Error]:
     found: dict[str, Error] = {}
-    inside = joints.t - joints.t[0] <= played.t[-1] + 1e-9
+    t = joints.t - joints.t[0]
+    inside = t <= played.t[-1] + 1e-9
+    if not system.driven:
+        inside &= (t >= _AT_ENDS) & (t <= t[-1] - _AT_ENDS)
     said = joints.position if system.driven else joints.effort
     noise = joints.position_std if system.driven else joints.effort_std
-    if said is not None:
-        model = _at(joints.t[inside] - joints.t[0], played.t, played.values)
+    if said is not None and inside.any():
+        model = _at(t[inside], played.t, played.values)
         error = float(np.sqrt(np.mean((model - said[inside][:, columns]) ** 2)))
         level = np.zeros(1) if noise is None else np.broadcast_to(noise, (len(joints.names),))[columns]
         unit = "rad" if system.driven else "N m"

@@ -241,16 +241,16 @@ def _owner(name: str) -> str:
 def _gate(calibrated: Calibrated, system: System, text: str) -> dict[str, Any]:
     """Errors of the exported model, and of the nominal one, on recordings that neither was fitted to."""
     which = "held_out" if calibrated.run.recordings.held_out else "estimate"
-    recordings = read_recordings(calibrated.run, which)
-    if not recordings:
-        return {"status": "not done", "reason": "the run has no recordings"}
     try:
+        recordings = read_recordings(calibrated.run, which)
+        if not recordings:
+            return {"status": "not done", "reason": "the run has no recordings"}
         kept = [f"{e.kind}@{e.location}" for e in calibrated.nominal.model.effects]
         present = [f"{e.kind}@{e.location}" for e in system.effects]
         nominal = _with(calibrated.nominal, [label for label in kept if label in present])
         before = _replayed(mujoco_xml(nominal, emulate=True, actuators=True), nominal, recordings)
         after = _replayed(text, system, recordings)
-    except ModelError as error:
+    except (DataError, ModelError) as error:
         return {"status": "not done", "reason": error.what}
     channels = {
         name: {

@@ -41,7 +41,8 @@ def load_plugins(run: Run) -> None:
     for entry in _installed():
         name, of = f"entry point {entry.name}", _distribution(entry)
         if name not in _loaded:
-            with _registering(name, f"{entry.value} of {of}", "update that package, or remove it"):
+            imported = entry.module in sys.modules  # by somebody's script, which registered it
+            with _registering(name, f"{entry.value} of {of}", "update that package, or remove it", None, imported):
                 entry.load()
             _loaded[name] = of
     for path, where in plugin_files(run):
@@ -88,12 +89,18 @@ def _run(path: Path, digest: str) -> None:
 
 
 @contextmanager
-def _registering(name: str, where: str, hint: str, path: Path | None = None) -> Iterator[None]:
-    """Say what is wrong with a plug-in that the block runs, and forget what it registered until then."""
+def _registering(
+    name: str, where: str, hint: str, path: Path | None = None, nothing_new: bool = False
+) -> Iterator[None]:
+    """Say what is wrong with a plug-in that the block runs, and forget what it registered until then.
+
+    Registering nothing is wrong as well, unless there may be `nothing_new`.
+    """
     before = [set(registry) for registry in _REGISTRIES]
     try:
         yield
-        if all(set(registry) == known for registry, known in zip(_REGISTRIES, before, strict=True)):
+        unchanged = all(set(registry) == known for registry, known in zip(_REGISTRIES, before, strict=True))
+        if unchanged and not nothing_new:
             decorators = "@EFFECTS.register(NAME) or @SENSORS.register(NAME)"
             raise ConfigError(
                 f"the {name} registers nothing", where=where, allowed=f"a class or function under {decorators}"
