@@ -6,8 +6,9 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from yid_ocp.integrator.discrete import rest_equations
 from yid_ocp.integrator.rollout import simulate
-from yid_ocp.integrator.statics import HOLD_STIFFNESS, Statics, relaxed
+from yid_ocp.integrator.statics import HOLD_STIFFNESS, HOLD_STIFFNESS_WITH_TORQUE, Statics, relaxed
 from yid_ocp.integrator.step import compile_alike, compile_step
 from yid_ocp.model import Grasp, Segment, System, flexible_object, forward_kinematics
 from yid_ocp.model.rotations import roll_pitch_yaw
@@ -91,6 +92,17 @@ def test_derivatives_of_an_equilibrium(arm):
     np.testing.assert_allclose(rest.by_torque[:, 0], slope(lambda e: (posture, theta, torque + e)), atol=1e-8)
 
 
+def derivatives(step, rest, given, held, stiffness, theta):
+    """Of the state by theta and by the known coordinates, by CasADi from the equations of rest as a whole."""
+    e, n = rest_equations(step.equations), step.system.size
+    others = ca.vertcat(e.inputs[4], e.inputs[1])
+    outputs = [ca.densify(ca.jacobian(f, x)) for f in (e.residual, e.state) for x in (e.inputs[0], others)]
+    w = np.concatenate([rest.state[list(step.system.free_indices)], rest.state[2 * n :], rest.constraint_force])
+    at = (w, given, held, stiffness, theta, step.time_step)
+    by_w, by_others, state_by_w, state_by_others = (np.array(x) for x in ca.Function("by", e.inputs, outputs)(*at))
+    return state_by_others - state_by_w @ np.linalg.lstsq(by_w, by_others, rcond=None)[0]
+
+
 def test_compiled_and_interpreted_equilibria_are_one(case):
     """Of every feature of a step; those without a spring have nowhere to rest."""
     system, names = case.step.system, case.step.system.parameters.names
@@ -102,10 +114,16 @@ def test_compiled_and_interpreted_equilibria_are_one(case):
     steps = case.step, compile_alike(case.step, system, use_compiler=False)
     fast, slow = (Statics(step).solve(given, case.theta, torque, guess, names) for step in steps)
     assert fast.converged == slow.converged == bool(system.elastic), fast.message
-    slopes = ("by_theta", "by_posture", "by_torque") if fast.converged else ()
-    for name in ("state", "torque", "constraint_force", *slopes):
-        expected = getattr(slow, name)
-        np.testing.assert_allclose(getattr(fast, name), expected, rtol=1e-7, atol=1e-8, err_msg=name)
+    for name in ("state", "torque", "constraint_force"):
+        np.testing.assert_allclose(getattr(fast, name), getattr(slow, name), rtol=1e-7, atol=1e-8, err_msg=name)
+    if not fast.converged:
+        return
+    stiffness = HOLD_STIFFNESS if torque is None else HOLD_STIFFNESS_WITH_TORQUE
+    held = np.zeros(0) if torque is None else torque
+    expected = derivatives(steps[1], fast, given, held, stiffness, case.theta)
+    for rest in (fast, slow):
+        np.testing.assert_allclose(np.hstack([rest.by_theta, rest.by_posture]), expected, rtol=1e-7, atol=1e-8)
+        np.testing.assert_allclose(rest.by_torque, rest.by_posture[:, : len(held)] / stiffness, rtol=1e-12)
 
 
 def test_a_measured_torque_that_fits_takes_the_load_off_the_holding_spring(arm):
