@@ -48,6 +48,8 @@ def test_no_memory_is_said_by_every_entry_point(poor, step, parts, urdf_folder):
     trajectory = (case.theta, plain.state, plain.multipliers, plain.torque, names, True)
     assert poor.grants_needed(lambda: kernel.linearize(*trajectory)) == 3
     given = np.concatenate([case.start[list(case.step.system.driven_indices)], case.path[0]])
+    loads = np.ones((sum(model.sizes[key] for key in ("n", "nz", "m")), 1)), np.ones((model.sizes["n"], 1))
+    assert poor.grants_needed(lambda: kernel.slopes(*trajectory[:4], *loads)) == 4
     unknowns = np.zeros(sum(model.sizes[key] for key in ("n", "nz", "m")) - model.sizes["nc"])
     assert poor.grants_needed(lambda: kernel.rest(case.theta, unknowns, given, case.torque[0], 1e3, 1e-9)) == 4
 

@@ -246,3 +246,26 @@ def test_linearized_steps_are_the_equations_along_any_trajectory(case):
         if part == "rows":
             actual[:, :n] += moves[1][:-1, n : 2 * n]
         np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-6 * scale_of(expected))
+
+
+def test_single_steps_are_differentiated_alike_by_both_kernels(case):
+    """By state, torque and loads that act on every step alike."""
+    sizes, slow = case.step.sizes, compile_alike(case.step, case.step.system, use_compiler=False)
+    rollout = case.rollout()
+    assert rollout.status.ok, rollout.status.message
+    rng = np.random.default_rng(3)
+    rows = rng.normal(size=(sizes["n"] + sizes["nz"] + sizes["m"], 2))
+    momentum = rng.normal(size=(sizes["n"], 2))
+    along = (case.theta, rollout.state, rollout.multipliers, rollout.torque, rows, momentum)
+    made, expected = (step.kernel.slopes(*along) for step in (case.step, slow))
+    assert made[0].shape == (len(case.torque), sizes["nx"], sizes["nx"] + sizes["nu"] + 2)
+    for one, other in zip(made, expected, strict=True):
+        # large terms cancel in efforts
+        scale = np.maximum(np.max(np.abs(other), axis=(0, 1), initial=0.0), 1e-4 * np.max(np.abs(other), initial=1.0))
+        assert np.max(np.abs(one - other) / scale, initial=0.0) < 1e-9
+    n, q0 = sizes["n"], rollout.state[0]
+    prescribed = (case.path[0], case.path[1]) if sizes["nc"] else None
+    A, B_u, _ = case.step.jacobians(q0[:n], q0[n : 2 * n], case.torque[0], case.theta, prescribed, q0[2 * n :], ())
+    free = np.delete(np.arange(sizes["nx"]), list(case.step.system.prescribed_indices))
+    np.testing.assert_allclose(made[0][0][free, : sizes["nx"]], A[free], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(made[0][0][free, sizes["nx"] : -2], B_u[free], rtol=1e-9, atol=1e-9)

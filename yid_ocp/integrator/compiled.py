@@ -239,6 +239,28 @@ class CompiledKernel:
         self._check(code, outcome)
         return out
 
+    def slopes(
+        self, theta: Array, state: Array, multipliers: Array, torque: Array, load_rows: Array, load_momentum: Array
+    ) -> tuple[Array, Array]:
+        """See `Kernel.slopes`."""
+        sizes, loads = self._model.sizes, load_rows.shape[1]
+        width = sizes["nx"] + sizes["nu"] + loads
+        after, effort = (np.zeros((len(torque), sizes[key], width)) for key in ("nx", "nc"))
+        along = [_doubles(a) for a in (state, multipliers, None, torque)]
+        rows, momentum = np.ascontiguousarray(load_rows, float), np.ascontiguousarray(load_momentum, float)
+        outcome = _Outcome()
+        code = self._library.yid_slopes(
+            ctypes.byref(self._motion(len(torque), theta, None, None, None, None)),
+            ctypes.byref(_filled(_Trajectory, *along)),
+            ctypes.c_int(loads),
+            *(ctypes.c_void_p(a.ctypes.data) for a in (rows, momentum, after, effort)),
+            ctypes.byref(outcome),
+        )
+        self._check(code, outcome)
+        if code != StepCode.OK:
+            raise np.linalg.LinAlgError(f"the equations of step {outcome.step} are singular")
+        return after, effort
+
     def rest(
         self, theta: Array, unknowns: Array, given: Array, held: Array, stiffness: float, tolerance: float
     ) -> tuple[Array, float, bool]:

@@ -252,6 +252,34 @@ class InterpretedKernel:
                     getattr(out, f"p1_{key}")[k] = jacobian[self._p1, index]
         return out
 
+    def slopes(
+        self, theta: Array, state: Array, multipliers: Array, torque: Array, load_rows: Array, load_momentum: Array
+    ) -> tuple[Array, Array]:
+        """See `Kernel.slopes`."""
+        sizes = self._model.sizes
+        point = self._point(theta, state[0], state[1], multipliers[0], torque[0])
+        h = float(self._model.functions.scales(*(point[index] for index in self._at.values()))[1])
+        n, nz, nx, nu, count = sizes["n"], sizes["nz"], sizes["nx"], sizes["nu"], len(torque)
+        system = self._model.system
+        free, fixed = (np.array(index, int) for index in (system.free_indices, system.prescribed_indices))
+        found = self.linearize(theta, state, multipliers, torque, (), True)
+        width = nx + nu + load_rows.shape[1]
+        top, bottom = np.zeros((count, self._rows, width)), np.zeros((count, n, width))
+        for target, old, push, load in (
+            (top, found.rows_old, found.rows_input, load_rows),
+            (bottom, found.p1_old, found.p1_input, load_momentum),
+        ):
+            target[:, :, :n], target[:, :, 2 * n : nx] = old[:, :, :n], old[:, :, n:]
+            target[:, :, nx : nx + nu], target[:, :, nx + nu :] = push, load
+        top[:, np.arange(n), n + np.arange(n)] += 1.0
+        solved = self._residual
+        moved = -np.linalg.solve(found.rows_new[:, solved[:, None], solved], top[:, solved])
+        after = np.zeros((count, nx, width))
+        after[:, free] = moved[:, : len(free)]
+        after[:, n : 2 * n] = bottom + found.p1_new[:, :, solved] @ moved
+        after[:, 2 * n :] = moved[:, len(free) : len(free) + nz]
+        return after, -(top[:, fixed] + found.rows_new[:, fixed[:, None], solved] @ moved) / h
+
     def rest(
         self, theta: Array, unknowns: Array, given: Array, held: Array, stiffness: float, tolerance: float
     ) -> tuple[Array, float, bool]:

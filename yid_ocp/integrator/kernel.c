@@ -576,11 +576,13 @@ static void theta_columns(const Directions *dir, const Point *a) {
 
 /* Columns of one step, each (rows, d): of the state before (NX) and after, the input (NU) or NULL, the prescribed
  * coordinates after (NC) or NULL, multipliers and effort or NULL; then room for rows (NT), joined (NT), Y (NY), input
- * (NU) and start (NQZ). */
+ * (NU) and start (NQZ). The last `loads` columns get more of the rows (NT, loads) and of p1 (N, loads). */
 typedef struct {
     const double *before, *input, *path;
     double *after, *multipliers, *effort;
     double *rows, *joined, *Y, *input_room, *start;
+    int loads;
+    const double *load_rows, *load_p1;
 } Columns;
 
 /* Forward sensitivities of one converged step. */
@@ -602,6 +604,11 @@ static void sensitivity_step(Work *k, const Point *a, const Directions *dir, con
         add_sparse(dir->rows_nz, dir->rows_pattern, rows, d);
         add_sparse(dir->p1_nz, dir->p1_pattern, p1, d);
     }
+    const int loads = columns->loads, loaded = d - loads;
+    for (int r = 0; r < NT; r++)
+        for (int c = 0; c < loads; c++) rows[(size_t)r * d + loaded + c] += columns->load_rows[(size_t)r * loads + c];
+    for (int r = 0; r < N; r++)
+        for (int c = 0; c < loads; c++) p1[(size_t)r * d + loaded + c] += columns->load_p1[(size_t)r * loads + c];
     if (input)
         for (int r = 0; r < N; r++)
             for (int j = 0; j < NU; j++) {
@@ -644,6 +651,7 @@ static void sensitivity_step(Work *k, const Point *a, const Directions *dir, con
                 for (int i = 0; i < NT; i++) sum += k->R1[at][i] * joined[(size_t)i * d + c];
                 if (input)
                     for (int i = 0; i < NU; i++) sum += k->Ru[at][i] * input[(size_t)i * d + c];
+                if (c >= loaded) sum += columns->load_rows[(size_t)at * loads + c - loaded];
                 target[c] -= sum / k->h;
             }
         }
@@ -897,6 +905,53 @@ int yid_linearize(const Motion *motion, const Trajectory *along, const Lineariza
     }
     work_free(k);
     return OK;
+}
+
+/* State (steps, NX, d) and effort (steps, NC, d) after single steps of a finished rollout by the state before, the torque
+ * and further loads, d = NX + NU + loads columns; the loads add to the rows (NT, loads) and to p1 (N, loads) of every step
+ * alike. A status. */
+int yid_slopes(const Motion *motion, const Trajectory *along, int loads, const double *load_rows, const double *load_p1,
+               double *state, double *effort, Outcome *outcome) {
+    const size_t d = NX + NU + (size_t)loads;
+    const Directions dir = {.count = (int)d};
+    Work *k;
+    double *buffer;
+    if (!room_for(d * (2 * ONE(NT) + ONE(NY) + ONE(NU) + ONE(NQZ) + ONE(NX)) + BLOCK, &k, &buffer, outcome))
+        return OUT_OF_MEMORY;
+    prepare(k, motion->theta, &motion->time_step);
+    double *before = buffer, *input = before + d * ONE(NX);
+    Columns columns = {.before = before, .input = NU ? input : NULL, .loads = loads};
+    columns.load_rows = load_rows;
+    columns.load_p1 = load_p1;
+    columns.rows = input + d * ONE(NU);
+    columns.joined = columns.rows + d * ONE(NT);
+    columns.Y = columns.joined + d * ONE(NT);
+    columns.start = columns.Y + d * ONE(NY);
+    for (int i = 0; i < NX; i++) before[i * d + i] = 1.0;
+    for (int i = 0; i < NU; i++) input[i * d + NX + i] = 1.0;
+    double q1[ONE(N)], z1[ONE(NZ)], lam[ONE(M)], none[ONE(NU)];
+    memset(none, 0, sizeof none);
+    int status = OK, step = 0;
+    for (; step < motion->steps; step++) {
+        const double *x = along->state + (size_t)step * NX, *next = x + NX;
+        const double *u = NU ? along->applied + (size_t)step * NU : none;
+        memcpy(q1, next, sizeof(double) * N);
+        memcpy(z1, next + 2 * N, sizeof(double) * NZ);
+        memcpy(lam, along->multipliers + (size_t)step * M, sizeof(double) * M);
+        Point a = {x, x + N, x + 2 * N, u, motion->theta, &motion->time_step, q1, z1, lam};
+        constraint_matrix(k, &a);
+        evaluate(k, &a);
+        finish(k, &a);
+        linearise(k, &a, 1);
+        if (NY && (status = factorise(k))) break;
+        columns.after = state + (size_t)step * NX * d;
+        columns.effort = effort + (size_t)step * NC * d;
+        sensitivity_step(k, &a, &dir, &columns);
+    }
+    outcome->step = step;
+    YID_FREE(buffer);
+    work_free(k);
+    return status;
 }
 
 /* What a rest works on: its equations are those of a step from q to q, with p such that it comes out again. */

@@ -112,29 +112,11 @@ def linear_steps(
 
 
 def _chunk(step: Step, theta: Array, rollout: Rollout, loads: Loads, span: slice) -> list[LinearStep]:
-    sizes, h = step.sizes, step.time_step
-    n, nz, nu, nx = sizes["n"], sizes["nz"], sizes["nu"], sizes["nx"]
-    nt, count, width = n + nz + sizes["m"], span.stop - span.start, nx + nu + loads.rows.shape[1]
-    free, fixed = (np.array(index, int) for index in (step.system.free_indices, step.system.prescribed_indices))
+    nx, nu = step.sizes["nx"], step.sizes["nu"]
     state = rollout.state[span.start : span.stop + 1]
-    found = step.kernel.linearize(theta, state, rollout.multipliers[span], rollout.torque[span], (), True)
-    top, bottom = np.zeros((count, nt, width)), np.zeros((count, n, width))
-    pushed = slice(nx, nx + nu)
-    for target, old, push, load in (
-        (top, found.rows_old, found.rows_input, loads.rows),
-        (bottom, found.p1_old, found.p1_input, loads.momentum),
-    ):
-        target[:, :, :n], target[:, :, 2 * n : nx] = old[:, :, :n], old[:, :, n:]
-        target[:, :, pushed], target[:, :, nx + nu :] = push, load
-    top[:, np.arange(n), n + np.arange(n)] += 1.0
-    solved = np.concatenate([free, np.arange(n, nt)])
-    moved = -np.linalg.solve(found.rows_new[:, solved[:, None], solved], top[:, solved])
-    after = np.zeros((count, nx, width))
-    after[:, free] = moved[:, : len(free)]
-    after[:, n : 2 * n] = bottom + found.p1_new[:, :, solved] @ moved
-    after[:, 2 * n :] = moved[:, len(free) : len(free) + nz]
-    effort = -(top[:, fixed] + found.rows_new[:, fixed[:, None], solved] @ moved) / h
-    parts = (slice(0, nx), pushed, slice(nx + nu, width))
+    along = (theta, state, rollout.multipliers[span], rollout.torque[span])
+    after, effort = step.kernel.slopes(*along, loads.rows, loads.momentum)
+    parts = (slice(0, nx), slice(nx, nx + nu), slice(nx + nu, after.shape[2]))
     return [
         LinearStep(*(a[:, part] for part in parts), *(e[:, part] for part in parts))
         for a, e in zip(after, effort, strict=True)

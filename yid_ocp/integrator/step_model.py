@@ -334,6 +334,32 @@ class Kernel(Protocol):
         """Equations of len(torque) steps along a trajectory, with their Jacobians where asked for."""
         ...
 
+    def slopes(
+        self, theta: Array, state: Array, multipliers: Array, torque: Array, load_rows: Array, load_momentum: Array
+    ) -> tuple[Array, Array]:
+        """Derivatives of single steps of a finished rollout by the implicit function theorem.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (ntheta,)
+        state : ndarray, shape (N + 1, nx)
+        multipliers : ndarray, shape (N, m)
+        torque : ndarray, shape (N, nu)
+        load_rows, load_momentum : ndarray, shape (nt, e) and (n, e)
+            What further loads add to the rows and to p_{k+1} of every step.
+
+        Returns
+        -------
+        state, effort : ndarray, shape (N, nx, nx + nu + e) and (N, nc, nx + nu + e)
+            State after the step and effort of prescribed coordinates, by (q, p, z) before it, torque and loads.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            A step's equations are singular.
+        """
+        ...
+
     def rest(
         self, theta: Array, unknowns: Array, given: Array, held: Array, stiffness: float, tolerance: float
     ) -> tuple[Array, float, bool]:
