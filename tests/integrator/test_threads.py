@@ -110,5 +110,5 @@ def test_equilibria(parts, monkeypatch):
 
     built = slowed(monkeypatch, ca, "jacobian")
     together = at_once(rest(shared), thetas)
-    assert len(built) == 4  # of residual and state by the unknowns and by the rest, once
+    assert len(built) == 3  # of the residual at rest, and of a step by its unknowns and by all else, once
     assert_same(together, [rest(plain)(theta) for theta in thetas])
