@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -146,7 +147,7 @@ def test_estimated_start_gives_the_same_optimum_in_both_formulations(make_proble
 def test_bounds_are_respected(one_arm, recording, make_problem):
     problem = make_problem(free=("T1.bend", "T2.bend"), duration=0.5)
     system = problem.system
-    narrow = type(system)(**{**vars(system), "parameters": system.parameters.with_bounds({"T1.bend": (0.0, 15.0)})})
+    narrow = replace(system, parameters=system.parameters.with_bounds({"T1.bend": (0.0, 15.0)}))
     step = compile_alike(problem.step, narrow)
     problem = EstimationProblem(step, [recording], problem.free, problem.options)
     for solver in (GaussNewton(), SingleShooting(), MultipleShooting(node_interval=10)):

@@ -383,9 +383,9 @@ def _responses(base: _Base, chosen: NDArray[np.int64]) -> Array:
     for k, update in enumerate(updates):
         unknown[:, :k] *= model.decay
         unknown[:, k] = math.sqrt(1 - model.decay**2) if k else 1.0
-        left = behind.reshape(len(kept), -1)
+        left = behind.reshape(len(kept), u * count)
         rows = update.shaped[:, kept] @ left
-        rows += (update.shaped[:, ns + chosen][:, :, None] * unknown).reshape(len(rows), -1)
+        rows += (update.shaped[:, ns + chosen][:, :, None] * unknown).reshape(rows.shape)
         found.append(rows)
         left = update.move[np.ix_(kept, kept)] @ (left - update.half[:, kept].T @ rows)
         behind = left.reshape(behind.shape)
