@@ -19,7 +19,8 @@ import signal, sys, time
 from pathlib import Path
 from yid_ocp import interruption
 interruption.PATIENCE, interruption.LAST_RESORT = 0.2, {last}
-signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have had it ignored
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have had it ignored, as nohup has SIGHUP
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 folder = Path(sys.argv[1])
 folder.mkdir()
 try:
