@@ -39,7 +39,7 @@ from make_recordings import OFFSETS, TRUTH
 
 from yid_ocp.config.reader import DIAGNOSIS_DEFAULT, load_config
 from yid_ocp.data.hdf5 import write_recording
-from yid_ocp.files import content_hash, write_json
+from yid_ocp.files import content_hash, jsonable, write_json
 from yid_ocp.parallel import Task, TaskResult, Workers, run_tasks
 from yid_ocp.report.terminal import table
 from yid_ocp.version import code_hash
@@ -132,7 +132,7 @@ def diagnose_twin(config: Path, estimate: Path, held_out: Path, settings: Sequen
         for entry in finding.visibility
         for name, value in entry.detectable.items()
     }
-    return {
+    told = {
         "verdict": finding.verdict,
         "chi2_per_dof": finding.before.chi2_per_dof,
         "held_out_chi2_per_dof": finding.held_out_before.chi2_per_dof,
@@ -147,6 +147,8 @@ def diagnose_twin(config: Path, estimate: Path, held_out: Path, settings: Sequen
         "detectable": detectable,
         "seconds": sum(finding.seconds.values()),
     }
+    found: dict[str, Any] = jsonable(told)  # what cannot be seen has no detectable size
+    return found
 
 
 USES = ("estimate", "held_out")
