@@ -773,6 +773,22 @@ int yid_rollout(const Motion *motion, const Trajectory *out, const Sensitivities
     return status;
 }
 
+/* What a step ends with, copied because a step may write it; and the torque where there is none. */
+typedef struct {
+    double q1[ONE(N)], z1[ONE(NZ)], lam[ONE(M)], none[ONE(NU)];
+} Ends;
+
+/* One step of a trajectory that is given. */
+static Point recorded_step(const Motion *motion, const Trajectory *along, int step, Ends *ends) {
+    const double *x = along->state + (size_t)step * NX, *next = x + NX;
+    const double *u = NU ? along->applied + (size_t)step * NU : ends->none;
+    memcpy(ends->q1, next, sizeof(double) * N);
+    memcpy(ends->z1, next + 2 * N, sizeof(double) * NZ);
+    memcpy(ends->lam, along->multipliers + (size_t)step * M, sizeof(double) * M);
+    const Point a = {x, x + N, x + 2 * N, u, motion->theta, &motion->time_step, ends->q1, ends->z1, ends->lam};
+    return a;
+}
+
 /* Gradient of a cost along a finished rollout, step by step from its end; a status. */
 int yid_adjoint(const Motion *motion, const Trajectory *rollout, const Partials *by, const Gradient *gradient,
                 Outcome *outcome) {
@@ -784,18 +800,12 @@ int yid_adjoint(const Motion *motion, const Trajectory *rollout, const Partials 
     if (!room_for(0, &k, &buffer, outcome)) return OUT_OF_MEMORY;
     prepare(k, motion->theta, &motion->time_step);
     double costate[ONE(NX)], g[ONE(NY)], nu[ONE(NY)], full[ONE(NT)], mu[ONE(NX)], mu_u[ONE(NU)];
-    double q1[ONE(N)], z1[ONE(NZ)], lam[ONE(M)], none[ONE(NU)];
-    memset(none, 0, sizeof none);
+    Ends ends = {0};
     memset(gradient->theta, 0, sizeof(double) * thetas);
     memcpy(costate, by->state + (size_t)steps * NX, sizeof(double) * NX);
     int status = OK, step = steps - 1;
     for (; step >= 0; step--) {
-        const double *x = rollout->state + (size_t)step * NX, *next = rollout->state + (size_t)(step + 1) * NX;
-        const double *u = NU ? rollout->applied + (size_t)step * NU : none;
-        memcpy(q1, next, sizeof(double) * N);
-        memcpy(z1, next + 2 * N, sizeof(double) * NZ);
-        memcpy(lam, rollout->multipliers + (size_t)step * M, sizeof(double) * M);
-        Point a = {x, x + N, x + 2 * N, u, motion->theta, &motion->time_step, q1, z1, lam};
+        const Point a = recorded_step(motion, rollout, step, &ends);
         constraint_matrix(k, &a);
         if (MIDDLE) {
             evaluate(k, &a);
@@ -869,15 +879,9 @@ int yid_linearize(const Motion *motion, const Trajectory *along, const Lineariza
     double *buffer;
     if (!room_for(0, &k, &buffer, outcome)) return OUT_OF_MEMORY;
     prepare(k, motion->theta, &motion->time_step);
-    double q1[ONE(N)], z1[ONE(NZ)], lam[ONE(M)], none[ONE(NU)];
-    memset(none, 0, sizeof none);
+    Ends ends = {0};
     for (int step = 0; step < motion->steps; step++) {
-        const double *x = along->state + (size_t)step * NX, *next = x + NX;
-        const double *u = NU ? along->applied + (size_t)step * NU : none;
-        memcpy(q1, next, sizeof(double) * N);
-        memcpy(z1, next + 2 * N, sizeof(double) * NZ);
-        memcpy(lam, along->multipliers + (size_t)step * M, sizeof(double) * M);
-        Point a = {x, x + N, x + 2 * N, u, motion->theta, &motion->time_step, q1, z1, lam};
+        const Point a = recorded_step(motion, along, step, &ends);
         constraint_matrix(k, &a);
         evaluate(k, &a);
         finish(k, &a);
@@ -929,16 +933,10 @@ int yid_slopes(const Motion *motion, const Trajectory *along, int loads, const d
     columns.start = columns.Y + d * ONE(NY);
     for (int i = 0; i < NX; i++) before[i * d + i] = 1.0;
     for (int i = 0; i < NU; i++) input[i * d + NX + i] = 1.0;
-    double q1[ONE(N)], z1[ONE(NZ)], lam[ONE(M)], none[ONE(NU)];
-    memset(none, 0, sizeof none);
+    Ends ends = {0};
     int status = OK, step = 0;
     for (; step < motion->steps; step++) {
-        const double *x = along->state + (size_t)step * NX, *next = x + NX;
-        const double *u = NU ? along->applied + (size_t)step * NU : none;
-        memcpy(q1, next, sizeof(double) * N);
-        memcpy(z1, next + 2 * N, sizeof(double) * NZ);
-        memcpy(lam, along->multipliers + (size_t)step * M, sizeof(double) * M);
-        Point a = {x, x + N, x + 2 * N, u, motion->theta, &motion->time_step, q1, z1, lam};
+        const Point a = recorded_step(motion, along, step, &ends);
         constraint_matrix(k, &a);
         evaluate(k, &a);
         finish(k, &a);
