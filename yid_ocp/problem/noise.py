@@ -75,6 +75,10 @@ class InputErrors:
         Value of b that is taken off the recorded torque [N m], so that what is linearised is small.
     white : ndarray, shape (N, nu)
         Value of w that is taken off in every step [N m].
+    read : ndarray, shape (N, nu)
+        What of the recorded torque is noise on account of w, so that effects on torques see what it was without [N m].
+    through : ndarray, shape (N, nu)
+        What of w is off the torque that acts once `read` is off the recorded one [N m].
     followed : ndarray, shape (N, nb), or None
         What the tracking filter follows in place of the measured motion.
     """
@@ -87,22 +91,30 @@ class InputErrors:
     encoders: bool
     offset: Array
     white: Array
+    read: Array
+    through: Array
     followed: Array | None = None
 
     @property
     def taken_off(self) -> Array:
-        """Off the recorded torque of every step, shape (N, nu) [N m]."""
+        """Off the torque of every step, shape (N, nu) [N m]."""
         return self.offset + self.white
+
+    @property
+    def after_effects(self) -> Array:
+        """Off what effects on torques make of the recorded torque less `read`, shape (N, nu) [N m]."""
+        return self.taken_off - self.through
 
     @property
     def as_recorded(self) -> InputErrors:
         """The same with torques and angles as they were recorded, but for the constant offset."""
-        return replace(self, white=np.zeros_like(self.white), followed=None)
+        none = np.zeros_like(self.white)
+        return replace(self, white=none, read=none, through=none, followed=None)
 
     def until(self, steps: int) -> InputErrors:
         """The same of the first steps."""
-        followed = None if self.followed is None else self.followed[:steps]
-        return replace(self, sample=self.sample[:steps], white=self.white[:steps], followed=followed)
+        first = {name: getattr(self, name)[:steps] for name in ("sample", "white", "read", "through")}
+        return replace(self, **first, followed=None if self.followed is None else self.followed[:steps])
 
 
 def input_errors(
@@ -152,7 +164,7 @@ def input_errors(
         max(1.0, period / grid.time_step),
         encoders,
         np.zeros(len(driven)),
-        np.zeros((grid.steps, len(driven))),
+        *(np.zeros((grid.steps, len(driven))) for _ in range(3)),
     )
 
 

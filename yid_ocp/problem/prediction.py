@@ -18,11 +18,14 @@ from yid_ocp.problem.functions import ModelFunctions
 from yid_ocp.problem.inputs import held_torque, held_torque_slope
 from yid_ocp.problem.lag import Lag
 from yid_ocp.problem.measurements import Measurements
-from yid_ocp.problem.noise import Course, Innovations, innovations
+from yid_ocp.problem.noise import Course, Innovations, InputErrors, innovations
 from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.problem.unknowns import Unknowns
 
 Array = NDArray[np.float64]
+
+LEAST_GAIN = 0.1
+"""Least factor between a recorded torque and the one that acts at which an error of the latter is one of the former."""
 
 
 @dataclass(frozen=True)
@@ -209,29 +212,31 @@ class Predictor:
         """The recording's torques, angles and paths as the effects say they truly were."""
         corrections = self.functions.corrections
         torque, arm, path = episode.torque, episode.measured_arm, episode.path
-        nu, nc = torque.shape[1], path.shape[1]
+        nu, nc, errors = torque.shape[1], path.shape[1], episode.errors
         first = torque[0] if nu else np.zeros(0)
-        by_torque = by_first = by_arm = by_path = None
-        if nu and (corrections.delays_torque or corrections.corrects_efforts):
+        by_torque = by_first = by_arm = by_path = by_recorded = None
+        if nu and corrections.delays_torque:
             joints = episode.recording.joints
             assert joints is not None
             where = (joints, self.system.driven, episode.grid, episode.name)
             delay, by_delay = corrections.torque_delay(theta, wanted)
-            if corrections.delays_torque:
-                torque = held_torque(*where, delay)
+            torque = held_torque(*where, delay)
+            by_recorded = held_torque_slope(*where, delay)[:, :, None] * by_delay
+        if errors is not None:
+            # what multiplies or follows a reading would else take its noise for torque, and shrink to be rid of it
+            torque, first = torque - errors.read, first - errors.read[0]
+        if nu and (corrections.delays_torque or corrections.corrects_efforts):
             readings = np.pad(np.vstack([torque, first]), ((0, 0), (0, nc)))
             _, true, _, by_theta, by_reading = corrections.true(np.zeros_like(readings), readings, theta, wanted)
             by_theta = by_theta[:, :nu].copy()
-            if corrections.delays_torque and wanted:
-                slope = by_reading[:-1, :nu] * held_torque_slope(*where, delay)
-                by_theta[:-1] += slope[:, :, None] * by_delay
+            if by_recorded is not None and wanted:
+                by_theta[:-1] += by_reading[:-1, :nu, None] * by_recorded
             torque, first, by_torque, by_first = true[:-1, :nu], true[-1, :nu], by_theta[:-1], by_theta[-1]
         lag = corrections.torque_lag(theta, wanted)
         if lag is not None:
             torque, by_torque = Lag(*lag, self.step.time_step).of_steps(torque, by_torque)
-        if episode.errors is not None:
-            # errors are those of the torque that acts, whatever lies between it and what was recorded
-            torque, first = torque - episode.errors.taken_off, first - episode.errors.taken_off[0]
+        if errors is not None:
+            torque, first = torque - errors.after_effects, first - errors.after_effects[0]
         if corrections.corrects_angles:
             true, _, by_angle, _, _ = corrections.true(np.hstack([arm, path]), episode.load, theta, wanted)
             arm, path, by_arm, by_path = true[:, :nu], true[:, nu:], by_angle[:, :nu], by_angle[:, nu:]
@@ -326,15 +331,31 @@ class Predictor:
         errors, feedback = episode.errors, episode.feedback
         assert errors is not None
         found = before.smoothed(_plain(episode, result), result.push)
-        errors = replace(errors, offset=found.offset, white=found.white)
+        own = self.own_theta(episode, theta)
+        errors = self._behind_effects(episode, own, replace(errors, offset=found.offset, white=found.white))
         if errors.encoders and feedback is not None:
-            inputs = self.inputs(episode, self.own_theta(episode, theta), ())
+            inputs = self.inputs(episode, own, ())
             guided = inputs.guided(feedback, self.system.driven_indices, episode.measured_arm)
             assert guided is not None
             shift = guided.reference - feedback.reference
             true = (result.rollout.state - found.error)[:-1, feedback.index]
             errors = replace(errors, followed=true - shift)
         return replace(episode, errors=errors)
+
+    def _behind_effects(self, episode: Episode, theta: Array, errors: InputErrors) -> InputErrors:
+        """The same errors with what of the readings is noise: by which readings are multiplied, w is divided."""
+        corrections, nu = self.functions.corrections, errors.white.shape[1]
+        read = errors.white
+        if corrections.corrects_efforts:
+            readings = np.pad(episode.torque, ((0, 0), (0, episode.path.shape[1])))
+            by_reading = corrections.true(np.zeros_like(readings), readings, theta, ())[4][:, :nu]
+            # a reading of which hardly anything acts says nothing of what is wrong with it
+            seen = np.abs(by_reading) > LEAST_GAIN
+            read = np.where(seen, read, 0.0) / np.where(seen, by_reading, 1.0)
+        none = replace(episode, errors=errors.as_recorded)
+        without = replace(episode, errors=replace(errors.as_recorded, read=read))
+        through = self._corrected(none, theta, ()).torque - self._corrected(without, theta, ()).torque
+        return replace(errors, read=read, through=through)
 
     def about_torques(
         self, episode: Episode, whitening: Innovations | None, theta: Array, frozen: Array
