@@ -130,31 +130,52 @@ def test_noise_that_drives_the_motion_is_no_gap(step):
 # -- torques are regressors with errors -------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def geared(step) -> Step:
-    """The pendulum whose motor may have an inertia."""
-    effects = chosen_effects(step.system, [recorded(step, 1)], ["rotor_inertia@shoulder"])
+def with_absent(step: Step, effect: str) -> Step:
+    """The pendulum with an effect that it has not."""
+    effects = chosen_effects(step.system, [recorded(step, 1)], [effect])
     return compile_step(step.system.with_effects(effects), TIME_STEP)
 
 
+@pytest.fixture(scope="module")
+def geared(step) -> Step:
+    """The pendulum whose motor may have an inertia."""
+    return with_absent(step, "rotor_inertia@shoulder")
+
+
 def weighted_at_truth(geared: Step, recording: Recording, feedback: str) -> EstimationProblem:
-    free = (*FREE, "rotor_inertia@shoulder.armature")
+    free = (*FREE, *(name for effect in geared.system.effects for name in effect.parameters.names))
     options = ProblemOptions(initial_state="equilibrium", feedback=feedback, gains=(9.0,))
     problem = EstimationProblem(geared, [recording], free, options, {"elbow.stiffness": 3.0, "elbow.damping": 0.05})
     return problem.weighted_at(problem.start, rounds=3)
 
 
-def test_an_inertia_is_not_mistaken_for_noise_of_the_torques_beside_it(geared, step, monkeypatch):
-    """Derivatives along rollouts under the recorded torques put the absent inertia at five standard deviations."""
+@pytest.mark.parametrize("effect", ["rotor_inertia@shoulder", "effort_gain@shoulder", "effort_lag@shoulder"])
+def test_noise_of_torques_is_not_mistaken_for_what_they_multiply(step, monkeypatch, effect):
+    """By recorded torques absent inertias, gains and lags are on average three to five standard deviations off."""
     monkeypatch.setattr("test_torque_noise.WHITE", 6 * WHITE)
-    z = []
+    absent, z = with_absent(step, effect), []
     for seed in range(20, 32):
-        problem = weighted_at_truth(geared, recorded(step, seed), "proportional")
+        problem = weighted_at_truth(absent, recorded(step, seed), "proportional")
         residual, jacobian = problem.informing(problem.evaluate(problem.start))
         covariance = np.linalg.inv(jacobian.T @ jacobian)
         z.append(-covariance @ jacobian.T @ residual / np.sqrt(np.diag(covariance)))
     assert np.all(np.abs(np.mean(z, axis=0)) < 3 / np.sqrt(len(z)))
     assert np.all(np.mean(np.square(z), axis=0) < 2)
+
+
+@pytest.mark.parametrize("inverse", [0.5, -1.5, 0.0])
+def test_taking_noise_off_a_reading_leaves_the_torque_that_acts(step, inverse):
+    """Where weights are frozen, whatever reading and gain; further off the gain multiplies what is no noise."""
+    gained = with_absent(step, "effort_gain@shoulder")
+    problem = EstimationProblem(gained, [recorded(step, 7)], ("effort_gain@shoulder.inverse",))
+    at, near = (np.array([value]) for value in (inverse, inverse + 0.01))
+    episode = problem.weighted_at(at, rounds=3).episodes[0]
+    errors, [theta, later] = episode.errors, [problem.split(x, 0)[0] for x in (at, near)]
+    assert np.max(np.abs(errors.white)) > WHITE
+    acting, more = (problem.predictor.inputs(episode, own, ()).torque for own in (theta, later))
+    np.testing.assert_allclose(acting, inverse * episode.torque - errors.taken_off, atol=1e-12)
+    noise = errors.white / inverse if inverse else 0.0
+    np.testing.assert_allclose(more - acting, 0.01 * (episode.torque - noise), atol=1e-12)
 
 
 def test_what_is_found_does_not_depend_on_the_tracking_filter(geared, step):
