@@ -9,8 +9,9 @@ import pytest
 
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis import diagnose
-from yid_ocp.diagnosis.events import Event, Events, Fall, event_sentences, find_events, without_events
+from yid_ocp.diagnosis.events import Event, Events, Fall, find_events, without_events
 from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.diagnosis.words import event_sentences
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
 from yid_ocp.model.urdf import read_urdf

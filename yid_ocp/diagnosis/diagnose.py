@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -193,7 +194,10 @@ def _undivided(composed: CandidateProblem, problem: EstimationProblem) -> Estima
 
 
 def _happened(whole: EstimationProblem, fit: Fit, limits: Thresholds) -> Events:
-    """Events about a fit in all that was recorded; NOTHING where that cannot be predicted."""
+    """Events about a fit in all that was recorded; NOTHING where that cannot be predicted.
+
+    Forces that take little of the gap with them are the largest errors of a model that errs everywhere.
+    """
     own, x = fit.problem.on(whole.episodes, whole.held_out), fit.problem.vector(fit.values)
     smoothed = None
     if own.system.free_indices:
@@ -207,7 +211,28 @@ def _happened(whole: EstimationProblem, fit: Fit, limits: Thresholds) -> Events:
             smoothed = smooth_fit(replace(fit, problem=own, evaluation=evaluation), limits)
     if smoothed is None:
         evaluation = own.evaluate(x, False, fit.evaluation.warm)
-    return find_events(own, x, evaluation, smoothed, limits) if evaluation.ok else NOTHING
+    if not evaluation.ok:
+        return NOTHING
+    found = find_events(own, x, evaluation, smoothed, limits)
+    pushed = found.forces_alone
+    if pushed and _excess(fit, without_events(own, pushed)) > (1 - limits.event_share) * _excess(fit, own):
+        return found.without_forces
+    return found
+
+
+def _excess(fit: Fit, problem: EstimationProblem) -> float:
+    """r'r of a fit beyond the number of samples that count, in all of a problem's recordings that can be predicted."""
+    x, warm = problem.vector(fit.values), fit.evaluation.warm
+    judged = problem.weighted_at(x, warm) if problem.disturbed else problem
+    evaluation = judged.evaluate(x, False, warm)
+    if not evaluation.ok:
+        return math.inf
+    rows = [evaluation.residual[judged.rows.data]]
+    for i, (episode, result) in enumerate(judged.validate(x)):
+        if not isinstance(result, str):
+            rows.append(judged.held_out_rows(i, episode, result).residual)
+    counted = np.concatenate(rows)
+    return float(counted @ counted) - np.count_nonzero(counted)
 
 
 def _without_events(search: Search, nominal: Fit, whole: EstimationProblem) -> tuple[Search, Fit, Events]:

@@ -157,6 +157,16 @@ class Events:
             for a, b in pairs
         )
 
+    @property
+    def forces_alone(self) -> Events:
+        """Those that are forces."""
+        return Events(tuple(event for event in self.found if event.kind == "force"))
+
+    @property
+    def without_forces(self) -> Events:
+        """Those that are none, and where nothing could be judged."""
+        return Events(tuple(event for event in self.found if event.kind != "force"), self.falls)
+
     def of(self, recording: str) -> tuple[Event, ...]:
         """Those of one recording."""
         return tuple(event for event in self.found if event.recording == recording)
@@ -560,40 +570,3 @@ def _counting(episode: Episode, samples: Measurements, own: Sequence[Event], fal
     if not np.any(hidden & samples.seen):
         return samples
     return replace(samples, value=np.where(hidden, np.nan, samples.value), weight=np.where(hidden, 0.0, samples.weight))
-
-
-# -- in words ---------------------------------------------------------------------------------------------------------
-
-NAMED = 8
-"""Events that are told one by one."""
-
-
-def event_sentences(events: Events) -> str:
-    """What happened, where and when; empty where nothing did."""
-    text = []
-    if events.found:
-        count = len(events.found)
-        told = "; ".join(_said(event) for event in events.found[:NAMED])
-        more = f"; and {count - NAMED} more" if count > NAMED else ""
-        first = "One event stands" if count == 1 else f"{count} events stand"
-        text.append(f"{first} beside all this, short and in one place: {told}{more}.")
-    return " ".join([*text, *fall_sentences(events)])
-
-
-def fall_sentences(events: Events) -> list[str]:
-    """Where judging ends."""
-    why = "moves too fast for the model to follow."
-    return [
-        f"From {fall.time:.3g} s on nothing is judged in {fall.recording}, where {fall.joint} {why}"
-        for fall in events.falls
-    ]
-
-
-def _said(event: Event) -> str:
-    if event.kind == "sample":
-        when = f"at {0.5 * (event.begin + event.end):.3f} s in {event.recording}"
-        return f"{event.channel} is off by {event.peak:+.3g} {event.unit} {when}"
-    return (
-        f"{event.channel} is pushed by up to {event.peak:+.2g} {event.unit} from {event.begin:.2f} to {event.end:.2f} "
-        f"s in {event.recording} ({event.impulse:+.2g} ± {event.std:.1g} {event.unit} s)"
-    )

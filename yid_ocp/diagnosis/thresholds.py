@@ -87,6 +87,9 @@ class Thresholds:
         itself) that a good model may be wrong by at any moment without making an event.
     pulse : float
         Length of the longest event [s]; what lasts longer is the model's.
+    event_share : float
+        Part of what r'r exceeds the number of samples by that pushes must take with them to be events, and not the
+        largest errors of a model that errs everywhere.
     fall : float
         Speed of a joint beyond which the model is not held to anything for the rest of a recording [rad/s or m/s].
     """
@@ -135,6 +138,7 @@ class Thresholds:
     # events
     term_error: Annotated[float, Ge(0), Lt(1), About("part of every torque by which a good model may be wrong")] = 0.03
     pulse: Annotated[float, Gt(0), About("length of the longest event", "s")] = 1.0
+    event_share: Annotated[float, Ge(0), Lt(1), About("part of the gap that pushes take with them at least")] = 0.1
     fall: Annotated[float, Gt(0), About("speed of a joint from which nothing is judged any more", "rad/s or m/s")] = (
         20.0
     )

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from yid_ocp.diagnosis.baseline import Since
 from yid_ocp.diagnosis.carry_over import disagreeing
 from yid_ocp.diagnosis.counterfactual import Counterfactual
-from yid_ocp.diagnosis.events import event_sentences
+from yid_ocp.diagnosis.events import Event, Events
 from yid_ocp.diagnosis.finding import Finding
 from yid_ocp.diagnosis.hypotheses import Cut
 from yid_ocp.diagnosis.localise import Place, main_places
@@ -299,3 +299,40 @@ def _out_of_range(effect: EffectBase, fit: Fit) -> list[str]:
         if not low - room <= fit.values[name] <= high + room and effect.neutral[name] != fit.values[name]:
             found.append(f"{name} = {fit.values[name]:.3g} (range {low:.3g} to {high:.3g})")
     return found
+
+
+# -- events ---------------------------------------------------------------------------------------------------------
+
+NAMED = 8
+"""Events that are told one by one."""
+
+
+def event_sentences(events: Events) -> str:
+    """What happened, where and when; empty where nothing did."""
+    text = []
+    if events.found:
+        count = len(events.found)
+        told = "; ".join(_said(event) for event in events.found[:NAMED])
+        more = f"; and {count - NAMED} more" if count > NAMED else ""
+        first = "One event stands" if count == 1 else f"{count} events stand"
+        text.append(f"{first} beside all this, short and in one place: {told}{more}.")
+    return " ".join([*text, *fall_sentences(events)])
+
+
+def fall_sentences(events: Events) -> list[str]:
+    """Where judging ends."""
+    why = "moves too fast for the model to follow."
+    return [
+        f"From {fall.time:.3g} s on nothing is judged in {fall.recording}, where {fall.joint} {why}"
+        for fall in events.falls
+    ]
+
+
+def _said(event: Event) -> str:
+    if event.kind == "sample":
+        when = f"at {0.5 * (event.begin + event.end):.3f} s in {event.recording}"
+        return f"{event.channel} is off by {event.peak:+.3g} {event.unit} {when}"
+    return (
+        f"{event.channel} is pushed by up to {event.peak:+.2g} {event.unit} from {event.begin:.2f} to {event.end:.2f} "
+        f"s in {event.recording} ({event.impulse:+.2g} ± {event.std:.1g} {event.unit} s)"
+    )

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.diagnosis import Finding
-from yid_ocp.diagnosis.events import fall_sentences
 from yid_ocp.diagnosis.localise import informed_map, units
 from yid_ocp.diagnosis.smoother import Smoothed
+from yid_ocp.diagnosis.words import fall_sentences
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.null_test import residual_series
 from yid_ocp.problem.prediction import EpisodeResult
