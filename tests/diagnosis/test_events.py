@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis import diagnose
 from yid_ocp.diagnosis.events import Event, Events, Fall, find_events, without_events
+from yid_ocp.diagnosis.pulses import Pulse
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.words import event_sentences
 from yid_ocp.integrator.step import compile_step
@@ -130,6 +132,30 @@ def test_a_gap_that_lives_in_events_alone_is_none_and_the_words_tell_of_them(ben
     assert told["impulse"] == pytest.approx(0.1, rel=0.15)
     assert finding.to_dict()["not_judged"] == []
     assert "One event stands beside all this" in finding.summary
+
+
+def test_pushes_that_take_little_of_the_gap_with_them_are_a_model_that_errs_everywhere(bench, monkeypatch):
+    claimed = Event(
+        "run_1",
+        "elbow",
+        "elbow",
+        "force",
+        1.0,
+        1.2,
+        -0.1,
+        -0.01,
+        0.001,
+        "N m",
+        Pulse(1.0, 1.2, -0.1, False, 0.01, 1e-9),
+    )
+    odd = replace(claimed, kind="sample", channel="points_arm.tip.x", begin=2.0, end=2.01, unit="m", pulse=None)
+    monkeypatch.setattr(sys.modules["yid_ocp.diagnosis.diagnose"], "find_events", lambda *_: Events((claimed, odd)))
+    rubbing = [bench.recording({"joint_coulomb@elbow": {"tau_c": 0.3}}, seed) for seed in (1, 2)]
+    for share, expected in ((0.1, (odd,)), (0.0, (claimed, odd))):
+        limits = Thresholds(event_share=share)
+        finding = diagnose(bench.problem(rubbing[:1]), ["effort_offset@elbow"], rubbing[1:], thresholds=limits)
+        assert finding.verdict == "unknown"
+        assert finding.events.found == expected
 
 
 def test_samples_of_an_events_joint_in_its_window_do_not_count(twin, pushed):
