@@ -566,7 +566,8 @@ def _instead(
         others = [s for s, v in variance.items() if not v and scores[s][0] > scores[s][1]]
         others.sort(key=lambda s: -scores[s][0] / max(scores[s][1], 1e-300))
 
-        asked = others[:LATER]
+        # what pulls at one segment pulls at all that it hangs on
+        asked = [*others[:LATER], *(s for s in others[LATER:] if s.kind == "push")]
         bases = _bases(models, less) if asked else ()
 
         def tried(other: Source, bases: Sequence[_Base] = bases) -> float:
