@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 from factories import BIAS, FORCE, READ_FORCE, added, closed, effect, fit, outcome, score, smoothed, visible
@@ -157,7 +158,7 @@ def test_how_sure_an_excess_without_shape_must_be_is_a_threshold():
 # -- the verdict ------------------------------------------------------------------------------------------------------
 
 SEEN = (visible(ONE),)
-CERTAIN = closed(0.9, 0.8, 0.95)
+CERTAIN = closed(0.45, 0.4, 0.49)
 
 
 @pytest.mark.parametrize(
@@ -178,6 +179,9 @@ CERTAIN = closed(0.9, 0.8, 0.95)
         ({"total": closed(0.9, math.nan, math.nan)}, "unknown"),
         ({"explained": 0.49}, "unknown"),
         ({"explained": 0.5}, "effect"),
+        ({"explained": 0.1, "total": closed(0.9, 0.5, 0.95)}, "effect"),
+        ({"explained": 0.1, "total": closed(0.9, 0.49, 0.95)}, "unknown"),
+        ({"explained": 0.1, "total": replace(closed(0.9, math.nan, math.nan), sure=True)}, "unknown"),
         ({"explained": 7.0}, "effect"),
         ({"added": (added(ONE, [OTHER]),)}, "confusable"),
         ({"added": (added(ONE, [OTHER]), added(OTHER))}, "confusable"),
@@ -185,6 +189,8 @@ CERTAIN = closed(0.9, 0.8, 0.95)
         ({"added": (added(ONE, [OTHER]),), "explained": 0.1}, "unknown"),
         ({"added": (added(ONE), added(OTHER)), "explained": 0.74}, "unknown"),
         ({"added": (added(ONE), added(OTHER)), "explained": 0.75}, "effect"),
+        ({"added": (added(ONE), added(OTHER)), "explained": 0.1, "total": closed(0.9, 0.74, 0.95)}, "unknown"),
+        ({"added": (added(ONE), added(OTHER)), "explained": 0.1, "total": closed(0.9, 0.75, 0.95)}, "effect"),
         ({"added": (added(ONE), added(OTHER), added(THIRD)), "explained": 0.87}, "unknown"),
         ({"added": (added(ONE), added(OTHER), added(THIRD)), "explained": 0.88}, "effect"),
         ({"added": (added(ONE), added(ELSEWHERE)), "explained": 0.49}, "unknown"),
@@ -208,6 +214,9 @@ CERTAIN = closed(0.9, 0.8, 0.95)
         "no interval",
         "smoother explains more than twice as much",
         "smoother explains twice as much",
+        "little where it was fitted, half of the held-out gap",
+        "little where it was fitted, hardly half of the held-out gap",
+        "little where it was fitted, no interval on held-out motions",
         "smoother explains less",
         "two that do the same",
         "two that do the same, and more",
@@ -215,6 +224,8 @@ CERTAIN = closed(0.9, 0.8, 0.95)
         "confusable but explains little",
         "two explain too little for two",
         "two explain enough",
+        "two close too little for two",
+        "two close enough",
         "three explain too little for three",
         "three explain enough",
         "one law at two places explains too little",

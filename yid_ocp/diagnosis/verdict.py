@@ -108,14 +108,17 @@ def why_unknown(
 ) -> Reason:
     """Why no effect is named where there is a gap; empty where one is.
 
-    Effects of several kinds have to explain more than one: each further kind at least the part `explained` of what
-    could be left. Two or three together imitate almost anything, but only in part.
+    Effects have to explain the part `needed`, of what the smoother explains where the model was fitted, or surely of
+    the whole gap on held-out motions, of which nothing could explain more. Several kinds have to explain more than one:
+    each further kind at least the part `explained` of what could be left. Two or three together imitate almost
+    anything, but only in part.
     """
     if not added:
         return "none"
     if not (total.low > limits.closure or total.sure):
         return "unsure"
-    if explained < needed(added, limits):
+    enough = needed(added, limits)
+    if explained < enough and not total.low >= enough:
         return "little"
     return "" if carried else "stand_in"
 

@@ -53,8 +53,8 @@ NAMELESS = {
     "none": "No known effect explains it (the best, {best}, is not sure to be there and to close a part).",
     "unsure": "{names} close{s} {closure:.3g} % of it, but not surely: at least {low:.3g} %, where {least:.3g} % are "
     "asked.",
-    "little": "{names} explain{s} {explained:.3g} % of what unknown forces, offsets and biases explain, where "
-    "{enough:.3g} % are asked of {kinds}.",
+    "little": "{names} explain{s} {explained:.3g} % of what unknown forces, offsets and biases explain, and surely "
+    "close{s} {low:.3g} % on held-out motions; {enough:.3g} % of either are asked of {kinds}.",
     "stand_in": "{names} imitate{s} it (closing {closure:.3g} % on held-out motions) and {are} not its cause: {apart}.",
 }
 """Why a gap has no name, by `verdict.Reason`."""
