@@ -19,16 +19,20 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import product
+from typing import Any
 
 import numpy as np
 import scipy.linalg
+import scipy.sparse
 from numpy.typing import NDArray
 
 from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
 from yid_ocp.problem.low_pass import LowPass
 
 Array = NDArray[np.float64]
+Sparse = Any  # scipy.sparse.csc_array or, of few profiles, ndarray; the former has no types
 
 QUICK, SLOW = 0.3, 2.0
 """Times in which the error of a model and the rest forget their values, a and b [s]."""
@@ -155,10 +159,14 @@ class _Windows:
         return _Windows(np.array([begin]), np.array([end]), np.array([flat]))
 
     def at(self, t: Array) -> Array:
-        """shape (M, k)"""
-        part = np.clip((t[:, None] - self.begin) / (self.end - self.begin), 0.0, 1.0)
+        """At times (M, 1) shape (M, k); at one time for each, (k,), shape (k,)."""
+        part = np.clip((t - self.begin) / (self.end - self.begin), 0.0, 1.0)
         ramp = np.where(self.flat, FLAT / 2, 0.5)
         return np.asarray(np.sin(np.pi / 2 * np.minimum(np.minimum(part, 1 - part) / ramp, 1.0)) ** 2)
+
+    def of(self, chosen: NDArray[np.int64]) -> _Windows:
+        """Some of them."""
+        return _Windows(self.begin[chosen], self.end[chosen], self.flat[chosen])
 
 
 @dataclass(frozen=True)
@@ -181,16 +189,34 @@ class _Filter:
         return _Filter(delay, weight / weight.sum())
 
     def __call__(self, windows: _Windows, t: Array) -> Array:
+        """Profiles of windows as they are seen at times (M,), shape (M, k)."""
+        return self._seen(windows, t[:, None])
+
+    def of_many(self, windows: _Windows, t: Array) -> Sparse:
+        """The same of windows that are short beside the history."""
+        reach = float(self.delay[-1])
+        first, last = (np.searchsorted(t, ends) for ends in (windows.begin - reach, windows.end + reach))
+        count = last - first
+        column = np.repeat(np.arange(len(count)), count)
+        row = np.arange(len(column)) - np.repeat(np.cumsum(count) - count - first, count)
+        values = self._seen(windows.of(column), t[row])
+        return scipy.sparse.csc_array((values, (row, column)), shape=(len(t), len(count)))
+
+    def _seen(self, windows: _Windows, t: Array) -> Array:
         return sum((w * windows.at(t - d) for d, w in zip(self.delay, self.weight, strict=True)), np.zeros(()))
 
 
 @dataclass(frozen=True)
 class _Rest:
-    """The data less a rest of known covariance: Sigma^-1 (M, M), Sigma^-1 y (M,), log evidence without pulses."""
+    """The data less a rest of known covariance: Sigma^-1 (M, M), Sigma^-1 y (M,), log evidence without pulses.
+
+    Beside `taken`, Sigma^-1 is less `lost` lost' than without, shape (M, k).
+    """
 
     precision: Array
     scored: Array
     evidence: float
+    lost: Array
 
     @staticmethod
     def of(history: History, error: float, floor: float, slow: float) -> _Rest:
@@ -205,33 +231,45 @@ class _Rest:
         half = scipy.linalg.solve_triangular(inner, seen.T, lower=True)
         told = scipy.linalg.solve_triangular(inner, factor.T @ history.score, lower=True)
         evidence = 0.5 * float(told @ told) - float(np.sum(np.log(np.diag(inner))))
-        return _Rest(history.information - half.T @ half, history.score - half.T @ told, evidence)
+        none = np.zeros((len(factor), 0))
+        return _Rest(history.information - half.T @ half, history.score - half.T @ told, evidence, none)
 
     def beside(self, taken: Array) -> _Rest:
         """The same with profiles (M, k) of any size taken in."""
         if not taken.shape[1]:
             return self
         seen = self.precision @ taken
-        inner = scipy.linalg.cho_factor(taken.T @ seen + 1e-12 * np.eye(taken.shape[1]), lower=True)
-        size = scipy.linalg.cho_solve(inner, taken.T @ self.scored)
-        gain = 0.5 * float(size @ (taken.T @ self.scored))
-        precision = self.precision - seen @ scipy.linalg.cho_solve(inner, seen.T)
-        return _Rest(precision, self.scored - seen @ size, self.evidence + gain)
+        inner = np.linalg.cholesky(taken.T @ seen + 1e-12 * np.eye(taken.shape[1]))
+        lost = scipy.linalg.solve_triangular(inner, seen.T, lower=True).T
+        told = scipy.linalg.solve_triangular(inner, taken.T @ self.scored, lower=True)
+        evidence = self.evidence + 0.5 * float(told @ told)
+        return _Rest(self.precision - lost @ lost.T, self.scored - lost @ told, evidence, lost)
 
-    def gains(self, profiles: Array) -> Array:
-        """By how much the evidence rises with each of some profiles (M, k) of its best size, shape (k,)."""
-        told, sure = self._sizes(profiles)
+    def gains(self, profiles: Sparse, bare: Array | None = None) -> Array:
+        """By how much the evidence rises with each of some profiles (M, k) of its best size, shape (k,).
+
+        `bare` is what `information` says of them with nothing taken in, where that is known already.
+        """
+        told, sure = self._sizes(profiles, bare)
         return np.where(sure > 0, 0.5 * told**2 / np.where(sure > 0, sure, 1.0), 0.0)
+
+    def information(self, profiles: Sparse) -> Array:
+        """u' Sigma^-1 u of profiles u (M, k), shape (k,)."""
+        product = self.precision @ profiles
+        if scipy.sparse.issparse(profiles):
+            return np.asarray(profiles.multiply(product).sum(axis=0)).ravel()
+        return np.asarray(np.sum(profiles * product, axis=0))
 
     def sizes(self, profiles: Array) -> Array:
         """Best size of each profile, shape (k,), zero where the data say nothing."""
         told, sure = self._sizes(profiles)
         return np.where(sure > 0, told / np.where(sure > 0, sure, 1.0), 0.0)
 
-    def _sizes(self, profiles: Array) -> tuple[Array, Array]:
-        sure = np.sum(profiles * (self.precision @ profiles), axis=0)
-        seen = np.sum(profiles**2, axis=0) * max(float(np.trace(self.precision)) / len(self.scored), 1e-300)
-        return profiles.T @ self.scored, np.where(sure > 1e-6 * seen, sure, 0.0)
+    def _sizes(self, profiles: Sparse, bare: Array | None = None) -> tuple[Array, Array]:
+        sure = self.information(profiles) if bare is None else bare - np.sum((profiles.T @ self.lost) ** 2, axis=1)
+        squares = profiles.power(2).sum(axis=0) if scipy.sparse.issparse(profiles) else np.sum(profiles**2, axis=0)
+        seen = np.asarray(squares).ravel() * max(float(np.trace(self.precision)) / len(self.scored), 1e-300)
+        return np.asarray(profiles.T @ self.scored), np.where(sure > 1e-6 * seen, sure, 0.0)
 
 
 def pulses(history: History, limits: Thresholds = DEFAULTS) -> tuple[list[Pulse], float]:
@@ -250,18 +288,18 @@ def pulses(history: History, limits: Thresholds = DEFAULTS) -> tuple[list[Pulse]
     float
         Windows that do not overlap, of lengths a factor of two apart.
     """
-    windows, tries = _windows(history, limits)
+    windows, tries, profiles = _looked_at(history.t.tobytes(), history.cutoff, limits.pulse)
     if not len(windows.begin):
         return [], 0.0
     seen = _Filter.of(history.cutoff)
-    profiles = seen(windows, history.t)
     rests = _rests(history)
+    bare = [rest.information(profiles) for rest in rests]
     taken = np.zeros((len(history.t), 0))
     found: list[tuple[_Windows, float]] = []
     free = np.ones(len(windows.begin), bool)
     while taken.shape[1] < MOST and np.any(free):
         beside = [rest.beside(taken) for rest in rests]
-        gains = [free * rest.gains(profiles) for rest in beside]
+        gains = [free * rest.gains(profiles, known) for rest, known in zip(beside, bare, strict=True)]
         totals = [rest.evidence + float(gain.max()) for rest, gain in zip(beside, gains, strict=True)]
         best = int(np.argmax(totals))
         rest, gain = beside[best], gains[best]
@@ -284,19 +322,21 @@ def pulses(history: History, limits: Thresholds = DEFAULTS) -> tuple[list[Pulse]
     return _sized(history, rests, found, taken, seen), tries
 
 
-def _windows(history: History, limits: Thresholds) -> tuple[_Windows, float]:
-    """Windows to look at, and how many do not overlap."""
-    spacing, first, last = history.spacing, float(history.t[0]), float(history.t[-1])
+@lru_cache(maxsize=8)
+def _looked_at(times: bytes, cutoff: float, longest: float) -> tuple[_Windows, float, Sparse]:
+    """Windows to look at, how many do not overlap, and their profiles; the same for all joints of a recording."""
+    t = np.frombuffer(times)
+    spacing, first, last = float(np.median(np.diff(t))), float(t[0]), float(t[-1])
     lengths = [FEWEST * spacing]
-    while lengths[-1] * GROWTH <= limits.pulse:
+    while lengths[-1] * GROWTH <= longest:
         lengths.append(lengths[-1] * GROWTH)
     begins = [np.arange(first + spacing, last - spacing - length + 1e-9, spacing) for length in lengths]
     begin = np.concatenate(begins)
     end = begin + np.repeat(lengths, [len(b) for b in begins])
-    flat = np.repeat([False, True], len(begin))
+    windows = _Windows(np.tile(begin, 2), np.tile(end, 2), np.repeat([False, True], len(begin)))
     # windows of nearly the same length tell the same: those within a factor of two count as one
     tries = math.log2(GROWTH) * sum((last - first) / length for length in lengths if length <= last - first)
-    return _Windows(np.tile(begin, 2), np.tile(end, 2), flat), tries
+    return windows, tries, _Filter.of(cutoff).of_many(windows, t)
 
 
 def _rests(history: History) -> list[_Rest]:
