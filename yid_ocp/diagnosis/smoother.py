@@ -563,11 +563,8 @@ def _instead(
     for source in [s for s, v in variance.items() if v]:
         less = variance | {source: 0.0}
         scores = _scores(models, _run(models, less))
-        others = [s for s, v in variance.items() if not v and scores[s][0] > scores[s][1]]
-        others.sort(key=lambda s: -scores[s][0] / max(scores[s][1], 1e-300))
-
-        # what pulls at one segment pulls at all that it hangs on
-        asked = [*others[:LATER], *(s for s in others[LATER:] if s.kind == "push")]
+        # promise at no variance says little of how far a group gets: all of them are asked
+        asked = [s for s, v in variance.items() if not v and scores[s][0] > scores[s][1]]
         bases = _bases(models, less) if asked else ()
 
         def tried(other: Source, bases: Sequence[_Base] = bases) -> float:
