@@ -8,7 +8,7 @@ import pytest
 from factories import amplitude, carried, effect, fit, shape
 
 from yid_ocp.diagnosis import carry_over
-from yid_ocp.diagnosis.carry_over import carried_over, compared, disagreeing
+from yid_ocp.diagnosis.carry_over import carried_over, compared, counting_both, disagreeing
 from yid_ocp.diagnosis.hypotheses import CandidateProblem
 from yid_ocp.diagnosis.refit import Search
 from yid_ocp.diagnosis.thresholds import Thresholds
@@ -65,6 +65,28 @@ def test_a_small_part_of_a_vector_may_differ_by_a_part_of_the_whole():
     assert [entry.agrees for entry in compared(SHIFT, one, other)] == [True, True]
     far = of("shift@grasp", {"x": 1.0, "y": -0.3}, stds, (SHIFT,))
     assert [entry.agrees for entry in compared(SHIFT, one, far)] == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "std"),
+    [
+        # 2 apart: as likely as not with 0.6 and 0.8, together 1
+        ((2.0, 0.6), (4.0, 0.8), 0.6),
+        ((2.0, 0.6), (4.1, 0.8), 2.1 / math.sqrt(2)),
+        ((4.1, 0.6), (2.0, 0.8), 2.1 / math.sqrt(2)),
+        ((2.0, 1.6), (5.5, 0.1), 3.5 / math.sqrt(2)),
+        ((2.0, math.inf), (5.0, 0.1), math.inf),
+        ((2.0, 0.1), (5.0, math.nan), 0.1),
+    ],
+)
+def test_standard_deviations_count_how_far_two_sets_of_recordings_are_apart(first, second, std):
+    one, other = (of("spring@elbow", {"k": value, "s": 3.0}, {"k": size}) for value, size in (first, second))
+    counted = counting_both(one, compared(SPRING, one, other))
+    assert counted.std == one.std | {"spring@elbow.k": pytest.approx(std)}
+    assert counted.values == one.values
+    again = counting_both(other, compared(SPRING, other, one))
+    reach = 2 * (counted.std["spring@elbow.k"] + again.std["spring@elbow.k"])
+    assert not abs(first[0] - second[0]) > reach  # their intervals overlap
 
 
 def test_those_that_do_not_carry_over_are_told():

@@ -16,6 +16,9 @@ from yid_ocp.diagnosis.refit import Fit, Search, refit
 from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
 from yid_ocp.effects import EffectBase
 
+APART = 2.0
+"""Standard deviations from which two fits differ by more than they say."""
+
 
 @dataclass(frozen=True)
 class Carried:
@@ -85,6 +88,22 @@ def compared(effect: EffectBase, first: Fit, second: Fit, limits: Thresholds = D
         own = (first.values[name], first.std[name], second.values[name], second.std[name])
         found.append(Carried(effect.label, name.removeprefix(f"{effect.label}."), parameter.unit, *own, agrees))
     return found
+
+
+def counting_both(fit: Fit, entries: Sequence[Carried]) -> Fit:
+    """The same with standard deviations of amplitudes that count how far apart two sets of recordings have them.
+
+    What a model misses of all of a recording its residual does not show: where two fits differ by more than `APART`
+    standard deviations of both together, each is known to the spread of the two, their difference over the square root
+    of two.
+    """
+    std = dict(fit.std)
+    for entry in entries:
+        apart = abs(entry.value - entry.again)
+        if apart > APART * math.hypot(entry.std, entry.again_std):
+            name = f"{entry.effect}.{entry.name}"
+            std[name] = max(std[name], apart / math.sqrt(2.0))
+    return replace(fit, std=std)
 
 
 def disagreeing(entries: Sequence[Carried]) -> tuple[Carried, ...]:

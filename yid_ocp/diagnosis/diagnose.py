@@ -14,7 +14,7 @@ import threadpoolctl
 from yid_ocp.analysis.history import Estimates
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.baseline import with_baseline
-from yid_ocp.diagnosis.carry_over import carried_over
+from yid_ocp.diagnosis.carry_over import carried_over, counting_both
 from yid_ocp.diagnosis.earlier import UNTOLD, Earlier
 from yid_ocp.diagnosis.events import NOTHING, Events, find_events, without_events
 from yid_ocp.diagnosis.finding import Finding, absorption
@@ -140,6 +140,8 @@ def _diagnosed(
         fits, added = compose(search, nominal, screened, [place.location for place in there])
     clock.lap("refits")
     carried = carried_over(search, added[-1].fit) if added else ()
+    if carried:
+        added = (*added[:-1], replace(added[-1], fit=counting_both(added[-1].fit, carried)))
     clock.lap("carry_over")
     total = closure(nominal.loss, added[-1].fit.loss, limits=limits) if added else Closure(np.nan, np.nan, np.nan)
     explained = explained_part(nominal, added, trusted)
