@@ -44,6 +44,12 @@ class MadeUp(EffectBase):
         return ()
 
 
+class MadeUpThing(MadeUp):
+    """One that says nothing of other places."""
+
+    alone = True
+
+
 def amplitude(name="a", neutral=0.0, lower=0.0, upper=math.inf, expected=(0.0, 1.0), unit="N m"):
     """A quantity whose neutral value alone makes the effect vanish."""
     return Quantity(name, unit, neutral, lower, upper, expected, "made up")
@@ -54,12 +60,12 @@ def shape(name="s", neutral=0.5, expected=(0.1, 1.0), lower=0.0, upper=math.inf)
     return Quantity(name, "s", neutral, lower, upper, expected, "made up", shape=True)
 
 
-def effect(label="friction@elbow", *quantities: Quantity) -> EffectBase:
+def effect(label="friction@elbow", *quantities: Quantity, alone=False) -> EffectBase:
     """An effect `kind@location` with some quantities, one amplitude where none are given."""
     kind, _, location = label.partition("@")
     chosen = quantities or (amplitude(),)
     entries = (Parameter(f"{label}.{q.name}", q.neutral, q.unit, q.lower, q.upper, q.description) for q in chosen)
-    return MadeUp(kind, location, tuple(chosen), Parameters(entries))
+    return (MadeUpThing if alone else MadeUp)(kind, location, tuple(chosen), Parameters(entries))
 
 
 # -- null test --------------------------------------------------------------------------------------------------------

@@ -14,6 +14,7 @@ from yid_ocp.diagnosis.verdict import decide, explained_part, has_gap, shapeless
 LIMITS = Thresholds()
 ONE, OTHER = effect("friction@elbow"), effect("offset@elbow")
 ELSEWHERE, THIRD = effect("friction@wrist"), effect("spring@elbow")
+LOADS = effect("load@elbow", alone=True), effect("load@wrist", alone=True)
 
 
 def scored(*p_values):
@@ -189,12 +190,14 @@ CERTAIN = closed(0.45, 0.4, 0.49)
         ({"added": (added(ONE, [OTHER]),), "explained": 0.1}, "unknown"),
         ({"added": (added(ONE), added(OTHER)), "explained": 0.74}, "unknown"),
         ({"added": (added(ONE), added(OTHER)), "explained": 0.75}, "effect"),
-        ({"added": (added(ONE), added(OTHER)), "explained": 0.1, "total": closed(0.9, 0.74, 0.95)}, "unknown"),
-        ({"added": (added(ONE), added(OTHER)), "explained": 0.1, "total": closed(0.9, 0.75, 0.95)}, "effect"),
+        ({"added": (added(ONE), added(OTHER)), "explained": 0.1, "total": closed(0.95, 0.9, 0.98)}, "unknown"),
         ({"added": (added(ONE), added(OTHER), added(THIRD)), "explained": 0.87}, "unknown"),
         ({"added": (added(ONE), added(OTHER), added(THIRD)), "explained": 0.88}, "effect"),
         ({"added": (added(ONE), added(ELSEWHERE)), "explained": 0.49}, "unknown"),
         ({"added": (added(ONE), added(ELSEWHERE)), "explained": 0.5}, "effect"),
+        ({"added": (added(LOADS[0]), added(LOADS[1])), "explained": 0.74}, "unknown"),
+        ({"added": (added(LOADS[0]), added(LOADS[1])), "explained": 0.75}, "effect"),
+        ({"added": (added(ONE), added(ELSEWHERE)), "explained": 0.1, "total": closed(0.9, 0.5, 1.0)}, "effect"),
         ({"carried": False}, "unknown"),
         ({"carried": False, "gap": False}, "no_gap"),
     ],
@@ -224,12 +227,14 @@ CERTAIN = closed(0.45, 0.4, 0.49)
         "confusable but explains little",
         "two explain too little for two",
         "two explain enough",
-        "two close too little for two",
-        "two close enough",
+        "two explain little where they were fitted, however much of the held-out gap",
         "three explain too little for three",
         "three explain enough",
         "one law at two places explains too little",
         "one law at two places explains enough",
+        "loads at two places explain too little for two",
+        "loads at two places explain enough for two",
+        "one law at two places, half of the held-out gap",
         "does not carry over",
         "does not carry over where there is no gap",
     ],

@@ -342,7 +342,7 @@ def nameless(reason, **changed):
             "little",
             {"explained": 0.31, "closure": closed(0.4, 0.29, 0.5)},
             "explains 31 % of what unknown forces, offsets and biases explain, and surely closes 29 % on held-out "
-            "motions; 50 % of either are asked of one kind of effect",
+            "motions; 50 % of either are asked.",
         ),
         (
             "stand_in",
@@ -363,6 +363,12 @@ def test_several_effects_do_what_one_does(reason, said):
     both = (added(FRICTION), added(OFFSET))
     text = nameless(reason, added=both, explained=0.31, carried=(carried(),))
     assert f"friction@elbow and offset@wrist{said}" in text
+
+
+def test_of_several_effects_more_is_asked_and_only_where_they_were_fitted():
+    assert "; 75 % of the former are asked of 2 assumptions." in nameless(
+        "little", added=(added(FRICTION), added(OFFSET)), explained=0.7
+    )
 
 
 def test_what_does_not_carry_over_is_named_with_both_values():

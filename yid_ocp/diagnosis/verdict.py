@@ -98,9 +98,14 @@ def decide(
     return "confusable" if len(added[0].rivals) > 1 else "effect"
 
 
+def assumptions(added: Sequence[Added]) -> int:
+    """How many things effects assume: one law at several places is one, loads in several places are several."""
+    return len({entry.effect.label if entry.effect.alone else entry.effect.kind for entry in added})
+
+
 def needed(added: Sequence[Added], limits: Thresholds) -> float:
-    """Part of the smoother's explanation that effects have to reach; one law at several places is one assumption."""
-    return 1.0 - (1.0 - limits.explained) ** len({entry.effect.kind for entry in added})
+    """Part of the smoother's explanation that effects have to reach."""
+    return 1.0 - (1.0 - limits.explained) ** assumptions(added)
 
 
 def why_unknown(
@@ -108,17 +113,17 @@ def why_unknown(
 ) -> Reason:
     """Why no effect is named where there is a gap; empty where one is.
 
-    Effects have to explain the part `needed`, of what the smoother explains where the model was fitted, or surely of
-    the whole gap on held-out motions, of which nothing could explain more. Several kinds have to explain more than one:
-    each further kind at least the part `explained` of what could be left. Two or three together imitate almost
-    anything, but only in part.
+    Effects have to explain the part `needed` of what the smoother explains where the model was fitted. One that
+    stands for all may instead surely close it on held-out motions, of which nothing could explain more than all. Of
+    several each further assumption has to explain at least the part `explained` of what could be left: two or three
+    together imitate almost anything, but only in part.
     """
     if not added:
         return "none"
     if not (total.low > limits.closure or total.sure):
         return "unsure"
-    enough = needed(added, limits)
-    if explained < enough and not total.low >= enough:
+    elsewhere = assumptions(added) == 1 and total.low >= limits.explained
+    if explained < needed(added, limits) and not elsewhere:
         return "little"
     return "" if carried else "stand_in"
 

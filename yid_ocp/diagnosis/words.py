@@ -16,7 +16,7 @@ from yid_ocp.diagnosis.refit import Fit
 from yid_ocp.diagnosis.screening import Visibility
 from yid_ocp.diagnosis.select import Added
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.diagnosis.verdict import needed
+from yid_ocp.diagnosis.verdict import assumptions, needed
 from yid_ocp.effects import EffectBase
 from yid_ocp.effects.base import ASPECTS
 from yid_ocp.problem.null_test import NullTest
@@ -54,7 +54,7 @@ NAMELESS = {
     "unsure": "{names} close{s} {closure:.3g} % of it, but not surely: at least {low:.3g} %, where {least:.3g} % are "
     "asked.",
     "little": "{names} explain{s} {explained:.3g} % of what unknown forces, offsets and biases explain, and surely "
-    "close{s} {low:.3g} % on held-out motions; {enough:.3g} % of either are asked of {kinds}.",
+    "close{s} {low:.3g} % on held-out motions; {enough:.3g} % {asked}.",
     "stand_in": "{names} imitate{s} it (closing {closure:.3g} % on held-out motions) and {are} not its cause: {apart}.",
 }
 """Why a gap has no name, by `verdict.Reason`."""
@@ -181,7 +181,7 @@ def _nameless(finding: Finding) -> str:
         f"estimate on and {entry.again:.3g} ± {entry.again_std:.2g} on the held-out ones"
         for entry in disagreeing(finding.carried)
     ]
-    kinds = len({entry.effect.kind for entry in finding.added})
+    count = assumptions(finding.added)
     return NAMELESS[finding.reason].format(
         names=names,
         s="s" if len(finding.added) == 1 else "",
@@ -190,7 +190,7 @@ def _nameless(finding: Finding) -> str:
         low=100 * finding.closure.low,
         least=100 * finding.limits.closure,
         explained=100 * finding.explained,
-        kinds=f"effects of {kinds} kinds" if kinds > 1 else "one kind of effect",
+        asked=f"of the former are asked of {count} assumptions" if count > 1 else "of either are asked",
         enough=100 * needed(finding.added, finding.limits),
         apart="; ".join(apart[:2]),
     )

@@ -111,6 +111,8 @@ class EffectBase(ABC):
         "vary ...".
     needs : frozenset of str
         Sensors without which nothing shows it.
+    alone : bool
+        Whether it is a thing in one place, so that one place says nothing of others; a law such as friction is not.
     """
 
     kind: str
@@ -123,6 +125,7 @@ class EffectBase(ABC):
     equation: ClassVar[str] = ""
     depends_on: ClassVar[str] = ""
     needs: ClassVar[frozenset[str]] = frozenset()
+    alone: ClassVar[bool] = False
 
     @classmethod
     @abstractmethod

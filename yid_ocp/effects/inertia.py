@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -72,6 +73,7 @@ class LinkMass(EffectBase):
 
     equation = "mass and inertia of the child link times scale"
     depends_on = "how hard it accelerates"
+    alone: ClassVar[bool] = True
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
@@ -95,6 +97,7 @@ class PointMass(EffectBase):
 
     equation = "T += 1/2 mass |v|^2, V -= mass g.x"
     depends_on = "how hard it accelerates"
+    alone: ClassVar[bool] = True
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
@@ -141,6 +144,7 @@ class Payload(EffectBase):
 
     equation = "a mass at (mx, my, mz)/mass, moving with the frame"
     depends_on = "how it stands against gravity"
+    alone: ClassVar[bool] = True
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
