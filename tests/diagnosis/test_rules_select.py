@@ -184,6 +184,27 @@ def test_a_tie_is_a_part_of_the_best_loss():
     assert labels(within_reach(fits, Thresholds(tie=0.005))) == ["large@x"]
 
 
+@pytest.mark.parametrize(
+    ("level", "ratio", "blocks", "expected"),
+    [
+        # 40 ln 1.09 = 3.45 < ln 40 = 3.69 < 40 ln 1.1 = 3.81
+        (2e3, 1.09, 40, ["small@x", "large@x"]),
+        (2e3, 1.1, 40, ["large@x"]),
+        # 10 ln 1.25 = 2.23 < ln 10 = 2.30 < 10 ln 1.26 = 2.31
+        (2e3, 1.25, 10, ["small@x", "large@x"]),
+        (2e3, 1.26, 10, ["large@x"]),
+        (9e2, 1.09, 40, ["large@x"]),
+        (2e3, math.inf, 40, ["large@x"]),
+    ],
+)
+def test_where_a_model_errs_everywhere_fewer_parameters_outweigh_a_larger_loss(level, ratio, blocks, expected):
+    fits = [fit([LARGE], loss(*[level] * blocks)), fit([SMALL], loss(*[ratio * level] * blocks))]
+    assert labels(within_reach(fits)) == expected
+    # never the other way round
+    better = [fit([SMALL], loss(*[level] * blocks)), fit([LARGE], loss(*[ratio * level] * blocks))]
+    assert labels(within_reach(better)) == ["small@x"]
+
+
 def test_of_equally_simple_ones_the_better_comes_first():
     other = effect("other@x", amplitude())
     fits = [fit([SMALL], loss(1.004, 1.004)), fit([other], loss(1.0, 1.0)), fit([LARGE], loss(0.999, 0.999))]

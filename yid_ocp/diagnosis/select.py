@@ -6,6 +6,7 @@ doi:10.1214/aos/1176347265).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -97,9 +98,9 @@ def gain(before: Loss, after: Loss) -> tuple[float, float]:
 def within_reach(fits: Sequence[Fit], limits: Thresholds = DEFAULTS) -> list[Fit]:
     """Fits whose held-out loss is within one standard error of the best one's (or `tie` of it), the simplest first.
 
-    An effect whose shape is far from what an engineer would expect (`out_of_shape`) counts only where no other comes
-    near it: a solid that relaxes in a tenth of the shortest time expected is a damper. One whose amplitude is
-    (`oversized`) comes last.
+    Where the model errs everywhere, simpler ones are near by the evidence as well; see `outweighs`. An effect whose
+    shape is far from what an engineer would expect (`out_of_shape`) counts only where no other comes near it: a solid
+    that relaxes in a tenth of the shortest time expected is a damper. One whose amplitude is (`oversized`) comes last.
     """
     best = min(fits, key=lambda fit: fit.loss.mean)
     shapely = [fit for fit in fits if not (fit.effects and out_of_shape(fit.effects[-1], fit.values, limits))]
@@ -110,13 +111,30 @@ def within_reach(fits: Sequence[Fit], limits: Thresholds = DEFAULTS) -> list[Fit
     for fit in fits:
         lost, error = gain(fit.loss, best.loss)
         apart = far_likelier(fit.loss, best.loss, limits)
-        if fit is best or (lost <= max(error, limits.tie * best.loss.mean) and not apart):
+        if (
+            fit is best
+            or (lost <= max(error, limits.tie * best.loss.mean) and not apart)
+            or outweighs(fit, best, limits)
+        ):
             near.append(fit)
 
     def order(fit: Fit) -> tuple[bool, int, float]:
         return bool(fit.effects) and oversized(fit.effects[-1], fit.values, limits), fit.size, fit.loss.mean
 
     return sorted(near, key=order)
+
+
+def outweighs(fit: Fit, best: Fit, limits: Thresholds = DEFAULTS) -> bool:
+    """Whether fewer parameters outweigh a larger loss where both leave far more than noise.
+
+    Residuals are then errors of the model, of unknown size and alike for the length of a block: blocks times the
+    logarithm of the losses' ratio against parameters times that of the blocks (BIC, Schwarz 1978,
+    doi:10.1214/aos/1176344136).
+    """
+    if best.loss.mean < limits.everywhere or not np.isfinite(fit.loss.mean):
+        return False
+    blocks, fewer = len(best.loss.counts), best.size - fit.size
+    return fewer > 0 and blocks * math.log(fit.loss.mean / best.loss.mean) <= fewer * math.log(blocks)
 
 
 def out_of_shape(effect: EffectBase, values: Mapping[str, float], limits: Thresholds = DEFAULTS) -> bool:

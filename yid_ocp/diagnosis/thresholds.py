@@ -51,6 +51,9 @@ class Thresholds:
         of what is left.
     tie : float
         Part of chi2/n by which two models may differ and still count as equal, however sure the difference.
+    everywhere : float
+        chi2/n from which residuals are errors of the model and not noise, so that blocks of time are what is
+        independent, and fewer parameters outweigh a larger loss as in BIC.
     stand_in : float
         Part of chi2/n by which an effect of an unlikely shape must beat all others to count.
     shape_factor : float
@@ -116,6 +119,7 @@ class Thresholds:
     relevance: Annotated[float, Ge(0), Lt(1), About("part of a held-out error that an effect must take away")] = 0.01
     closure: Annotated[float, Ge(0), Lt(1), About("part of the held-out gap that must be closed")] = 0.05
     tie: Annotated[float, Ge(0), About("part of chi2/n within which models are equal")] = 0.01
+    everywhere: Annotated[float, Gt(0), About("chi2/n from which a model errs everywhere, and blocks count")] = 1e3
     stand_in: Annotated[float, Ge(0), About("part of chi2/n by which an unlikely shape must be better")] = 0.05
     shape_factor: Annotated[float, Ge(1), About("factor by which a shape parameter may leave its range")] = 2.0
     range_widths: Annotated[float, Ge(0), About("widths of its range by which a value may leave it")] = 1.0
