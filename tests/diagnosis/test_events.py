@@ -106,6 +106,14 @@ def test_a_snag_is_an_event_of_its_joint(twin):
     assert all(event.begin > 1.8 and event.end < 2.5 for event in found)
 
 
+def test_forces_that_mostly_recur_are_the_motions_own(twin, pushed):
+    """What is there at the same times of another recording comes with the motion; one that does is still an event."""
+    other = (replace(PUSHES[0], begin=3.2, end=3.7), *PUSHES[1:])
+    again, partly = (twin.recording(Interruptions(pushes), seed=1) for pushes in (PUSHES, other))
+    assert not twin.events(pushed, again).found
+    assert [event.location for event in twin.events(pushed, partly).found] == ["shoulder", "elbow", "elbow", "shoulder"]
+
+
 def test_a_wrong_encoder_sample_is_named_as_such_and_makes_no_push(twin):
     clean = twin.recording()
     position = clean.joints.position.copy()

@@ -53,6 +53,10 @@ NEIGHBOURS = 20
 """Samples on either side with which one is compared."""
 ALONE = 3.0
 """Times the largest deviation among its neighbours by which a wrong sample stands out."""
+SAME = 0.5
+"""Part of the longer of two windows by which they overlap where they are the same time."""
+MANY = 0.5
+"""Part of all forces that recur from which those that do are the motion's, which a model has to have."""
 SURE = 8.0
 """Standard deviations of noise, and robust ones of its neighbours, by which it does."""
 
@@ -231,6 +235,9 @@ def find_events(
     forces = _one_each([entry for entry, sure in zip(found, real, strict=True) if sure], problem)
     times = {(e.recording, 0.5 * (e.begin + e.end)) for e in wrong}
     forces = [f for f in forces if not any(f.recording == name and f.begin <= t <= f.end for name, t in times)]
+    single = [f for f in forces if not any(_recurs(f, other) for other in forces)]
+    if len(single) < MANY * len(forces):
+        forces = single
     everything = sorted([*forces, *wrong], key=lambda event: (event.recording, event.begin, event.location))
     there = {(event.recording, event.channel) for event in forces}
     shown = [
@@ -404,6 +411,14 @@ def _one_each(found: Sequence[tuple[History, Pulse]], problem: EstimationProblem
         )
         for history, pulse in kept
     ]
+
+
+def _recurs(one: Event, other: Event) -> bool:
+    """Whether the same force is there at the same time of another recording."""
+    if one.recording == other.recording or one.channel != other.channel or one.peak * other.peak < 0:
+        return False
+    both = min(one.end, other.end) - max(one.begin, other.begin)
+    return both > SAME * max(one.end - one.begin, other.end - other.begin)
 
 
 # -- wrong samples ----------------------------------------------------------------------------------------------------
