@@ -155,6 +155,12 @@ LARGE = effect("large@x", amplitude("a"), amplitude("b"))
 WIDE = effect("wide@x", amplitude("a"), shape("s", expected=(0.1, 1.0)))
 
 
+def there(of, *means, **values):
+    """A fit whose effect is surely there."""
+    sizes = {f"{of.label}.{q.name}": 1.0 for q in of.quantities if not q.shape}
+    return fit([of], loss(*means), values=sizes | {f"{of.label}.{name}": value for name, value in values.items()})
+
+
 def labels(fits):
     return [entry.effects[-1].label for entry in fits]
 
@@ -212,7 +218,7 @@ def test_of_equally_simple_ones_the_better_comes_first():
 
 
 def test_an_amplitude_far_out_of_its_range_comes_last():
-    fits = [fit([SMALL], loss(1.0, 1.0), values={"small@x.a": 2.5}), fit([LARGE], loss(1.0, 1.0))]
+    fits = [there(SMALL, 1.0, 1.0, a=2.5), there(LARGE, 1.0, 1.0)]
     assert labels(within_reach(fits)) == ["large@x", "small@x"]
     assert labels(within_reach(fits, Thresholds(range_widths=2.0))) == ["small@x", "large@x"]
 
@@ -228,18 +234,33 @@ def test_an_amplitude_far_out_of_its_range_comes_last():
     ids=["another comes near", "nothing comes near", "near as a part of it", "another is better"],
 )
 def test_an_unlikely_shape_counts_only_where_no_other_comes_near(odd, plain, expected):
-    fits = [fit([WIDE], loss(*odd), values={"wide@x.s": 9.0}), fit([SMALL], loss(*plain))]
+    fits = [there(WIDE, *odd, s=9.0), there(SMALL, *plain)]
     assert labels(within_reach(fits)) == expected
 
 
+@pytest.mark.parametrize(
+    ("unsure", "sure", "expected"),
+    [
+        ((1.0, 1.0), (1.04, 1.04), ["small@x"]),
+        ((1.0, 1.0), (1.2, 1.2), ["large@x"]),
+        ((10.0, 10.0), (10.4, 10.4), ["small@x"]),
+    ],
+    ids=["another comes near", "nothing comes near", "near as a part of it"],
+)
+def test_one_that_is_not_sure_to_be_there_counts_only_where_no_other_comes_near(unsure, sure, expected):
+    fits = [there(LARGE, *unsure, a=0.019, b=0.0), there(SMALL, *sure)]
+    assert labels(within_reach(fits)) == expected
+    assert labels(within_reach([there(LARGE, *unsure, a=0.021, b=0.0), there(SMALL, *sure)])) == ["large@x"]
+
+
 def test_how_near_another_must_come_is_a_threshold():
-    fits = [fit([WIDE], loss(1.0, 1.0), values={"wide@x.s": 9.0}), fit([SMALL], loss(1.08, 1.08))]
+    fits = [there(WIDE, 1.0, 1.0, s=9.0), there(SMALL, 1.08, 1.08)]
     assert labels(within_reach(fits)) == ["wide@x"]
     assert labels(within_reach(fits, Thresholds(stand_in=0.1))) == ["small@x"]
 
 
 def test_a_model_without_effects_is_the_simplest():
-    fits = [fit([SMALL], loss(1.0, 1.0)), fit((), loss(1.0, 1.0))]
+    fits = [there(SMALL, 1.0, 1.0), fit((), loss(1.0, 1.0))]
     assert [len(entry.effects) for entry in within_reach(fits)] == [0, 1]
     assert [entry.size for entry in (fit(), fit([SMALL]), fit([SMALL, LARGE]))] == [0, 1, 3]
 

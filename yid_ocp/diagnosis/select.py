@@ -100,12 +100,13 @@ def within_reach(fits: Sequence[Fit], limits: Thresholds = DEFAULTS) -> list[Fit
 
     Where the model errs everywhere, simpler ones are near by the evidence as well; see `outweighs`. An effect whose
     shape is far from what an engineer would expect (`out_of_shape`) counts only where no other comes near it: a solid
-    that relaxes in a tenth of the shortest time expected is a damper. One whose amplitude is (`oversized`) comes last.
+    that relaxes in a tenth of the shortest time expected is a damper. So does one that is not sure to be there. One
+    whose amplitude is out of its range (`oversized`) comes last.
     """
     best = min(fits, key=lambda fit: fit.loss.mean)
-    shapely = [fit for fit in fits if not (fit.effects and out_of_shape(fit.effects[-1], fit.values, limits))]
-    if shapely and min(fit.loss.mean for fit in shapely) <= (1 + limits.stand_in) * best.loss.mean:
-        fits = shapely
+    likely = [fit for fit in fits if not fit.effects or _likely(fit, limits)]
+    if likely and min(fit.loss.mean for fit in likely) <= (1 + limits.stand_in) * best.loss.mean:
+        fits = likely
         best = min(fits, key=lambda fit: fit.loss.mean)
     near = []
     for fit in fits:
@@ -122,6 +123,11 @@ def within_reach(fits: Sequence[Fit], limits: Thresholds = DEFAULTS) -> list[Fit
         return bool(fit.effects) and oversized(fit.effects[-1], fit.values, limits), fit.size, fit.loss.mean
 
     return sorted(near, key=order)
+
+
+def _likely(fit: Fit, limits: Thresholds) -> bool:
+    effect = fit.effects[-1]
+    return stands_out(effect, fit, limits) and not out_of_shape(effect, fit.values, limits)
 
 
 def outweighs(fit: Fit, best: Fit, limits: Thresholds = DEFAULTS) -> bool:
