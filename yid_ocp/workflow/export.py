@@ -8,7 +8,8 @@ from pathlib import Path
 from yid_ocp.data import read_recording
 from yid_ocp.errors import ConfigError
 from yid_ocp.export.csv import export_csv
-from yid_ocp.report.terminal import export_summary, recording_summary
+from yid_ocp.report.summaries import export_summary
+from yid_ocp.report.terminal import lines, recording_summary
 from yid_ocp.workflow.command import DONE, print_lines
 from yid_ocp.workflow.export_model import FORMATS, export_model
 from yid_ocp.workflow.progress import shown
@@ -25,7 +26,7 @@ def run(arguments: argparse.Namespace) -> int:
         with shown(arguments.quiet) as progress:
             manifest = export_model(source, arguments.out, form or "mjcf", progress)
         if not arguments.quiet:
-            print_lines(export_summary(manifest))
+            print_lines(lines(export_summary(manifest)))
         print(arguments.out)
         return DONE
     if form not in (None, "csv"):

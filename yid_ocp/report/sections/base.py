@@ -15,6 +15,7 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.prediction import EpisodeResult
 from yid_ocp.registry import Registry
+from yid_ocp.report.scene import Scene
 from yid_ocp.solvers import Solution
 
 if TYPE_CHECKING:
@@ -34,6 +35,8 @@ class Findings:
     problem : EstimationProblem, optional
     solution : Solution, optional
     held_out : sequence of (Episode, EpisodeResult or text)
+    scenes : sequence of Scene
+        What moves, where it does not follow from `problem`, `solution` and `held_out`.
     more : mapping
         Whatever else a command's own sections need.
     """
@@ -44,6 +47,7 @@ class Findings:
     problem: EstimationProblem | None = None
     solution: Solution | None = None
     held_out: Sequence[tuple[Episode, EpisodeResult | str]] = ()
+    scenes: Sequence[Scene] = ()
     more: Mapping[str, Any] = field(default_factory=dict)
 
     @property

@@ -20,6 +20,7 @@ from yid_ocp.problem.prediction import EpisodeResult
 from yid_ocp.report import figures
 from yid_ocp.report.figures import Change, Curve, Ranked, Row
 from yid_ocp.report.sections.base import Findings, section
+from yid_ocp.report.tables import error_words, readable
 
 Array = NDArray[np.float64]
 
@@ -66,14 +67,8 @@ def prepare(findings: Findings) -> Mapping[str, Any] | None:
             "curves": _curves(finding, findings.more["predictions"]),
             "absorbed": _absorbed(finding),
         }
-    return {
-        "result": result,
-        "chapters": chapters,
-        "channels": list(result["gap"]["before"]["rmse"]),
-        "which": result["which"][:LISTED],
-        "more": max(len(result["which"]) - LISTED, 0),
-        "places": [place for place in result["where"] if place["share"] > 0.005],
-    }
+    shown = [chapter for chapter in chapters.items() if chapter[1] is not None]
+    return {"chapters": dict(shown)} if shown else None
 
 
 # -- the gap ----------------------------------------------------------------------------------------------------------
@@ -88,7 +83,7 @@ def _gap(finding: Finding) -> Chapter:
         by_unit.setdefault(unit, {})[channel] = Change(error, later, mark=floor.get(channel))
     pictures = []
     for unit, rows in by_unit.items():
-        factor, shown = _readable(unit, [row.before for row in rows.values()])
+        factor, shown = readable(unit)
         scaled = {
             name: Change(
                 factor * row.before,
@@ -133,14 +128,8 @@ def _floor(finding: Finding) -> dict[str, float]:
     return {entry.channel: math.sqrt(width.get(entry.channel, 1)) * entry.std for entry in finding.floor}
 
 
-def _readable(unit: str, values: Sequence[float]) -> tuple[float, str]:
-    """Factor and unit in which lengths of some millimetres are not all zeros."""
-    return (1e3, "mm") if unit == "m" and max(map(abs, values), default=1.0) < 0.1 else (1.0, unit)
-
-
 def _amount(value: float, unit: str) -> str:
-    factor, shown = _readable(unit, [value])
-    return f"{factor * value:.3g} {shown}"
+    return " ".join(error_words(value, unit))
 
 
 # -- where ------------------------------------------------------------------------------------------------------------
@@ -355,14 +344,8 @@ def _curves(finding: Finding, predicted: Sequence[Prediction]) -> Chapter | None
                     continue
                 squares = [float(np.sum(((line - y)[seen] / std[seen]) ** 2)) for line in lines.values()]
                 name = channel if sensor.width == 1 else f"{channel}, {'xyz'[column % 3]}"
-                factor, unit = _readable(
-                    sensor.unit, [float(np.max(np.abs((line - y)[seen]))) for line in lines.values()]
-                )
-                noise = float(np.median(std[seen])) * factor
-                course = Curve(f"{name}<br>[{sensor.unit}]", t, y, {n: (t, line) for n, line in lines.items()})
-                errors = {n: _in_pieces(t[seen], factor * (line - y)[seen]) for n, line in lines.items()}
-                error = Curve(f"error [{unit}]", t[:0], y[:0], errors, 2 * noise)
-                found.append((squares[0] - (squares[1] if changed else 0.0), episode.name, course, error))
+                pair = figures.compared(name, sensor.unit, t, y, std, lines)
+                found.append((squares[0] - (squares[1] if changed else 0.0), episode.name, *pair))
     if not found:
         return None
     found.sort(key=lambda entry: -entry[0])
@@ -383,13 +366,6 @@ def _curves(finding: Finding, predicted: Sequence[Prediction]) -> Chapter | None
         "the error, with two standard deviations of the noise shaded: what is right stays within.",
     ]
     return Chapter("Measured and predicted", sentences, pictures)
-
-
-def _in_pieces(t: Array, values: Array) -> tuple[Array, Array]:
-    """A line that is broken where nothing was measured for long."""
-    steps = np.diff(t)
-    breaks = np.flatnonzero(steps > 5 * np.median(steps)) + 1 if len(steps) else np.zeros(0, int)
-    return np.insert(t, breaks, t[breaks]), np.insert(values, breaks, np.nan)
 
 
 def _absorbed(finding: Finding) -> Chapter | None:

@@ -1,4 +1,4 @@
-"""What a planned motion reaches, and what it asks of the joints."""
+"""A planned motion over time."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ import numpy as np
 
 from yid_ocp.report.figures import Curve, html, lines_over_time
 from yid_ocp.report.sections.base import Findings, section
-from yid_ocp.report.tables import plan_rows, plan_sentences
 
 
-@section("plan", 5, "The planned motion")
+@section("plan", 10, "The planned motion")
 def prepare(findings: Findings) -> Mapping[str, Any] | None:
-    """Sentences, the table of joints, and figures of the point and the joints."""
+    """How far the point is from its place, and the joints, over time."""
     found = findings.more.get("plan")
     if found is None:
         return None
@@ -30,10 +29,4 @@ def prepare(findings: Findings) -> Mapping[str, Any] | None:
     curves.append(
         Curve("effort [N m or N]", empty, empty, {n: (found.t, found.effort[:, i]) for i, n in enumerate(found.joints)})
     )
-    head, *rows = plan_rows(findings.result)
-    return {
-        "sentences": [f"{findings.result['status']}: {findings.result['message']}", *plan_sentences(findings.result)],
-        "head": head,
-        "rows": rows,
-        "figures": [html(lines_over_time(curve)) for curve in curves],
-    }
+    return {"figures": [html(lines_over_time(curve)) for curve in curves]}
