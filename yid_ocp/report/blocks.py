@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 Rows = list[Sequence[str]]
+Weight = Literal["note", "verdict", "conclusion"]
 
 
 @dataclass(frozen=True)
@@ -15,12 +17,13 @@ class Statement:
     Attributes
     ----------
     text : str
-    verdict : bool
-        Whether it is what the command was asked for; pages begin with these.
+    weight : "note", "verdict" or "conclusion"
+        Verdicts are what the command was asked for, a conclusion is what they come to: a page begins with conclusions,
+        then has the verdicts.
     """
 
     text: str
-    verdict: bool = False
+    weight: Weight = "note"
 
 
 @dataclass(frozen=True)
@@ -54,9 +57,9 @@ class Command:
 Block = Statement | Table | Command
 
 
-def statements(texts: Iterable[str], verdict: bool = False) -> list[Block]:
+def statements(texts: Iterable[str], weight: Weight = "note") -> list[Block]:
     """A statement of every text that is not empty."""
-    return [Statement(text, verdict) for text in texts if text]
+    return [Statement(text, weight) for text in texts if text]
 
 
 def filled(*tables: Table) -> list[Block]:

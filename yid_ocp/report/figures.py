@@ -374,8 +374,9 @@ def counted(
         hovertemplate="%{y}: said %{x}<extra></extra>",
     )  # fmt: skip
     figure = _styled(figure, 200 + 24 * len(rows), column, row)
-    figure.update_xaxes(showgrid=False, tickangle=-50, automargin=True, type="category")
-    figure.update_yaxes(showgrid=False, autorange="reversed", automargin=True, type="category")
+    every = {"type": "category", "tickmode": "array", "title_standoff": 6, "showgrid": False, "automargin": True}
+    figure.update_xaxes(tickangle=-50, tickvals=list(columns), **every)
+    figure.update_yaxes(autorange="reversed", tickvals=list(rows), **every)
     return figure
 
 
@@ -621,8 +622,9 @@ def matrix(names: Sequence[str], values: Array, row: str, column: str) -> plotly
         hovertemplate="%{y} explained by %{x}: %{z:.2f}<extra></extra>",
     )  # fmt: skip
     figure = _styled(figure, 190 + 27 * len(names), column, row)
-    figure.update_xaxes(showgrid=False, tickangle=-40, automargin=True)
-    figure.update_yaxes(showgrid=False, autorange="reversed", automargin=True)
+    every = {"type": "category", "tickmode": "array", "tickvals": list(names), "title_standoff": 6}
+    figure.update_xaxes(showgrid=False, tickangle=-40, automargin=True, **every)
+    figure.update_yaxes(showgrid=False, autorange="reversed", automargin=True, **every)
     return figure
 
 

@@ -34,14 +34,14 @@ def check_summary(result: Mapping[str, Any]) -> list[Block]:
     moved = moved_sentences(result)
     blocks += statements(["if the initial values were the estimates:", *moved]) if moved else []
     blocks += doubt_blocks(result)
-    blocks += statements((f"warning: {text}" for text in result["warnings"]), True)
+    blocks += statements((f"warning: {text}" for text in result["warnings"]), "verdict")
     if result.get("doubts"):
         ended = "a run is possible; see what is in doubt"
     elif result["warnings"]:
         ended = "a run is possible; see the warnings"
     else:
         ended = "nothing stands in the way of a run"
-    return [*blocks, Statement(ended, True)]
+    return [*blocks, Statement(ended, "conclusion")]
 
 
 def _noise_words(noise: Mapping[str, Any], name: str) -> str:
@@ -78,7 +78,7 @@ def inspect_summary(result: Mapping[str, Any]) -> list[Block]:
     counts = [f"{roles.count(role)} {role}" for role in ("driven", "prescribed", "free") if role in roles]
     equations, linear = result["equations"], result["linearisation"]
     size = f"coordinates: {len(roles)} ({', '.join(counts)}), constraints: {equations['sizes']['m']}"
-    blocks: list[Block] = [Statement(size, True)]
+    blocks: list[Block] = [Statement(size, "verdict")]
     rows: Rows = [("parameter", "value", "unit", "bounds", "")]
     for name, entry in result["parameters"].items():
         low, high = ("inf" if entry[key] is None else f"{entry[key]:g}" for key in ("lower", "upper"))
@@ -94,7 +94,7 @@ def inspect_summary(result: Mapping[str, Any]) -> list[Block]:
         blocks.append(Table(rows, head.capitalize()))
     blocks += _patterns(result)
     said = f"linearised at {linear['at']}: spectral radius of A {linear['spectral_radius']:.6g}"
-    blocks.append(Statement(said, True))
+    blocks.append(Statement(said, "verdict"))
     rows = [("matrix", "norm", "largest difference from finite differences")]
     rows += [
         (name, f"{norm:.4g}", f"{linear['finite_difference_errors'][name]:.1e}")
@@ -139,7 +139,7 @@ def _patterns(result: Mapping[str, Any]) -> list[Block]:
 def simulate_summary(result: Mapping[str, Any]) -> list[Block]:
     """What a `yid-simulate/1` result says."""
     if result["status"] == "failed":
-        return [Statement(f"failed: {result['message']}", True)]
+        return [Statement(f"failed: {result['message']}", "verdict")]
     rows: Rows = [("group", "samples")]
     rows += [(name, str(entry["samples"])) for name, entry in result["groups"].items()]
-    return [Table(rows, "Recorded", key=True), Statement(f"{result['duration']:g} s in recording.h5", True)]
+    return [Table(rows, "Recorded", key=True), Statement(f"{result['duration']:g} s in recording.h5", "verdict")]

@@ -118,6 +118,11 @@ class Skeleton:
             for link in layout.links
             for joint in link
         }
+        # what an effect put below the object is part of it, a robot's hand that carries it is not
+        for j in reversed(range(len(names))):
+            children = [names[k] for k, joint in enumerate(tree.joints) if joint.parent == j]
+            if "@" in names[j] and children and all(child in owned for child in children):
+                owned[names[j]] = owned[children[0]]
         pairs = [(joint.parent, j, names[j] in owned) for j, joint in enumerate(tree.joints)]
         ends = [f"{layout.name}_{i}_tip" for layout in system.segments for i in range(len(layout.links))]
         shown = [*ends, *system.points, *(frame for grasp in system.grasps for frame in (grasp.holder, grasp.held))]
@@ -140,11 +145,13 @@ class Skeleton:
         same = np.maximum(same, np.linalg.norm(both[1][:, :, None] - both[1][:, None], axis=0))
         first = np.argmax(same < SHORTEST, axis=1)
         # a robot stands on its base, an object on the ground or in a hand
-        known = {
-            (int(first[base if a < 0 else a]), int(first[b])): (owned[names[a]] if own else ARM_RADIUS, own)
-            for a, b, own in pairs
-            if a >= 0 or not own
-        }
+        known = {}
+        for a, b, own in pairs:
+            if a >= 0 or not own:
+                # an effect may have put joints between two links
+                child = owned.get(names[b] if b < len(names) else names[a], ARM_RADIUS)
+                radius = owned.get(names[a], child) if own else ARM_RADIUS
+                known[int(first[base if a < 0 else a]), int(first[b])] = (radius, own)
         known = {ends: told for ends, told in known.items() if ends[0] != ends[1]}
         kept = sorted({*(k for ends in known for k in ends), *(int(first[k]) for k in points.values())})
         at = {k: i for i, k in enumerate(kept)}

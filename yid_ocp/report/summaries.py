@@ -61,14 +61,14 @@ def solve_summary(result: Mapping[str, Any]) -> list[Block]:
     blocks += statements([*moved_sentences(result), *result.get("discretisation_notes", ())])
     if failed:
         said = "the values are the best point that was reached; nothing can be said about how sure they are"
-        blocks.append(Statement(said, True))
+        blocks.append(Statement(said, "verdict"))
     else:
         blocks += _unsure(free)
         if result["fit"]["explains"]:
-            blocks.append(Statement(fit_words(result["fit"]["chi2_per_dof"], True), True))
+            blocks.append(Statement(fit_words(result["fit"]["chi2_per_dof"], True), "conclusion"))
     blocks += statements([result.get("safeguard", "")])
     ended = f"{result['status']}: {result['message']} ({result['iterations']} iterations, {result['seconds']:.1f} s)"
-    return [*blocks, Statement(ended, result["status"] != "converged")]
+    return [*blocks, Statement(ended, "note" if result["status"] == "converged" else "conclusion")]
 
 
 def _estimate_rows(free: Mapping[str, Mapping[str, Any]], failed: bool) -> Rows:
@@ -88,7 +88,7 @@ def _estimate_rows(free: Mapping[str, Mapping[str, Any]], failed: bool) -> Rows:
 def _misfit(fit: Mapping[str, Any]) -> list[Block]:
     """What has to be said before anything else: a guess does better, or the model does not explain the recordings."""
     said = guess_sentences(fit.get("worse_than_guess", ()))
-    return statements([*said, *([] if fit["explains"] else [fit_words(fit["chi2_per_dof"], False)])], True)
+    return statements([*said, *([] if fit["explains"] else [fit_words(fit["chi2_per_dof"], False)])], "conclusion")
 
 
 def _unsure(free: Mapping[str, Mapping[str, Any]]) -> list[Block]:
@@ -106,7 +106,7 @@ def _unsure(free: Mapping[str, Mapping[str, Any]]) -> list[Block]:
             said.append("`yid-ocp identifiability` gives intervals that need not be symmetric")
     if bound:
         said.append(f"the search ended at a bound of {', '.join(bound)}: what is beyond it was not tried")
-    return statements(said, True)
+    return statements(said, "verdict")
 
 
 def plan_summary(result: Mapping[str, Any]) -> list[Block]:
@@ -118,7 +118,8 @@ def plan_summary(result: Mapping[str, Any]) -> list[Block]:
         said = information_sentences(result)
     else:
         said = plan_sentences(result)
-    return [*blocks, *statements([*said, f"{result['status']}: {result['message']}"], True)]
+    ended = Statement(f"{result['status']}: {result['message']}", "conclusion")
+    return [*blocks, *statements(said, "verdict"), ended]
 
 
 def track_summary(result: Mapping[str, Any]) -> list[Block]:
@@ -137,7 +138,7 @@ def track_summary(result: Mapping[str, Any]) -> list[Block]:
     return [
         *doubt_blocks(result),
         Table(rows, "Points", key=True),
-        Statement(said, True),
+        Statement(said, "verdict"),
         *statements([*dropped, result["clock"]["message"]]),
     ]
 
@@ -175,7 +176,7 @@ def compare_summary(result: Mapping[str, Any]) -> list[Block]:
         Table(rows, "Parameters by method", key=True),
         Table(_efforts(methods), "What it took"),
         *statements(said),
-        *statements(_agreement(result), True),
+        *statements(_agreement(result), "conclusion"),
     ]
 
 
@@ -226,7 +227,7 @@ def identifiability_summary(result: Mapping[str, Any]) -> list[Block]:
     """What a `yid-identifiability/1` result says."""
     if not result["parameters"]:
         text = f"{result['status']}: {result['message']}; there is no point at which to judge"
-        return [Statement(text, True)]
+        return [Statement(text, "verdict")]
     unsure = "± if start and grasps were unknown"
     rows: Rows = [("parameter", "value", "±", unsure, "± if all else were known", "95 % interval", "unit", "verdict")]
     for name, entry in result["parameters"].items():
@@ -246,11 +247,12 @@ def identifiability_summary(result: Mapping[str, Any]) -> list[Block]:
     blocks += statements(f"{name}: {note}" for name, entry in result["profiles"].items() for note in entry["notes"])
     blocks += [] if result["what_if"] is None else _what_if(result["what_if"], list(result["parameters"]))
     found = [name for name, entry in result["parameters"].items() if entry["verdict"] == "identifiable"]
-    said = [f"{len(found) or 'none'} of {len(result['parameters'])} parameters can be found from these recordings"]
+    said = f"{len(found) or 'none'} of {len(result['parameters'])} parameters can be found from these recordings"
+    blocks.append(Statement(said, "conclusion"))
     lost = [name for name in found if result["parameters"][name]["verdict_unknown"] != "identifiable"]
     if lost:
-        said.append(f"not found if start and grasps were unknown: {', '.join(lost)}")
-    return [*blocks, *statements(said, True)]
+        blocks.append(Statement(f"not found if start and grasps were unknown: {', '.join(lost)}", "verdict"))
+    return blocks
 
 
 def _what_if(asked: Mapping[str, Any], names: Sequence[str]) -> list[Block]:
@@ -262,7 +264,7 @@ def _what_if(asked: Mapping[str, Any], names: Sequence[str]) -> list[Block]:
     said = "with no set of up to three changes can all of them be found"
     if asked["smallest"]:
         said = f"fewest changes with which all of them can be found: {asked['smallest'][0]['words']}"
-    return [Table(rows, "What another experiment would tell"), Statement(said, True)]
+    return [Table(rows, "What another experiment would tell"), Statement(said, "verdict")]
 
 
 def _percent(value: float | None) -> str:
@@ -283,7 +285,7 @@ CANDIDATES = 15
 
 def diagnose_summary(result: Mapping[str, Any]) -> list[Block]:
     """What a `yid-diagnosis/1` result says."""
-    blocks = [*doubt_blocks(result), Statement(result["summary"], True)]
+    blocks = [*doubt_blocks(result), Statement(result["summary"], "verdict")]
     blocks += filled(Table(gap_rows(result), "Errors on held-out recordings", key=True))
     rows: Rows = [("candidate", "parameters", "closure alone", "score", "p")]
     for entry in result["which"][:CANDIDATES]:
@@ -318,7 +320,7 @@ def history_summary(result: Mapping[str, Any]) -> list[Block]:
     return [
         Table(history_rows(result), "Parameters", key=True),
         Table(run_rows(result), "Runs"),
-        *statements(history_sentences(result), True),
+        *statements(history_sentences(result), "verdict"),
     ]
 
 
@@ -334,7 +336,7 @@ def planning_command(section: Mapping[str, Any]) -> str:
 def blind_summary(result: Mapping[str, Any]) -> list[Block]:
     """What a `yid-blind/1` result says."""
     score, *others, cases = (Table(rows, title) for title, rows in blind_tables(result).items())
-    said = statements(blind_sentences(result), True)
+    said = statements(blind_sentences(result), "verdict")
     return [replace(score, key=True), *filled(*others, replace(cases, long=True)), *said]
 
 
@@ -345,7 +347,7 @@ def batch_summary(result: Mapping[str, Any]) -> list[Block]:
     blocks.append(Table(batch_rows(result), "Runs with all parameters", long=True))
     if result["history"] is not None:
         blocks.append(Table(run_rows(result["history"]), "Each run against the others"))
-    return [*blocks, *statements(batch_sentences(result), True)]
+    return [*blocks, *statements(batch_sentences(result), "verdict")]
 
 
 def export_summary(manifest: Mapping[str, Any]) -> list[Block]:

@@ -75,7 +75,7 @@ def doubt_blocks(result: Mapping[str, Any]) -> list[Block]:
         blocks.append(Statement(f"{row.cause}: {row.what}; {row.advice}"))
         blocks += [Command(row.setting)] if row.setting else []
     if any(entry["weight"] != "warning" for entry in result["doubts"]):
-        blocks.append(Statement("no number is said to be found while a recording of the run is in doubt", True))
+        blocks.append(Statement("no number is said to be found while a recording of the run is in doubt", "verdict"))
     return blocks
 
 

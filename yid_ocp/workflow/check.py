@@ -102,7 +102,13 @@ def run_check(run: Run, out: str | Path | None = None, progress: Progress = SILE
         written = folder.finish(result)
         if problem is not None and first is not None:
             taken = [episode.recording for episode in (*problem.episodes, *problem.held_out)]
-            folder.report(run, written, progress, scenes=_scenes(problem, first), more={"recordings": taken})
+            folder.report(
+                run,
+                written,
+                progress,
+                scenes=_scenes(problem, first),
+                more={"recordings": taken, "system": step.system},
+            )
         else:
             folder.report(run, written, progress)
     return CheckOutcome(folder.path, written)

@@ -14,6 +14,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import Run
 from yid_ocp.data.hdf5 import write_recording
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate
+from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.options import SensorOptions
@@ -92,12 +93,13 @@ def run_simulate(
     """
     with new_run_folder(run, out, "simulate") as folder:
         folder.begin(run, "simulate", _flags(seed, noise))
+        system = build_system(run)
         scenes: list[Scene] = []
         made: Recording | str
         if run.recordings.estimate:
-            made, scenes = _predicted(run, progress, seed if noise else None)
+            made, scenes = _predicted(run, system, progress, seed if noise else None)
         else:
-            made, scenes = _virtual(run, progress, seed)
+            made, scenes = _virtual(run, system, progress, seed)
         result: dict[str, Any] = {"format": FORMAT, "status": "done", "message": "", "seed": seed}
         if isinstance(made, str):
             result |= {"status": "failed", "message": made}
@@ -111,7 +113,7 @@ def run_simulate(
                 "truth": dict(recording.truth),
             }
         written = folder.finish(result)
-        more = {"recordings": [] if recording is None else [recording]}
+        more = {"recordings": [] if recording is None else [recording], "system": system}
         folder.report(run, written, progress, scenes=scenes, more=more)
     return SimulateOutcome(folder.path, written, recording)
 
@@ -121,11 +123,10 @@ def _flags(seed: int, noise: bool) -> list[str]:
     return [*(["--seed", str(seed)] if seed else []), *(["--noise"] if noise else [])]
 
 
-def _virtual(run: Run, progress: Progress, seed: int) -> tuple[Recording, list[Scene]]:
+def _virtual(run: Run, system: System, progress: Progress, seed: int) -> tuple[Recording, list[Scene]]:
     from yid_ocp.virtual.engine import Simulation
     from yid_ocp.virtual.experiment import VirtualExperiment, virtual_experiment
 
-    system = build_system(run)
     if run.model.robot is None:
         raise run.refuse(
             "nothing moves an object without a robot by itself",
@@ -144,9 +145,9 @@ def _virtual(run: Run, progress: Progress, seed: int) -> tuple[Recording, list[S
     return made, [] if alone is None else [alone]
 
 
-def _predicted(run: Run, progress: Progress, seed: int | None) -> tuple[Recording | str, list[Scene]]:
+def _predicted(run: Run, system: System, progress: Progress, seed: int | None) -> tuple[Recording | str, list[Scene]]:
     progress.stage("building the model and its compiled step")
-    step = build_step(run)
+    step = build_step(run, system)
     first = replace(run, recordings=replace(run.recordings, estimate=run.recordings.estimate[:1]))
     recordings = read_recordings(first, "estimate")
     options = replace(problem_options(run, step.system, recordings), local=(), priors={})

@@ -283,8 +283,8 @@ def _which(finding: Finding, result: Mapping[str, Any]) -> Chapter | None:
         ]
     else:
         sentences = [f"W{promise}", "No candidate promised enough to be refitted."]
-    axis = "promised where fitted [%]" if percent else "promised fall of r'r [1]"
-    picture = figures.html(figures.ranking(entries, "closed on held-out motions [%]", axis))
+    # beside each other on a phone there is room for a word
+    picture = figures.html(figures.ranking(entries, "closed [%]", "promised [%]" if percent else "promised [1]"))
     title = "What each effect could explain" if finding.verdict == "no_gap" else "Which effect makes it"
     return Chapter(title, sentences, [("", picture)])
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from yid_ocp.report.figures import Curve, html, lines_over_time
-from yid_ocp.report.sections.base import Findings, section
+from yid_ocp.report.sections.base import Findings, joint_unit, section
 
 
 @section("information", 10, "The motion that tells most")
@@ -18,10 +19,11 @@ def prepare(findings: Findings) -> Mapping[str, Any] | None:
     if found is None:
         return None
     empty = np.zeros(0)
+    unit = partial(joint_unit, found.mover.step.system, found.joints)
     courses = {
-        "joints, from the start [rad or m]": found.position - found.position[0],
-        "velocity [rad/s or m/s]": found.velocity,
-        "effort [N m or N]": found.effort,
+        f"joints, from the start [{unit('position')}]": found.position - found.position[0],
+        f"velocity [{unit('velocity')}]": found.velocity,
+        f"effort [{unit('effort')}]": found.effort,
     }
     curves = [
         Curve(words, empty, empty, {name: (found.t, values[:, i]) for i, name in enumerate(found.joints)})

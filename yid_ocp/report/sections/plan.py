@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from yid_ocp.report.figures import Curve, html, lines_over_time
-from yid_ocp.report.sections.base import Findings, section
+from yid_ocp.report.sections.base import Findings, joint_unit, section
 
 
 @section("plan", 10, "The planned motion")
@@ -19,14 +20,20 @@ def prepare(findings: Findings) -> Mapping[str, Any] | None:
         return None
     where = found.points.get(findings.result["point"])
     empty = np.zeros(0)
+    unit = partial(joint_unit, found.mover.step.system, found.joints)
     curves = []
     if where is not None:
         off = 1e3 * (where - found.place)
         lines = {axis: (found.t, off[:, i]) for i, axis in enumerate("xyz")}
         curves.append(Curve("from the place [mm]", empty, empty, lines, 1e3 * findings.result["tolerance"]))
     moved = {name: (found.t, found.position[:, i] - found.position[0, i]) for i, name in enumerate(found.joints)}
-    curves.append(Curve("joints, from the start [rad or m]", empty, empty, moved))
+    curves.append(Curve(f"joints, from the start [{unit('position')}]", empty, empty, moved))
     curves.append(
-        Curve("effort [N m or N]", empty, empty, {n: (found.t, found.effort[:, i]) for i, n in enumerate(found.joints)})
+        Curve(
+            f"effort [{unit('effort')}]",
+            empty,
+            empty,
+            {n: (found.t, found.effort[:, i]) for i, n in enumerate(found.joints)},
+        )
     )
     return {"figures": [html(lines_over_time(curve)) for curve in curves]}

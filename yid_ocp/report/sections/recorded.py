@@ -8,32 +8,35 @@ from typing import Any
 import numpy as np
 
 from yid_ocp.data.recording import JointGroup, Recording
+from yid_ocp.model.system import System
 from yid_ocp.report import figures
 from yid_ocp.report.figures import Curve
-from yid_ocp.report.sections.base import Findings, section
+from yid_ocp.report.sections.base import Findings, joint_unit, section
 
 MOST = 3  # recordings that are drawn
 MOST_POINTS = 6  # points of a group; more are in the recording
-UNITS = {"position": "rad or m", "velocity": "rad/s or m/s", "effort": "N m or N", "position_command": "rad or m"}
+CHANNELS = ("position", "velocity", "effort", "position_command")
 
 
 @section("recorded", 30, "What was recorded")
 def prepare(findings: Findings) -> Mapping[str, Any] | None:
     """Joints' channels and points over time."""
     recordings: list[Recording] = findings.more.get("recordings", [])[:MOST]
+    system: System | None = findings.more.get("system")
     pictures = [
         (f"{title} of {recording.name}", figures.html(figures.lines_over_time(curve)))
         for recording in recordings
-        for title, curve in _curves(recording)
+        for title, curve in _curves(recording, system)
     ]
     return {"pictures": pictures} if pictures else None
 
 
-def _curves(recording: Recording) -> list[tuple[str, Curve]]:
+def _curves(recording: Recording, system: System | None) -> list[tuple[str, Curve]]:
     empty, found = np.zeros(0), []
     for group in recording.groups:
         if isinstance(group, JointGroup):
-            for channel, unit in UNITS.items():
+            for channel in CHANNELS:
+                unit = joint_unit(system, group.names, channel)
                 values = group.channels.get(channel)
                 if values is not None:
                     lines = {name: (group.t, values[:, i]) for i, name in enumerate(group.names)}

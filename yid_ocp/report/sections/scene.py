@@ -13,12 +13,15 @@ MOST = 4  # recordings; a page with more is slow to open
 ROLES = {"estimate": "estimated on", "held_out": "held out"}
 
 
-@section("scene", 8, "In motion")
+@section("scene", 3, "In motion")
 def prepare(findings: Findings) -> Mapping[str, Any] | None:
     """What the command made to be shown, else what was predicted of every recording; held-out ones first."""
     scenes = [entry for entry in findings.scenes or _predicted(findings) if len(entry.t) > 1]
     told = json.dumps([entry.to_dict() for entry in scenes[:MOST]], separators=(",", ":")).replace("<", "\\u003c")
-    return {"scenes": told} if scenes else None
+    both = any(
+        len({motion.name for motion in entry.motions} - {"measured"}) < len(entry.motions) > 1 for entry in scenes
+    )
+    return {"scenes": told, "both": both} if scenes else None
 
 
 def _predicted(findings: Findings) -> Sequence[Scene]:

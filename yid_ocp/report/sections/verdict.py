@@ -12,11 +12,12 @@ from yid_ocp.report.summaries import SUMMARIES
 
 @section("verdict", 0, "What was found")
 def prepare(findings: Findings) -> Mapping[str, Any] | None:
-    """The statements that are verdicts, and all up to the table that stands beside them."""
+    """Conclusions and verdicts, and all up to the table that stands beside them."""
     blocks = summary(findings)
     if not blocks:
         return None
-    said = [block.text for block in blocks if isinstance(block, Statement) and block.verdict]
+    told = [block for block in blocks if isinstance(block, Statement)]
+    said = [block.text for weight in ("conclusion", "verdict") for block in told if block.weight == weight]
     return {"verdict": said, "blocks": without_verdicts(blocks[: key(blocks)])}
 
 
@@ -33,4 +34,4 @@ def key(blocks: list[Block]) -> int:
 
 def without_verdicts(blocks: list[Block]) -> list[Block]:
     """What is left when the verdicts have been said."""
-    return [block for block in blocks if not (isinstance(block, Statement) and block.verdict)]
+    return [block for block in blocks if not (isinstance(block, Statement) and block.weight != "note")]

@@ -19,14 +19,20 @@ async function library() {
   document.head.append(script);
 }
 
-function fitted(layout, width) {
+function fitted({ data, layout }, width) {
   if (width > 560) return layout;
   layout.font = { ...layout.font, size: 11 };
   layout.margin = { ...layout.margin, l: Math.min(layout.margin.l, 46), r: Math.min(layout.margin.r, 16) };
   for (const name of Object.keys(layout).filter((key) => /^[xy]axis/.test(key))) {
     const listed = layout[name].categoryarray || layout[name].tickvals || layout[name].type === "category";
-    layout[name] = { ...layout[name], nticks: listed ? 0 : layout[name].nticks || 5, tickfont: { ...layout[name].tickfont, size: 10 } };
+    const size = listed && (layout[name].tickvals || []).length > 10 ? 8 : 10;
+    layout[name] = { ...layout[name], nticks: listed ? 0 : layout[name].nticks || 5, tickfont: { ...layout[name].tickfont, size } };
   }
+  // what stands beside a figure has no room
+  const beside = (entry) => entry.xref === "paper" && entry.x > 1;
+  if ((layout.annotations || []).some(beside)) layout.margin.r = 52;
+  layout.annotations = (layout.annotations || []).filter((entry) => !beside(entry));
+  data.filter((trace) => trace.colorbar).forEach((trace) => Object.assign(trace.colorbar, { x: 1.02, thickness: 10 }));
   return layout;
 }
 
@@ -34,7 +40,7 @@ function draw(box) {
   const figure = JSON.parse(inColors(box.querySelector("script").textContent));
   const config = { responsive: true, displaylogo: false, displayModeBar: box.clientWidth > 560 ? "hover" : false };
   box.drawn = true;
-  return Plotly.react(box.target, figure.data, fitted(figure.layout, box.clientWidth), config);
+  return Plotly.react(box.target, figure.data, fitted(figure, box.clientWidth), config);
 }
 
 async function figures() {
