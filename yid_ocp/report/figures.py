@@ -569,7 +569,7 @@ def ranking(entries: Sequence[Ranked], closed: str, promised: str) -> plotly.gra
 
     done = [(entry.name, *entry.closed) for entry in entries if entry.closed is not None]
     last = 2 if done else 1
-    figure = make_subplots(rows=1, cols=last, shared_yaxes=True, horizontal_spacing=0.04)
+    figure = make_subplots(rows=1, cols=last, shared_yaxes=True, horizontal_spacing=0.08)
     figure.add_bar(
         x=[entry.promised for entry in entries], y=[entry.name for entry in entries], orientation="h", width=0.55,
         marker={"color": COLORS[1]}, showlegend=False, row=1, col=last,

@@ -19,6 +19,8 @@ from yid_ocp.solvers.words import VERDICT_WORDS
 log = logging.getLogger(__name__)
 ABOVE = 2
 """Levels above a page where a script that it may share is looked for: a batch is two above the pages of its runs."""
+LONG = 24
+"""Characters from which the cells of a column are wrapped."""
 _VERDICTS = {words: verdict for verdict, words in VERDICT_WORDS.items()}
 _NUMBER = re.compile(r"^(–|-|(< |± )?[-+]?\d[\d.]*(e[-+]?\d+)?( %| ms| s| Hz)?( ± [\d.]+(e[-+]?\d+)?( %)?)?)?$")
 
@@ -121,4 +123,8 @@ def cell_class(table: Table) -> list[str]:
     """How the columns of a table are set, those without an entry left out as None: numbers to the right."""
     head, *body = table.rows
     columns = [[row[i] for row in body] for i in range(len(head))]
-    return ["" if not any(c) else "number" if all(map(_NUMBER.match, c)) else "text" for c in columns]
+    kinds = []
+    for cells in columns:
+        numbers, longest = all(map(_NUMBER.match, cells)), max(map(len, cells), default=0)
+        kinds.append("" if not any(cells) else "number" if numbers else "long" if longest > LONG else "text")
+    return kinds

@@ -31,8 +31,8 @@ def export_run_signals(folder: str | Path, out: str | Path) -> tuple[list[Path],
     Topics: `/measured/...`, `/predicted/...` (of a diagnosis `/nominal/...` and `/with_effects/...`) and
     `/residual/...`, predicted minus measured, with `joints/QUANTITY` or `points/GROUP/POINT` behind; the whole
     configuration as `/predicted/joint_states`, what moves it as `/predicted/driven_efforts` and
-    `/predicted/prescribed_efforts`; `/unknown/joint_states` (forces), `/unknown/push/SEGMENT`, `/unknown/offset/GRASP`, `/unknown/bias/POINT`
-    and `/events/CHANNEL` of a diagnosis.
+    `/predicted/prescribed_efforts`. Of a diagnosis also `/unknown/joint_states` (forces), `/unknown/push/SEGMENT`,
+    `/unknown/offset/GRASP`, `/unknown/bias/POINT` and `/events/CHANNEL`.
 
     Parameters
     ----------

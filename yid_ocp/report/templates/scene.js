@@ -54,7 +54,7 @@ class Viewer {
   color(name) {
     const dark = darkness.matches ? 1 : 0;
     const others = Object.keys(this.marks).filter((entry) => entry !== "measured");
-    return name === "measured" ? PALETTE.measured[dark] : PALETTE.other[others.indexOf(name) % 3][dark];
+    return name === "measured" ? PALETTE.measured[dark] : PALETTE.other[(others.length - 1 - others.indexOf(name)) % 3][dark];
   }
 
   swatches() { for (const [name, mark] of Object.entries(this.marks)) mark.style.background = this.color(name); }
