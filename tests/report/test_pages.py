@@ -44,7 +44,7 @@ addEventListener("load", async () => {
   const played = () => viewers.map((viewer) => viewer.time > viewer.from);
   for (let i = 0; i < 200 && played().includes(false); i++) await new Promise((go) => setTimeout(go, 20));
   parent.postMessage(JSON.stringify({
-    width: innerWidth, wide, scroll: document.documentElement.scrollWidth, 
+    width: innerWidth, wide, scroll: document.documentElement.scrollWidth,
     cut: cut.map((e) => e.outerHTML.slice(0, 80)),
     boxes: boxes.length, drawn: document.querySelectorAll(".plot .main-svg").length, moments,
     played: played(),
