@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Literal
 
 Rows = list[Sequence[str]]
@@ -39,12 +39,15 @@ class Table:
         Whether it stands beside the verdict on a page.
     long : bool
         Whether it is for pages alone.
+    links : mapping of str to str
+        Pages that cells of the first column lead to.
     """
 
     rows: Rows
     title: str = ""
     key: bool = False
     long: bool = False
+    links: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -342,9 +342,12 @@ def blind_summary(result: Mapping[str, Any]) -> list[Block]:
 
 def batch_summary(result: Mapping[str, Any]) -> list[Block]:
     """What a `yid-batch/1` result says."""
-    blocks: list[Block] = [Table(batch_rows(result, SHOWN), "Runs", key=True)]
+    links = {entry["name"]: f"{entry['folder']}/report.html" for entry in result["runs"] if entry["folder"]}
+    blocks: list[Block] = [Table(batch_rows(result, SHOWN), "Runs", key=True, links=links)]
     blocks += filled(Table(spread_rows(result), "Parameters over all runs"))
-    blocks.append(Table(batch_rows(result), "Runs with all parameters", long=True))
+    whole = batch_rows(result)
+    if len(whole[0]) > len(batch_rows(result, SHOWN)[0]):
+        blocks.append(Table(whole, "Runs with all parameters", long=True, links=links))
     if result["history"] is not None:
         blocks.append(Table(run_rows(result["history"]), "Each run against the others"))
     return [*blocks, *statements(batch_sentences(result), "verdict")]

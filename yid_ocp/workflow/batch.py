@@ -6,6 +6,7 @@ import argparse
 import glob
 import json
 import logging
+import shlex
 import shutil
 import time
 from collections.abc import Sequence
@@ -79,9 +80,18 @@ def run(arguments: argparse.Namespace) -> int:
     workers = given_workers(arguments) or LOCAL
     out = arguments.out or Path("runs") / f"batch-{time.strftime('%Y%m%d-%H%M%S')}"
     outcome = carry_out(
-        lambda shown: run_batch(members, out, arguments.each, workers, shown), batch_summary, arguments.quiet
+        lambda shown: run_batch(members, out, arguments.each, workers, shown, _again(arguments, out)),
+        batch_summary,
+        arguments.quiet,
     )
     return DONE if outcome.ok else FAILED
+
+
+def _again(arguments: argparse.Namespace, out: str | Path) -> str:
+    words = ["yid-ocp", "batch", *map(str, arguments.configs)]
+    words += ["--recordings", arguments.recordings] if arguments.recordings else []
+    words += ["--command", arguments.each, *(word for said in arguments.overrides for word in ("--set", said))]
+    return shlex.join([*words, "--out", str(out)])
 
 
 def batch_members(
@@ -148,6 +158,7 @@ def run_batch(
     command: str = "solve",
     workers: Workers | Executor = LOCAL,
     progress: Progress = SILENT,
+    again: str = "",
 ) -> BatchOutcome:
     """Run a command on every member of a batch; what the folder holds of them is not done again.
 
@@ -161,6 +172,8 @@ def run_batch(
     command : {'solve', 'diagnose'}
     workers : Workers or Executor, optional
     progress : Progress, optional
+    again : str
+        The command line that does the same, for the report.
 
     Returns
     -------
@@ -204,6 +217,7 @@ def run_batch(
     result = {
         "format": FORMAT,
         "command": command,
+        "again": again,
         "runs": entries,
         "history": _alike([folder / RUNS / entry["name"] for entry in entries if entry["ok"]]),
         "date": now(),
