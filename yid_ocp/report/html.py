@@ -22,7 +22,9 @@ ABOVE = 2
 LONG = 24
 """Characters from which the cells of a column are wrapped."""
 _VERDICTS = {words: verdict for verdict, words in VERDICT_WORDS.items()}
-_NUMBER = re.compile(r"^(–|-|(< |± )?[-+]?\d[\d.]*(e[-+]?\d+)?( %| ms| s| Hz)?( ± [\d.]+(e[-+]?\d+)?( %)?)?)?$")
+_NUMBER = re.compile(
+    r"^(–|-|unknown|failed|(< |± )?[-+]?\d[\d.]*(e[-+]?\d+)?( %| ms| s| Hz)?( ± [\d.]+(e[-+]?\d+)?( %)?)?)?$"
+)
 
 
 def write_report(path: Path, findings: Findings) -> bool:

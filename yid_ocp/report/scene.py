@@ -21,7 +21,7 @@ ARM_RADIUS = 0.03
 """How thick an arm is drawn [m]."""
 SCALE = 1e4
 """Places are kept as whole numbers of a tenth of a millimetre."""
-SHORTEST = 1e-6
+SHORTEST, EARLY = 1e-6, 1e-9  # what counts as one place [m], as one time [s]
 
 
 @dataclass(frozen=True)
@@ -55,12 +55,15 @@ class Motion:
         [m]; NaN where nothing is known.
     points : mapping of str to int
         Places that a sensor sees.
+    fresh : ndarray, shape (F, number of points)
+        Whether a point was measured at that moment, and is not only held until the next measurement.
     """
 
     name: str
     sticks: tuple[Stick, ...]
     places: Array
     points: Mapping[str, int] = field(default_factory=dict)
+    fresh: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True)
@@ -90,6 +93,7 @@ class Scene:
                     "name": motion.name,
                     "sticks": [[*stick.ends, round(stick.radius, 4), int(stick.own)] for stick in motion.sticks],
                     "points": dict(motion.points),
+                    "fresh": None if motion.fresh is None else motion.fresh.astype(int).tolist(),
                     "places": [_whole(places) for places in motion.places],
                 }
                 for motion in self.motions
@@ -219,26 +223,30 @@ def recorded_scene(title: str, system: System, theta: Array, recording: Recordin
 def _measured(told: Told, recording: Recording, t: Array) -> Motion:
     """Recorded arms and points at times t."""
     system, joints = told.system, recording.joints
-    known = [] if joints is None else [name for name in joints.names if name in system.mechanism.joint_names]
+    recorded = [] if joints is None else [name for name in joints.names if name in system.mechanism.joint_names]
     moved = {*system.driven, *system.prescribed}
     skeleton, places = Skeleton(system, told.theta), np.full((len(t), 0, 3), np.nan)
     sticks: tuple[Stick, ...] = ()
-    if joints is not None and moved and moved <= {*known} and joints.position is not None:
+    if joints is not None and moved and moved <= {*recorded} and joints.position is not None:
         q = np.stack([np.interp(t, told.t, column) for column in told.q.T], axis=1)
-        for name in known:
+        for name in recorded:
             q[:, system.mechanism.joint_index(name)] = _at(joints, name, t)
         sticks, places = skeleton.arms, skeleton.at(q)
     seen: dict[str, Array] = {}
+    fresh: dict[str, NDArray[np.bool_]] = {}
     for group in recording.points:
         near, apart = _nearest(group.t, t)
-        longest = max(float(np.median(np.diff(group.t))) if len(group.t) > 1 else 0.0, _spacing(t)) / 2 + 1e-9
+        longest = max(float(np.median(np.diff(group.t))) if len(group.t) > 1 else 0.0, _spacing(t)) / 2 + EARLY
         for i, name in enumerate(group.names):
             own = np.where((apart <= longest)[:, None], group.position[near, i], np.nan)
+            now = (apart <= _spacing(t) / 2 + EARLY) & np.isfinite(own).all(axis=1)
+            fresh[name] = now | fresh.get(name, np.zeros(len(t), bool))
             seen[name] = own if name not in seen else np.where(np.isfinite(seen[name]), seen[name], own)
     first = places.shape[1]
     if seen:
         places = np.concatenate([places, np.stack(list(seen.values()), axis=1)], axis=1)
-    return Motion("measured", sticks, places, {name: first + i for i, name in enumerate(seen)})
+    known = np.stack(list(fresh.values()), axis=1) if fresh else None
+    return Motion("measured", sticks, places, {name: first + i for i, name in enumerate(seen)}, known)
 
 
 def _at(joints: JointGroup, name: str, t: Array) -> Array:

@@ -167,7 +167,7 @@ def run_identifiability(
         result = identifiability_result(problem, solution, information, unknown, ranking, asked)
         folder.log("end", status=result["status"], message=result["message"])
         written = folder.finish(result)
-        folder.report(run, written, progress, solution=solution)
+        folder.report(run, written, progress, problem=problem, solution=solution)
     if elsewhere is not None:
         elsewhere.clear()
     return IdentifiabilityOutcome(folder.path, written, information)

@@ -137,11 +137,12 @@ class Viewer {
     let i = t.findIndex((value) => value > this.time);
     i = i < 0 ? t.length - 1 : Math.max(i, 1);
     const part = (this.time - t[i - 1]) / (t[i] - t[i - 1]), [a, b] = [motion.places[i - 1], motion.places[i]];
-    const near = part < 0.5 ? a : b;
-    return (k) => {
+    const near = part < 0.5 ? a : b, fresh = motion.fresh ? motion.fresh[part < 0.5 ? i - 1 : i] : null;
+    const at = (k) => {
       const found = [0, 1, 2].map((c) => (a[3 * k + c] === null || b[3 * k + c] === null ? near[3 * k + c] : a[3 * k + c] + part * (b[3 * k + c] - a[3 * k + c])));
       return found.includes(null) ? null : found.map((x) => x / scale);
     };
+    return Object.assign(at, { fresh });
   }
 
   paint() {
@@ -177,9 +178,15 @@ class Viewer {
 
   points(pen, see, measured, predicted, ink) {
     const at = this.places(measured), color = darkness.matches ? "#ffd166" : "#b3261e", found = [];
-    for (const [name, k] of Object.entries(measured.points)) {
+    for (const [i, [name, k]] of Object.entries(measured.points).entries()) {
       const place = at(k);
       if (!place) continue;
+      // a point that waits for its next measurement says nothing of now
+      if (at.fresh && !at.fresh[i]) {
+        const q = see(place);
+        found.push([q[2] - 0.25 * this.reach, () => { pen.globalAlpha = 0.35; this.dot(pen, q, 3, color, false, ink); pen.globalAlpha = 1; }]);
+        continue;
+      }
       let shown = place;
       for (const motion of predicted) {
         if (!(name in motion.points)) continue;
