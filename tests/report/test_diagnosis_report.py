@@ -14,8 +14,9 @@ from yid_ocp.data import JointGroup, Recording, write_recording
 from yid_ocp.diagnosis import Thresholds, diagnose
 from yid_ocp.diagnosis.events import Event, Events, Fall, Force
 from yid_ocp.diagnosis.pulses import Pulse
-from yid_ocp.report import figures
-from yid_ocp.report.figures import Change, Curve, Ranked, Row
+from yid_ocp.report import charts, figures
+from yid_ocp.report.charts import Change, Ranked, Row
+from yid_ocp.report.figures import Curve
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import Findings
 from yid_ocp.workflow.build import load_problem
@@ -134,14 +135,14 @@ def test_a_result_alone_gives_words_and_tables(found, tmp_path):
 
 
 def test_changes_of_very_different_sizes_get_a_logarithmic_axis():
-    close = figures.changes({"a": Change(2.0, 1.0), "b": Change(3.0, None, mark=1.0)}, "x [m]", ("1", "2", "3"))
-    far = figures.changes({"a": Change(20.0, 0.1), "b": Change(3.0, 1.0)}, "x [m]", ("1", "2", "3"))
+    close = charts.changes({"a": Change(2.0, 1.0), "b": Change(3.0, None, mark=1.0)}, "x [m]", ("1", "2", "3"))
+    far = charts.changes({"a": Change(20.0, 0.1), "b": Change(3.0, 1.0)}, "x [m]", ("1", "2", "3"))
     assert (close.layout.xaxis.type, far.layout.xaxis.type) == (None, "log")
     assert [trace.name for trace in close.data[1:]] == ["1", "2", "3"]
 
 
 def test_bars_of_what_cannot_be_told_do_not_widen_the_axis():
-    figure = figures.changes({"a": Change(2.0, 1.0, float("inf"), 1e7)}, "x", ("1", "2", ""))
+    figure = charts.changes({"a": Change(2.0, 1.0, float("inf"), 1e7)}, "x", ("1", "2", ""))
     assert figure.layout.xaxis.range[1] < 3.0
     assert figure.data[1].error_x.array is None
     assert figure.data[2].error_x.array == (2e7,)
@@ -150,7 +151,7 @@ def test_bars_of_what_cannot_be_told_do_not_widen_the_axis():
 def test_a_map_keeps_its_groups_together_and_its_gaps_empty():
     values = np.array([1.0, np.nan, -4000.0])
     rows = [Row(name, group, values, ["", "", ""]) for name, group in (("x", "a"), ("y", "a"), ("z", "b"))]
-    figure = figures.time_map(np.array([0.0, 0.1, 0.2, 0.3]), rows, "deviations")
+    figure = charts.time_map(np.array([0.0, 0.1, 0.2, 0.3]), rows, "deviations")
     heat = figure.data[0]
     assert heat.z[0][1] is None
     assert heat.zmax == -heat.zmin > 0
@@ -162,10 +163,10 @@ def test_a_map_keeps_its_groups_together_and_its_gaps_empty():
 
 def test_a_ranking_says_what_lies_beyond_its_axis():
     entries = [Ranked("good", (90.0, 80.0, 95.0), 88.0), Ranked("bad", (-900.0, -2000.0, -100.0), 1.0)]
-    figure = figures.ranking([*entries, Ranked("untried", None, 0.5)], "closed [%]", "promised [%]")
+    figure = charts.ranking([*entries, Ranked("untried", None, 0.5)], "closed [%]", "promised [%]")
     assert [a.text for a in figure.layout.annotations] == ["◀ -900"]
     assert figure.layout.yaxis.categoryarray == ("untried", "bad", "good")
-    alone = figures.ranking([Ranked("untried", None, 0.5)], "closed", "promised")
+    alone = charts.ranking([Ranked("untried", None, 0.5)], "closed", "promised")
     assert [trace.type for trace in alone.data] == ["bar"]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from yid_ocp.report import figures
+from yid_ocp.report import charts, figures
 from yid_ocp.report.sections.base import Findings, section
 
 
@@ -19,4 +19,4 @@ def prepare(findings: Findings) -> Mapping[str, Any] | None:
     for name, entry in result["parameters"].items():
         told = {run: (own["value"], own["std"]) for run, own in entry["values"].items()}
         by_unit.setdefault(entry["unit"], {})[name] = told
-    return {"pictures": [("", figures.html(figures.side_by_side(rows, unit))) for unit, rows in by_unit.items()]}
+    return {"pictures": [("", figures.html(charts.side_by_side(rows, unit))) for unit, rows in by_unit.items()]}

@@ -17,8 +17,9 @@ from yid_ocp.diagnosis.smoother import Smoothed
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.null_test import residual_series
 from yid_ocp.problem.prediction import EpisodeResult
-from yid_ocp.report import figures
-from yid_ocp.report.figures import Change, Curve, Ranked, Row
+from yid_ocp.report import charts, figures
+from yid_ocp.report.charts import Change, Ranked, Row
+from yid_ocp.report.figures import Curve
 from yid_ocp.report.sections.base import Findings, section
 from yid_ocp.report.tables import error_words, readable
 
@@ -93,7 +94,7 @@ def _gap(finding: Finding) -> Chapter:
             for name, row in rows.items()
         }
         words = (NOMINAL, EXTENDED, "noise alone")
-        pictures.append(("", figures.html(figures.changes(scaled, f"held-out error (rms) [{shown}]", words))))
+        pictures.append(("", figures.html(charts.changes(scaled, f"held-out error (rms) [{shown}]", words))))
     first, last = finding.held_out_before.chi2_per_dof, finding.remaining.chi2_per_dof
     sentences = [
         "Errors on recordings that no fit has touched, channel by channel; the tick is what noise alone gives."
@@ -176,7 +177,7 @@ def _where(finding: Finding) -> Chapter | None:
             source = trace.sources[k]
             group = f"{source.location} {source.kind} [{unit}]"
             rows.append(Row(trace.unknowns[k], group, values[:, k], texts))
-        pictures.append((f"Recording {trace.recording}", figures.html(figures.time_map(trace.edges, rows, axis))))
+        pictures.append((f"Recording {trace.recording}", figures.html(charts.time_map(trace.edges, rows, axis))))
         if i == 0:
             sentences.append(_surest(smoothed, shown, None if blank else values))
     if pictures:
@@ -284,7 +285,7 @@ def _which(finding: Finding, result: Mapping[str, Any]) -> Chapter | None:
     else:
         sentences = [f"W{promise}", "No candidate promised enough to be refitted."]
     # beside each other on a phone there is room for a word
-    picture = figures.html(figures.ranking(entries, "closed [%]", "promised [%]" if percent else "promised [1]"))
+    picture = figures.html(charts.ranking(entries, "closed [%]", "promised [%]" if percent else "promised [1]"))
     title = "What each effect could explain" if finding.verdict == "no_gap" else "Which effect makes it"
     return Chapter(title, sentences, [("", picture)])
 
@@ -320,7 +321,7 @@ def _alike(finding: Finding, result: Mapping[str, Any]) -> Chapter | None:
         "can; 100 % cannot be told apart by these motions and sensors, whatever the residual is.",
         f"Alike: {listed}." if close else f"No two of them are alike; the closest are {a} and {b} ({100 * v:.0f} %).",
     ]
-    picture = figures.matrix(names, values, "trace of", "explained by [%]")
+    picture = charts.matrix(names, values, "trace of", "explained by [%]")
     return Chapter("What could be mistaken for what", sentences, [("", figures.html(picture))])
 
 
@@ -376,7 +377,7 @@ def _absorbed(finding: Finding) -> Chapter | None:
         std = finding.nominal.std.get(entry.name, 0.0)
         by_unit.setdefault(entry.unit, {})[entry.name] = Change(entry.before, entry.after, std, entry.std)
     words = ("fitted without the effects", EXTENDED, "")
-    pictures = [("", figures.html(figures.changes(rows, f"value [{unit}]", words))) for unit, rows in by_unit.items()]
+    pictures = [("", figures.html(charts.changes(rows, f"value [{unit}]", words))) for unit, rows in by_unit.items()]
     moved = [e for e in finding.absorbed if abs(e.after - e.before) > 0.1 * max(abs(e.before), 1e-9)]
     moved.sort(key=lambda e: -abs(e.after - e.before) / max(abs(e.before), 1e-9))
     said = ", ".join(f"{e.name} goes from {e.before:.3g} to {e.after:.3g} {e.unit}" for e in moved[:4])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from yid_ocp.report import figures
+from yid_ocp.report import charts, figures
 from yid_ocp.report.sections.base import Findings, section
 
 
@@ -20,4 +20,4 @@ def prepare(findings: Findings) -> Mapping[str, Any] | None:
             by_unit.setdefault(entry["unit"], {})[name] = (entry["value"], entry["std"], entry["initial"], found)
     if not by_unit:
         return None
-    return {"pictures": [figures.html(figures.estimates(values, unit)) for unit, values in by_unit.items()]}
+    return {"pictures": [figures.html(charts.estimates(values, unit)) for unit, values in by_unit.items()]}

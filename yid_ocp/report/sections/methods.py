@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from yid_ocp.analysis.compare import Comparison
-from yid_ocp.report import figures
+from yid_ocp.report import charts, figures
 from yid_ocp.report.sections.base import Findings, section
 
 
@@ -23,7 +23,7 @@ def prepare(findings: Findings) -> Mapping[str, Any] | None:
             own = {m: e["parameters"][name] for m, e in findings.result["methods"].items()}
             told = {method: (found["value"], found["std"]) for method, found in own.items()}
             by_unit.setdefault(entry["unit"], {})[name] = told
-    pictures = [("Estimates", figures.html(figures.side_by_side(rows, unit))) for unit, rows in by_unit.items()]
+    pictures = [("Estimates", figures.html(charts.side_by_side(rows, unit))) for unit, rows in by_unit.items()]
     fallen = {}
     for run in comparison.runs:
         history = [entry for entry in run.solution.history if not entry.note]

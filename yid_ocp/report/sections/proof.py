@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from yid_ocp.report import figures
+from yid_ocp.report import charts, figures
 from yid_ocp.report.sections.base import Findings, section
 
 CALIBRATED = {"intervals": "intervals of effects' parameters", "p_values": "p-values of clean recordings"}
@@ -30,7 +30,7 @@ def prepare(findings: Findings) -> Mapping[str, Any] | None:
     shown = result["confusion"]
     counts = np.array(shown["counts"], float).reshape(len(shown["true"]), len(shown["said"]))
     if counts.size:
-        picture = figures.counted(shown["true"], shown["said"], counts, "true", "said first")
+        picture = charts.counted(shown["true"], shown["said"], counts, "true", "said first")
         pictures.append(("What was said of what", figures.html(picture)))
     kept = {
         label: {entry["level"]: entry for entry in result["calibration"][key] if entry["of"]}
