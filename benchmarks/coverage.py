@@ -37,7 +37,8 @@ from yid_ocp.errors import ModelError
 from yid_ocp.files import content_hash, write_json
 from yid_ocp.model.system import System
 from yid_ocp.parallel import Task, TaskResult, Workers, run_tasks
-from yid_ocp.report.terminal import solve_summary, table
+from yid_ocp.report.summaries import solve_summary
+from yid_ocp.report.terminal import lines, table
 from yid_ocp.sensors.base import EffortKind
 from yid_ocp.version import code_hash
 from yid_ocp.virtual.engine import Simulation, simulate_in_mujoco
@@ -199,7 +200,7 @@ def solve_twin(config: Path, recording: Path, settings: Sequence[str]) -> dict[s
             for name, entry in result["parameters"].items()
             if entry["free"]
         },
-        "diagnose": any("diagnose" in line for line in solve_summary(result)),
+        "diagnose": any("diagnose" in line for line in lines(solve_summary(result))),
     }
 
 

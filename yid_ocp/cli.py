@@ -209,11 +209,12 @@ def _init(parser: argparse.ArgumentParser) -> None:
 
 
 def _export(parser: argparse.ArgumentParser) -> None:
-    text = "recording to write as CSV, or run folder of solve or diagnose whose model to write"
+    text = "recording to write as CSV or MCAP, or run folder of solve or diagnose whose model or signals to write"
     parser.add_argument("source", metavar="RECORDING.h5|RUN", help=text)
-    text = "of a run's model: mjcf (default), urdf, sdf, or yaml for a configuration that starts at the estimates"
+    text = "of a recording: csv (default) or mcap; of a run: mjcf (default), urdf, sdf, yaml for a configuration that "
+    text += "starts at the estimates, or mcap for what was measured, predicted and left over"
     parser.add_argument("--format", metavar="FORMAT", help=text)
-    text = "folder for the CSV files, or file for the model; its manifest stands beside it"
+    text = "folder for CSV or MCAP files, or file for the model; its manifest stands beside it"
     parser.add_argument("--out", metavar="PATH", required=True, help=text)
     parser.add_argument("--quiet", action="store_true", help="print nothing but the files' paths")
 
@@ -258,7 +259,7 @@ COMMANDS: tuple[Command, ...] = (
     Command("inspect", "show the model's equations: names, patterns, single entries, numbers", "inspect", _inspect),
     Command("track", "measure the object's points in the frames of a depth camera", "track", _doubting),
     Command("import", "turn a file of another tool into a recording", "import_recording", _import),
-    Command("export", "turn a recording into CSV, or a run's model into MJCF, URDF, SDF or YAML", "export", _export),
+    Command("export", "turn a recording into CSV or MCAP, a run into MJCF, URDF, SDF, YAML or MCAP", "export", _export),
     Command("schema", "print the JSON Schema of configuration files, for editors", "schema", _schema),
 )
 

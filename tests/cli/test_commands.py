@@ -19,7 +19,7 @@ from yid_ocp.data import read_recording
 
 SOLVE_KEYS = {
     "format", "status", "message", "parameters", "cost", "iterations", "evaluations", "seconds", "residuals", "fit",
-    "held_out", "inputs", "versions", "notes", "safeguard", "discretisation",
+    "held_out", "command", "date", "inputs", "versions", "notes", "safeguard", "discretisation",
         "covariance", "discretisation_notes", "stability",
     "doubts", "torque_offsets",
 }  # fmt: skip

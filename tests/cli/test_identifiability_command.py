@@ -123,7 +123,7 @@ def test_a_failed_solve_leaves_no_point_to_judge_at(cli, repository, tmp_path, m
     assert done.code == 1
     assert "failed: the rollout failed; there is no point at which to judge" in done.out
     assert read(tmp_path / "run")["parameters"] == {}
-    assert "There is no point at which to judge" in (tmp_path / "run" / "report.html").read_text()
+    assert "there is no point at which to judge" in (tmp_path / "run" / "report.html").read_text()
 
 
 @pytest.mark.parametrize("named", ["pendulum", "springs_torsion", "springs_series_joint"])

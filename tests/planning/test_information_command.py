@@ -12,7 +12,8 @@ from small_problems import pendulum_step, taken
 from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording
 from yid_ocp.data.hdf5 import write_recording
-from yid_ocp.report.terminal import plan_summary, planning_command
+from yid_ocp.report.summaries import plan_summary, planning_command
+from yid_ocp.report.terminal import lines
 from yid_ocp.workflow.information import next_plan
 from yid_ocp.workflow.plan import run_plan
 
@@ -74,7 +75,7 @@ def test_the_run_folder_says_what_is_told_and_what_limits_it(config, tmp_path):
     np.testing.assert_allclose(planned.joints.position, outcome.plan.position)
     page = (tmp_path / "out" / "report.html").read_text()
     assert '<section id="information">' in page
-    words = "\n".join(plan_summary(result))
+    words = "\n".join(lines(plan_summary(result)))
     for name, known in outcome.plan.parameters.items():
         assert result["parameters"][name]["std_relative_after"] == pytest.approx(known.after)
         assert f"± {100 * known.after:.2g} %" in words
@@ -98,7 +99,7 @@ def test_a_diagnosis_hands_over_its_parameters_and_effects(config, tmp_path):
     pairs = {(entry["effect"], entry["explained_by"]) for entry in outcome.result["distances"]}
     assert pairs == {PAIR, PAIR[::-1]}
     assert all(entry["after"] > entry["before"] for entry in outcome.result["distances"])
-    assert f"{PAIR[0]}" in "\n".join(plan_summary(outcome.result))
+    assert f"{PAIR[0]}" in "\n".join(lines(plan_summary(outcome.result)))
 
 
 @pytest.mark.parametrize(

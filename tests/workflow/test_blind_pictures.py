@@ -9,7 +9,7 @@ from yid_ocp.diagnosis.blind import Mark, score
 from yid_ocp.errors import OutputError
 from yid_ocp.files import jsonable
 from yid_ocp.report.pictures import draw_blind
-from yid_ocp.report.tables import blind_table
+from yid_ocp.report.tables import blind_markdown
 
 
 def made(category: str, gap: bool, right: bool, size: float = float("nan"), experiment: str = "one", **more) -> Mark:
@@ -35,7 +35,7 @@ def test_pictures_are_drawn_of_whatever_there_is(tmp_path, marks):
 
 
 def test_the_table_has_rates_with_intervals_by_size_and_by_experiment():
-    lines = blind_table(jsonable(score(MARKS)))
+    lines = blind_markdown(jsonable(score(MARKS)))
     assert "| false alarms on clean data | 0 % (0 of 5, 0 % to 52 %) |" in lines
     assert "| 3 | 8 | 75 % (6 of 8, 35 % to 97 %) | 50 % (4 of 8, 16 % to 84 %) |" in lines
     assert "| two | 5 | 0 % (0 of 5, 0 % to 52 %) | - |" in lines

@@ -12,12 +12,13 @@ import pytest
 
 from yid_ocp.config.reader import DIAGNOSIS_DEFAULT, load_config
 from yid_ocp.diagnosis.refit import SOLVER
-from yid_ocp.workflow.diagnose import reproducing, run_diagnose
+from yid_ocp.workflow.diagnose import run_diagnose
+from yid_ocp.workflow.folder import reproducing
 
 
 def without_times(folder) -> dict:
     result = json.loads((folder / "result.json").read_text())
-    return {name: value for name, value in result.items() if name not in ("seconds", "command", "inputs")}
+    return {name: value for name, value in result.items() if name not in ("seconds", "command", "date", "inputs")}
 
 
 def close(one, other) -> bool:
@@ -117,5 +118,5 @@ def test_the_result_says_how_sure_a_closure_is_and_where_the_unknown_forces_are(
 def test_the_command_that_gives_a_result_again(rubbing, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     changed = load_config(rubbing, ["diagnosis.level=0.02"])
-    assert reproducing(changed, tmp_path / "runs" / "a b") == "yid-ocp diagnose 'runs/a b/config.yaml'"
-    assert reproducing(load_config(None, (), DIAGNOSIS_DEFAULT), tmp_path) == "yid-ocp diagnose"
+    assert reproducing(changed, tmp_path / "runs" / "a b", "diagnose") == "yid-ocp diagnose 'runs/a b/config.yaml'"
+    assert reproducing(load_config(None, (), DIAGNOSIS_DEFAULT), tmp_path, "diagnose") == "yid-ocp diagnose"

@@ -80,7 +80,7 @@ def test_no_number_from_a_recording_in_grave_doubt_is_found(cli, damaged, tmp_pa
     assert "no number is said to be found while a recording of the run is in doubt" in done.out
     assert "sensors.joints.effort.std: 0.1" in done.out
     page = (tmp_path / "run" / "report.html").read_text()
-    assert '<section id="doubts">' in page
+    assert "<h3>In doubt</h3>" in page
     assert "more noise than stated" in page
 
 

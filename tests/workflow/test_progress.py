@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pytest
 
+from yid_ocp.report.blocks import Statement
 from yid_ocp.solvers import Iterate
 from yid_ocp.workflow.command import carry_out
 from yid_ocp.workflow.progress import SILENT, BarProgress, PlainProgress, duration_words, shown
@@ -141,7 +142,7 @@ def test_a_command_ends_with_its_table_and_its_folder(tmp_path, monkeypatch, cap
         progress.stage("working")
         return Outcome(tmp_path / "runs" / "x")
 
-    outcome = carry_out(work, lambda result: [f"a = {result['a']}", "done"], quiet)
+    outcome = carry_out(work, lambda result: [Statement(f"a = {result['a']}"), Statement("done")], quiet)
     captured = capsys.readouterr()
     assert outcome.folder == tmp_path / "runs" / "x"
     if quiet:

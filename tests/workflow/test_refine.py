@@ -6,7 +6,8 @@ import pytest
 from made_cross import TRUTH, configuration, record
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.report.terminal import solve_summary
+from yid_ocp.report.summaries import solve_summary
+from yid_ocp.report.terminal import lines
 from yid_ocp.workflow.check import run_check
 from yid_ocp.workflow.refine import wanted
 from yid_ocp.workflow.solve import run_solve
@@ -48,7 +49,7 @@ def test_too_few_links_are_told_and_counted(folder, tmp_path):
     # with twice the links it is nearer to the truth by what is said
     moved = result["discretisation"]["north.bend"]["links"] / TRUTH["north.bend"]
     assert -error < moved < -0.4 * error
-    told = solve_summary(result)
+    told = lines(solve_summary(result))
     assert any(line.startswith("with twice the links these move by more than the data's") for line in told)
 
 

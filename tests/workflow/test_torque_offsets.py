@@ -14,9 +14,9 @@ from yid_ocp.model import System
 from yid_ocp.model.system import Spring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.report.sections import SECTIONS, Findings
+from yid_ocp.report.inspection import _noise_words
 from yid_ocp.report.tables import offset_rows
-from yid_ocp.report.terminal import _noise_words, table
+from yid_ocp.report.terminal import table
 from yid_ocp.workflow.check import _input_noise
 from yid_ocp.workflow.simulate import as_recording
 from yid_ocp.workflow.torque_offsets import torque_offsets
@@ -72,7 +72,6 @@ def test_where_offsets_are_no_part_of_the_model_nothing_is_said(step):
     problem = problem_of(step, bias=0.0)
     assert torque_offsets(problem.weighted_at(problem.start), problem.start) == {}
     assert offset_rows({"torque_offsets": {}}) == offset_rows({}) == []
-    assert SECTIONS["torques"].prepare(Findings("run", "", {"torque_offsets": {}})) is None
 
 
 def entry(value, prior=0.3):
@@ -90,8 +89,6 @@ def test_the_table_has_a_row_for_a_joint_and_a_column_for_a_recording():
     many = {f"run {i}": {"s0": entry(0.1)} for i in range(6)}
     assert offset_rows({"torque_offsets": many})[-1][0] == "2 more recordings are in result.json"
     assert table(rows)[0].split() == ["torque", "offset", "[N", "m]", "a", "b", "expected"]
-    said = SECTIONS["torques"].prepare(Findings("run", "", {"torque_offsets": offsets}))
-    assert (said["head"], said["rows"]) == (rows[0], rows[1:])
 
 
 def simulated(problem, seed):

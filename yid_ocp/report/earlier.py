@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
-Rows = list[Sequence[str]]
+from yid_ocp.report.blocks import Rows
 
 
 def baseline_rows(result: Mapping[str, Any]) -> Rows:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
+from yid_ocp.report.blocks import Rows
 from yid_ocp.solvers.words import VERDICT_WORDS
 
-Rows = list[Sequence[str]]
 SHOWN = 6
 """Parameters that have a column of their own on a terminal; result.json has all."""
 

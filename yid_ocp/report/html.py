@@ -1,19 +1,37 @@
-"""The report: one self-contained page put together from the registered sections."""
+"""The report: one page put together from the registered sections, for any screen, light or dark, without a network."""
 
 from __future__ import annotations
 
+import base64
+import gzip
 import logging
+import os
+import re
 from importlib import util
 from pathlib import Path
 
 from yid_ocp.files import write_text
+from yid_ocp.report.blocks import Command, Statement, Table
+from yid_ocp.report.figures import DARK
 from yid_ocp.report.sections import SECTIONS, Findings, written_sections
+from yid_ocp.solvers.words import VERDICT_WORDS
 
 log = logging.getLogger(__name__)
+ABOVE = 2
+"""Levels above a page where a script that it may share is looked for: a batch is two above the pages of its runs."""
+LONG = 24
+"""Characters from which the cells of a column are wrapped."""
+_VERDICTS = {words: verdict for verdict, words in VERDICT_WORDS.items()}
+_NUMBER = re.compile(
+    r"^(–|-|unknown|failed|(< |± )?[-+]?\d[\d.]*(e[-+]?\d+)?( %| ms| s| Hz)?( ± [\d.]+(e[-+]?\d+)?( %)?)?)?$"
+)
 
 
 def write_report(path: Path, findings: Findings) -> bool:
-    """Write the page; plotly's script is embedded once, so it needs no network.
+    """Write the page.
+
+    Plotly's script is packed into it, so that it can be sent alone and needs no network; or it refers to a copy that
+    `share_script` left in its folder, or up to two above.
 
     Parameters
     ----------
@@ -29,22 +47,71 @@ def write_report(path: Path, findings: Findings) -> bool:
     ------
     OutputError
     """
-    if util.find_spec("jinja2") is None or util.find_spec("plotly") is None:
+    if not _installed():
         log.warning("no report: install it with  pip install 'yid-ocp[report]'")
         return False
     import jinja2
-    import plotly.offline
 
     beside = {str(SECTIONS[name].folder) for name in SECTIONS}
     loader = jinja2.ChoiceLoader([jinja2.PackageLoader("yid_ocp.report"), jinja2.FileSystemLoader(sorted(beside))])
-    environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
-    environment.filters["number"] = number
+    environment = jinja2.Environment(
+        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters |= {"number": number, "listed": cell_class, "verdict": _VERDICTS.get}
+    environment.tests |= {
+        "statement": lambda block: isinstance(block, Statement),
+        "table": lambda block: isinstance(block, Table),
+        "command": lambda block: isinstance(block, Command),
+    }
     sections = written_sections(findings, environment)
+    shared = _shared(path)
     page = environment.get_template("page.html").render(
-        findings=findings, sections=sections, script=plotly.offline.get_plotlyjs()
+        findings=findings,
+        sections=sections,
+        dark=DARK,
+        shared=shared,
+        packed="" if shared else _packed(),
     )
     write_text(path, page)
     return True
+
+
+def share_script(folder: Path) -> None:
+    """Leave one copy of plotly's script in a folder, for all pages in it and up to two levels below.
+
+    Raises
+    ------
+    OutputError
+    """
+    if _installed() and not (folder / _script_name()).exists():
+        import plotly.offline
+
+        write_text(folder / _script_name(), plotly.offline.get_plotlyjs())
+
+
+def _installed() -> bool:
+    return all(util.find_spec(name) is not None for name in ("jinja2", "plotly"))
+
+
+def _script_name() -> str:
+    import plotly.offline
+
+    return f"plotly-{plotly.offline.get_plotlyjs_version()}.min.js"
+
+
+def _shared(path: Path) -> str:
+    """Where a page finds a script that it shares, relative to itself; empty where there is none."""
+    folders = [path.parent, *path.parent.parents][: ABOVE + 1]
+    found = next((folder / _script_name() for folder in folders if (folder / _script_name()).is_file()), None)
+    return "" if found is None else Path(os.path.relpath(found, path.parent)).as_posix()
+
+
+def _packed() -> str:
+    """Plotly's script as text that the page unpacks: a third of its size."""
+    import plotly.offline
+
+    small = gzip.compress(plotly.offline.get_plotlyjs().encode(), mtime=0)
+    return base64.b64encode(small).decode("ascii")
 
 
 def number(value: object, digits: int = 4) -> str:
@@ -52,3 +119,14 @@ def number(value: object, digits: int = 4) -> str:
     if value is None:
         return "–"
     return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
+
+
+def cell_class(table: Table) -> list[str]:
+    """How the columns of a table are set, those without an entry left out as None: numbers to the right."""
+    head, *body = table.rows
+    columns = [[row[i] for row in body] for i in range(len(head))]
+    kinds = []
+    for cells in columns:
+        numbers, longest = all(map(_NUMBER.match, cells)), max(map(len, cells), default=0)
+        kinds.append("" if not any(cells) else "number" if numbers else "long" if longest > LONG else "text")
+    return kinds

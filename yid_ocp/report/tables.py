@@ -1,4 +1,4 @@
-"""Rows that the report and the command line show alike."""
+"""Rows and sentences that summaries are made of."""
 
 from __future__ import annotations
 
@@ -8,11 +8,33 @@ from dataclasses import dataclass
 from typing import Any
 
 from yid_ocp.data.doubt import CAUSES
+from yid_ocp.report.blocks import Block, Command, Rows, Statement, Table
 from yid_ocp.solvers.words import VERDICT_WORDS
 
 MOST_ALIKE = 3  # doubts of one kind
 MOST_OFFSETS = 4  # recordings side by side
+LEAST_SHARE, MOST_WINDOWS = 0.005, 6  # of places that are listed
 MOST_POINTS = 4  # a group of more points is shown as a whole; result.json has every point
+
+
+GUESSES = {
+    "stays": "points stay where they were first seen",
+    "zero": "an effort of zero",
+    "moves_with_clamps": "points move with the mean of the clamps",
+    "linear_carry": "the clamps' motion carried along the cable",
+}
+"""Predictions without a model."""
+
+
+def readable(unit: str) -> tuple[float, str]:
+    """Factor and unit in which people read errors: distances in millimetres, all else as it is."""
+    return (1e3, "mm") if unit == "m" else (1.0, unit)
+
+
+def error_words(value: float | None, unit: str, digits: int = 3) -> tuple[str, str]:
+    """An error and its unit for people; what is not known is a dash."""
+    factor, shown = readable(unit)
+    return ("–" if value is None else f"{factor * value:.{digits}g}"), shown
 
 
 @dataclass(frozen=True)
@@ -41,12 +63,20 @@ def doubt_rows(result: Mapping[str, Any]) -> list[DoubtRow]:
     return rows
 
 
-def doubt_sentences(result: Mapping[str, Any]) -> list[str]:
-    """What follows from the doubts of a result."""
-    grave = [entry for entry in result.get("doubts", ()) if entry["weight"] != "warning"]
-    if not grave:
+def doubt_blocks(result: Mapping[str, Any]) -> list[Block]:
+    """What is in doubt about the recordings, as one table, and what follows; nothing where nothing is."""
+    shown = doubt_rows(result)
+    if not shown:
         return []
-    return ["no number is said to be found while a recording of the run is in doubt"]
+    rows: Rows = [("in doubt", "where", "how sure", "times its limit")]
+    rows += [(row.cause, row.where, row.sure, f"{row.evidence:.3g}") for row in shown]
+    blocks: list[Block] = [Table(rows, "In doubt")]
+    for row in shown:
+        blocks.append(Statement(f"{row.cause}: {row.what}; {row.advice}"))
+        blocks += [Command(row.setting)] if row.setting else []
+    if any(entry["weight"] != "warning" for entry in result["doubts"]):
+        blocks.append(Statement("no number is said to be found while a recording of the run is in doubt", "verdict"))
+    return blocks
 
 
 @dataclass(frozen=True)
@@ -99,13 +129,34 @@ def medians(rows: Sequence[HeldOutRow]) -> list[HeldOutRow]:
     return result
 
 
-def offset_rows(result: Mapping[str, Any]) -> list[Sequence[str]]:
+def guess_words(rows: Sequence[HeldOutRow]) -> str:
+    """What the guesses beside held-out errors are; empty where there are none."""
+    named = dict.fromkeys(name for row in rows for name in row.baselines)
+    said = "; ".join(f"{name}, {GUESSES[name]}" for name in named if name in GUESSES)
+    return f"without a model: {said}" if said else ""
+
+
+def moved_sentences(result: Mapping[str, Any]) -> list[str]:
+    """One sentence for each refinement: which estimates it moves by more than their standard deviation."""
+    said = []
+    for key, words in (("links", "twice the links"), ("time_step", "half the time step")):
+        tried = {name: own for name, own in result.get("discretisation", {}).items() if own[key] is not None}
+        moved = {n: own for n, own in tried.items() if own["std"] is not None and abs(own[key]) > own["std"]}
+        changes = [f"{name} by {own[key]:+.2g} (± {own['std']:.2g} from the data)" for name, own in moved.items()]
+        if moved:
+            said.append(f"with {words} these move by more than the data's standard deviation: {', '.join(changes)}")
+        elif tried:
+            said.append(f"with {words} no estimate moves by more than its standard deviation")
+    return said
+
+
+def offset_rows(result: Mapping[str, Any]) -> Rows:
     """Head and rows of the torque offsets of a result, joints below each other; empty where they are no part of it."""
     offsets: Mapping[str, Mapping[str, Any]] = result.get("torque_offsets", {})
     if not offsets:
         return []
     shown = dict(list(offsets.items())[:MOST_OFFSETS])
-    rows: list[Sequence[str]] = [("torque offset [N m]", *shown, "expected")]
+    rows: Rows = [("torque offset [N m]", *shown, "expected")]
     for joint in dict.fromkeys(joint for entry in shown.values() for joint in entry):
         own = [entry.get(joint) for entry in shown.values()]
         cells = ["" if known is None else f"{known['value']:.2f} ± {known['std']:.2f}" for known in own]
@@ -121,7 +172,7 @@ def guess_sentences(worse: Sequence[Mapping[str, Any]]) -> list[str]:
     """Sentences on the channels of a `yid-solve/1` result that a guess without a model predicts better."""
     lines = []
     for entry in worse[:MOST_POINTS]:
-        own, other = (f"{entry[key]:.3g} {entry['unit']}".rstrip() for key in ("rmse", "guess"))
+        own, other = (" ".join(error_words(entry[key], entry["unit"])).rstrip() for key in ("rmse", "guess"))
         where = f"{entry['channel']} of {entry['recording']}"
         lines.append(f"worse than a guess without a model: {where}, {own} against {other} ({entry['baseline']})")
     if len(worse) > MOST_POINTS:
@@ -129,14 +180,11 @@ def guess_sentences(worse: Sequence[Mapping[str, Any]]) -> list[str]:
     return lines
 
 
-def blind_table(result: Mapping[str, Any]) -> list[str]:
-    """The score and every case, as Markdown."""
+def blind_tables(result: Mapping[str, Any]) -> dict[str, Rows]:
+    """Of a `yid-blind/1` by title: the score, detection by size, the experiments, every case."""
 
     def share(value: float | None, digits: int = 0) -> str:
         return "-" if value is None else f"{100 * value:.{digits}f} %"
-
-    def row(*cells: str) -> str:
-        return f"| {' | '.join(cells)} |"
 
     def rate(own: Mapping[str, Any]) -> str:
         if not own["of"]:
@@ -144,62 +192,106 @@ def blind_table(result: Mapping[str, Any]) -> list[str]:
         return f"{share(own['rate'])} ({own['count']} of {own['of']}, {share(own['low'])} to {share(own['high'])})"
 
     sure = {name: rate(own) for name, own in result["intervals"].items()}
-    lines = [row("what", "value, and its binomial 95 % interval"), row("---", "---")]
-    lines += [
-        row("false alarms on clean data", sure["false_alarms"]),
-        row("true kind and place first, of the gaps found", sure["kind_first"]),
-        row("among the first two", sure["kind_in_two"]),
-        row("place first", sure["location_first"]),
-        row("sets named as not separable hold the truth", sure["confusable_covers"]),
-        row("their size", "-" if result["confusable_size"] is None else f"{result['confusable_size']:.1f}"),
-        row("unknown said of effects outside the library", sure["unknown_recall"]),
-        row("their place", sure["unknown_location"]),
-        row("pairs found", sure["pairs_right"]),
-        row("closure over that of the true effect refitted", share(result["closure_of_best"])),
-        row("median error of the effects' parameters", share(result["parameter_error"], 1)),
-        row("their 95 % intervals that hold the truth", sure["interval_coverage"]),
-        row("time of one diagnosis", "-" if result["seconds"] is None else f"{result['seconds']:.0f} s"),
+    marks: Rows = [
+        ("what", "value, and its binomial 95 % interval"),
+        ("false alarms on clean data", sure["false_alarms"]),
+        ("true kind and place first, of the gaps found", sure["kind_first"]),
+        ("among the first two", sure["kind_in_two"]),
+        ("place first", sure["location_first"]),
+        ("sets named as not separable hold the truth", sure["confusable_covers"]),
+        ("their size", "-" if result["confusable_size"] is None else f"{result['confusable_size']:.1f}"),
+        ("unknown said of effects outside the library", sure["unknown_recall"]),
+        ("their place", sure["unknown_location"]),
+        ("pairs found", sure["pairs_right"]),
+        ("closure over that of the true effect refitted", share(result["closure_of_best"])),
+        ("median error of the effects' parameters", share(result["parameter_error"], 1)),
+        ("their 95 % intervals that hold the truth", sure["interval_coverage"]),
+        ("time of one diagnosis", "-" if result["seconds"] is None else f"{result['seconds']:.0f} s"),
     ]
-    lines += ["", row("size / detectable", "cases", "gap seen", "right"), row(*["---"] * 4)]
+    sizes: Rows = [("size / detectable", "cases", "gap seen", "right")]
     for size, entry in result["detection"].items():
         own = result["detection_intervals"][size]
-        lines.append(row(size, str(entry["cases"]), rate(own["gap"]), rate(own["right"])))
-    lines += ["", row("experiment", "cases", "false alarms", "right"), row(*["---"] * 4)]
+        sizes.append((size, str(entry["cases"]), rate(own["gap"]), rate(own["right"])))
+    experiments: Rows = [("experiment", "cases", "false alarms", "right")]
     for name, own in result["experiments"].items():
-        lines.append(row(name, str(own["cases"]), rate(own["false_alarms"]), rate(own["right"])))
-    head = (
-        "case",
-        "experiment",
-        "sort",
-        "truth",
-        "size",
-        "verdict",
-        "added",
-        "not separable",
-        "place",
-        "closure",
-        "best",
-        "time",
-    )
-    lines += ["", row(*head), row(*["---"] * len(head))]
+        experiments.append((name, str(own["cases"]), rate(own["false_alarms"]), rate(own["right"])))
+    told = ("case", "experiment", "sort", "truth", "size", "verdict", "added")
+    cases: Rows = [(*told, "not separable", "place", "closure", "best", "time")]
     for entry in result["marks"]:
-        lines.append(
-            row(
-                entry["case"],
-                entry["experiment"],
-                entry["category"],
-                entry["truth"],
-                "-" if entry["multiple"] is None else f"{entry['multiple']:.3g}",
-                entry["verdict"] + ("" if entry["right"] or entry["category"] == "finer_chain" else " (wrong)"),
-                entry["answer"],
-                ", ".join(entry["confusable"]) or "-",
-                "right" if entry["location_first"] else "-",
-                share(entry["closure"]),
-                share(entry["best"]),
-                "-" if entry["seconds"] is None else f"{entry['seconds']:.0f} s",
-            )
-        )
-    return lines
+        wrong = "" if entry["right"] or entry["category"] == "finer_chain" else " (wrong)"
+        cases.append((
+            entry["case"],
+            entry["experiment"],
+            entry["category"],
+            entry["truth"],
+            "-" if entry["multiple"] is None else f"{entry['multiple']:.3g}",
+            entry["verdict"] + wrong,
+            entry["answer"],
+            ", ".join(entry["confusable"]) or "-",
+            "right" if entry["location_first"] else "-",
+            share(entry["closure"]),
+            share(entry["best"]),
+            "-" if entry["seconds"] is None else f"{entry['seconds']:.0f} s",
+        ))  # fmt: skip
+    return {"Score": marks, "Detection by size": sizes, "Experiments": experiments, "Cases": cases}
+
+
+def blind_markdown(result: Mapping[str, Any]) -> list[str]:
+    """The tables of `blind_tables` as Markdown, an empty line between two."""
+    lines: list[str] = []
+    for head, *rows in blind_tables(result).values():
+        cells = [head, ["---"] * len(head), *rows]
+        lines += ["", *(f"| {' | '.join(row)} |" for row in cells)]
+    return lines[1:]
+
+
+def blind_sentences(result: Mapping[str, Any]) -> list[str]:
+    """What a `yid-blind/1` comes to."""
+    cases, right, alarms = len(result["marks"]), result["intervals"]["kind_first"], result["intervals"]["false_alarms"]
+    said = [f"{cases} {'case' if cases == 1 else 'cases'} of seed {result['seed']}, drawn for {result['purpose']}"]
+    if right["of"]:
+        said.append(f"of {right['of']} gaps found, {right['count']} were named right: kind and place first")
+    if alarms["of"]:
+        said.append(f"of {alarms['of']} clean recordings, {alarms['count']} gave a false alarm")
+    return said
+
+
+def gap_rows(result: Mapping[str, Any]) -> Rows:
+    """Errors of a `yid-diagnosis/1` on held-out recordings: nominal, and with every effect that was added."""
+    before, steps = result["gap"]["before"], result.get("steps", ())
+    rows: Rows = [("held-out channel", "nominal", *(f"+ {step['added']}" for step in steps), "unit")]
+    for channel, error in before["rmse"].items():
+        unit = before["unit"][channel]
+        later = (error_words(step["rmse"].get(channel), unit)[0] for step in steps)
+        rows.append((channel, error_words(error, unit)[0], *later, readable(unit)[1]))
+    return rows
+
+
+def place_rows(result: Mapping[str, Any]) -> Rows:
+    """Places of a `yid-diagnosis/1` with their share of the gap, and when."""
+    rows: Rows = [("where", "share of the gap", "when [s]")]
+    for place in result.get("where", ()):
+        if place["share"] > LEAST_SHARE:
+            when = ", ".join(f"{begin:.3g} to {end:.3g}" for begin, end in place["windows"][:MOST_WINDOWS])
+            more = ", …" if len(place["windows"]) > MOST_WINDOWS else ""
+            rows.append((place["location"], f"{100 * place['share']:.1f} %", when + more))
+    return rows
+
+
+def event_rows(result: Mapping[str, Any]) -> Rows:
+    """Events of a `yid-diagnosis/1`."""
+    rows: Rows = [("event", "recording", "from [s]", "to [s]", "peak", "impulse", "unit")]
+    for own in result.get("events", ()):
+        size = ("–" if own["peak"] is None else f"{own['peak']:.3g}", _impulse(own))
+        times = ("–" if own[key] is None else f"{own[key]:.4g}" for key in ("from", "to"))
+        rows.append((own["channel"], own["recording"], *times, *size, f"{own['unit']}, {own['unit']} s"))
+    return rows
+
+
+def _impulse(event: Mapping[str, Any]) -> str:
+    if event["impulse"] is None:
+        return "–"
+    return f"{event['impulse']:.3g}" + ("" if event["std"] is None else f" ± {event['std']:.2g}")
 
 
 def plan_rows(result: Mapping[str, Any]) -> Sequence[tuple[str, ...]]:

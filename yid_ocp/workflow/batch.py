@@ -6,6 +6,7 @@ import argparse
 import glob
 import json
 import logging
+import shlex
 import shutil
 import time
 from collections.abc import Sequence
@@ -20,14 +21,15 @@ from yid_ocp.config.settings import Run
 from yid_ocp.errors import ConfigError, OutputError, YidError, nearest
 from yid_ocp.files import file_sha256, jsonable, reason, write_json
 from yid_ocp.parallel import LOCAL, Task, TaskResult, Workers, run_tasks
-from yid_ocp.report.html import write_report
+from yid_ocp.report.html import share_script, write_report
 from yid_ocp.report.sections import Findings
-from yid_ocp.report.terminal import batch_summary
+from yid_ocp.report.summaries import batch_summary
 from yid_ocp.version import versions
 from yid_ocp.workflow.baseline import read_estimates, refuse_unlike
 from yid_ocp.workflow.build import input_files
 from yid_ocp.workflow.command import DONE, FAILED, carry_out, given_workers
 from yid_ocp.workflow.diagnose import run_diagnose
+from yid_ocp.workflow.folder import now
 from yid_ocp.workflow.progress import SILENT, Progress
 from yid_ocp.workflow.report import history_result
 from yid_ocp.workflow.solve import run_solve
@@ -78,9 +80,18 @@ def run(arguments: argparse.Namespace) -> int:
     workers = given_workers(arguments) or LOCAL
     out = arguments.out or Path("runs") / f"batch-{time.strftime('%Y%m%d-%H%M%S')}"
     outcome = carry_out(
-        lambda shown: run_batch(members, out, arguments.each, workers, shown), batch_summary, arguments.quiet
+        lambda shown: run_batch(members, out, arguments.each, workers, shown, _again(arguments, out)),
+        batch_summary,
+        arguments.quiet,
     )
     return DONE if outcome.ok else FAILED
+
+
+def _again(arguments: argparse.Namespace, out: str | Path) -> str:
+    words = ["yid-ocp", "batch", *map(str, arguments.configs)]
+    words += ["--recordings", arguments.recordings] if arguments.recordings else []
+    words += ["--command", arguments.each, *(word for said in arguments.overrides for word in ("--set", said))]
+    return shlex.join([*words, "--out", str(out)])
 
 
 def batch_members(
@@ -147,6 +158,7 @@ def run_batch(
     command: str = "solve",
     workers: Workers | Executor = LOCAL,
     progress: Progress = SILENT,
+    again: str = "",
 ) -> BatchOutcome:
     """Run a command on every member of a batch; what the folder holds of them is not done again.
 
@@ -160,6 +172,8 @@ def run_batch(
     command : {'solve', 'diagnose'}
     workers : Workers or Executor, optional
     progress : Progress, optional
+    again : str
+        The command line that does the same, for the report.
 
     Returns
     -------
@@ -173,6 +187,7 @@ def run_batch(
     WorkerError
     """
     folder = _folder(Path(out))
+    share_script(folder)
     results: dict[str, TaskResult] = {}
     tasks = []
     for member in members:
@@ -202,8 +217,10 @@ def run_batch(
     result = {
         "format": FORMAT,
         "command": command,
+        "again": again,
         "runs": entries,
         "history": _alike([folder / RUNS / entry["name"] for entry in entries if entry["ok"]]),
+        "date": now(),
         "versions": versions(),
     }
     written: dict[str, Any] = jsonable(result)

@@ -6,6 +6,7 @@ import argparse
 import json
 import logging
 import math
+import shlex
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
@@ -32,12 +33,15 @@ from yid_ocp.diagnosis.blind import (
 from yid_ocp.errors import ConfigError, OutputError, YidError
 from yid_ocp.files import jsonable, write_json, write_text
 from yid_ocp.parallel import LOCAL, Task, Workers, run_tasks, values_of
+from yid_ocp.report.html import write_report
 from yid_ocp.report.pictures import draw_blind
-from yid_ocp.report.tables import blind_table
-from yid_ocp.report.terminal import blind_summary
+from yid_ocp.report.sections import Findings
+from yid_ocp.report.summaries import blind_summary
+from yid_ocp.report.tables import blind_markdown
 from yid_ocp.version import package_code, versions
 from yid_ocp.workflow.command import DONE, carry_out, given_workers
 from yid_ocp.workflow.experiments import VARIATIONS, Experiment, experiments_of, refuse_unfit
+from yid_ocp.workflow.folder import now
 from yid_ocp.workflow.progress import SILENT, Progress
 
 COMMITMENT, LABELS, RESULT, TABLE = "commitment.json", "sealed/labels.json", "result.json", "table.md"
@@ -135,19 +139,28 @@ def run_blind(
         mark(label, found["result"], best.get(label.case, math.nan), float(found["seconds"]))
         for label, found in zip(labels, answers, strict=True)
     ]
+    files = [folder / CONFIGS / f"{entry.name}.yaml" for entry in runs]
+    flags = ["--cases", count, "--seed", seed, *(["--calibration"] if purpose == PURPOSES[1] else [])]
+    again = shlex.join(["yid-ocp", "blind", *map(str, files), *map(str, flags)])
     result = score(marks) | {
         "seed": seed,
         "purpose": purpose,
         "code": package_code(),
         "code_of_cases": commitment["code"],
+        "command": again,
+        "date": now(),
         "versions": versions(),
         "candidates": {entry.name: entry.diagnosis.candidates for entry in runs},
         "variations": {name: varied.words for name, varied in VARIATIONS.items()},
     }
     written = jsonable(result)
     write_json(folder / RESULT, written)
-    write_text(folder / TABLE, "\n".join(blind_table(written)) + "\n")
+    write_text(folder / TABLE, "\n".join(blind_markdown(written)) + "\n")
     draw_blind(folder, written)
+    if all(entry.output.report for entry in runs):
+        progress.stage("writing the report")
+        said = f"{count} virtual cases whose effect was withheld, diagnosed, then opened."
+        write_report(folder / "report.html", Findings(folder.name, said, written))
     return BlindOutcome(folder, written)
 
 

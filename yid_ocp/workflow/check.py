@@ -18,8 +18,10 @@ from yid_ocp.integrator.step import Step
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.options import SensorOptions
-from yid_ocp.report.terminal import check_summary
+from yid_ocp.report.scene import Scene, Told, recorded_scene, scene
+from yid_ocp.report.summaries import check_summary
 from yid_ocp.sensors.joints import EFFORT, POSITION, angle_std, is_stated, torque_std
 from yid_ocp.solvers.base import estimates, uncertainty
 from yid_ocp.workflow.build import build_problem, build_step, first_gaps, input_files
@@ -85,7 +87,8 @@ def run_check(run: Run, out: str | Path | None = None, progress: Progress = SILE
         mechanics = _mechanics(plain, step, problem, warnings)
         progress.stage("refining links and time step")
         convergence = refine(run, problem, warnings)
-        moved = {} if problem is None else _moves(plain, problem, warnings, progress)
+        first = None if problem is None else problem.evaluate(problem.start)
+        moved = {} if problem is None or first is None else _moves(plain, problem, first, warnings, progress)
         result = {
             "format": FORMAT,
             "model": model,
@@ -97,6 +100,17 @@ def run_check(run: Run, out: str | Path | None = None, progress: Progress = SILE
             "warnings": warnings,
         }
         written = folder.finish(result)
+        if problem is not None and first is not None:
+            taken = [episode.recording for episode in (*problem.episodes, *problem.held_out)]
+            folder.report(
+                run,
+                written,
+                progress,
+                scenes=_scenes(problem, first),
+                more={"recordings": taken, "system": step.system},
+            )
+        else:
+            folder.report(run, written, progress)
     return CheckOutcome(folder.path, written)
 
 
@@ -189,13 +203,29 @@ def _input_noise(problem: EstimationProblem, episode: Episode) -> dict[str, Any]
     return noise
 
 
-def _moves(run: Run, problem: EstimationProblem, warnings: list[str], progress: Progress) -> dict[str, Any]:
+def _scenes(problem: EstimationProblem, first: Evaluation) -> list[Scene]:
+    """What the initial parameters make of every recording that is estimated on, or what was recorded alone."""
+    system, scenes = problem.system, []
+    for i, episode in enumerate(problem.episodes):
+        theta = problem.predictor.own_theta(episode, problem.split(problem.start, i)[0])
+        if first.ok:
+            q = first.episodes[i].rollout.state[:, : system.size]
+            told = [Told("with the initial values", system, theta, episode.grid.times, q)]
+            scenes.append(scene(episode.name, told, episode.recording))
+        else:
+            alone = recorded_scene(episode.name, system, theta, episode.recording)
+            scenes += [] if alone is None else [alone]
+    return scenes
+
+
+def _moves(
+    run: Run, problem: EstimationProblem, at_x: Evaluation, warnings: list[str], progress: Progress
+) -> dict[str, Any]:
     """How far estimates would move with a finer model if they were the initial values, and by what they are known."""
     x = problem.start
     growth = growth_of_fit(problem, x)
     if growth is not None and not growth.stable:
         warnings.append(f"with the initial parameters {growth.words}")
-    at_x = problem.evaluate(x)
     if not at_x.ok:
         warnings.append(f"the model cannot be rolled out with the initial parameters: {at_x.message}")
         return {}

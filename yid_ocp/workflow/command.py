@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from yid_ocp.parallel import Workers
+from yid_ocp.report.blocks import Block
+from yid_ocp.report.terminal import lines
 from yid_ocp.workflow.progress import Progress, shown
 
 DONE, FAILED, WRONG_INPUT = 0, 1, 2
@@ -33,7 +35,7 @@ Left = TypeVar("Left", bound=Outcome)
 
 
 def carry_out(
-    work: Callable[[Progress], Left], summary: Callable[[Mapping[str, Any]], Sequence[str]], quiet: bool
+    work: Callable[[Progress], Left], summary: Callable[[Mapping[str, Any]], Sequence[Block]], quiet: bool
 ) -> Left:
     """Do the work of a command and print for a person what it found and where it is; quietly, only where it is.
 
@@ -42,7 +44,7 @@ def carry_out(
     work : callable
         The work, given the progress to report to.
     summary : callable
-        From the result to the lines to print.
+        From the result to what is said of it.
     quiet : bool
 
     Returns
@@ -53,7 +55,7 @@ def carry_out(
     with shown(quiet) as progress:
         outcome = work(progress)
     if not quiet:
-        print_lines(summary(outcome.result))
+        print_lines(lines(summary(outcome.result)))
     near = os.path.relpath(outcome.folder)
     print(outcome.folder if quiet or near.startswith("..") else f"run folder: {near}")
     return outcome
@@ -74,6 +76,6 @@ def given_workers(arguments: argparse.Namespace) -> Workers | None:
     return workers
 
 
-def print_lines(lines: Sequence[str]) -> None:
+def print_lines(texts: Sequence[str]) -> None:
     """Print lines on standard output."""
-    print("\n".join(lines))
+    print("\n".join(texts))

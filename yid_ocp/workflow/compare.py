@@ -13,7 +13,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import Run
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.report.pictures import draw_convergence
-from yid_ocp.report.terminal import compare_summary
+from yid_ocp.report.summaries import compare_summary
 from yid_ocp.solvers import SOLVERS, Iterate
 from yid_ocp.solvers.base import Solver
 from yid_ocp.workflow.build import build_problem
@@ -108,6 +108,9 @@ def run_compare(run: Run, out: str | Path | None = None, progress: Progress = SI
             "truth": truth,
         }
         written = folder.finish(compare_result(problem, comparison) | about)
+        held_out = tuple(comparison.judged_held_out)
+        known = {"problem": own, "solution": judged, "held_out": held_out, "more": {"comparison": comparison}}
+        folder.report(run, written, progress, **known)
     return CompareOutcome(folder.path, written, comparison)
 
 

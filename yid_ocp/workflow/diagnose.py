@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import argparse
 import logging
-import os
-import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,9 +19,8 @@ from yid_ocp.diagnosis import Finding, diagnose
 from yid_ocp.diagnosis.baseline import with_baseline
 from yid_ocp.diagnosis.finding import model_result
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.report.html import write_report
-from yid_ocp.report.sections import Findings
-from yid_ocp.report.terminal import diagnose_summary
+from yid_ocp.report.scene import Scene, Told, scene
+from yid_ocp.report.summaries import diagnose_summary
 from yid_ocp.sensors.joints import EFFORT, POSITION
 from yid_ocp.solvers import Solution, solve
 from yid_ocp.workflow.baseline import earlier_runs, recordings_without, refuse_same, with_effects_of
@@ -87,7 +84,7 @@ def run_diagnose(run: Run, out: str | Path | None = None, progress: Progress = S
     ConfigError, DataError, ModelError, SolverError, OutputError
     """
     with new_run_folder(run, out, "diagnose") as folder:
-        folder.begin(run, "diagnose")
+        folder.begin(run, "diagnose", _flags(run))
         refits = Refits(folder, folder.inputs, dump_config(run), used_versions())
 
         def stage(text: str) -> None:
@@ -121,14 +118,11 @@ def run_diagnose(run: Run, out: str | Path | None = None, progress: Progress = S
             "model": model_result(finding),
             "doubts": doubts_result(problem.options.doubts),
             "torque_offsets": offsets,
-            "command": reproducing(run, folder.target),
             "next_plan": next_plan(told["confusable"] if moving else (), folder.target),
         }
         written = folder.finish(told | own)
-        if run.output.report:
-            progress.stage("writing the report")
-            more = {"finding": finding, "predictions": predicted}
-            write_report(folder.path / "report.html", Findings(run.name, run.description, written, problem, more=more))
+        more = {"finding": finding, "predictions": predicted}
+        folder.report(run, written, progress, problem=problem, scenes=_scenes(finding, predicted), more=more)
     refits.clear()
     return DiagnoseOutcome(folder.path, written, finding)
 
@@ -159,20 +153,13 @@ def _found(
     )
 
 
-def reproducing(run: Run, folder: Path) -> str:
-    """The command that gives a result again; the resolved configuration in its folder, where `--set` changed one."""
-    origins = list(run.places.values())
-    if any(origin.startswith("--set") for origin in origins):
-        near = os.path.relpath(folder)
-        return shlex.join(
-            ["yid-ocp", "diagnose", str((folder if near.startswith("..") else Path(near)) / "config.yaml")]
-        )
-    said = [part for folder in run.diagnosis.baseline for part in ("--baseline", folder)]
+def _flags(run: Run) -> list[str]:
+    """What the command was given beside the configuration: baselines that it does not say itself."""
+    if any(origin.startswith("--set") for origin in run.places.values()):
+        return []
     if any(key[:2] == ("diagnosis", "baseline") for key in run.places):
-        said = []  # the configuration says it
-    if any(origin.startswith("embedded default") for origin in origins):
-        return shlex.join(["yid-ocp", "diagnose", *said])
-    return shlex.join(["yid-ocp", "diagnose", run.file, *said])
+        return []
+    return [part for folder in run.diagnosis.baseline for part in ("--baseline", folder)]
 
 
 def in_units_of_noise(problem: EstimationProblem, run: Run) -> EstimationProblem:
@@ -250,3 +237,19 @@ def predictions(finding: Finding) -> list[Prediction]:
         for (episode, first), (_, last) in zip(before, after, strict=True)
         if not isinstance(first, str) and not isinstance(last, str)
     ]
+
+
+def _scenes(finding: Finding, predicted: Sequence[Prediction]) -> list[Scene]:
+    """What was predicted of every held-out recording, without the effects and with them."""
+    fits = {"nominal model": finding.nominal}
+    fits |= {"with the effects": finding.last} if finding.effects else {}
+    scenes = []
+    for episode, *outcomes in predicted:
+        told = []
+        for (name, fit), outcome in zip(fits.items(), outcomes, strict=False):
+            system, predictor = fit.problem.system, fit.problem.predictor
+            theta, _ = fit.problem.split(fit.problem.vector(fit.values), 0)
+            q = outcome.rollout.state[:, : system.size]
+            told.append(Told(name, system, predictor.own_theta(episode, theta), episode.grid.times, q))
+        scenes.append(scene(f"{episode.name} (held out)", told, episode.recording))
+    return scenes

@@ -1,4 +1,4 @@
-"""The command `export`: a recording as CSV, the model of a run for other engines."""
+"""The command `export`: recordings as CSV or MCAP, what a run predicted as MCAP, its model for other engines."""
 
 from __future__ import annotations
 
@@ -8,10 +8,15 @@ from pathlib import Path
 from yid_ocp.data import read_recording
 from yid_ocp.errors import ConfigError
 from yid_ocp.export.csv import export_csv
-from yid_ocp.report.terminal import export_summary, recording_summary
+from yid_ocp.export.mcap import export_mcap, recorded_signals
+from yid_ocp.report.summaries import export_summary
+from yid_ocp.report.terminal import lines, recording_summary
 from yid_ocp.workflow.command import DONE, print_lines
 from yid_ocp.workflow.export_model import FORMATS, export_model
+from yid_ocp.workflow.export_signals import export_run_signals
 from yid_ocp.workflow.progress import shown
+
+MCAP = "mcap"
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -20,20 +25,35 @@ def run(arguments: argparse.Namespace) -> int:
     if source.is_dir():
         if form == "csv":
             raise ConfigError(
-                "a run's model is no table", where="--format csv", allowed=", ".join(FORMATS), hint="export a recording"
+                "a run is no table",
+                where="--format csv",
+                allowed=", ".join((*FORMATS, MCAP)),
+                hint="export a recording, or the run's signals as mcap",
             )
+        if form == MCAP:
+            written, notes = export_run_signals(source, arguments.out)
+            print_lines([*([] if arguments.quiet else notes), *map(str, written)])
+            return DONE
         with shown(arguments.quiet) as progress:
             manifest = export_model(source, arguments.out, form or "mjcf", progress)
         if not arguments.quiet:
-            print_lines(export_summary(manifest))
+            print_lines(lines(export_summary(manifest)))
         print(arguments.out)
         return DONE
-    if form not in (None, "csv"):
+    if form not in (None, "csv", MCAP):
         raise ConfigError(
-            f"{source.name} is no run folder", where=f"--format {form}", allowed="a run folder of `solve` or `diagnose`"
+            f"{source.name} is no run folder",
+            where=f"--format {form}",
+            allowed=f"csv or {MCAP} of a recording; {', '.join(FORMATS)} of a run folder of `solve` or `diagnose`",
         )
     recording = read_recording(source, allow_nan_effort=True)
-    files = export_csv(recording, arguments.out)
+    if form == MCAP:
+        files: tuple[Path, ...] = (Path(arguments.out) / f"{source.stem}.mcap",)
+        shift = export_mcap(recorded_signals(recording), files[0])
+        if shift and not arguments.quiet:
+            print_lines([f"{shift:g} s were added to all times, as stamps cannot be negative"])
+    else:
+        files = export_csv(recording, arguments.out)
     if not arguments.quiet:
         print_lines(recording_summary(recording))
     print_lines([str(file) for file in files])

@@ -6,10 +6,12 @@ import contextlib
 import json
 import logging
 import os
+import shlex
 import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -19,9 +21,12 @@ from yid_ocp import interruption
 from yid_ocp.config.settings import Run, dump_config
 from yid_ocp.errors import OutputError
 from yid_ocp.files import file_sha256, jsonable, reason, write_text
+from yid_ocp.report.html import write_report
+from yid_ocp.report.sections import Findings
 from yid_ocp.version import versions
 from yid_ocp.workflow.build import input_files
 from yid_ocp.workflow.plugins import plugin_versions
+from yid_ocp.workflow.progress import Progress
 
 log = logging.getLogger(__name__)
 _UNFINISHED, _LOCK, _NAMES = ".partial", "lock", 1000
@@ -41,6 +46,8 @@ class RunFolder:
         Where an interrupted run may leave what the next one with the same name, or none, can use; not made here.
     inputs : dict of str to str
         SHA-256 of every file that the run reads, by name; see `begin`.
+    command : str
+        What gives its result again; see `begin`.
     """
 
     target: Path
@@ -48,17 +55,44 @@ class RunFolder:
     partial: Path
     _log: TextIO = field(repr=False)
     inputs: dict[str, str] = field(default_factory=dict)
+    command: str = ""
     _begun: float = field(default_factory=time.perf_counter, repr=False)
 
-    def begin(self, run: Run, command: str) -> None:
-        """Write config.yaml, hash what the run reads and log the start; errors as `input_files`."""
+    def begin(self, run: Run, command: str, flags: Sequence[str] = ()) -> None:
+        """Write config.yaml, hash what the run reads and log the start; errors as `input_files`.
+
+        Parameters
+        ----------
+        run : Run
+        command : str
+        flags : sequence of str
+            That the command was given beside its configuration.
+        """
         self.write("config.yaml", dump_config(run))
         self.inputs |= {name: file_sha256(path) for name, path in input_files(run).items()}
+        self.command = reproducing(run, self.target, command, flags)
         self.log("start", command=command, versions=used_versions(), inputs=self.inputs)
 
     def finish(self, result: Mapping[str, Any]) -> dict[str, Any]:
-        """Write result.json with inputs and versions; returns what was written."""
-        return self.write_json("result.json", {**result, "inputs": self.inputs, "versions": used_versions()})
+        """Write result.json with command, date, inputs and versions; returns what was written."""
+        made = {"command": self.command, "date": now(), "inputs": self.inputs, "versions": used_versions()}
+        return self.write_json("result.json", {**result, **made})
+
+    def report(self, run: Run, result: Mapping[str, Any], progress: Progress, **known: Any) -> None:
+        """Write report.html, unless the settings want none.
+
+        Parameters
+        ----------
+        run : Run
+        result : mapping
+            As it was written.
+        progress : Progress
+        **known
+            What the page can show beside it, by the attributes of `Findings`.
+        """
+        if run.output.report:
+            progress.stage("writing the report")
+            write_report(self.path / "report.html", Findings(run.name, run.description, result, **known))
 
     def log(self, event: str, **entries: Any) -> None:
         """Add a line to log.jsonl."""
@@ -309,6 +343,22 @@ def _clear(temporary: Path | None, made: Sequence[Path]) -> None:
         for parent in made:
             with contextlib.suppress(OSError):
                 parent.rmdir()
+
+
+def now() -> str:
+    """The time of day, with the zone, to the second."""
+    return datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
+
+
+def reproducing(run: Run, folder: Path, command: str, flags: Sequence[str] = ()) -> str:
+    """The command that gives a result again; the resolved configuration in its folder, where `--set` changed one."""
+    origins = list(run.places.values())
+    if any(origin.startswith("--set") for origin in origins):
+        near = os.path.relpath(folder)
+        said = [str((folder if near.startswith("..") else Path(near)) / "config.yaml")]
+    else:
+        said = [] if any(origin.startswith("embedded default") for origin in origins) else [run.file]
+    return shlex.join(["yid-ocp", command, *said, *flags])
 
 
 def used_versions() -> dict[str, str]:

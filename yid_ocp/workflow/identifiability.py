@@ -26,9 +26,7 @@ from yid_ocp.model.system import System
 from yid_ocp.parallel import Workers
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.null_test import GapLimits
-from yid_ocp.report.html import write_report
-from yid_ocp.report.sections import Findings
-from yid_ocp.report.terminal import identifiability_summary
+from yid_ocp.report.summaries import identifiability_summary
 from yid_ocp.solvers import Iterate, Solution, Status, solve
 from yid_ocp.workflow.build import build_problem, build_step, build_system
 from yid_ocp.workflow.command import DONE, FAILED, carry_out, given_workers
@@ -65,6 +63,19 @@ class Question:
     grasp_std: float | None = None
     intervals: Literal["auto", "all"] | Sequence[str] = "auto"
     what_if: bool = False
+
+    @property
+    def flags(self) -> list[str]:
+        """The same on a command line."""
+        names = self.intervals if isinstance(self.intervals, str) else ",".join(self.intervals) or "none"
+        said = {
+            "--what-if": self.what_if,
+            "--initial": self.at == "initial",
+            "--unknown-start": self.start == "unknown",
+            "--unknown-grasp": self.grasp_std is not None,
+        }
+        asked = [flag for flag, given in said.items() if given]
+        return asked + ([] if names == "auto" else ["--intervals", names])
 
 
 @dataclass(frozen=True)
@@ -132,7 +143,7 @@ def run_identifiability(
     """
     asked = question or Question()
     with new_run_folder(run, out, "identifiability") as folder:
-        folder.begin(run, "identifiability")
+        folder.begin(run, "identifiability", asked.flags)
         progress.stage("building the model and its compiled step")
         system = build_system(run)
         problem = build_problem(run, build_step(run, with_grasp_offsets(system)))
@@ -156,10 +167,7 @@ def run_identifiability(
         result = identifiability_result(problem, solution, information, unknown, ranking, asked)
         folder.log("end", status=result["status"], message=result["message"])
         written = folder.finish(result)
-        if run.output.report:
-            progress.stage("writing the report")
-            findings = Findings(run.name, run.description, written, solution=solution)
-            write_report(folder.path / "report.html", findings)
+        folder.report(run, written, progress, problem=problem, solution=solution)
     if elsewhere is not None:
         elsewhere.clear()
     return IdentifiabilityOutcome(folder.path, written, information)

@@ -28,7 +28,7 @@ from yid_ocp.integrator.step import Step
 from yid_ocp.integrator.step_model import StepLinearization
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.report.sparsity import draw_patterns
-from yid_ocp.report.terminal import inspect_summary
+from yid_ocp.report.summaries import inspect_summary
 from yid_ocp.workflow.build import build_problem, build_step, parameter_settings
 from yid_ocp.workflow.command import DONE, carry_out
 from yid_ocp.workflow.folder import new_run_folder
@@ -100,7 +100,7 @@ def run_inspect(
     ConfigError, DataError, ModelError, OutputError
     """
     with new_run_folder(run, out, "inspect") as folder:
-        folder.begin(run, "inspect")
+        folder.begin(run, "inspect", [part for name in entries for part in ("--entry", name)])
         progress.stage("building the model and its compiled step")
         begun = time.perf_counter()
         step = build_step(run)
@@ -137,6 +137,8 @@ def run_inspect(
             "exported": [str(path) for path in files],
         }
         written = folder.finish(result)
+        pictures = [path for path in (folder.path / name for name in ("sparsity.png", "kkt.png")) if path.exists()]
+        folder.report(run, written, progress, more={"pictures": pictures})
     return InspectOutcome(folder.path, written)
 
 

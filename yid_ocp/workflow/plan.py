@@ -26,9 +26,8 @@ from yid_ocp.planning.plan import Known, Plan, plan
 from yid_ocp.problem.grid import make_grid
 from yid_ocp.problem.inputs import prescribed_path
 from yid_ocp.problem.low_pass import LowPass
-from yid_ocp.report.html import write_report
-from yid_ocp.report.sections import Findings
-from yid_ocp.report.terminal import plan_summary
+from yid_ocp.report.scene import Scene, Told, scene
+from yid_ocp.report.summaries import plan_summary
 from yid_ocp.workflow.build import build_cable, build_step, located, parameter_settings, read_recordings
 from yid_ocp.workflow.command import DONE, FAILED, carry_out
 from yid_ocp.workflow.folder import new_run_folder
@@ -102,10 +101,8 @@ def run_plan(run: Run, out: str | Path | None = None, progress: Progress = SILEN
         folder.log("end", reached=found.reached, message=found.message)
         told = plan_result(run, found) if isinstance(found, Plan) else information_result(run, found)
         written = folder.finish(motion_result(run, found, source) | told)
-        if run.output.report:
-            progress.stage("writing the report")
-            more = {"plan" if isinstance(found, Plan) else "information": found}
-            write_report(folder.path / "report.html", Findings(run.name, run.description, written, more=more))
+        more = {"plan" if isinstance(found, Plan) else "information": found}
+        folder.report(run, written, progress, scenes=_scenes(found), more=more)
     return PlanOutcome(folder.path, written, found)
 
 
@@ -223,6 +220,13 @@ def plan_result(run: Run, found: Plan) -> dict[str, Any]:
         "tolerance": run.plan.tolerance,
         "evaluations": found.evaluations,
     }
+
+
+def _scenes(found: Plan | InformationPlan) -> list[Scene]:
+    """The planned motion, as the model has it."""
+    system = found.mover.step.system
+    state = found.state if isinstance(found, Plan) else found.rollout.state
+    return [scene("planned", [Told("planned", system, found.mover.theta, found.t, state[:, : system.size])])]
 
 
 def _share(values: Array, limit: float) -> float | None:

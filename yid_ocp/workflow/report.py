@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,11 +15,11 @@ from yid_ocp.errors import ConfigError
 from yid_ocp.files import file_sha256
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import Findings
-from yid_ocp.report.terminal import history_summary
+from yid_ocp.report.summaries import history_summary
 from yid_ocp.version import versions
 from yid_ocp.workflow.baseline import read_estimates, refuse_unlike
 from yid_ocp.workflow.command import DONE, carry_out
-from yid_ocp.workflow.folder import new_run_folder
+from yid_ocp.workflow.folder import new_run_folder, now
 from yid_ocp.workflow.progress import SILENT, Progress
 
 FORMAT = "yid-history/1"
@@ -79,7 +80,9 @@ def run_report(
     with new_run_folder(Run(name="history"), out, "report") as folder:
         inputs = {str(path): file_sha256(path / "result.json") for path in paths}
         folder.log("start", command="report", versions=versions(), inputs=inputs)
-        result = history_result(found) | {"inputs": inputs, "versions": versions()}
+        again = shlex.join(["yid-ocp", "report", *map(str, folders)])
+        made = {"command": again, "date": now(), "inputs": inputs, "versions": versions()}
+        result = history_result(found) | made
         written = folder.write_json("history.json", result)
         progress.stage("writing the report")
         write_report(folder.path / "report.html", Findings("history", "Runs of one model side by side.", written))

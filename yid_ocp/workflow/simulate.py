@@ -14,11 +14,13 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import Run
 from yid_ocp.data.hdf5 import write_recording
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate
+from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.options import SensorOptions
 from yid_ocp.problem.prediction import EpisodeResult
-from yid_ocp.report.terminal import simulate_summary
+from yid_ocp.report.scene import Scene, Told, recorded_scene, scene
+from yid_ocp.report.summaries import simulate_summary
 from yid_ocp.sensors.joints import EFFORT, POSITION, angle_std, by_joint, torque_bias_std, torque_std
 from yid_ocp.workflow.build import build_step, build_system, problem_options, read_recordings
 from yid_ocp.workflow.command import DONE, FAILED, carry_out
@@ -90,11 +92,14 @@ def run_simulate(
     ConfigError, DataError, ModelError, OutputError
     """
     with new_run_folder(run, out, "simulate") as folder:
-        folder.begin(run, "simulate")
+        folder.begin(run, "simulate", _flags(seed, noise))
+        system = build_system(run)
+        scenes: list[Scene] = []
+        made: Recording | str
         if run.recordings.estimate:
-            made = _predicted(run, progress, seed if noise else None)
+            made, scenes = _predicted(run, system, progress, seed if noise else None)
         else:
-            made = _virtual(run, progress, seed)
+            made, scenes = _virtual(run, system, progress, seed)
         result: dict[str, Any] = {"format": FORMAT, "status": "done", "message": "", "seed": seed}
         if isinstance(made, str):
             result |= {"status": "failed", "message": made}
@@ -108,14 +113,20 @@ def run_simulate(
                 "truth": dict(recording.truth),
             }
         written = folder.finish(result)
+        more = {"recordings": [] if recording is None else [recording], "system": system}
+        folder.report(run, written, progress, scenes=scenes, more=more)
     return SimulateOutcome(folder.path, written, recording)
 
 
-def _virtual(run: Run, progress: Progress, seed: int) -> Recording:
+def _flags(seed: int, noise: bool) -> list[str]:
+    """What the command was given beside the configuration."""
+    return [*(["--seed", str(seed)] if seed else []), *(["--noise"] if noise else [])]
+
+
+def _virtual(run: Run, system: System, progress: Progress, seed: int) -> tuple[Recording, list[Scene]]:
     from yid_ocp.virtual.engine import Simulation
     from yid_ocp.virtual.experiment import VirtualExperiment, virtual_experiment
 
-    system = build_system(run)
     if run.model.robot is None:
         raise run.refuse(
             "nothing moves an object without a robot by itself",
@@ -129,12 +140,14 @@ def _virtual(run: Run, progress: Progress, seed: int) -> Recording:
     experiment = VirtualExperiment(
         simulation=Simulation(duration), seed=seed, name=run.name, description=run.description
     )
-    return virtual_experiment(system, None, experiment)
+    made = virtual_experiment(system, None, experiment)
+    alone = recorded_scene("recorded", system, system.parameters.vector(), made)
+    return made, [] if alone is None else [alone]
 
 
-def _predicted(run: Run, progress: Progress, seed: int | None) -> Recording | str:
+def _predicted(run: Run, system: System, progress: Progress, seed: int | None) -> tuple[Recording | str, list[Scene]]:
     progress.stage("building the model and its compiled step")
-    step = build_step(run)
+    step = build_step(run, system)
     first = replace(run, recordings=replace(run.recordings, estimate=run.recordings.estimate[:1]))
     recordings = read_recordings(first, "estimate")
     options = replace(problem_options(run, step.system, recordings), local=(), priors={})
@@ -143,8 +156,11 @@ def _predicted(run: Run, progress: Progress, seed: int | None) -> Recording | st
     progress.stage(f"rolling out {episode.grid.steps} steps")
     outcome = problem.predictor.run(episode, problem.theta, np.zeros(len(problem.start)), False)
     if isinstance(outcome, str):
-        return outcome
-    return validate(as_recording(run, problem, episode, outcome, seed))
+        return outcome, []
+    made = validate(as_recording(run, problem, episode, outcome, seed))
+    theta, q = problem.predictor.own_theta(episode, problem.theta), outcome.rollout.state[:, : step.system.size]
+    told = Told("simulated", step.system, theta, episode.grid.times, q)
+    return made, [scene("simulated", [told], episode.recording)]
 
 
 def as_recording(

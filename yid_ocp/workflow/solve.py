@@ -21,9 +21,7 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.prediction import EpisodeResult
 from yid_ocp.problem.validation import channel_errors
-from yid_ocp.report.html import write_report
-from yid_ocp.report.sections import Findings
-from yid_ocp.report.terminal import solve_summary
+from yid_ocp.report.summaries import solve_summary
 from yid_ocp.solvers import Iterate, Solution, Status, solve
 from yid_ocp.solvers.judgement import distrusted, known_covariance
 from yid_ocp.workflow.build import build_cable, build_problem
@@ -127,10 +125,7 @@ def run_solve(run: Run, out: str | Path | None = None, progress: Progress = SILE
             "torque_offsets": {} if solution.evaluation is None else torque_offsets(problem, solution.x),
         }
         written = folder.finish(solve_result(problem, solution, held_out, cable) | more)
-        if run.output.report:
-            progress.stage("writing the report")
-            findings = Findings(run.name, run.description, written, problem, solution, tuple(held_out))
-            write_report(folder.path / "report.html", findings)
+        folder.report(run, written, progress, problem=problem, solution=solution, held_out=tuple(held_out))
     return SolveOutcome(folder.path, written, solution, problem)
 
 

@@ -18,7 +18,9 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.errors import ConfigError
 from yid_ocp.files import file_sha256
 from yid_ocp.model.system import System
-from yid_ocp.report.terminal import track_summary
+from yid_ocp.report.scene import Told
+from yid_ocp.report.scene import scene as moving
+from yid_ocp.report.summaries import track_summary
 from yid_ocp.vision.camera import DepthCamera, FrameTiming, VirtualCamera, VirtualFrames, virtual_frames
 from yid_ocp.vision.fit import ShapeFit
 from yid_ocp.vision.frames import FrameSequence, look_at, read_frames, write_frames
@@ -115,6 +117,10 @@ def run_track(run: Run, out: str | Path | None = None, progress: Progress = SILE
             "truth_errors": {} if made is None else truth_errors(system, found, made),
         }
         written = folder.finish(result)
+        told = Told("fitted shape", system, system.parameters.vector(), found.t, found.q)
+        files = [folder.path / "track.png", *sorted((folder.path / "pictures").glob("*.png"))]
+        more = {"pictures": [path for path in files if path.exists()]}
+        folder.report(run, written, progress, scenes=[moving("tracked", [told], tracked)], more=more)
     return TrackOutcome(folder.path, written, found, tracked)
 
 

@@ -30,8 +30,9 @@ def write_trajectories(
     """Trajectories, predictions and the unknowns with their covariance, as `yid-trajectories/1`.
 
     `unknowns/`: names, x, covariance. `recordings/NAME/`: `t` (N+1,) [s], `q`, `p` (N+1, n), `multipliers` (N, m)
-    [N s], `torque` (N, nu) [N m], `effort` (N, nc) [N m], and for every sensor `GROUP/` with `t`, `measured`,
-    `predicted`, `std` and the attributes `channels`, `unit`.
+    [N s], `torque` (N, nu) [N m], `effort` (N, nc) [N m], the attributes `joints` (n names), `driven` (nu) and
+    `prescribed` (nc), and for every sensor `GROUP/` with `t`, `measured`, `predicted`, `std` and the attributes
+    `channels`, `unit`.
 
     Raises
     ------
@@ -50,6 +51,8 @@ def write_trajectories(
             group = file.require_group("recordings").create_group(episode.name)
             group.attrs["role"] = role
             group.attrs["joints"] = _texts(problem.system.mechanism.joint_names)
+            group.attrs["driven"] = _texts(problem.system.driven)
+            group.attrs["prescribed"] = _texts(problem.system.prescribed)
             if isinstance(outcome, str):
                 group.attrs["message"] = outcome
                 continue
@@ -76,7 +79,8 @@ def write_diagnosis_trajectories(path: Path, finding: Finding, predicted: Sequen
     `where/RECORDING/` for every recording that was estimated on, where there was a gap to locate: `edges` (J + 1,) [s]
     since its first node, of the intervals over which unknowns are constant; `mean` and `std` (J, nd) of the unknown
     forces, offsets and biases about the nominal model and `prior` (nd,), the standard deviation at the largest
-    evidence, zero where a group was not taken in; the attributes `unknowns`, `locations`, `kinds`, `units` (nd,) each.
+    evidence, zero where a group was not taken in; the attributes `unknowns`, `locations`, `kinds`, `units` (nd,) each,
+    and `start`, the time of the first node [s].
 
     `events/RECORDING/CHANNEL/` where a force acted as an event: `t` (M,) [s], `value` (M,) the force beside what model
     and recording have, `allowed` (M,) what the model may be wrong by; the attribute `unit`.
@@ -90,9 +94,11 @@ def write_diagnosis_trajectories(path: Path, finding: Finding, predicted: Sequen
             for k, samples in enumerate(episode.samples):
                 both = {"before": before.predicted[k], "after": after.predicted[k]}
                 _store_sensor(file.require_group(episode.name), episode, samples, both)
+        starts = {episode.name: episode.grid.start for episode in finding.nominal.problem.episodes}
         for trace in () if finding.smoothed is None else finding.smoothed.traces:
             assert finding.smoothed is not None
             group = file.create_group(f"where/{trace.recording}")
+            group.attrs["start"] = starts[trace.recording]
             group.attrs["unknowns"] = _texts(trace.unknowns)
             group.attrs["locations"] = _texts([source.location for source in trace.sources])
             group.attrs["kinds"] = _texts([source.kind for source in trace.sources])

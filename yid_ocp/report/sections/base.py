@@ -11,10 +11,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.prediction import EpisodeResult
 from yid_ocp.registry import Registry
+from yid_ocp.report.scene import Scene
 from yid_ocp.solvers import Solution
 
 if TYPE_CHECKING:
@@ -34,6 +36,8 @@ class Findings:
     problem : EstimationProblem, optional
     solution : Solution, optional
     held_out : sequence of (Episode, EpisodeResult or text)
+    scenes : sequence of Scene
+        What moves, where it does not follow from `problem`, `solution` and `held_out`.
     more : mapping
         Whatever else a command's own sections need.
     """
@@ -44,6 +48,7 @@ class Findings:
     problem: EstimationProblem | None = None
     solution: Solution | None = None
     held_out: Sequence[tuple[Episode, EpisodeResult | str]] = ()
+    scenes: Sequence[Scene] = ()
     more: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -85,6 +90,19 @@ def section(name: str, order: int, title: str) -> Callable[[Prepare], Prepare]:
         return prepare
 
     return enter
+
+
+TURNING = {"position": "rad", "velocity": "rad/s", "effort": "N m", "position_command": "rad"}
+SLIDING = {"position": "m", "velocity": "m/s", "effort": "N", "position_command": "m"}
+
+
+def joint_unit(system: System | None, names: Sequence[str], channel: str) -> str:
+    """Unit of what joints do, one for all of them; joints that no system knows are taken to turn."""
+    kinds = {} if system is None else {joint.name: joint.kind for joint in system.mechanism.joints}
+    sliding = [kinds.get(name) == "prismatic" for name in names]
+    if any(sliding) and not all(sliding):
+        return f"{TURNING[channel]}, {SLIDING[channel]}"
+    return SLIDING[channel] if names and all(sliding) else TURNING[channel]
 
 
 def written_sections(findings: Findings, environment: jinja2.Environment) -> list[dict[str, str]]:

@@ -17,9 +17,11 @@ from yid_ocp.diagnosis.words import fall_sentences
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.null_test import residual_series
 from yid_ocp.problem.prediction import EpisodeResult
-from yid_ocp.report import figures
-from yid_ocp.report.figures import Change, Curve, Ranked, Row
+from yid_ocp.report import charts, figures
+from yid_ocp.report.charts import Change, Ranked, Row
+from yid_ocp.report.figures import Curve
 from yid_ocp.report.sections.base import Findings, section
+from yid_ocp.report.tables import error_words, readable
 
 Array = NDArray[np.float64]
 
@@ -66,14 +68,8 @@ def prepare(findings: Findings) -> Mapping[str, Any] | None:
             "curves": _curves(finding, findings.more["predictions"]),
             "absorbed": _absorbed(finding),
         }
-    return {
-        "result": result,
-        "chapters": chapters,
-        "channels": list(result["gap"]["before"]["rmse"]),
-        "which": result["which"][:LISTED],
-        "more": max(len(result["which"]) - LISTED, 0),
-        "places": [place for place in result["where"] if place["share"] > 0.005],
-    }
+    shown = [chapter for chapter in chapters.items() if chapter[1] is not None]
+    return {"chapters": dict(shown)} if shown else None
 
 
 # -- the gap ----------------------------------------------------------------------------------------------------------
@@ -88,7 +84,7 @@ def _gap(finding: Finding) -> Chapter:
         by_unit.setdefault(unit, {})[channel] = Change(error, later, mark=floor.get(channel))
     pictures = []
     for unit, rows in by_unit.items():
-        factor, shown = _readable(unit, [row.before for row in rows.values()])
+        factor, shown = readable(unit)
         scaled = {
             name: Change(
                 factor * row.before,
@@ -98,7 +94,7 @@ def _gap(finding: Finding) -> Chapter:
             for name, row in rows.items()
         }
         words = (NOMINAL, EXTENDED, "noise alone")
-        pictures.append(("", figures.html(figures.changes(scaled, f"held-out error (rms) [{shown}]", words))))
+        pictures.append(("", figures.html(charts.changes(scaled, f"held-out error (rms) [{shown}]", words))))
     first, last = finding.held_out_before.chi2_per_dof, finding.remaining.chi2_per_dof
     sentences = [
         "Errors on recordings that no fit has touched, channel by channel; the tick is what noise alone gives."
@@ -133,14 +129,8 @@ def _floor(finding: Finding) -> dict[str, float]:
     return {entry.channel: math.sqrt(width.get(entry.channel, 1)) * entry.std for entry in finding.floor}
 
 
-def _readable(unit: str, values: Sequence[float]) -> tuple[float, str]:
-    """Factor and unit in which lengths of some millimetres are not all zeros."""
-    return (1e3, "mm") if unit == "m" and max(map(abs, values), default=1.0) < 0.1 else (1.0, unit)
-
-
 def _amount(value: float, unit: str) -> str:
-    factor, shown = _readable(unit, [value])
-    return f"{factor * value:.3g} {shown}"
+    return " ".join(error_words(value, unit))
 
 
 # -- where ------------------------------------------------------------------------------------------------------------
@@ -187,7 +177,7 @@ def _where(finding: Finding) -> Chapter | None:
             source = trace.sources[k]
             group = f"{source.location} {source.kind} [{unit}]"
             rows.append(Row(trace.unknowns[k], group, values[:, k], texts))
-        pictures.append((f"Recording {trace.recording}", figures.html(figures.time_map(trace.edges, rows, axis))))
+        pictures.append((f"Recording {trace.recording}", figures.html(charts.time_map(trace.edges, rows, axis))))
         if i == 0:
             sentences.append(_surest(smoothed, shown, None if blank else values))
     if pictures:
@@ -294,8 +284,8 @@ def _which(finding: Finding, result: Mapping[str, Any]) -> Chapter | None:
         ]
     else:
         sentences = [f"W{promise}", "No candidate promised enough to be refitted."]
-    axis = "promised where fitted [%]" if percent else "promised fall of r'r [1]"
-    picture = figures.html(figures.ranking(entries, "closed on held-out motions [%]", axis))
+    # beside each other on a phone there is room for a word
+    picture = figures.html(charts.ranking(entries, "closed [%]", "promised [%]" if percent else "promised [1]"))
     title = "What each effect could explain" if finding.verdict == "no_gap" else "Which effect makes it"
     return Chapter(title, sentences, [("", picture)])
 
@@ -331,7 +321,7 @@ def _alike(finding: Finding, result: Mapping[str, Any]) -> Chapter | None:
         "can; 100 % cannot be told apart by these motions and sensors, whatever the residual is.",
         f"Alike: {listed}." if close else f"No two of them are alike; the closest are {a} and {b} ({100 * v:.0f} %).",
     ]
-    picture = figures.matrix(names, values, "trace of", "explained by [%]")
+    picture = charts.matrix(names, values, "trace of", "explained by [%]")
     return Chapter("What could be mistaken for what", sentences, [("", figures.html(picture))])
 
 
@@ -355,14 +345,8 @@ def _curves(finding: Finding, predicted: Sequence[Prediction]) -> Chapter | None
                     continue
                 squares = [float(np.sum(((line - y)[seen] / std[seen]) ** 2)) for line in lines.values()]
                 name = channel if sensor.width == 1 else f"{channel}, {'xyz'[column % 3]}"
-                factor, unit = _readable(
-                    sensor.unit, [float(np.max(np.abs((line - y)[seen]))) for line in lines.values()]
-                )
-                noise = float(np.median(std[seen])) * factor
-                course = Curve(f"{name}<br>[{sensor.unit}]", t, y, {n: (t, line) for n, line in lines.items()})
-                errors = {n: _in_pieces(t[seen], factor * (line - y)[seen]) for n, line in lines.items()}
-                error = Curve(f"error [{unit}]", t[:0], y[:0], errors, 2 * noise)
-                found.append((squares[0] - (squares[1] if changed else 0.0), episode.name, course, error))
+                pair = figures.compared(name, sensor.unit, t, y, std, lines)
+                found.append((squares[0] - (squares[1] if changed else 0.0), episode.name, *pair))
     if not found:
         return None
     found.sort(key=lambda entry: -entry[0])
@@ -385,13 +369,6 @@ def _curves(finding: Finding, predicted: Sequence[Prediction]) -> Chapter | None
     return Chapter("Measured and predicted", sentences, pictures)
 
 
-def _in_pieces(t: Array, values: Array) -> tuple[Array, Array]:
-    """A line that is broken where nothing was measured for long."""
-    steps = np.diff(t)
-    breaks = np.flatnonzero(steps > 5 * np.median(steps)) + 1 if len(steps) else np.zeros(0, int)
-    return np.insert(t, breaks, t[breaks]), np.insert(values, breaks, np.nan)
-
-
 def _absorbed(finding: Finding) -> Chapter | None:
     if not finding.effects or not finding.absorbed:
         return None
@@ -400,7 +377,7 @@ def _absorbed(finding: Finding) -> Chapter | None:
         std = finding.nominal.std.get(entry.name, 0.0)
         by_unit.setdefault(entry.unit, {})[entry.name] = Change(entry.before, entry.after, std, entry.std)
     words = ("fitted without the effects", EXTENDED, "")
-    pictures = [("", figures.html(figures.changes(rows, f"value [{unit}]", words))) for unit, rows in by_unit.items()]
+    pictures = [("", figures.html(charts.changes(rows, f"value [{unit}]", words))) for unit, rows in by_unit.items()]
     moved = [e for e in finding.absorbed if abs(e.after - e.before) > 0.1 * max(abs(e.before), 1e-9)]
     moved.sort(key=lambda e: -abs(e.after - e.before) / max(abs(e.before), 1e-9))
     said = ", ".join(f"{e.name} goes from {e.before:.3g} to {e.after:.3g} {e.unit}" for e in moved[:4])

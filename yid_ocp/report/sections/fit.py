@@ -10,69 +10,50 @@ import numpy as np
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.prediction import EpisodeResult
 from yid_ocp.report import figures
+from yid_ocp.report.figures import Curve
 from yid_ocp.report.sections.base import Findings, section
-from yid_ocp.report.tables import held_out_rows, medians
 from yid_ocp.sensors import Sensor
-from yid_ocp.solvers.words import fit_words
 
 MOST_PICTURES = 24  # a page with more is too heavy to open; result.json and trajectories.h5 have them all
-WORDS = {
-    "stays": "points stay where they were first seen",
-    "zero": "an effort of zero",
-    "moves_with_clamps": "points move with the mean of the clamps",
-    "linear_carry": "the clamps' motion carried along the cable",
-}
 
 
 @section("fit", 20, "How well it fits")
 def prepare(findings: Findings) -> Mapping[str, Any] | None:
-    """Errors per channel, curves and the histogram of whitened residuals."""
+    """Measured and predicted over time with what is left, and the histogram of whitened residuals."""
     if findings.problem is None or not findings.episodes:
         return None
-    result = findings.result
     pictures: list[tuple[str, str]] = []
     left = 0
     for role, episode, outcome in findings.episodes:
-        for title, picture in _pictures(findings, role, episode, outcome):
+        for title, curves in _pictures(findings, role, episode, outcome):
             if len(pictures) < MOST_PICTURES:
                 role_words = "held out" if role == "held_out" else "estimated on"
-                pictures.append((f"{title} in {episode.name} ({role_words})", figures.html(picture)))
+                pictures.append((f"{title} in {episode.name} ({role_words})", figures.html(figures.over_time(curves))))
             else:
                 left += 1
     residuals = _whitened(findings)
-    rows = held_out_rows(result)
-    return {
-        "residuals": result.get("residuals", {}),
-        "held_out": rows,
-        "medians": medians(rows),
-        "unpredicted": [entry for entry in result.get("held_out", []) if "message" in entry],
-        "words": WORDS,
-        "pictures": pictures,
-        "left": left,
-        "histogram": figures.html(figures.residual_histogram(residuals)) if residuals else None,
-        "fit": None if "fit" not in result else fit_words(result["fit"]["chi2_per_dof"], result["fit"]["explains"]),
-    }
+    histogram = figures.html(figures.residual_histogram(residuals)) if residuals else None
+    return {"pictures": pictures, "left": left, "histogram": histogram}
 
 
-def _pictures(findings: Findings, role: str, episode: Episode, outcome: EpisodeResult) -> list[tuple[str, Any]]:
+def _pictures(findings: Findings, role: str, episode: Episode, outcome: EpisodeResult) -> list[tuple[str, list[Curve]]]:
     assert findings.problem is not None
     step = findings.problem.step.time_step
     found = []
     for samples, predicted in zip(episode.samples, outcome.predicted, strict=True):
         t = episode.grid.start + step * (samples.node + samples.fraction)
-        sensor = samples.sensor
-        if sensor.width == 1:
-            names = [channel.rsplit(".", 1)[1] for channel in sensor.channels]
-            curves = {name: (t, samples.value[:, i], t, predicted[:, i]) for i, name in enumerate(names)}
-            found.append((sensor.group, figures.measured_and_predicted(curves, sensor.unit)))
-            continue
-        t_model, course = t, predicted
-        if len(t) < episode.grid.steps / 2:
-            t_model, course = episode.grid.times, _course(findings, role, episode, outcome, sensor)
-        for c, channel in enumerate(sensor.channels):
-            at = 3 * c
-            curves = {axis: (t, samples.value[:, at + i], t_model, course[:, at + i]) for i, axis in enumerate("xyz")}
-            found.append((channel, figures.measured_and_predicted(curves, sensor.unit)))
+        sensor, course = samples.sensor, None
+        if sensor.width == 3 and len(t) < episode.grid.steps / 2:
+            course = _course(findings, role, episode, outcome, sensor)
+        for c, channel in enumerate(sensor.channels) if sensor.width == 3 else [(0, sensor.group)]:
+            columns = [3 * c + i for i in range(3)] if sensor.width == 3 else range(len(sensor.channels))
+            curves: list[Curve] = []
+            for i in columns:
+                name = "xyz"[i % 3] if sensor.width == 3 else sensor.channels[i].rsplit(".", 1)[1]
+                told = (t, samples.value[:, i], samples.std[:, i], {"predicted": predicted[:, i]})
+                smooth = None if course is None else (episode.grid.times, course[:, i])
+                curves += figures.compared(name, sensor.unit, *told, smooth)
+            found.append((channel, curves))
     return found
 
 

@@ -1,4 +1,4 @@
-"""What the run was made from: hashes and versions."""
+"""What the run was made from: when, by which command, inputs with hashes, versions."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ from yid_ocp.report.sections.base import Findings, section
 
 @section("inputs", 90, "What it was made from")
 def prepare(findings: Findings) -> Mapping[str, Any] | None:
-    """Inputs with their hashes, versions, and notes on values that are not numbers."""
+    """Date and command line, inputs with their hashes, versions, and notes on values that are not numbers."""
     result = findings.result
-    if "inputs" not in result:
+    if "versions" not in result:
         return None
-    return {"inputs": result["inputs"], "versions": result["versions"], "notes": result.get("notes", [])}
+    parts = {"date": "", "inputs": {}, "notes": []}
+    known = {"versions": result["versions"], "command": result.get("again", result.get("command", ""))}
+    return known | {name: result.get(name, empty) for name, empty in parts.items()}

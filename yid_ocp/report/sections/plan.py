@@ -1,39 +1,39 @@
-"""What a planned motion reaches, and what it asks of the joints."""
+"""A planned motion over time."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from yid_ocp.report.figures import Curve, html, lines_over_time
-from yid_ocp.report.sections.base import Findings, section
-from yid_ocp.report.tables import plan_rows, plan_sentences
+from yid_ocp.report.sections.base import Findings, joint_unit, section
 
 
-@section("plan", 5, "The planned motion")
+@section("plan", 10, "The planned motion")
 def prepare(findings: Findings) -> Mapping[str, Any] | None:
-    """Sentences, the table of joints, and figures of the point and the joints."""
+    """How far the point is from its place, and the joints, over time."""
     found = findings.more.get("plan")
     if found is None:
         return None
     where = found.points.get(findings.result["point"])
     empty = np.zeros(0)
+    unit = partial(joint_unit, found.mover.step.system, found.joints)
     curves = []
     if where is not None:
         off = 1e3 * (where - found.place)
         lines = {axis: (found.t, off[:, i]) for i, axis in enumerate("xyz")}
         curves.append(Curve("from the place [mm]", empty, empty, lines, 1e3 * findings.result["tolerance"]))
     moved = {name: (found.t, found.position[:, i] - found.position[0, i]) for i, name in enumerate(found.joints)}
-    curves.append(Curve("joints, from the start [rad or m]", empty, empty, moved))
+    curves.append(Curve(f"joints, from the start [{unit('position')}]", empty, empty, moved))
     curves.append(
-        Curve("effort [N m or N]", empty, empty, {n: (found.t, found.effort[:, i]) for i, n in enumerate(found.joints)})
+        Curve(
+            f"effort [{unit('effort')}]",
+            empty,
+            empty,
+            {n: (found.t, found.effort[:, i]) for i, n in enumerate(found.joints)},
+        )
     )
-    head, *rows = plan_rows(findings.result)
-    return {
-        "sentences": [f"{findings.result['status']}: {findings.result['message']}", *plan_sentences(findings.result)],
-        "head": head,
-        "rows": rows,
-        "figures": [html(lines_over_time(curve)) for curve in curves],
-    }
+    return {"figures": [html(lines_over_time(curve)) for curve in curves]}

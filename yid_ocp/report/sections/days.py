@@ -1,0 +1,22 @@
+"""Parameters of several runs beside each other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from yid_ocp.report import charts, figures
+from yid_ocp.report.sections.base import Findings, section
+
+
+@section("days", 10, "From run to run")
+def prepare(findings: Findings) -> Mapping[str, Any] | None:
+    """Values with two standard deviations, run by run, of a history or of a batch of one model."""
+    result = findings.result if findings.result.get("format") == "yid-history/1" else findings.result.get("history")
+    if not result or result.get("format") != "yid-history/1":
+        return None
+    by_unit: dict[str, dict[str, dict[str, tuple[float, float | None]]]] = {}
+    for name, entry in result["parameters"].items():
+        told = {run: (own["value"], own["std"]) for run, own in entry["values"].items()}
+        by_unit.setdefault(entry["unit"], {})[name] = told
+    return {"pictures": [("", figures.html(charts.side_by_side(rows, unit))) for unit, rows in by_unit.items()]}

@@ -1,0 +1,23 @@
+"""Estimates beside their starts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from yid_ocp.report import charts, figures
+from yid_ocp.report.sections.base import Findings, section
+
+
+@section("estimates", 10, "Estimates")
+def prepare(findings: Findings) -> Mapping[str, Any] | None:
+    """Free parameters with two standard deviations, those that cannot be trusted apart; one figure for each unit."""
+    result = findings.result
+    by_unit: dict[str, dict[str, tuple[float, float | None, float, bool]]] = {}
+    for name, entry in result.get("parameters", {}).items():
+        if entry.get("free") and "initial" in entry:
+            found = entry["verdict"] not in ("not_identifiable", "not_trusted") and result["status"] != "failed"
+            by_unit.setdefault(entry["unit"], {})[name] = (entry["value"], entry["std"], entry["initial"], found)
+    if not by_unit:
+        return None
+    return {"pictures": [figures.html(charts.estimates(values, unit)) for unit, values in by_unit.items()]}

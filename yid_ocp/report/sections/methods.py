@@ -1,0 +1,32 @@
+"""Methods beside each other: how their costs fell, and what they estimate."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from yid_ocp.analysis.compare import Comparison
+from yid_ocp.report import charts, figures
+from yid_ocp.report.sections.base import Findings, section
+
+
+@section("methods", 10, "Methods")
+def prepare(findings: Findings) -> Mapping[str, Any] | None:
+    """Estimates of every method, and its cost over time."""
+    comparison: Comparison | None = findings.more.get("comparison")
+    if comparison is None:
+        return None
+    judged = findings.result["judged"]["parameters"]
+    by_unit: dict[str, dict[str, dict[str, tuple[float, float | None]]]] = {}
+    for name, entry in judged.items():
+        if entry["free"]:
+            own = {m: e["parameters"][name] for m, e in findings.result["methods"].items()}
+            told = {method: (found["value"], found["std"]) for method, found in own.items()}
+            by_unit.setdefault(entry["unit"], {})[name] = told
+    pictures = [("Estimates", figures.html(charts.side_by_side(rows, unit))) for unit, rows in by_unit.items()]
+    fallen = {}
+    for run in comparison.runs:
+        history = [entry for entry in run.solution.history if not entry.note]
+        fallen[run.method] = ([entry.seconds for entry in history], [entry.cost for entry in history])
+    pictures.append(("Cost over time", figures.html(figures.falling(fallen))))
+    return {"pictures": pictures}

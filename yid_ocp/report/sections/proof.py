@@ -1,0 +1,45 @@
+"""Pictures of a blind proof: what is detected, and whether intervals and p-values keep what they promise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from yid_ocp.report import charts, figures
+from yid_ocp.report.sections.base import Findings, section
+
+CALIBRATED = {"intervals": "intervals of effects' parameters", "p_values": "p-values of clean recordings"}
+
+
+@section("proof", 10, "What was seen and named")
+def prepare(findings: Findings) -> Mapping[str, Any] | None:
+    """Detection against size, what was said of what, and calibration, as far as there are cases for them."""
+    result = findings.result
+    if result.get("format") != "yid-blind/1":
+        return None
+    pictures = []
+    sizes = {
+        label: {float(size): own[key] for size, own in result["detection_intervals"].items()}
+        for key, label in (("gap", "gap seen"), ("right", "named right"))
+    }
+    if result["detection"]:
+        picture = figures.rates(sizes, "size over the detectable size", "part of the cases", log_x=True)
+        pictures.append(("Detection by size, with binomial 95 % intervals", figures.html(picture)))
+    shown = result["confusion"]
+    counts = np.array(shown["counts"], float).reshape(len(shown["true"]), len(shown["said"]))
+    if counts.size:
+        picture = charts.counted(shown["true"], shown["said"], counts, "true", "said first")
+        pictures.append(("What was said of what", figures.html(picture)))
+    kept = {
+        label: {entry["level"]: entry for entry in result["calibration"][key] if entry["of"]}
+        for key, label in (
+            ("intervals", "intervals of effects' parameters"),
+            ("p_values", "p-values of clean recordings"),
+        )
+    }
+    if any(kept.values()):
+        picture = figures.rates(kept, "promised", "kept", diagonal=True)
+        pictures.append(("What is promised, and what is kept", figures.html(picture)))
+    return {"pictures": pictures} if pictures else None

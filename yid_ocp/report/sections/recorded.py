@@ -1,0 +1,52 @@
+"""What recordings hold, group by group."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from yid_ocp.data.recording import JointGroup, Recording
+from yid_ocp.model.system import System
+from yid_ocp.report import figures
+from yid_ocp.report.figures import Curve
+from yid_ocp.report.sections.base import Findings, joint_unit, section
+
+MOST = 3  # recordings that are drawn
+MOST_POINTS = 6  # points of a group; more are in the recording
+CHANNELS = ("position", "velocity", "effort", "position_command")
+
+
+@section("recorded", 30, "What was recorded")
+def prepare(findings: Findings) -> Mapping[str, Any] | None:
+    """Joints' channels and points over time."""
+    recordings: list[Recording] = findings.more.get("recordings", [])[:MOST]
+    system: System | None = findings.more.get("system")
+    pictures = [
+        (f"{title} of {recording.name}", figures.html(figures.lines_over_time(curve)))
+        for recording in recordings
+        for title, curve in _curves(recording, system)
+    ]
+    return {"pictures": pictures} if pictures else None
+
+
+def _curves(recording: Recording, system: System | None) -> list[tuple[str, Curve]]:
+    empty, found = np.zeros(0), []
+    for group in recording.groups:
+        if isinstance(group, JointGroup):
+            for channel in CHANNELS:
+                unit = joint_unit(system, group.names, channel)
+                values = group.channels.get(channel)
+                if values is not None:
+                    lines = {name: (group.t, values[:, i]) for i, name in enumerate(group.names)}
+                    title = f"{channel.replace('_', ' ')} [{unit}]"
+                    found.append((f"Joints: {channel.replace('_', ' ')}", Curve(title, empty, empty, lines)))
+            continue
+        lines = {
+            f"{name}.{axis}": (group.t, group.position[:, i, c])
+            for i, name in enumerate(group.names[:MOST_POINTS])
+            for c, axis in enumerate("xyz")
+        }
+        found.append((f"Points: {group.name}", Curve("position [m]", empty, empty, lines)))
+    return found

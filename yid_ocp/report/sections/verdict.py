@@ -1,0 +1,37 @@
+"""What a command found, first of all: its verdict in the words of the terminal, and the table beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from yid_ocp.report.blocks import Block, Statement, Table
+from yid_ocp.report.sections.base import Findings, section
+from yid_ocp.report.summaries import SUMMARIES
+
+
+@section("verdict", 0, "What was found")
+def prepare(findings: Findings) -> Mapping[str, Any] | None:
+    """Conclusions and verdicts, and all up to the table that stands beside them."""
+    blocks = summary(findings)
+    if not blocks:
+        return None
+    told = [block for block in blocks if isinstance(block, Statement)]
+    said = [block.text for weight in ("conclusion", "verdict") for block in told if block.weight == weight]
+    return {"verdict": said, "blocks": without_verdicts(blocks[: key(blocks)])}
+
+
+def summary(findings: Findings) -> list[Block]:
+    """All that is said of a result; nothing of a format that is not known."""
+    known = SUMMARIES.get(str(findings.result.get("format")))
+    return [] if known is None else known(findings.result)
+
+
+def key(blocks: list[Block]) -> int:
+    """Where what stands beside the verdict ends."""
+    return next((i + 1 for i, block in enumerate(blocks) if isinstance(block, Table) and block.key), 0)
+
+
+def without_verdicts(blocks: list[Block]) -> list[Block]:
+    """What is left when the verdicts have been said."""
+    return [block for block in blocks if not (isinstance(block, Statement) and block.weight != "note")]
