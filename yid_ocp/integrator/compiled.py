@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -17,6 +18,7 @@ from yid_ocp.integrator.step_model import (
     Directions,
     Feedback,
     Gradient,
+    Member,
     Rollout,
     StepCode,
     StepLinearization,
@@ -26,9 +28,12 @@ from yid_ocp.integrator.step_model import (
     ended,
     out_of_memory,
 )
-from yid_ocp.parallel import Once
+from yid_ocp.parallel import Once, map_threads
 
 Array = NDArray[np.float64]
+
+FEWEST = 2
+"""Members for which a batch pays: it costs about as much as so many one by one."""
 
 
 class _Struct(ctypes.Structure):
@@ -103,6 +108,7 @@ class _Linearization(_Struct):
 class _Outcome(_Struct):
     _fields_ = (
         ("step", ctypes.c_int),
+        ("status", ctypes.c_int),
         ("error", ctypes.c_double),
         ("iterations", ctypes.c_longlong),
         ("factorisations", ctypes.c_longlong),
@@ -146,12 +152,13 @@ class CompiledKernel:
     def __init__(self, model: StepModel, library: ctypes.CDLL) -> None:
         self._model = model
         self._library = library
+        self._batched: Once[None, tuple[ctypes.CDLL, int] | None] = Once(lambda _: _batched_library(model))
         self._theta_columns: Once[tuple[str, ...], _ThetaColumns] = Once(lambda names: _theta_columns(model, names))
 
     def of(self, model: StepModel) -> CompiledKernel:
         """See `Kernel.of`."""
         other = CompiledKernel(model, self._library)
-        other._theta_columns = self._theta_columns
+        other._theta_columns, other._batched = self._theta_columns, self._batched
         return other
 
     def rollout(
@@ -164,25 +171,73 @@ class CompiledKernel:
         wanted: Directions | None,
     ) -> Rollout:
         """See `Kernel.rollout`."""
-        count = None if wanted is None else wanted.count
-        out = empty_rollout(self._model.sizes, len(torque), count)
-        out.state[0] = start
-        sensitivities, directions = None, None
-        if wanted is not None and out.by_state is not None:
-            out.by_state[0] = wanted.start
-            given = _doubles(wanted.torque), _doubles(wanted.path)
-            sensitivities = _filled(_Sensitivities, out.by_state, out.by_multipliers, out.by_effort, *given)
-            directions = self._directions(wanted.names, wanted.count)
-        outcome = _Outcome()
-        code = self._library.yid_rollout(
-            ctypes.byref(self._motion(len(torque), theta, torque, path, feedback, directions)),
-            ctypes.byref(_filled(_Trajectory, out.state, out.multipliers, out.effort, out.torque)),
-            None if sensitivities is None else ctypes.byref(sensitivities),
-            ctypes.byref(outcome),
+        return self._rolled_out(self._library, [Member(theta, start, torque, path, feedback, wanted)])[0]
+
+    def rollouts(self, members: Sequence[Member]) -> list[Rollout]:
+        """See `Kernel.rollouts`."""
+        alike: dict[Hashable, list[int]] = {}
+        for i, member in enumerate(members):
+            alike.setdefault(_sort(member), []).append(i)
+        batches = [part for group in alike.values() for part in self._split(group)]
+
+        def one(batch: Sequence[int]) -> list[Rollout]:
+            return self._together([members[i] for i in batch])
+
+        found: dict[int, Rollout] = {}
+        for batch, rollouts in zip(batches, map_threads(one, batches), strict=True):
+            found |= zip(batch, rollouts, strict=True)
+        return [found[i] for i in range(len(members))]
+
+    def _split(self, group: Sequence[int]) -> list[Sequence[int]]:
+        """Batches of members that are alike, and single ones where too few are left for a batch to pay."""
+        known = self._batched(None) if len(group) >= FEWEST else None
+        if known is None:
+            return [[i] for i in group]
+        parts = [group[at : at + known[1]] for at in range(0, len(group), known[1])]
+        if len(parts[-1]) < FEWEST:
+            parts[-1:] = [[i] for i in parts[-1]]
+        return parts
+
+    def _together(self, members: Sequence[Member]) -> list[Rollout]:
+        known = self._batched(None) if len(members) > 1 else None
+        if known is None:
+            return [self._rolled_out(self._library, [member])[0] for member in members]
+        found = self._rolled_out(known[0], members)
+        # a batch knows simplified Newton only; what needs more, and what fails, is told by the kernel of one member
+        return [
+            rollout if rollout.status.ok else self._rolled_out(self._library, [member])[0]
+            for rollout, member in zip(found, members, strict=True)
+        ]
+
+    def _rolled_out(self, library: ctypes.CDLL, members: Sequence[Member]) -> list[Rollout]:
+        """Rollouts by one call of the kernel of one member, or of a batch."""
+        sizes = self._model.sizes
+        outs, motions, trajectories, sensitivities = [], [], [], []
+        for m in members:
+            out = empty_rollout(sizes, len(m.torque), None if m.wanted is None else m.wanted.count)
+            out.state[0] = m.start
+            directions = None
+            if m.wanted is not None and out.by_state is not None:
+                out.by_state[0] = m.wanted.start
+                given = _doubles(m.wanted.torque), _doubles(m.wanted.path)
+                sensitivities.append(_filled(_Sensitivities, out.by_state, out.by_multipliers, out.by_effort, *given))
+                directions = self._directions(m.wanted.names, m.wanted.count)
+            motions.append(self._motion(len(m.torque), m.theta, m.torque, m.path, m.feedback, directions))
+            trajectories.append(_filled(_Trajectory, out.state, out.multipliers, out.effort, out.torque))
+            outs.append(out)
+        outcomes = (_Outcome * len(members))()
+        code = library.yid_rollout(
+            ctypes.c_int(len(members)),
+            (_Motion * len(members))(*motions),
+            (_Trajectory * len(members))(*trajectories),
+            (_Sensitivities * len(members))(*sensitivities) if sensitivities else None,
+            outcomes,
         )
-        self._check(code, outcome)
-        counts = outcome.iterations, outcome.factorisations
-        return ended(out, self._model.sizes, code, outcome.step, outcome.error, counts)
+        self._check(code, outcomes[0])
+        return [
+            ended(out, sizes, o.status, o.step, o.error, (o.iterations, o.factorisations))
+            for out, o in zip(outs, outcomes, strict=True)
+        ]
 
     def adjoint(
         self,
@@ -302,6 +357,23 @@ class CompiledKernel:
     def _check(self, code: int, outcome: _Outcome) -> None:
         if code == StepCode.OUT_OF_MEMORY:
             raise out_of_memory("the work on one step", outcome.memory)
+
+
+def _sort(member: Member) -> Hashable:
+    """What members of one batch have in common."""
+    feedback, wanted = member.feedback, member.wanted
+    fed = None if feedback is None else tuple(np.asarray(feedback.index).tolist())
+    if wanted is None:
+        return fed, None
+    return fed, (wanted.count, wanted.torque is None, wanted.path is None)
+
+
+def _batched_library(model: StepModel) -> tuple[ctypes.CDLL, int] | None:
+    """The kernel of a batch and how many members it takes; None where compiler or machine have no vectors for it."""
+    source = codegen.kernel_source(model.functions, model.structure, batched=True)
+    library = None if source is None else compiler.compile_library(source)
+    count = 0 if library is None else int(library.yid_lanes())
+    return None if library is None or count < FEWEST else (library, count)
 
 
 def _theta_columns(model: StepModel, names: tuple[str, ...]) -> _ThetaColumns:
