@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
@@ -28,12 +29,14 @@ from yid_ocp.integrator.step_model import (
     ended,
     out_of_memory,
 )
-from yid_ocp.parallel import Once, map_threads
+from yid_ocp.parallel import Once, map_threads, threads
 
 Array = NDArray[np.float64]
 
-FEWEST = 2
-"""Members for which a batch pays: it costs about as much as so many one by one."""
+BATCH, BATCH_PER_COLUMN = 1.7, 0.11
+"""What a batch costs, however many its members: so many rollouts of one member, and more for each column."""
+WORTH = 50_000
+"""Steps of members that could have marched together, from which on it is worth compiling what that takes."""
 
 
 class _Struct(ctypes.Structure):
@@ -152,6 +155,7 @@ class CompiledKernel:
     def __init__(self, model: StepModel, library: ctypes.CDLL) -> None:
         self._model = model
         self._library = library
+        self._wished = 0  # steps for which a batch would have been the better way
         self._batched: Once[None, tuple[ctypes.CDLL, int] | None] = Once(lambda _: _batched_library(model))
         self._theta_columns: Once[tuple[str, ...], _ThetaColumns] = Once(lambda names: _theta_columns(model, names))
 
@@ -178,7 +182,10 @@ class CompiledKernel:
         alike: dict[Hashable, list[int]] = {}
         for i, member in enumerate(members):
             alike.setdefault(_sort(member), []).append(i)
-        batches = [part for group in alike.values() for part in self._split(group)]
+        batches: list[Sequence[int]] = []
+        for group in alike.values():
+            steps = sum(len(members[i].torque) for i in group)
+            batches += self._split(group, _width(members[group[0]]), steps)
 
         def one(batch: Sequence[int]) -> list[Rollout]:
             return self._together([members[i] for i in batch])
@@ -188,15 +195,23 @@ class CompiledKernel:
             found |= zip(batch, rollouts, strict=True)
         return [found[i] for i in range(len(members))]
 
-    def _split(self, group: Sequence[int]) -> list[Sequence[int]]:
-        """Batches of members that are alike, and single ones where too few are left for a batch to pay."""
-        known = self._batched(None) if len(group) >= FEWEST else None
-        if known is None:
-            return [[i] for i in group]
-        parts = [group[at : at + known[1]] for at in range(0, len(group), known[1])]
-        if len(parts[-1]) < FEWEST:
-            parts[-1:] = [[i] for i in parts[-1]]
-        return parts
+    def _split(self, group: Sequence[int], width: int, steps: int) -> list[Sequence[int]]:
+        """Batches of members that are alike, and single ones where threads are done with them sooner."""
+        cost = BATCH + BATCH_PER_COLUMN * width
+        singles = list(group)
+        batches: list[Sequence[int]] = []
+        if math.ceil(len(singles) / threads()) >= cost:
+            self._wished += steps
+        while (
+            self._wished > WORTH
+            and math.ceil(len(singles) / threads()) >= cost
+            and (known := self._batched(None)) is not None
+        ):
+            if known[1] < cost:
+                break
+            batches.append(singles[: known[1]])
+            singles = singles[known[1] :]
+        return [*batches, *([i] for i in singles)]
 
     def _together(self, members: Sequence[Member]) -> list[Rollout]:
         known = self._batched(None) if len(members) > 1 else None
@@ -368,12 +383,17 @@ def _sort(member: Member) -> Hashable:
     return fed, (wanted.count, wanted.torque is None, wanted.path is None)
 
 
+def _width(member: Member) -> int:
+    """Columns of derivatives."""
+    return 0 if member.wanted is None else member.wanted.count
+
+
 def _batched_library(model: StepModel) -> tuple[ctypes.CDLL, int] | None:
     """The kernel of a batch and how many members it takes; None where compiler or machine have no vectors for it."""
     source = codegen.kernel_source(model.functions, model.structure, batched=True)
     library = None if source is None else compiler.compile_library(source)
     count = 0 if library is None else int(library.yid_lanes())
-    return None if library is None or count < FEWEST else (library, count)
+    return None if library is None or not count else (library, count)
 
 
 def _theta_columns(model: StepModel, names: tuple[str, ...]) -> _ThetaColumns:

@@ -47,6 +47,7 @@ typedef struct {
     long long *iw;
     void *block;
     mask factored;
+    int age; /* of the factors [steps] */
     whole iterations, factorisations;
 } Work;
 
@@ -378,6 +379,11 @@ static void settle_multipliers(Work *k, const Point *a, const real *delta, mask 
     if (NC) pull_by(k, change);
 }
 
+/* Factors serve for so many steps, whatever they still do: when to renew them then does not depend on the members of a
+ * batch, all of which pay for it. */
+#define OLDEST 4
+#define SLOW 0.3 /* contraction that is worth a new factorisation at once */
+
 /* Simplified Newton with the factorisation at hand; refactorises where it contracts slowly. Which of the members at work
  * converged: those that did stay where they are, with the residual and the correction of that point, until all have. */
 static mask newton_chord(Work *k, const Point *a, real tolerance, int limit, mask at_work, real *error) {
@@ -404,7 +410,7 @@ static mask newton_chord(Work *k, const Point *a, real tolerance, int limit, mas
         left &= NOT(done);
         if (it > 0) {
             left &= NOT((rate > 0.9) & fresh);
-            const mask slow = left & (rate > 0.1);
+            const mask slow = left & (rate > SLOW);
             refactor |= slow;
             fresh &= NOT(slow);
         }
@@ -475,6 +481,10 @@ static mask one_step(Work *k, const Point *a, real tolerance, int limit, mask at
     memcpy(z_guess, a->z1, sizeof(double) * NZ);
     memcpy(lam_guess, a->lam, sizeof(double) * M);
 #endif
+    if (++k->age >= OLDEST) {
+        k->factored = NOT(EVERY);
+        k->age = 0;
+    }
     mask good = newton_chord(k, a, tolerance, 20, at_work, error);
 #if LANES == 1
     for (int attempt = 0; !good && attempt < 2; attempt++) {
@@ -892,6 +902,7 @@ int yid_rollout(int members, const Motion *motions, const Trajectory *outs, cons
         if (d && any(good)) {
             linearise(k, &a, 1);
             const mask solvable = NY ? factorise(k, EVERY, EVERY) : EVERY;
+            k->age = 0;
             columns.before = X[step % 2];
             columns.after = X[1 - step % 2];
             columns.input = columns.path = NULL;

@@ -12,3 +12,4 @@ from yid_ocp.parallel.threads import SYMBOLIC as SYMBOLIC
 from yid_ocp.parallel.threads import Once as Once
 from yid_ocp.parallel.threads import map_threads as map_threads
 from yid_ocp.parallel.threads import processors as processors
+from yid_ocp.parallel.threads import threads as threads
