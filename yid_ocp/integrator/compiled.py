@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import math
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
@@ -29,12 +28,14 @@ from yid_ocp.integrator.step_model import (
     ended,
     out_of_memory,
 )
-from yid_ocp.parallel import Once, map_threads, threads
+from yid_ocp.parallel import Once, ask_together, map_threads
 
 Array = NDArray[np.float64]
 
 BATCH, BATCH_PER_COLUMN = 1.7, 0.11
 """What a batch costs, however many its members: so many rollouts of one member, and more for each column."""
+GAIN = 2.0
+"""How many times its cost a batch must save: two threads could do so many members alone in the same time."""
 WORTH = 50_000
 """Steps of members that could have marched together, from which on it is worth compiling what that takes."""
 
@@ -179,13 +180,16 @@ class CompiledKernel:
 
     def rollouts(self, members: Sequence[Member]) -> list[Rollout]:
         """See `Kernel.rollouts`."""
+        return ask_together(self._rollouts, list(members))
+
+    def _rollouts(self, members: Sequence[Member]) -> list[Rollout]:
         alike: dict[Hashable, list[int]] = {}
         for i, member in enumerate(members):
             alike.setdefault(_sort(member), []).append(i)
-        batches: list[Sequence[int]] = []
+        # a batch takes as many columns and steps as its widest and longest member
         for group in alike.values():
-            steps = sum(len(members[i].torque) for i in group)
-            batches += self._split(group, _width(members[group[0]]), steps)
+            group.sort(key=lambda i: (_width(members[i]), len(members[i].torque)), reverse=True)
+        batches = [part for group in alike.values() for part in self._split(group, members)]
 
         def one(batch: Sequence[int]) -> list[Rollout]:
             return self._together([members[i] for i in batch])
@@ -195,23 +199,21 @@ class CompiledKernel:
             found |= zip(batch, rollouts, strict=True)
         return [found[i] for i in range(len(members))]
 
-    def _split(self, group: Sequence[int], width: int, steps: int) -> list[Sequence[int]]:
-        """Batches of members that are alike, and single ones where threads are done with them sooner."""
-        cost = BATCH + BATCH_PER_COLUMN * width
-        singles = list(group)
+    def _split(self, group: Sequence[int], members: Sequence[Member]) -> list[Sequence[int]]:
+        """Batches of members that are alike, and single ones where a batch would have too few.
+
+        As results differ by rounding, the same members are split in the same way whatever threads there are.
+        """
         batches: list[Sequence[int]] = []
-        if math.ceil(len(singles) / threads()) >= cost:
-            self._wished += steps
-        while (
-            self._wished > WORTH
-            and math.ceil(len(singles) / threads()) >= cost
-            and (known := self._batched(None)) is not None
-        ):
-            if known[1] < cost:
-                break
-            batches.append(singles[: known[1]])
-            singles = singles[known[1] :]
-        return [*batches, *([i] for i in singles)]
+        left = list(group)
+        fewest = max(GAIN * (BATCH + BATCH_PER_COLUMN * _width(members[left[0]])), 2.0)
+        if len(left) >= fewest:
+            self._wished += sum(len(members[i].torque) for i in left)
+        known = self._batched(None) if len(left) >= fewest and self._wished > WORTH else None
+        while known is not None and min(len(left), known[1]) >= fewest:
+            batches.append(left[: known[1]])
+            left = left[known[1] :]
+        return [*batches, *([i] for i in left)]
 
     def _together(self, members: Sequence[Member]) -> list[Rollout]:
         known = self._batched(None) if len(members) > 1 else None
@@ -377,10 +379,7 @@ class CompiledKernel:
 def _sort(member: Member) -> Hashable:
     """What members of one batch have in common."""
     feedback, wanted = member.feedback, member.wanted
-    fed = None if feedback is None else tuple(np.asarray(feedback.index).tolist())
-    if wanted is None:
-        return fed, None
-    return fed, (wanted.count, wanted.torque is None, wanted.path is None)
+    return None if feedback is None else tuple(np.asarray(feedback.index).tolist()), wanted is None
 
 
 def _width(member: Member) -> int:

@@ -779,8 +779,19 @@ static void gather(const double *const *from, size_t count, real *to) {
 
 /* Entries of one member back into its own array. */
 static void scatter(const real *from, size_t count, int lane, double *to) {
-    if ((const void *)from == (const void *)to) return;
     for (size_t i = 0; i < count; i++) to[i] = LANE(from[i], lane);
+}
+
+/* One member's rows of `own` columns, among those of `d` columns of all. */
+static void gather_columns(const double *from, size_t rows, size_t own, size_t d, int lane, real *to) {
+    for (size_t i = 0; i < rows; i++)
+        for (size_t c = 0; c < own; c++) LANE(to[i * d + c], lane) = from[i * own + c];
+}
+
+static void scatter_columns(const real *from, size_t rows, size_t own, size_t d, int lane, double *to) {
+    if ((const void *)from == (const void *)to) return;
+    for (size_t i = 0; i < rows; i++)
+        for (size_t c = 0; c < own; c++) to[i * own + c] = LANE(from[i * d + c], lane);
 }
 
 /* What a batch is given and carries from step to step; states are those of this node and of the two before. */
@@ -791,13 +802,15 @@ typedef struct {
 } March;
 
 /* Rollouts of so many members at once, with forward sensitivities where there are directions. Members have their own
- * number of steps; their directions and their feedback are alike in number and place. How each ended is in its outcome:
- * a batch leaves members that do not get through by simplified Newton alone to whoever asked. */
+ * number of steps and their own directions, if any has some; what their feedback reads is the same. How each ended is in
+ * its outcome: a batch leaves members that do not get through by simplified Newton alone to whoever asked. */
 int yid_rollout(int members, const Motion *motions, const Trajectory *outs, const Sensitivities *bys, Outcome *outcomes) {
     const Feedback *feedback = NU ? motions->feedback : NULL;
     const int feeds = feedback ? feedback->count : 0;
     const int *fed = feeds ? feedback->index : NULL;
-    const size_t d = motions->directions ? motions->directions->count : 0;
+    size_t d = 0; /* columns of the member with the most; those that others lack stay zero */
+    for (int lane = 0; lane < members && motions->directions; lane++)
+        if ((size_t)motions[lane].directions->count > d) d = motions[lane].directions->count;
     const size_t apart = LANES == 1 ? 0 : d; /* a single member's columns are worked out where they are wanted */
     memset(outcomes, 0, sizeof(Outcome) * members);
     Work *k = work_new(3 * NX + NTHETA + (NU + 1) * (size_t)feeds + NU + NC + d * (2 * NT + NY + NU + NQZ) +
@@ -844,9 +857,13 @@ int yid_rollout(int members, const Motion *motions, const Trajectory *outs, cons
     gather(from, NTHETA, m.theta);
     EACH from[lane] = out[lane]->state;
     gather(from, NX, m.x[0]);
-    if (apart) {
-        EACH from[lane] = by[lane]->state;
-        gather(from, NX * apart, X[0]);
+    size_t own[LANES];
+    int moves = 0, fed_forward = 0;
+    EACH {
+        own[lane] = d ? (size_t)motion[lane]->directions->count : 0;
+        moves |= d && by[lane]->path;
+        fed_forward |= d && by[lane]->torque;
+        if (apart) gather_columns(by[lane]->state, NX, own[lane], d, lane, X[0]);
     }
     prepare(k, m.theta, &m.time_step);
 
@@ -912,27 +929,31 @@ int yid_rollout(int members, const Motion *motions, const Trajectory *outs, cons
                 columns.multipliers = (real *)bys->multipliers + (size_t)step * M * d;
                 columns.effort = (real *)bys->effort + (size_t)step * NC * d;
             }
-            if (NU && (feeds || bys->torque)) {
+            if (NU && (feeds || fed_forward)) {
                 columns.input = columns.input_room;
                 memset(columns.input_room, 0, sizeof(real) * NU * d);
-                EACH if (bys->torque) from[lane] = by[lane]->torque + (size_t)row[lane] * NU * d;
-                if (bys->torque) gather(from, NU * d, columns.input_room);
+                EACH {
+                    const double *given = by[lane]->torque ? by[lane]->torque + row[lane] * NU * own[lane] : NULL;
+                    if (given) gather_columns(given, NU, own[lane], d, lane, columns.input_room);
+                }
                 feed_columns(feeds, fed, m.gain, (int)d, columns.before, columns.input_room);
             }
-            if (bys->path) {
-                columns.path = moved_path;
-                EACH from[lane] = by[lane]->path + (size_t)(row[lane] + 1) * NC * d;
-                if (LANES == 1) columns.path = (const real *)*from;
-                else gather(from, NC * d, moved_path);
+            if (moves) {
+                columns.path = LANES == 1 ? (const real *)bys->path + (size_t)(step + 1) * NC * d : moved_path;
+                EACH {
+                    const double *given = by[lane]->path ? by[lane]->path + (row[lane] + 1) * NC * own[lane] : NULL;
+                    if (given && LANES > 1) gather_columns(given, NC, own[lane], d, lane, moved_path);
+                }
             }
             if (any(solvable)) sensitivity_step(k, &a, (int)d, members, motions, &columns);
             for (int lane = 0; lane < members; lane++) {
                 if (!LANE(good, lane)) continue;
                 if (!LANE(solvable, lane)) outcomes[lane].status = SINGULAR;
                 else {
-                    scatter(columns.after, NX * d, lane, bys[lane].state + (size_t)(step + 1) * NX * d);
-                    scatter(columns.multipliers, M * d, lane, bys[lane].multipliers + (size_t)step * M * d);
-                    scatter(columns.effort, NC * d, lane, bys[lane].effort + (size_t)step * NC * d);
+                    const size_t of = own[lane], at = step;
+                    scatter_columns(columns.after, NX, of, d, lane, bys[lane].state + (at + 1) * NX * of);
+                    scatter_columns(columns.multipliers, M, of, d, lane, bys[lane].multipliers + at * M * of);
+                    scatter_columns(columns.effort, NC, of, d, lane, bys[lane].effort + at * NC * of);
                 }
             }
             m.running &= solvable | NOT(good);

@@ -29,7 +29,7 @@ def map_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> li
     if workers < 2:
         return [function(entry) for entry in entries]
     own = threads() // workers
-    with ThreadPoolExecutor(max_workers=workers, initializer=_take, initargs=(own,)) as pool:
+    with ThreadPoolExecutor(max_workers=workers, initializer=share_of_threads, initargs=(own,)) as pool:
         return list(pool.map(function, entries))
 
 
@@ -53,8 +53,8 @@ def threads() -> int:
     return min(own, getattr(_SHARE, "count", own))
 
 
-def _take(count: int) -> None:
-    """Leave so many threads to what the present one does."""
+def share_of_threads(count: int) -> None:
+    """Leave so many threads, at most, to what the present one does."""
     _SHARE.count = count
 
 

@@ -264,7 +264,7 @@ class Predictor:
     def run_all(
         self, asked: Sequence[tuple[Episode, Array, Array, Array | None]], derivatives: bool
     ) -> list[EpisodeResult | str]:
-        """Roll several episodes out, together where that pays, each from (episode, theta, offset, guess) as in `run`."""
+        """Roll several episodes out, together where that pays; each is given as (episode, theta, offset, guess)."""
 
         def part(some: Sequence[tuple[Episode, Array, Array, Array | None]]) -> list[EpisodeResult | str]:
             prepared = map_threads(lambda one: self._prepared(*one, derivatives), some)
