@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from yid_ocp.diagnosis.hypotheses import CandidateProblem, describe
 from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
 from yid_ocp.effects import EffectBase, Reported
-from yid_ocp.parallel import map_threads
+from yid_ocp.parallel import map_in_step
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.evaluation import Evaluation
@@ -315,7 +315,7 @@ def refit_all(
             search.progress(f"{done} with {effect.label}: held-out chi2/n {fit.loss.mean:.4g}")
         return fit
 
-    return [fit for fit in map_threads(one, tried) if fit is not None]
+    return [fit for fit in map_in_step(one, tried) if fit is not None]
 
 
 def block_length(episodes: Sequence[Episode]) -> float:

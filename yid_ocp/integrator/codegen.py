@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.integrator.discrete import DiscreteEquations
+from yid_ocp.integrator.lane_functions import lane_functions_source
 
 Indices = NDArray[np.int32]
 
@@ -232,8 +233,16 @@ def structure(functions: StepFunctions) -> Structure:
     return Structure(unknown_row, order, tuple(fill), ancestors, columns(rows_old), columns(p1_old), columns(p1_new))
 
 
-def kernel_source(functions: StepFunctions, tables: Structure) -> str:
-    """C source of the stepping kernel: sizes, tables, CasADi's functions, then `kernel.c`."""
+def kernel_source(functions: StepFunctions, tables: Structure, batched: bool = False) -> str | None:
+    """C source of the stepping kernel: `lanes.c`, CasADi's functions, sizes, tables, then `kernel.c`.
+
+    Parameters
+    ----------
+    functions : StepFunctions
+    tables : Structure
+    batched : bool
+        For several members at once, as many as `yid_lanes` says. None where a function has no form for that.
+    """
     e = functions.equations
     system = e.system
     n, nz, m = system.size, e.z0.numel(), e.lam.numel()
@@ -247,6 +256,7 @@ def kernel_source(functions: StepFunctions, tables: Structure) -> str:
         "NF": n - len(system.prescribed),
         "NY": len(tables.order),
         "NT": n + nz + m,
+        "NTHETA": e.theta.numel(),
         "NNZ_REST": patterns["rest"].nnz(),
         "NNZ_REST_P": patterns["rest_p"].nnz(),
         "NNZ_CONSTRAINT": patterns["constraint"].nnz(),
@@ -295,8 +305,14 @@ def kernel_source(functions: StepFunctions, tables: Structure) -> str:
         row, column = triplet(patterns[key])
         table(f"{key}_row", row)
         table(f"{key}_col", column)
-    body = resources.files("yid_ocp.integrator").joinpath("kernel.c").read_text(encoding="utf-8")
-    return "\n".join([functions_source("step", functions.all), *lines, body])
+    made = lane_functions_source(functions.all) if batched else functions_source("step", functions.all)
+    if made is None:
+        return None
+    arithmetic, kernel = (
+        resources.files("yid_ocp.integrator").joinpath(name).read_text(encoding="utf-8")
+        for name in ("lanes.c", "kernel.c")
+    )
+    return "\n".join(["#define BATCHED" if batched else "", arithmetic, made, *lines, kernel])
 
 
 def functions_source(name: str, functions: Sequence[ca.Function]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -17,6 +18,7 @@ from yid_ocp.integrator.step_model import (
     Directions,
     Feedback,
     Gradient,
+    Member,
     Rollout,
     StepCode,
     StepLinearization,
@@ -26,9 +28,16 @@ from yid_ocp.integrator.step_model import (
     ended,
     out_of_memory,
 )
-from yid_ocp.parallel import Once
+from yid_ocp.parallel import Once, ask_together, map_threads
 
 Array = NDArray[np.float64]
+
+BATCH, BATCH_PER_COLUMN = 1.7, 0.11
+"""What a batch costs, however many its members: so many rollouts of one member, and more for each column."""
+GAIN = 2.0
+"""How many times its cost a batch must save: two threads could do so many members alone in the same time."""
+WORTH = 50_000
+"""Steps of members that could have marched together, from which on it is worth compiling what that takes."""
 
 
 class _Struct(ctypes.Structure):
@@ -103,6 +112,7 @@ class _Linearization(_Struct):
 class _Outcome(_Struct):
     _fields_ = (
         ("step", ctypes.c_int),
+        ("status", ctypes.c_int),
         ("error", ctypes.c_double),
         ("iterations", ctypes.c_longlong),
         ("factorisations", ctypes.c_longlong),
@@ -146,12 +156,14 @@ class CompiledKernel:
     def __init__(self, model: StepModel, library: ctypes.CDLL) -> None:
         self._model = model
         self._library = library
+        self._wished = 0  # steps for which a batch would have been the better way
+        self._batched: Once[None, tuple[ctypes.CDLL, int] | None] = Once(lambda _: _batched_library(model))
         self._theta_columns: Once[tuple[str, ...], _ThetaColumns] = Once(lambda names: _theta_columns(model, names))
 
     def of(self, model: StepModel) -> CompiledKernel:
         """See `Kernel.of`."""
         other = CompiledKernel(model, self._library)
-        other._theta_columns = self._theta_columns
+        other._theta_columns, other._batched = self._theta_columns, self._batched
         return other
 
     def rollout(
@@ -164,25 +176,85 @@ class CompiledKernel:
         wanted: Directions | None,
     ) -> Rollout:
         """See `Kernel.rollout`."""
-        count = None if wanted is None else wanted.count
-        out = empty_rollout(self._model.sizes, len(torque), count)
-        out.state[0] = start
-        sensitivities, directions = None, None
-        if wanted is not None and out.by_state is not None:
-            out.by_state[0] = wanted.start
-            given = _doubles(wanted.torque), _doubles(wanted.path)
-            sensitivities = _filled(_Sensitivities, out.by_state, out.by_multipliers, out.by_effort, *given)
-            directions = self._directions(wanted.names, wanted.count)
-        outcome = _Outcome()
-        code = self._library.yid_rollout(
-            ctypes.byref(self._motion(len(torque), theta, torque, path, feedback, directions)),
-            ctypes.byref(_filled(_Trajectory, out.state, out.multipliers, out.effort, out.torque)),
-            None if sensitivities is None else ctypes.byref(sensitivities),
-            ctypes.byref(outcome),
+        return self._rolled_out(self._library, [Member(theta, start, torque, path, feedback, wanted)])[0]
+
+    def rollouts(self, members: Sequence[Member]) -> list[Rollout]:
+        """See `Kernel.rollouts`."""
+        return ask_together(self._rollouts, list(members))
+
+    def _rollouts(self, members: Sequence[Member]) -> list[Rollout]:
+        alike: dict[Hashable, list[int]] = {}
+        for i, member in enumerate(members):
+            alike.setdefault(_sort(member), []).append(i)
+        # a batch takes as many columns and steps as its widest and longest member
+        for group in alike.values():
+            group.sort(key=lambda i: (_width(members[i]), len(members[i].torque)), reverse=True)
+        batches = [part for group in alike.values() for part in self._split(group, members)]
+
+        def one(batch: Sequence[int]) -> list[Rollout]:
+            return self._together([members[i] for i in batch])
+
+        found: dict[int, Rollout] = {}
+        for batch, rollouts in zip(batches, map_threads(one, batches), strict=True):
+            found |= zip(batch, rollouts, strict=True)
+        return [found[i] for i in range(len(members))]
+
+    def _split(self, group: Sequence[int], members: Sequence[Member]) -> list[Sequence[int]]:
+        """Batches of members that are alike, and single ones where a batch would have too few.
+
+        As results differ by rounding, the same members are split in the same way whatever threads there are.
+        """
+        batches: list[Sequence[int]] = []
+        left = list(group)
+        fewest = max(GAIN * (BATCH + BATCH_PER_COLUMN * _width(members[left[0]])), 2.0)
+        if len(left) >= fewest:
+            self._wished += sum(len(members[i].torque) for i in left)
+        known = self._batched(None) if len(left) >= fewest and self._wished > WORTH else None
+        while known is not None and min(len(left), known[1]) >= fewest:
+            batches.append(left[: known[1]])
+            left = left[known[1] :]
+        return [*batches, *([i] for i in left)]
+
+    def _together(self, members: Sequence[Member]) -> list[Rollout]:
+        known = self._batched(None) if len(members) > 1 else None
+        if known is None:
+            return [self._rolled_out(self._library, [member])[0] for member in members]
+        found = self._rolled_out(known[0], members)
+        # a batch knows simplified Newton only; what needs more, and what fails, is told by the kernel of one member
+        return [
+            rollout if rollout.status.ok else self._rolled_out(self._library, [member])[0]
+            for rollout, member in zip(found, members, strict=True)
+        ]
+
+    def _rolled_out(self, library: ctypes.CDLL, members: Sequence[Member]) -> list[Rollout]:
+        """Rollouts by one call of the kernel of one member, or of a batch."""
+        sizes = self._model.sizes
+        outs, motions, trajectories, sensitivities = [], [], [], []
+        for m in members:
+            out = empty_rollout(sizes, len(m.torque), None if m.wanted is None else m.wanted.count)
+            out.state[0] = m.start
+            directions = None
+            if m.wanted is not None and out.by_state is not None:
+                out.by_state[0] = m.wanted.start
+                given = _doubles(m.wanted.torque), _doubles(m.wanted.path)
+                sensitivities.append(_filled(_Sensitivities, out.by_state, out.by_multipliers, out.by_effort, *given))
+                directions = self._directions(m.wanted.names, m.wanted.count)
+            motions.append(self._motion(len(m.torque), m.theta, m.torque, m.path, m.feedback, directions))
+            trajectories.append(_filled(_Trajectory, out.state, out.multipliers, out.effort, out.torque))
+            outs.append(out)
+        outcomes = (_Outcome * len(members))()
+        code = library.yid_rollout(
+            ctypes.c_int(len(members)),
+            (_Motion * len(members))(*motions),
+            (_Trajectory * len(members))(*trajectories),
+            (_Sensitivities * len(members))(*sensitivities) if sensitivities else None,
+            outcomes,
         )
-        self._check(code, outcome)
-        counts = outcome.iterations, outcome.factorisations
-        return ended(out, self._model.sizes, code, outcome.step, outcome.error, counts)
+        self._check(code, outcomes[0])
+        return [
+            ended(out, sizes, o.status, o.step, o.error, (o.iterations, o.factorisations))
+            for out, o in zip(outs, outcomes, strict=True)
+        ]
 
     def adjoint(
         self,
@@ -302,6 +374,25 @@ class CompiledKernel:
     def _check(self, code: int, outcome: _Outcome) -> None:
         if code == StepCode.OUT_OF_MEMORY:
             raise out_of_memory("the work on one step", outcome.memory)
+
+
+def _sort(member: Member) -> Hashable:
+    """What members of one batch have in common."""
+    feedback, wanted = member.feedback, member.wanted
+    return None if feedback is None else tuple(np.asarray(feedback.index).tolist()), wanted is None
+
+
+def _width(member: Member) -> int:
+    """Columns of derivatives."""
+    return 0 if member.wanted is None else member.wanted.count
+
+
+def _batched_library(model: StepModel) -> tuple[ctypes.CDLL, int] | None:
+    """The kernel of a batch and how many members it takes; None where compiler or machine have no vectors for it."""
+    source = codegen.kernel_source(model.functions, model.structure, batched=True)
+    library = None if source is None else compiler.compile_library(source)
+    count = 0 if library is None else int(library.yid_lanes())
+    return None if library is None or not count else (library, count)
 
 
 def _theta_columns(model: StepModel, names: tuple[str, ...]) -> _ThetaColumns:

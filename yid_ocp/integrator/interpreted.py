@@ -21,6 +21,7 @@ from yid_ocp.integrator.step_model import (
     Directions,
     Feedback,
     Gradient,
+    Member,
     Rollout,
     StepCode,
     StepLinearization,
@@ -194,6 +195,10 @@ class InterpretedKernel:
         change += slopes[:, self._unknown] @ moved[self._unknown]
         after = np.concatenate([moved[at["q1"]], change[self._p1], moved[at["z1"]]])
         return after, moved[at["lam"]], change[self._effort]
+
+    def rollouts(self, members: Sequence[Member]) -> list[Rollout]:
+        """See `Kernel.rollouts`."""
+        return [self.rollout(m.theta, m.start, m.torque, m.path, m.feedback, m.wanted) for m in members]
 
     def adjoint(
         self,

@@ -7,11 +7,10 @@
  *   N coordinates, NZ internal ones, M constraints, NU inputs, NC prescribed and NF free coordinates,
  *   NT = N + NZ + M rows, NY = NF + NZ + M unknowns of a step, NX = 2 N + NZ state (q, p, z).
  * All matrices are row-major. compiled.py declares the structs of the entry points at the end once more.
+ *
+ * Everything is compiled for one member, and once more for a batch of `LANES` members that march together, see lanes.c.
+ * What only one member can do (damped steps, adjoint, equilibria) is left out of a batch.
  */
-#include <math.h>
-#include <stdlib.h>
-#include <string.h>
-
 #define NX (2 * N + NZ)
 #define NQZ (N + NZ)
 #define ONE(x) ((x) > 0 ? (x) : 1)
@@ -28,45 +27,38 @@ enum { OK = 0, NOT_CONVERGED = 1, SINGULAR = 2, NOT_FINITE = 3, OUT_OF_MEMORY = 
 typedef int (*theta_function)(const double **, double **, long long *, double *, int);
 
 typedef struct {
-    double balance[ONE(N)], internal[ONE(NZ)], constraint[ONE(M)], p1[ONE(N)];
-    double pairs[(30 + 12 * CLOSED) * ONE(N)];
-    double rest[ONE(NNZ_REST)], rest_p[ONE(NNZ_REST_P)], by_unknown[ONE(NNZ_CONSTRAINT)];
-    double matrix_nz[ONE(NNZ_MATRIX)], middle_nz[ONE(NNZ_MATRIX)], right_nz[ONE(NNZ_MATRIX)], pull_nz[ONE(NNZ_PULL)];
-    double curve_nz[ONE(NNZ_CURVE)], after_curve_nz[ONE(NNZ_AFTER_CURVE)];
-    double Phi[ONE(M)][ONE(N)]; /* rows of the multipliers' pull in the balance */
-    double R1[ONE(NT)][ONE(NT)], R0[ONE(NT)][ONE(NQZ)], Ru[ONE(NT)][ONE(NU)];
-    double P1[ONE(N)][ONE(NT)], P0[ONE(N)][ONE(NQZ)], Pu[ONE(N)][ONE(NU)];
-    double A[ONE(NY)][ONE(NY)], LT[ONE(NY)][ONE(NY)], inverse[ONE(NY)];
-    double row_scale[ONE(N)], h;
-    double r[ONE(NY)], delta[ONE(NY)], y[ONE(NY)];
-    double *w;
-    long long *iw;
-    int factored;
-    long iterations, factorisations;
-} Work;
-
-static void work_free(Work *k) {
-    YID_FREE(k->w);
-    YID_FREE(k->iw);
-    YID_FREE(k);
-}
-
-static Work *work_new(void) {
-    Work *k = YID_ALLOCATE(1, sizeof(Work));
-    if (!k) return NULL;
-    k->w = YID_ALLOCATE(ONE(SZ_W), sizeof(double));
-    k->iw = YID_ALLOCATE(ONE(SZ_IW), sizeof(long long));
-    if (k->w && k->iw) return k;
-    work_free(k);
-    return NULL;
-}
+    real A[ONE(NY)][ONE(NY)], LT[ONE(NY)][ONE(NY)], inverse[ONE(NY)];
+} Factors;
 
 typedef struct {
-    const double *q0, *p0, *z0, *u, *theta, *time_step;
-    double *q1, *z1, *lam;
+    real balance[ONE(N)], internal[ONE(NZ)], constraint[ONE(M)], p1[ONE(N)];
+    real pairs[(30 + 12 * CLOSED) * ONE(N)];
+    real rest[ONE(NNZ_REST)], rest_p[ONE(NNZ_REST_P)], by_unknown[ONE(NNZ_CONSTRAINT)];
+    real matrix_nz[ONE(NNZ_MATRIX)], middle_nz[ONE(NNZ_MATRIX)], right_nz[ONE(NNZ_MATRIX)], pull_nz[ONE(NNZ_PULL)];
+    real curve_nz[ONE(NNZ_CURVE)], after_curve_nz[ONE(NNZ_AFTER_CURVE)];
+    real Phi[ONE(M)][ONE(N)]; /* rows of the multipliers' pull in the balance */
+    real R1[ONE(NT)][ONE(NT)], R0[ONE(NT)][ONE(NQZ)], Ru[ONE(NT)][ONE(NU)];
+    real P1[ONE(N)][ONE(NT)], P0[ONE(N)][ONE(NQZ)], Pu[ONE(N)][ONE(NU)];
+    Factors factors;
+    Factors fresh[LANES > 1]; /* what only some members of a batch take over */
+    real row_scale[ONE(N)], h;
+    real r[ONE(NY)], delta[ONE(NY)], y[ONE(NY)];
+    real *w, *room;
+    long long *iw;
+    void *block;
+    mask factored;
+    int age; /* of the factors [steps] */
+    whole iterations, factorisations;
+} Work;
+
+static void work_free(Work *k) { YID_FREE(k->block); }
+
+typedef struct {
+    const real *q0, *p0, *z0, *u, *theta, *time_step;
+    real *q1, *z1, *lam;
 } Point;
 
-static void arguments(const Point *a, const double *args[9]) {
+static void arguments(const Point *a, const real *args[9]) {
     args[0] = a->q0; args[1] = a->q1; args[2] = a->p0; args[3] = a->z0; args[4] = a->z1;
     args[5] = a->lam; args[6] = a->u; args[7] = a->theta; args[8] = a->time_step;
 }
@@ -74,15 +66,15 @@ static void arguments(const Point *a, const double *args[9]) {
 /* What pulls at node k, kept for the whole step because it does not depend on the unknowns. */
 static void constraint_matrix(Work *k, const Point *a) {
     if (M == 0) return;
-    const double *args[9];
-    double *res[1] = {k->matrix_nz};
+    const real *args[9];
+    real *res[1] = {k->matrix_nz};
     arguments(a, args);
     matrix(args, res, k->iw, k->w, 0);
     for (int e = 0; e < NNZ_MATRIX; e++) k->Phi[matrix_row[e]][matrix_col[e]] = k->matrix_nz[e];
 }
 
 /* Take the pull of multipliers, or of a change of them, off the balance. */
-static void pull_by(Work *k, const double *lam) {
+static void pull_by(Work *k, const real *lam) {
     for (int e = 0; e < NNZ_MATRIX; e++) {
         const int i = matrix_col[e], c = matrix_row[e];
         k->balance[i] -= k->row_scale[i] * k->Phi[c][i] * lam[c];
@@ -92,8 +84,8 @@ static void pull_by(Work *k, const double *lam) {
 /* Take the multipliers' pull off p1, once all unknowns are known. */
 static void finish(Work *k, const Point *a) {
     if (!MIDDLE || M == 0) return;
-    const double *args[9];
-    double *res[1] = {k->right_nz};
+    const real *args[9];
+    real *res[1] = {k->right_nz};
     arguments(a, args);
     ending(args, res, k->iw, k->w, 0);
     for (int e = 0; e < NNZ_MATRIX; e++) {
@@ -104,29 +96,29 @@ static void finish(Work *k, const Point *a) {
 }
 
 /* Full rows of the balance (N), internal (NZ) and constraint (M) equations at the point; p1 on the way, but for what
- * `finish` adds. */
-static int evaluate(Work *k, const Point *a) {
-    const double *args[9];
-    double *res[5] = {k->balance, k->internal, k->constraint, k->p1, k->middle_nz};
+ * `finish` adds. Whether all is finite. */
+static mask evaluate(Work *k, const Point *a) {
+    const real *args[9];
+    real *res[5] = {k->balance, k->internal, k->constraint, k->p1, k->middle_nz};
     arguments(a, args);
     residual(args, res, k->iw, k->w, 0);
     for (int e = 0; MIDDLE && e < NNZ_MATRIX; e++)
         k->Phi[matrix_row[e]][matrix_col[e]] = k->matrix_nz[e] + k->middle_nz[e];
     pull_by(k, a->lam);
-    double sum = 0;
+    real sum = {0};
     for (int i = 0; i < NF; i++) sum += (k->r[i] = k->balance[free_index[i]]);
     for (int i = 0; i < NZ; i++) sum += (k->r[NF + i] = k->internal[i]);
     for (int i = 0; i < M; i++) sum += (k->r[NF + NZ + i] = k->constraint[i]);
-    return isfinite(sum) ? OK : NOT_FINITE;
+    return is_finite(sum);
 }
 
 /* Jacobians of the rows and of p1; `everything` adds those with respect to q_k, z_k and u. */
 static void linearise(Work *k, const Point *a, int everything) {
-    const double *args[9];
-    double *res[5] = {k->pairs, k->rest, k->rest_p, k->by_unknown, k->curve_nz};
+    const real *args[9];
+    real *res[5] = {k->pairs, k->rest, k->rest_p, k->by_unknown, k->curve_nz};
     arguments(a, args);
     linear(args, res, k->iw, k->w, 0);
-    const double *P = k->pairs, *D = P + 6 * N, *X = D + 6 * N, *Y = X + 6 * N, *W = Y + 6 * N, *G = W + 3 * N;
+    const real *P = k->pairs, *D = P + 6 * N, *X = D + 6 * N, *Y = X + 6 * N, *W = Y + 6 * N, *G = W + 3 * N;
     memset(k->R1, 0, sizeof k->R1);
     if (everything) {
         memset(k->R0, 0, sizeof k->R0);
@@ -136,14 +128,14 @@ static void linearise(Work *k, const Point *a, int everything) {
         memset(k->Pu, 0, sizeof k->Pu);
     }
     for (int j = 0; j < N; j++) {
-        double x[6], y[6], g[3], low[ONE(N)], up[ONE(N)], here[ONE(N)], there[ONE(N)];
+        real x[6], y[6], g[3], low[ONE(N)], up[ONE(N)], here[ONE(N)], there[ONE(N)];
         for (int c = 0; c < 6; c++) { x[c] = X[c * N + j]; y[c] = Y[c * N + j]; }
         for (int c = 0; c < 3; c++) g[c] = G[c * N + j];
         for (int run = ancestor_start[j]; run < ancestor_start[j + 1]; run++) {
             const int first = ancestor_run[2 * run], last = ancestor_run[2 * run + 1];
             for (int i = first; i < last; i++) {
-                double weight = W[i] * g[0] + W[N + i] * g[1] + W[2 * N + i] * g[2];
-                double px = weight, dy = weight;
+                real weight = W[i] * g[0] + W[N + i] * g[1] + W[2 * N + i] * g[2];
+                real px = weight, dy = weight;
                 for (int c = 0; c < 6; c++) {
                     px += P[c * N + i] * x[c];
                     dy -= D[c * N + i] * y[c];
@@ -153,8 +145,8 @@ static void linearise(Work *k, const Point *a, int everything) {
             }
             if (everything)
                 for (int i = first; i < last; i++) {
-                    double weight = W[i] * g[0] + W[N + i] * g[1] + W[2 * N + i] * g[2];
-                    double dx = weight, py = weight;
+                    real weight = W[i] * g[0] + W[N + i] * g[1] + W[2 * N + i] * g[2];
+                    real dx = weight, py = weight;
                     for (int c = 0; c < 6; c++) {
                         dx -= D[c * N + i] * x[c];
                         py += P[c * N + i] * y[c];
@@ -177,13 +169,13 @@ static void linearise(Work *k, const Point *a, int everything) {
     }
     if (CLOSED)
         for (int j = 0; j < N; j++) {
-            const double *A = P + 30 * N + j, *T = A + 6 * N;
+            const real *A = P + 30 * N + j, *T = A + 6 * N;
             for (int run = ancestor_start[j]; run < ancestor_start[j + 1]; run++)
                 for (int i = ancestor_run[2 * run]; i < ancestor_run[2 * run + 1]; i++) {
                     /* S.A, h/2 D.A and h/2 S.T, from S = (P + D)/2 and h/2 D = (P - D)/2 */
-                    double sa = 0, da = 0, st = 0;
+                    real sa = {0}, da = {0}, st = {0};
                     for (int c = 0; c < 6; c++) {
-                        const double s = 0.5 * (P[c * N + i] + D[c * N + i]);
+                        const real s = 0.5 * (P[c * N + i] + D[c * N + i]);
                         sa += s * A[c * N];
                         da += (P[c * N + i] - s) * A[c * N];
                         st += s * T[c * N];
@@ -220,7 +212,7 @@ static void linearise(Work *k, const Point *a, int everything) {
         for (int i = 0; i < N; i++) k->R1[i][N + NZ + c] -= k->row_scale[i] * k->Phi[c][i];
     for (int e = 0; e < NNZ_CURVE; e++) {
         const int i = curve_row[e], j = curve_col[e];
-        const double bent = k->row_scale[i] * k->curve_nz[e];
+        const real bent = k->row_scale[i] * k->curve_nz[e];
         k->R1[i][j] -= bent;
         if (!everything) continue;
         k->R0[i][j] -= bent;
@@ -239,7 +231,7 @@ static void linearise(Work *k, const Point *a, int everything) {
         k->P1[i][N + NZ + matrix_row[e]] -= k->row_scale[i] * k->right_nz[e];
     }
     if (M > 0) {
-        double *pulls[2] = {k->pull_nz, k->after_curve_nz};
+        real *pulls[2] = {k->pull_nz, k->after_curve_nz};
         pull(args, pulls, k->iw, k->w, 0);
         for (int e = 0; e < NNZ_PULL; e++)
             k->R0[pull_row[e]][pull_col[e]] -= k->row_scale[pull_row[e]] * k->pull_nz[e];
@@ -249,174 +241,202 @@ static void linearise(Work *k, const Point *a, int everything) {
 }
 
 /* LU without pivoting in an order that eliminates tips before roots and multipliers last, so that the tree's sparsity
- * survives; the mass matrix over h keeps the pivots away from zero. */
-static int factorise(Work *k) {
-    k->factored = 0;
+ * survives; the mass matrix over h keeps the pivots away from zero. Which members' pivots are fit to be divided by. */
+static mask eliminate(const Work *k, Factors *f) {
+    mask good = EVERY;
     for (int a = 0; a < NY; a++) {
-        const double *row = k->R1[unknown_row[order[a]]];
-        for (int b = 0; b < NY; b++) k->A[a][b] = row[unknown_row[order[b]]];
+        const real *row = k->R1[unknown_row[order[a]]];
+        for (int b = 0; b < NY; b++) f->A[a][b] = row[unknown_row[order[b]]];
     }
     for (int p = 0; p < NY; p++) {
-        const double pivot = k->A[p][p];
-        if (!(fabs(pivot) > 1e-300) || !isfinite(pivot)) return SINGULAR;
-        const double inverse = k->inverse[p] = 1.0 / pivot;
-        const double *source = k->A[p];
+        const real pivot = f->A[p][p];
+        good &= (magnitude(pivot) > 1e-300) & is_finite(pivot);
+        if (!any(good)) break;
+        const real inverse = f->inverse[p] = 1.0 / pivot;
+        const real *source = f->A[p];
         for (int rr = fill_start[p]; rr < fill_start[p + 1]; rr++)
             for (int i = fill_run[2 * rr]; i < fill_run[2 * rr + 1]; i++) {
-                double *target = k->A[i];
-                const double factor = target[p] * inverse;
-                k->LT[p][i] = factor;
-                if (factor == 0.0) continue;
+                real *target = f->A[i];
+                const real factor = target[p] * inverse;
+                f->LT[p][i] = factor;
+                if (LANES == 1 && !any(factor != 0)) continue;
                 for (int cr = fill_start[p]; cr < fill_start[p + 1]; cr++) {
                     const int last = fill_run[2 * cr + 1];
-#pragma omp simd
+                    SIMD
                     for (int c = fill_run[2 * cr]; c < last; c++) target[c] -= factor * source[c];
                 }
             }
     }
-    k->factored = 1;
-    k->factorisations++;
-    return OK;
+    return good;
 }
 
-static void solve(Work *k, const double *b, double *x) {
-    double *y = k->y;
+/* Take over some members' factors. */
+static void take_factors(Factors *to, const Factors *from, mask m) {
+    for (int p = 0; p < NY; p++) {
+        to->inverse[p] = choose(m, from->inverse[p], to->inverse[p]);
+        for (int rr = fill_start[p]; rr < fill_start[p + 1]; rr++)
+            for (int i = fill_run[2 * rr]; i < fill_run[2 * rr + 1]; i++) {
+                to->A[p][i] = choose(m, from->A[p][i], to->A[p][i]);
+                to->LT[p][i] = choose(m, from->LT[p][i], to->LT[p][i]);
+            }
+    }
+}
+
+/* Factors of the rows' Jacobian for some members, which the others of those at work must not notice; which are good. */
+static mask factorise(Work *k, mask wanted, mask at_work) {
+    const int apart = LANES > 1 && any(at_work & NOT(wanted));
+    Factors *f = apart ? k->fresh : &k->factors;
+    const mask good = eliminate(k, f) & wanted;
+    if (apart) take_factors(&k->factors, f, wanted);
+    k->factored = (k->factored & NOT(wanted)) | good;
+    k->factorisations += ONES(good);
+    return good;
+}
+
+static void solve(Work *k, const real *b, real *x) {
+    const Factors *f = &k->factors;
+    real *y = k->y;
     for (int a = 0; a < NY; a++) y[a] = b[order[a]];
     for (int p = 0; p < NY; p++) {
-        const double value = y[p];
+        const real value = y[p];
         for (int rr = fill_start[p]; rr < fill_start[p + 1]; rr++)
-#pragma omp simd
-            for (int i = fill_run[2 * rr]; i < fill_run[2 * rr + 1]; i++) y[i] -= k->LT[p][i] * value;
+            SIMD
+            for (int i = fill_run[2 * rr]; i < fill_run[2 * rr + 1]; i++) y[i] -= f->LT[p][i] * value;
     }
     for (int p = NY - 1; p >= 0; p--) {
-        double sum = y[p];
+        real sum = y[p];
         for (int rr = fill_start[p]; rr < fill_start[p + 1]; rr++)
-#pragma omp simd reduction(- : sum)
-            for (int c = fill_run[2 * rr]; c < fill_run[2 * rr + 1]; c++) sum -= k->A[p][c] * y[c];
-        y[p] = sum * k->inverse[p];
+            SIMD_SUM
+            for (int c = fill_run[2 * rr]; c < fill_run[2 * rr + 1]; c++) sum -= f->A[p][c] * y[c];
+        y[p] = sum * f->inverse[p];
     }
     for (int a = 0; a < NY; a++) x[order[a]] = y[a];
 }
 
-static void solve_transposed(Work *k, const double *b, double *x) {
-    double *y = k->y;
-    for (int a = 0; a < NY; a++) y[a] = b[order[a]];
-    for (int p = 0; p < NY; p++) {
-        const double value = y[p] *= k->inverse[p];
-        for (int rr = fill_start[p]; rr < fill_start[p + 1]; rr++)
-#pragma omp simd
-            for (int c = fill_run[2 * rr]; c < fill_run[2 * rr + 1]; c++) y[c] -= k->A[p][c] * value;
-    }
-    for (int p = NY - 1; p >= 0; p--) {
-        double sum = y[p];
-        for (int rr = fill_start[p]; rr < fill_start[p + 1]; rr++)
-#pragma omp simd reduction(- : sum)
-            for (int i = fill_run[2 * rr]; i < fill_run[2 * rr + 1]; i++) sum -= k->LT[p][i] * y[i];
-        y[p] = sum;
-    }
-    for (int a = 0; a < NY; a++) x[order[a]] = y[a];
-}
-
-/* Sensitivities are worked on in blocks of columns that fit into registers. */
-typedef double Lanes __attribute__((vector_size(64), aligned(8), may_alias));
+/* Sensitivities are worked on in blocks of columns that fit into registers: of one member side by side, of a batch one
+ * column of all members beside another. */
+#if LANES == 1
+typedef double Wide __attribute__((vector_size(64), aligned(8), may_alias));
 #define BLOCK 16
+#else
+typedef real Wide;
+#define BLOCK 2
+#endif
 
 /* Y <- A^-1 Y for d right-hand sides; rows of Y are already in elimination order. */
-static void solve_many(Work *k, double *Y, int d) {
-    Lanes B[ONE(NY)][2];
+static void solve_many(Work *k, real *Y, int d) {
+    const Factors *f = &k->factors;
+    Wide B[ONE(NY)][2];
     memset(B, 0, sizeof B);
     for (int first = 0; first < d; first += BLOCK) {
-        const size_t size = sizeof(double) * (size_t)(d - first < BLOCK ? d - first : BLOCK);
+        const size_t size = sizeof(real) * (size_t)(d - first < BLOCK ? d - first : BLOCK);
         for (int p = 0; p < NY; p++) memcpy(B[p], Y + (size_t)p * d + first, size);
         for (int p = 0; p < NY; p++) {
-            const Lanes s0 = B[p][0], s1 = B[p][1];
+            const Wide s0 = B[p][0], s1 = B[p][1];
             for (int rr = fill_start[p]; rr < fill_start[p + 1]; rr++)
                 for (int i = fill_run[2 * rr]; i < fill_run[2 * rr + 1]; i++) {
-                    B[i][0] -= k->LT[p][i] * s0;
-                    B[i][1] -= k->LT[p][i] * s1;
+                    B[i][0] -= f->LT[p][i] * s0;
+                    B[i][1] -= f->LT[p][i] * s1;
                 }
         }
         for (int p = NY - 1; p >= 0; p--) {
-            Lanes s0 = B[p][0], s1 = B[p][1];
+            Wide s0 = B[p][0], s1 = B[p][1];
             for (int rr = fill_start[p]; rr < fill_start[p + 1]; rr++)
                 for (int i = fill_run[2 * rr]; i < fill_run[2 * rr + 1]; i++) {
-                    s0 -= k->A[p][i] * B[i][0];
-                    s1 -= k->A[p][i] * B[i][1];
+                    s0 -= f->A[p][i] * B[i][0];
+                    s1 -= f->A[p][i] * B[i][1];
                 }
-            B[p][0] = s0 * k->inverse[p];
-            B[p][1] = s1 * k->inverse[p];
+            B[p][0] = s0 * f->inverse[p];
+            B[p][1] = s1 * f->inverse[p];
         }
         for (int p = 0; p < NY; p++) memcpy(Y + (size_t)p * d + first, B[p], size);
     }
 }
 
-static double coordinate_norm(const double *delta) {
-    double norm = 0;
+/* Largest correction of a coordinate, or NaN. */
+static real coordinate_norm(const real *delta) {
+    real norm = {0}, sum = {0};
     for (int i = 0; i < NF + NZ; i++) {
-        if (isnan(delta[i])) return NAN;
-        norm = fmax(norm, fabs(delta[i]));
+        const real size = magnitude(delta[i]);
+        norm = choose(size > norm, size, norm);
+        sum += delta[i];
     }
-    return norm;
+    return choose(sum == sum, norm, sum);
 }
 
-static void advance(const Point *a, const double *delta, double factor) {
-    for (int i = 0; i < NF; i++) a->q1[free_index[i]] += factor * delta[i];
-    for (int i = 0; i < NZ; i++) a->z1[i] += factor * delta[NF + i];
-    for (int i = 0; i < M; i++) a->lam[i] += factor * delta[NF + NZ + i];
+static void advance(const Point *a, const real *delta, real factor, mask m) {
+    const real none = {0}, by = choose(m, factor, none);
+    for (int i = 0; i < NF; i++) a->q1[free_index[i]] += choose(m, by * delta[i], none);
+    for (int i = 0; i < NZ; i++) a->z1[i] += choose(m, by * delta[NF + i], none);
+    for (int i = 0; i < M; i++) a->lam[i] += choose(m, by * delta[NF + NZ + i], none);
 }
 
 /* Last correction of the multipliers, and of the balance, which gives the effort. */
-static void settle_multipliers(Work *k, const Point *a, const double *delta) {
-    const double *change = delta + NF + NZ;
-    for (int c = 0; c < M; c++) a->lam[c] += change[c];
+static void settle_multipliers(Work *k, const Point *a, const real *delta, mask m) {
+    const real none = {0};
+    real change[ONE(M)];
+    for (int c = 0; c < M; c++) a->lam[c] += change[c] = choose(m, delta[NF + NZ + c], none);
     if (NC) pull_by(k, change);
 }
 
-/* Simplified Newton with the factorisation at hand; refactorises where it contracts slowly. */
-static int newton_chord(Work *k, const Point *a, double tolerance, int limit, double *error) {
-    double previous = INFINITY;
-    int refactor = !k->factored, fresh = 0;
-    for (int it = 0; it < limit; it++) {
-        k->iterations++;
-        if (evaluate(k, a)) return NOT_FINITE;
-        if (refactor) {
+/* Factors serve for so many steps, whatever they still do: when to renew them then does not depend on the members of a
+ * batch, all of which pay for it. */
+#define OLDEST 4
+#define SLOW 0.3 /* contraction that is worth a new factorisation at once */
+
+/* Simplified Newton with the factorisation at hand; refactorises where it contracts slowly. Which of the members at work
+ * converged: those that did stay where they are, with the residual and the correction of that point, until all have. */
+static mask newton_chord(Work *k, const Point *a, real tolerance, int limit, mask at_work, real *error) {
+    real previous = INFINITY + (real){0};
+    const real whole_step = 1.0 + (real){0};
+    mask left = at_work, good = NOT(EVERY), refactor = NOT(k->factored), fresh = NOT(EVERY);
+    for (int it = 0; it < limit && any(left); it++) {
+        k->iterations += ONES(left);
+        left &= evaluate(k, a);
+        if (any(left & refactor)) {
             linearise(k, a, 0);
-            if (factorise(k)) return SINGULAR;
-            fresh = 1;
-            refactor = 0;
+            const mask wanted = left & refactor;
+            left &= NOT(wanted) | factorise(k, wanted, at_work);
+            fresh |= wanted;
+            refactor &= NOT(wanted);
         }
         for (int i = 0; i < NY; i++) k->r[i] = -k->r[i];
         solve(k, k->r, k->delta);
-        const double norm = *error = coordinate_norm(k->delta);
-        if (!isfinite(norm)) return NOT_FINITE;
-        const double rate = norm / previous;
-        if (norm <= tolerance || (norm < 1e3 * tolerance && rate > 0.5)) {
-            settle_multipliers(k, a, k->delta);
-            return OK;
+        const real norm = coordinate_norm(k->delta), rate = norm / previous;
+        *error = choose(left, norm, *error);
+        left &= is_finite(norm);
+        const mask done = left & ((norm <= tolerance) | ((norm < 1e3 * tolerance) & (rate > 0.5)));
+        good |= done;
+        left &= NOT(done);
+        if (it > 0) {
+            left &= NOT((rate > 0.9) & fresh);
+            const mask slow = left & (rate > SLOW);
+            refactor |= slow;
+            fresh &= NOT(slow);
         }
-        if (it > 0 && rate > 0.9 && fresh) return NOT_CONVERGED;
-        if (it > 0 && rate > 0.1) refactor = 1, fresh = 0;
-        if (norm > 1.0) return NOT_CONVERGED;
-        advance(a, k->delta, 1.0);
+        left &= NOT(norm > 1.0);
+        advance(a, k->delta, whole_step, left);
         previous = norm;
     }
-    return NOT_CONVERGED;
+    settle_multipliers(k, a, k->delta, good);
+    return good;
 }
 
+#if LANES == 1
 /* Full Newton, damped by the natural monotonicity test (Deuflhard 2011, section 3.3). */
 static int newton_damped(Work *k, const Point *a, double tolerance, int limit, double *error) {
     double q_keep[ONE(N)], z_keep[ONE(NZ)], lam_keep[ONE(M)], step[ONE(NY)], trial[ONE(NY)], previous = INFINITY;
     for (int it = 0; it < limit; it++) {
         k->iterations++;
-        if (evaluate(k, a)) return NOT_FINITE;
+        if (!evaluate(k, a)) return NOT_FINITE;
         linearise(k, a, 0);
-        if (factorise(k)) return SINGULAR;
+        if (!factorise(k, EVERY, EVERY)) return SINGULAR;
         for (int i = 0; i < NY; i++) k->r[i] = -k->r[i];
         solve(k, k->r, step);
         const double norm = *error = coordinate_norm(step);
         if (!isfinite(norm)) return NOT_FINITE;
         if (norm <= tolerance || (norm < 1e3 * tolerance && norm > 0.5 * previous)) {
-            settle_multipliers(k, a, step);
+            settle_multipliers(k, a, step, EVERY);
             return OK;
         }
         previous = norm;
@@ -425,8 +445,8 @@ static int newton_damped(Work *k, const Point *a, double tolerance, int limit, d
         memcpy(lam_keep, a->lam, sizeof(double) * M);
         double factor = norm > 0.5 ? 0.5 / norm : 1.0;
         for (;;) {
-            advance(a, step, factor);
-            if (!evaluate(k, a)) {
+            advance(a, step, factor, EVERY);
+            if (evaluate(k, a)) {
                 for (int i = 0; i < NY; i++) k->r[i] = -k->r[i];
                 solve(k, k->r, trial);
                 const double size = coordinate_norm(trial);
@@ -441,59 +461,72 @@ static int newton_damped(Work *k, const Point *a, double tolerance, int limit, d
     }
     return NOT_CONVERGED;
 }
+#endif
 
-/* One step from the guess in q1 (prescribed entries already exact), z1, lam. */
-static int one_step(Work *k, const Point *a, double tolerance, int limit, double *error) {
-    *error = 0;
+/* One step of the members at work from the guess in q1 (prescribed entries already exact), z1, lam; which came through,
+ * and, of a single member, how it ended. */
+static mask one_step(Work *k, const Point *a, real tolerance, int limit, mask at_work, real *error, int *status) {
+    *error = (real){0};
+    *status = OK;
     constraint_matrix(k, a);
     if (NY == 0) {
-        const int status = evaluate(k, a);
+        const mask good = evaluate(k, a);
         finish(k, a);
-        return status;
+        *status = any(good) ? OK : NOT_FINITE;
+        return good & at_work;
     }
+#if LANES == 1
     double q_guess[ONE(N)], z_guess[ONE(NZ)], lam_guess[ONE(M)];
     memcpy(q_guess, a->q1, sizeof(double) * N);
     memcpy(z_guess, a->z1, sizeof(double) * NZ);
     memcpy(lam_guess, a->lam, sizeof(double) * M);
-    int status = newton_chord(k, a, tolerance, 20, error);
-    for (int attempt = 0; status && attempt < 2; attempt++) {
+#endif
+    if (++k->age >= OLDEST) {
+        k->factored = NOT(EVERY);
+        k->age = 0;
+    }
+    mask good = newton_chord(k, a, tolerance, 20, at_work, error);
+#if LANES == 1
+    for (int attempt = 0; !good && attempt < 2; attempt++) {
         for (int i = 0; i < N; i++) a->q1[i] = q_guess[i];
         if (attempt)
             for (int i = 0; i < NF; i++) a->q1[free_index[i]] = a->q0[free_index[i]];
         for (int i = 0; i < NZ; i++) a->z1[i] = attempt ? a->z0[i] : z_guess[i];
         for (int i = 0; i < M; i++) a->lam[i] = attempt ? 0.0 : lam_guess[i];
-        status = newton_damped(k, a, tolerance, limit, error);
+        *status = newton_damped(k, a, tolerance, limit, error);
+        good = *status == OK;
     }
-    if (status) k->factored = 0;
-    else finish(k, a);
-    return status;
+#endif
+    k->factored &= good;
+    if (any(good)) finish(k, a);
+    return good;
 }
 
-static void prepare(Work *k, const double *theta, const double *time_step) {
-    double none[ONE(NX)] = {0};
+static void prepare(Work *k, const real *theta, const real *time_step) {
+    real none[ONE(NX)] = {0};
     Point a = {none, none, none, none, theta, time_step, none, none, none};
-    const double *args[9];
-    double *res[2] = {k->row_scale, &k->h};
+    const real *args[9];
+    real *res[2] = {k->row_scale, &k->h};
     arguments(&a, args);
     scales(args, res, k->iw, k->w, 0);
 }
 
 /* C[rows] += A X for the listed nonzero columns of each row; A has `width` columns, X has d, and room for BLOCK entries
  * after its last one, which are read but not used. */
-static void multiply_rows(const double *A, int width, const int *start, const int *column, int rows, const double *X,
-                          int d, double *C) {
+static void multiply_rows(const real *A, int width, const int *start, const int *column, int rows, const real *X, int d,
+                          real *C) {
     for (int first = 0; first < d; first += BLOCK) {
         const int wide = d - first < BLOCK ? d - first : BLOCK;
         for (int r = 0; r < rows; r++) {
-            Lanes sum[2] = {{0}, {0}};
+            Wide sum[2] = {{0}, {0}};
             for (int e = start[r]; e < start[r + 1]; e++) {
-                const double factor = A[(size_t)r * width + column[e]];
-                const Lanes *source = (const Lanes *)(X + (size_t)column[e] * d + first);
+                const real factor = A[(size_t)r * width + column[e]];
+                const Wide *source = (const Wide *)(X + (size_t)column[e] * d + first);
                 sum[0] += factor * source[0];
                 sum[1] += factor * source[1];
             }
-            double *target = C + (size_t)r * d + first;
-            for (int c = 0; c < wide; c++) target[c] += ((const double *)sum)[c];
+            real *target = C + (size_t)r * d + first;
+            for (int c = 0; c < wide; c++) target[c] += ((const real *)sum)[c];
         }
     }
 }
@@ -553,24 +586,38 @@ typedef struct {
     double *rows, *p1, *rows_new, *rows_old, *rows_input, *p1_new, *p1_old, *p1_input, *rows_theta, *p1_theta;
 } Linearization;
 
-/* The step reached, Newton's last correction, totals of iterations and factorisations, and the memory that was asked
+/* The step reached and how it ended, Newton's last correction, totals of iterations and factorisations, and the memory that was asked
  * for [bytes]. */
 typedef struct {
-    int step;
+    int step, status;
     double error;
     long long iterations, factorisations, memory;
 } Outcome;
 
-static void add_sparse(const double *nz, const long long *pattern, double *C, int d) {
+/* C += nz in one member's lane. */
+static void add_sparse(const double *nz, const long long *pattern, real *C, int d, int lane) {
     const long long columns = pattern[1], *offset = pattern + 2, *row = pattern + 3 + columns;
     for (long long c = 0; c < columns; c++)
-        for (long long e = offset[c]; e < offset[c + 1]; e++) C[(size_t)row[e] * d + c] += nz[e];
+        for (long long e = offset[c]; e < offset[c + 1]; e++) LANE(C[(size_t)row[e] * d + c], lane) += nz[e];
 }
 
-static void theta_columns(const Directions *dir, const Point *a) {
-    const double *args[9];
+/* One member's entries of something, one after another. */
+static const double *member(const real *x, int count, int lane, double *room) {
+    if (LANES == 1) return (const double *)x;
+    for (int i = 0; i < count; i++) room[i] = LANE(x[i], lane);
+    return room;
+}
+
+/* Derivatives by one member's parameters, which need not be those of another. */
+static void theta_columns(const Motion *motion, const Point *a, int lane) {
+    const Directions *dir = motion->directions;
+    double q0[ONE(N)], q1[ONE(N)], p0[ONE(N)], z0[ONE(NZ)], z1[ONE(NZ)], lam[ONE(M)], u[ONE(NU)];
+    const double *args[9] = {
+        member(a->q0, N, lane, q0),   member(a->q1, N, lane, q1), member(a->p0, N, lane, p0), member(a->z0, NZ, lane, z0),
+        member(a->z1, NZ, lane, z1), member(a->lam, M, lane, lam), member(a->u, NU, lane, u), motion->theta,
+        &motion->time_step,
+    };
     double *res[3] = {dir->rows_nz, dir->p1_nz, dir->effort_nz};
-    arguments(a, args);
     dir->by_theta(args, res, dir->iw, dir->w, 0);
 }
 
@@ -578,31 +625,32 @@ static void theta_columns(const Directions *dir, const Point *a) {
  * coordinates after (NC) or NULL, multipliers and effort or NULL; then room for rows (NT), joined (NT), Y (NY), input
  * (NU) and start (NQZ). The last `loads` columns get more of the rows (NT, loads) and of p1 (N, loads). */
 typedef struct {
-    const double *before, *input, *path;
-    double *after, *multipliers, *effort;
-    double *rows, *joined, *Y, *input_room, *start;
+    const real *before, *input, *path;
+    real *after, *multipliers, *effort;
+    real *rows, *joined, *Y, *input_room, *start;
     int loads;
-    const double *load_rows, *load_p1;
+    const real *load_rows, *load_p1;
 } Columns;
 
-/* Forward sensitivities of one converged step. */
-static void sensitivity_step(Work *k, const Point *a, const Directions *dir, const Columns *columns) {
-    const int d = dir->count;
-    const double *X0 = columns->before, *input = columns->input, *path = columns->path;
-    double *X1 = columns->after, *effort = columns->effort, *rows = columns->rows, *joined = columns->joined;
-    double *Y = columns->Y, *start = columns->start;
+/* Forward sensitivities of one converged step in d directions, for so many members. */
+static void sensitivity_step(Work *k, const Point *a, int d, int members, const Motion *motion, const Columns *columns) {
+    const real *X0 = columns->before, *input = columns->input, *path = columns->path;
+    real *X1 = columns->after, *effort = columns->effort, *rows = columns->rows, *joined = columns->joined;
+    real *Y = columns->Y, *start = columns->start;
     /* (q, z) of X0 side by side */
-    memcpy(start, X0, sizeof(double) * N * d);
-    memcpy(start + (size_t)N * d, X0 + (size_t)2 * N * d, sizeof(double) * NZ * d);
-    memset(rows, 0, sizeof(double) * NT * d);
+    memcpy(start, X0, sizeof(real) * N * d);
+    memcpy(start + (size_t)N * d, X0 + (size_t)2 * N * d, sizeof(real) * NZ * d);
+    memset(rows, 0, sizeof(real) * NT * d);
     multiply_rows(&k->R0[0][0], ONE(NQZ), rows_old_start, rows_old_col, NT, start, d, rows);
     for (int i = 0; i < N * d; i++) rows[i] += X0[(size_t)N * d + i];
-    double *p1 = X1 + (size_t)N * d;
-    memset(p1, 0, sizeof(double) * N * d);
-    if (dir->theta_count) {
-        theta_columns(dir, a);
-        add_sparse(dir->rows_nz, dir->rows_pattern, rows, d);
-        add_sparse(dir->p1_nz, dir->p1_pattern, p1, d);
+    real *p1 = X1 + (size_t)N * d;
+    memset(p1, 0, sizeof(real) * N * d);
+    for (int lane = 0; lane < members; lane++) {
+        const Directions *dir = motion[lane].directions;
+        if (!dir || !dir->theta_count) continue;
+        theta_columns(motion + lane, a, lane);
+        add_sparse(dir->rows_nz, dir->rows_pattern, rows, d, lane);
+        add_sparse(dir->p1_nz, dir->p1_pattern, p1, d, lane);
     }
     const int loads = columns->loads, loaded = d - loads;
     for (int r = 0; r < NT; r++)
@@ -612,41 +660,45 @@ static void sensitivity_step(Work *k, const Point *a, const Directions *dir, con
     if (input)
         for (int r = 0; r < N; r++)
             for (int j = 0; j < NU; j++) {
-                const double f = k->Ru[r][j], g = k->Pu[r][j];
-                for (int c = 0; f != 0.0 && c < d; c++) rows[(size_t)r * d + c] += f * input[(size_t)j * d + c];
-                for (int c = 0; g != 0.0 && c < d; c++) p1[(size_t)r * d + c] += g * input[(size_t)j * d + c];
+                const real f = k->Ru[r][j], g = k->Pu[r][j];
+                const int f_acts = any(f != 0), g_acts = any(g != 0);
+                for (int c = 0; f_acts && c < d; c++) rows[(size_t)r * d + c] += f * input[(size_t)j * d + c];
+                for (int c = 0; g_acts && c < d; c++) p1[(size_t)r * d + c] += g * input[(size_t)j * d + c];
             }
-    memset(joined, 0, sizeof(double) * NT * d);
+    memset(joined, 0, sizeof(real) * NT * d);
     if (path)
         for (int j = 0; j < NC; j++) {
             const int at = prescribed_index[j];
-            memcpy(joined + (size_t)at * d, path + (size_t)j * d, sizeof(double) * d);
+            memcpy(joined + (size_t)at * d, path + (size_t)j * d, sizeof(real) * d);
             for (int r = 0; r < NT; r++) {
-                const double f = k->R1[r][at];
-                for (int c = 0; f != 0.0 && c < d; c++) rows[(size_t)r * d + c] += f * path[(size_t)j * d + c];
+                const real f = k->R1[r][at];
+                const int acts = any(f != 0);
+                for (int c = 0; acts && c < d; c++) rows[(size_t)r * d + c] += f * path[(size_t)j * d + c];
             }
         }
     for (int b = 0; b < NY; b++) {
-        const double *source = rows + (size_t)unknown_row[order[b]] * d;
+        const real *source = rows + (size_t)unknown_row[order[b]] * d;
         for (int c = 0; c < d; c++) Y[(size_t)b * d + c] = -source[c];
     }
     solve_many(k, Y, d);
     for (int b = 0; b < NY; b++)
-        memcpy(joined + (size_t)unknown_row[order[b]] * d, Y + (size_t)b * d, sizeof(double) * d);
-    memcpy(X1, joined, sizeof(double) * N * d);
-    memcpy(X1 + (size_t)2 * N * d, joined + (size_t)N * d, sizeof(double) * NZ * d);
-    if (columns->multipliers) memcpy(columns->multipliers, joined + (size_t)(N + NZ) * d, sizeof(double) * M * d);
+        memcpy(joined + (size_t)unknown_row[order[b]] * d, Y + (size_t)b * d, sizeof(real) * d);
+    memcpy(X1, joined, sizeof(real) * N * d);
+    memcpy(X1 + (size_t)2 * N * d, joined + (size_t)N * d, sizeof(real) * NZ * d);
+    if (columns->multipliers) memcpy(columns->multipliers, joined + (size_t)(N + NZ) * d, sizeof(real) * M * d);
     multiply_rows(&k->P0[0][0], ONE(NQZ), p1_old_start, p1_old_col, N, start, d, p1);
     multiply_rows(&k->P1[0][0], ONE(NT), p1_new_start, p1_new_col, N, joined, d, p1);
     if (effort) {
-        memset(effort, 0, sizeof(double) * NC * d);
-        if (dir->theta_count) add_sparse(dir->effort_nz, dir->effort_pattern, effort, d);
-
+        memset(effort, 0, sizeof(real) * NC * d);
+        for (int lane = 0; lane < members; lane++) {
+            const Directions *dir = motion[lane].directions;
+            if (dir && dir->theta_count) add_sparse(dir->effort_nz, dir->effort_pattern, effort, d, lane);
+        }
         for (int j = 0; j < NC; j++) {
             const int at = prescribed_index[j];
-            double *target = effort + (size_t)j * d;
+            real *target = effort + (size_t)j * d;
             for (int c = 0; c < d; c++) {
-                double sum = X0[(size_t)(N + at) * d + c];
+                real sum = X0[(size_t)(N + at) * d + c];
                 for (int i = 0; i < NQZ; i++) sum += k->R0[at][i] * start[(size_t)i * d + c];
                 for (int i = 0; i < NT; i++) sum += k->R1[at][i] * joined[(size_t)i * d + c];
                 if (input)
@@ -658,119 +710,288 @@ static void sensitivity_step(Work *k, const Point *a, const Directions *dir, con
     }
 }
 
-static void effort_of(const Work *k, double *effort) {
+static void effort_of(const Work *k, real *effort) {
     for (int j = 0; j < NC; j++) effort[j] = -k->balance[prescribed_index[j]] / k->h;
 }
 
-static void apply_feedback(const Feedback *f, int step, const double *state, const double *nominal, double *u) {
+/* u = nominal - gain (state[index] - reference) */
+static void apply_feedback(int count, const int *index, const real *gain, const real *reference, const real *state,
+                           const real *nominal, real *u) {
     for (int i = 0; i < NU; i++) {
-        double value = nominal[i];
-        for (int j = 0; j < f->count; j++)
-            value -= f->gain[((size_t)step * NU + i) * f->count + j] *
-                     (state[f->index[j]] - f->reference[(size_t)step * f->count + j]);
+        real value = nominal[i];
+        for (int j = 0; j < count; j++) value -= gain[i * count + j] * (state[index[j]] - reference[j]);
         u[i] = value;
     }
 }
 
-/* Columns of the torque of one step: those of the nominal one (or NULL) less what the feedback makes of the state's.
- * NULL where neither is there. */
-static const double *input_columns(const Feedback *f, int step, int d, const double *given, const double *state,
-                                   double *room) {
-    const int feeds = f && f->count > 0;
-    if (!NU || !(feeds || given)) return NULL;
-    if (given) memcpy(room, given, sizeof(double) * NU * d);
-    else memset(room, 0, sizeof(double) * NU * d);
-    for (int i = 0; feeds && i < NU; i++)
-        for (int j = 0; j < f->count; j++) {
-            const double gain = f->gain[((size_t)step * NU + i) * f->count + j];
-            const double *source = state + (size_t)f->index[j] * d;
-            for (int c = 0; gain != 0.0 && c < d; c++) room[(size_t)i * d + c] -= gain * source[c];
+/* Columns of the torque of one step: those of the nominal one, already in the room or none, less what the feedback makes
+ * of the state's. */
+static void feed_columns(int count, const int *index, const real *gain, int d, const real *state, real *room) {
+    for (int i = 0; i < NU; i++)
+        for (int j = 0; j < count; j++) {
+            const real by = gain[i * count + j];
+            const real *source = state + (size_t)index[j] * d;
+            const int acts = any(by != 0);
+            for (int c = 0; acts && c < d; c++) room[(size_t)i * d + c] -= by * source[c];
         }
-    return room;
 }
 
-/* Where a step from the last of the states x is looked for first: q and z extrapolated, prescribed entries known. */
-static void guess(const double *x, int step, const double *prescribed, double *q1, double *z1) {
+/* Where a step from the last of the states x, the one before and that before it is looked for first: q and z
+ * extrapolated, prescribed entries known. */
+static void guess(real *const x[3], int step, const real *prescribed, real *q1, real *z1) {
+    const real *now = x[0], *before = x[1], *first = x[2];
     for (int i = 0; i < N; i++) {
-        q1[i] = x[i];
-        if (step > 1) q1[i] = 3 * (x[i] - x[i - NX]) + x[i - 2 * NX];
-        else if (step == 1) q1[i] = 2 * x[i] - x[i - NX];
+        q1[i] = now[i];
+        if (step > 1) q1[i] = 3 * (now[i] - before[i]) + first[i];
+        else if (step == 1) q1[i] = 2 * now[i] - before[i];
     }
-    for (int i = 0; i < NZ; i++) z1[i] = step > 0 ? 2 * x[2 * N + i] - x[2 * N + i - NX] : x[2 * N + i];
+    for (int i = 2 * N; i < NX; i++) {
+        z1[i - 2 * N] = now[i];
+        if (step > 0) z1[i - 2 * N] = 2 * now[i] - before[i];
+    }
     for (int j = 0; j < NC; j++) q1[prescribed_index[j]] = prescribed[j];
 }
 
-/* Room for one step's work and `doubles` more; 0 where there is not so much memory. */
-static int room_for(size_t doubles, Work **k, double **buffer, Outcome *outcome) {
+#define ALIGNMENT 64
+#define EACH for (int lane = 0; lane < LANES; lane++)
+
+/* Room for one step's work and so many numbers more (`room`), in one block; NULL where there is not so much memory. */
+static Work *work_new(size_t numbers, Outcome *outcome) {
+    const size_t reals = numbers + ONE(SZ_W);
+    const size_t size = sizeof(Work) + sizeof(real) * reals + sizeof(long long) * ONE(SZ_IW) + 2 * ALIGNMENT;
     memset(outcome, 0, sizeof *outcome);
-    outcome->memory = (long long)(sizeof(Work) + sizeof(double) * (SZ_W + doubles) + sizeof(long long) * SZ_IW);
-    *k = work_new();
-    *buffer = *k && doubles ? YID_ALLOCATE(doubles, sizeof(double)) : NULL;
-    if (*k && (*buffer || !doubles)) return 1;
-    if (*k) work_free(*k);
-    return 0;
+    outcome->memory = (long long)size;
+    char *block = YID_ALLOCATE(1, size);
+    if (!block) return NULL;
+    Work *k = (Work *)(block + ALIGNMENT - (size_t)block % ALIGNMENT);
+    k->block = block;
+    k->room = (real *)((char *)k + (sizeof(Work) + ALIGNMENT - 1) / ALIGNMENT * ALIGNMENT);
+    k->w = k->room + numbers;
+    k->iw = (long long *)(k->w + ONE(SZ_W));
+    return k;
 }
 
-/* Rollout, with forward sensitivities where there are directions; a status. */
-int yid_rollout(const Motion *motion, const Trajectory *out, const Sensitivities *by, Outcome *outcome) {
-    const Directions *dir = motion->directions;
-    const Feedback *feedback = motion->feedback;
-    const size_t d = dir ? dir->count : 0;
-    Work *k;
-    double *buffer;
-    if (!room_for(d ? d * (2 * ONE(NT) + ONE(NY) + ONE(NU) + ONE(NQZ)) + BLOCK : 0, &k, &buffer, outcome))
-        return OUT_OF_MEMORY;
-    prepare(k, motion->theta, &motion->time_step);
+/* `count` entries of an array of every member, side by side; members beyond the last are like it. */
+static void gather(const double *const *from, size_t count, real *to) {
+    EACH
+        for (size_t i = 0; i < count; i++) LANE(to[i], lane) = from[lane][i];
+}
+
+/* Entries of one member back into its own array. */
+static void scatter(const real *from, size_t count, int lane, double *to) {
+    for (size_t i = 0; i < count; i++) to[i] = LANE(from[i], lane);
+}
+
+/* One member's rows of `own` columns, among those of `d` columns of all. */
+static void gather_columns(const double *from, size_t rows, size_t own, size_t d, int lane, real *to) {
+    for (size_t i = 0; i < rows; i++)
+        for (size_t c = 0; c < own; c++) LANE(to[i * d + c], lane) = from[i * own + c];
+}
+
+static void scatter_columns(const real *from, size_t rows, size_t own, size_t d, int lane, double *to) {
+    if ((const void *)from == (const void *)to) return;
+    for (size_t i = 0; i < rows; i++)
+        for (size_t c = 0; c < own; c++) to[i * own + c] = LANE(from[i * d + c], lane);
+}
+
+/* What a batch is given and carries from step to step; states are those of this node and of the two before. */
+typedef struct {
+    real *x[3], *theta, *gain, *reference, *nominal, *prescribed;
+    real time_step, tolerance, error;
+    mask running;
+} March;
+
+/* Rollouts of so many members at once, with forward sensitivities where there are directions. Members have their own
+ * number of steps and their own directions, if any has some; what their feedback reads is the same. How each ended is in
+ * its outcome: a batch leaves members that do not get through by simplified Newton alone to whoever asked. */
+int yid_rollout(int members, const Motion *motions, const Trajectory *outs, const Sensitivities *bys, Outcome *outcomes) {
+    const Feedback *feedback = NU ? motions->feedback : NULL;
+    const int feeds = feedback ? feedback->count : 0;
+    const int *fed = feeds ? feedback->index : NULL;
+    size_t d = 0; /* columns of the member with the most; those that others lack stay zero */
+    for (int lane = 0; lane < members && motions->directions; lane++)
+        if ((size_t)motions[lane].directions->count > d) d = motions[lane].directions->count;
+    const size_t apart = LANES == 1 ? 0 : d; /* a single member's columns are worked out where they are wanted */
+    memset(outcomes, 0, sizeof(Outcome) * members);
+    Work *k = work_new(3 * NX + NTHETA + (NU + 1) * (size_t)feeds + NU + NC + d * (2 * NT + NY + NU + NQZ) +
+                           apart * (2 * NX + M + 2 * NC) + BLOCK,
+                       outcomes);
+    if (!k) return OUT_OF_MEMORY;
+    March m;
+    real *room = k->room;
+    for (int i = 0; i < 3; i++, room += NX) m.x[i] = room;
+    m.theta = room;
+    m.gain = m.theta + NTHETA;
+    m.reference = m.gain + NU * feeds;
+    m.nominal = m.reference + feeds;
+    m.prescribed = m.nominal + NU;
+    room = m.prescribed + NC;
     Columns columns = {0};
-    if (d) {
-        columns.rows = buffer;
-        columns.joined = columns.rows + d * ONE(NT);
-        columns.Y = columns.joined + d * ONE(NT);
-        columns.input_room = columns.Y + d * ONE(NY);
-        columns.start = columns.input_room + d * ONE(NU);
+    real *X[2] = {room, room + NX * apart}, *moved_path;
+    columns.multipliers = X[1] + NX * apart;
+    columns.effort = columns.multipliers + M * apart;
+    moved_path = columns.effort + NC * apart;
+    columns.rows = moved_path + NC * apart;
+    columns.joined = columns.rows + NT * d;
+    columns.Y = columns.joined + NT * d;
+    columns.input_room = columns.Y + NY * d;
+    columns.start = columns.input_room + NU * d;
+
+    /* lanes beyond the last member do what the first one does, and nobody looks */
+    const Motion *motion[LANES];
+    const Trajectory *out[LANES];
+    const Sensitivities *by[LANES];
+    const double *from[LANES];
+    int most = 0;
+    EACH {
+        const int who = lane < members ? lane : 0;
+        motion[lane] = motions + who;
+        out[lane] = outs + who;
+        by[lane] = bys + who;
+        if (motion[lane]->steps > most) most = motion[lane]->steps;
+        LANE(m.running, lane) = ONES(lane < members);
+        LANE(m.time_step, lane) = motion[lane]->time_step;
+        LANE(m.tolerance, lane) = motion[lane]->tolerance;
     }
-    double q1[ONE(N)], z1[ONE(NZ)], lam[ONE(M)], u[ONE(NU)];
+    EACH from[lane] = motion[lane]->theta;
+    gather(from, NTHETA, m.theta);
+    EACH from[lane] = out[lane]->state;
+    gather(from, NX, m.x[0]);
+    size_t own[LANES];
+    int moves = 0, fed_forward = 0;
+    EACH {
+        own[lane] = d ? (size_t)motion[lane]->directions->count : 0;
+        moves |= d && by[lane]->path;
+        fed_forward |= d && by[lane]->torque;
+        if (apart) gather_columns(by[lane]->state, NX, own[lane], d, lane, X[0]);
+    }
+    prepare(k, m.theta, &m.time_step);
+
+    real q1[ONE(N)], z1[ONE(NZ)], lam[ONE(M)], u[ONE(NU)], effort[ONE(NC)], error;
     memset(lam, 0, sizeof lam);
-    int status = OK, step = 0;
-    double error = 0;
-    for (; step < motion->steps; step++) {
-        const double *x = out->state + (size_t)step * NX;
-        double *next = out->state + (size_t)(step + 1) * NX;
+    m.error = (real){0};
+    for (int step = 0; step < most && any(m.running); step++) {
+        mask at_work = m.running;
+        int row[LANES], status;
+        EACH {
+            const int last = motion[lane]->steps - 1;
+            row[lane] = step < last ? step : last;
+            LANE(at_work, lane) &= ONES(step <= last);
+        }
+        EACH from[lane] = motion[lane]->path + (size_t)(row[lane] + 1) * NC;
+        gather(from, NC, m.prescribed);
         if (NU) {
-            const double *nominal = motion->torque + (size_t)step * NU;
-            memcpy(u, nominal, sizeof(double) * NU);
-            if (feedback && feedback->count > 0) apply_feedback(feedback, step, x, nominal, u);
-            memcpy(out->applied + (size_t)step * NU, u, sizeof(double) * NU);
+            EACH from[lane] = motion[lane]->torque + (size_t)row[lane] * NU;
+            gather(from, NU, m.nominal);
         }
-        guess(x, step, motion->path + (size_t)(step + 1) * NC, q1, z1);
-        Point a = {x, x + N, x + 2 * N, u, motion->theta, &motion->time_step, q1, z1, lam};
-        status = one_step(k, &a, motion->tolerance, motion->limit, &error);
-        memcpy(next, q1, sizeof(double) * N);
-        memcpy(next + N, k->p1, sizeof(double) * N);
-        memcpy(next + 2 * N, z1, sizeof(double) * NZ);
-        if (status) break;
-        memcpy(out->multipliers + (size_t)step * M, lam, sizeof(double) * M);
-        effort_of(k, out->effort + (size_t)step * NC);
-        if (d) {
+        if (feeds) {
+            EACH from[lane] = motion[lane]->feedback->gain + (size_t)row[lane] * NU * feeds;
+            gather(from, (size_t)NU * feeds, m.gain);
+            EACH from[lane] = motion[lane]->feedback->reference + (size_t)row[lane] * feeds;
+            gather(from, feeds, m.reference);
+        }
+        const real *x = m.x[0];
+        real *next = m.x[2];
+        apply_feedback(feeds, fed, m.gain, m.reference, x, m.nominal, u);
+        guess(m.x, step, m.prescribed, q1, z1);
+        Point a = {x, x + N, x + 2 * N, u, m.theta, &m.time_step, q1, z1, lam};
+        const mask good = one_step(k, &a, m.tolerance, motions->limit, at_work, &error, &status);
+        m.error = choose(at_work, error, m.error);
+        effort_of(k, effort);
+        for (int lane = 0; lane < members; lane++) {
+            if (!LANE(at_work, lane)) continue;
+            double *state = outs[lane].state + (size_t)(step + 1) * NX;
+            scatter(u, NU, lane, outs[lane].applied + (size_t)step * NU);
+            scatter(q1, N, lane, state);
+            scatter(k->p1, N, lane, state + N);
+            scatter(z1, NZ, lane, state + 2 * N);
+            outcomes[lane].step = step;
+            outcomes[lane].status = LANE(good, lane) ? OK : LANES == 1 ? status : NOT_CONVERGED;
+            if (!LANE(good, lane)) continue;
+            scatter(lam, M, lane, outs[lane].multipliers + (size_t)step * M);
+            scatter(effort, NC, lane, outs[lane].effort + (size_t)step * NC);
+        }
+        /* those that have ended, well or not, stay where they are */
+        for (int i = 0; i < N; i++) next[i] = choose(good, q1[i], x[i]);
+        for (int i = 0; i < N; i++) next[N + i] = choose(good, k->p1[i], x[N + i]);
+        for (int i = 0; i < NZ; i++) next[2 * N + i] = choose(good, z1[i], x[2 * N + i]);
+        m.running &= good | NOT(at_work);
+        if (d && any(good)) {
             linearise(k, &a, 1);
-            if (NY && (status = factorise(k))) break;
-            columns.before = by->state + (size_t)step * NX * d;
-            columns.after = by->state + (size_t)(step + 1) * NX * d;
-            columns.input = input_columns(feedback, step, (int)d, by->torque ? by->torque + (size_t)step * NU * d : NULL,
-                                          columns.before, columns.input_room);
-            columns.path = by->path ? by->path + (size_t)(step + 1) * NC * d : NULL;
-            columns.multipliers = by->multipliers + (size_t)step * M * d;
-            columns.effort = by->effort + (size_t)step * NC * d;
-            sensitivity_step(k, &a, dir, &columns);
+            const mask solvable = NY ? factorise(k, EVERY, EVERY) : EVERY;
+            k->age = 0;
+            columns.before = X[step % 2];
+            columns.after = X[1 - step % 2];
+            columns.input = columns.path = NULL;
+            if (LANES == 1) {
+                columns.before = (real *)bys->state + (size_t)step * NX * d;
+                columns.after = (real *)bys->state + (size_t)(step + 1) * NX * d;
+                columns.multipliers = (real *)bys->multipliers + (size_t)step * M * d;
+                columns.effort = (real *)bys->effort + (size_t)step * NC * d;
+            }
+            if (NU && (feeds || fed_forward)) {
+                columns.input = columns.input_room;
+                memset(columns.input_room, 0, sizeof(real) * NU * d);
+                EACH {
+                    const double *given = by[lane]->torque ? by[lane]->torque + row[lane] * NU * own[lane] : NULL;
+                    if (given) gather_columns(given, NU, own[lane], d, lane, columns.input_room);
+                }
+                feed_columns(feeds, fed, m.gain, (int)d, columns.before, columns.input_room);
+            }
+            if (moves) {
+                columns.path = LANES == 1 ? (const real *)bys->path + (size_t)(step + 1) * NC * d : moved_path;
+                EACH {
+                    const double *given = by[lane]->path ? by[lane]->path + (row[lane] + 1) * NC * own[lane] : NULL;
+                    if (given && LANES > 1) gather_columns(given, NC, own[lane], d, lane, moved_path);
+                }
+            }
+            if (any(solvable)) sensitivity_step(k, &a, (int)d, members, motions, &columns);
+            for (int lane = 0; lane < members; lane++) {
+                if (!LANE(good, lane)) continue;
+                if (!LANE(solvable, lane)) outcomes[lane].status = SINGULAR;
+                else {
+                    const size_t of = own[lane], at = step;
+                    scatter_columns(columns.after, NX, of, d, lane, bys[lane].state + (at + 1) * NX * of);
+                    scatter_columns(columns.multipliers, M, of, d, lane, bys[lane].multipliers + at * M * of);
+                    scatter_columns(columns.effort, NC, of, d, lane, bys[lane].effort + at * NC * of);
+                }
+            }
+            m.running &= solvable | NOT(good);
         }
+        m.x[2] = m.x[1];
+        m.x[1] = m.x[0];
+        m.x[0] = next;
     }
-    outcome->step = step;
-    outcome->error = error;
-    outcome->iterations = k->iterations;
-    outcome->factorisations = k->factorisations;
-    YID_FREE(buffer);
+    for (int lane = 0; lane < members; lane++) {
+        if (outcomes[lane].status == OK) outcomes[lane].step = motions[lane].steps;
+        outcomes[lane].error = LANE(m.error, lane);
+        outcomes[lane].iterations = LANE(k->iterations, lane);
+        outcomes[lane].factorisations = LANE(k->factorisations, lane);
+    }
     work_free(k);
-    return status;
+    return OK;
+}
+
+/* What follows does one member alone. */
+#if LANES == 1
+
+static void solve_transposed(Work *k, const double *b, double *x) {
+    double *y = k->y;
+    for (int a = 0; a < NY; a++) y[a] = b[order[a]];
+    for (int p = 0; p < NY; p++) {
+        const double value = y[p] *= k->factors.inverse[p];
+        for (int rr = fill_start[p]; rr < fill_start[p + 1]; rr++)
+            SIMD
+            for (int c = fill_run[2 * rr]; c < fill_run[2 * rr + 1]; c++) y[c] -= k->factors.A[p][c] * value;
+    }
+    for (int p = NY - 1; p >= 0; p--) {
+        double sum = y[p];
+        for (int rr = fill_start[p]; rr < fill_start[p + 1]; rr++)
+            SIMD_SUM
+            for (int i = fill_run[2 * rr]; i < fill_run[2 * rr + 1]; i++) sum -= k->factors.LT[p][i] * y[i];
+        y[p] = sum;
+    }
+    for (int a = 0; a < NY; a++) x[order[a]] = y[a];
 }
 
 /* What a step ends with, copied because a step may write it; and the torque where there is none. */
@@ -795,9 +1016,8 @@ int yid_adjoint(const Motion *motion, const Trajectory *rollout, const Partials 
     const Directions *dir = motion->directions;
     const Feedback *feedback = motion->feedback;
     const int steps = motion->steps, feeds = feedback && feedback->count > 0, thetas = dir ? dir->theta_count : 0;
-    Work *k;
-    double *buffer;
-    if (!room_for(0, &k, &buffer, outcome)) return OUT_OF_MEMORY;
+    Work *k = work_new(0, outcome);
+    if (!k) return OUT_OF_MEMORY;
     prepare(k, motion->theta, &motion->time_step);
     double costate[ONE(NX)], g[ONE(NY)], nu[ONE(NY)], full[ONE(NT)], mu[ONE(NX)], mu_u[ONE(NU)];
     Ends ends = {0};
@@ -812,7 +1032,10 @@ int yid_adjoint(const Motion *motion, const Trajectory *rollout, const Partials 
             finish(k, &a);
         }
         linearise(k, &a, 1);
-        if (NY && (status = factorise(k))) break;
+        if (NY && !factorise(k, EVERY, EVERY)) {
+            status = SINGULAR;
+            break;
+        }
         const double *weight = costate + N, *effort = by->effort ? by->effort + (size_t)step * NC : NULL;
         for (int b = 0; b < NY; b++) {
             const int column = unknown_row[b];
@@ -851,7 +1074,7 @@ int yid_adjoint(const Motion *motion, const Trajectory *rollout, const Partials 
                 mu[feedback->index[c]] -= feedback->gain[((size_t)step * NU + j) * feedback->count + c] * mu_u[j];
         if (thetas) {
             for (int j = 0; effort && j < NC; j++) full[prescribed_index[j]] = 0;
-            theta_columns(dir, &a);
+            theta_columns(motion, &a, 0);
             const long long *patterns[3] = {dir->rows_pattern, dir->p1_pattern, dir->effort_pattern};
             const double *values[3] = {dir->rows_nz, dir->p1_nz, dir->effort_nz}, *weights[3] = {full, weight, effort};
             for (int part = 0; part < 3; part++) {
@@ -875,9 +1098,8 @@ int yid_adjoint(const Motion *motion, const Trajectory *rollout, const Partials 
  * iterate); a status. */
 int yid_linearize(const Motion *motion, const Trajectory *along, const Linearization *out, Outcome *outcome) {
     const Directions *dir = motion->directions;
-    Work *k;
-    double *buffer;
-    if (!room_for(0, &k, &buffer, outcome)) return OUT_OF_MEMORY;
+    Work *k = work_new(0, outcome);
+    if (!k) return OUT_OF_MEMORY;
     prepare(k, motion->theta, &motion->time_step);
     Ends ends = {0};
     for (int step = 0; step < motion->steps; step++) {
@@ -902,9 +1124,9 @@ int yid_linearize(const Motion *motion, const Trajectory *along, const Lineariza
         }
         if (dir && dir->theta_count) {
             const int d = dir->count;
-            theta_columns(dir, &a);
-            add_sparse(dir->rows_nz, dir->rows_pattern, out->rows_theta + (size_t)step * NT * d, d);
-            add_sparse(dir->p1_nz, dir->p1_pattern, out->p1_theta + (size_t)step * N * d, d);
+            theta_columns(motion, &a, 0);
+            add_sparse(dir->rows_nz, dir->rows_pattern, out->rows_theta + (size_t)step * NT * d, d, 0);
+            add_sparse(dir->p1_nz, dir->p1_pattern, out->p1_theta + (size_t)step * N * d, d, 0);
         }
     }
     work_free(k);
@@ -917,13 +1139,10 @@ int yid_linearize(const Motion *motion, const Trajectory *along, const Lineariza
 int yid_slopes(const Motion *motion, const Trajectory *along, int loads, const double *load_rows, const double *load_p1,
                double *state, double *effort, Outcome *outcome) {
     const size_t d = NX + NU + (size_t)loads;
-    const Directions dir = {.count = (int)d};
-    Work *k;
-    double *buffer;
-    if (!room_for(d * (2 * ONE(NT) + ONE(NY) + ONE(NU) + ONE(NQZ) + ONE(NX)) + BLOCK, &k, &buffer, outcome))
-        return OUT_OF_MEMORY;
+    Work *k = work_new(d * (2 * ONE(NT) + ONE(NY) + ONE(NU) + ONE(NQZ) + ONE(NX)) + BLOCK, outcome);
+    if (!k) return OUT_OF_MEMORY;
     prepare(k, motion->theta, &motion->time_step);
-    double *before = buffer, *input = before + d * ONE(NX);
+    double *before = k->room, *input = before + d * ONE(NX);
     Columns columns = {.before = before, .input = NU ? input : NULL, .loads = loads};
     columns.load_rows = load_rows;
     columns.load_p1 = load_p1;
@@ -941,13 +1160,15 @@ int yid_slopes(const Motion *motion, const Trajectory *along, int loads, const d
         evaluate(k, &a);
         finish(k, &a);
         linearise(k, &a, 1);
-        if (NY && (status = factorise(k))) break;
+        if (NY && !factorise(k, EVERY, EVERY)) {
+            status = SINGULAR;
+            break;
+        }
         columns.after = state + (size_t)step * NX * d;
         columns.effort = effort + (size_t)step * NC * d;
-        sensitivity_step(k, &a, &dir, &columns);
+        sensitivity_step(k, &a, (int)d, 1, motion, &columns);
     }
     outcome->step = step;
-    YID_FREE(buffer);
     work_free(k);
     return status;
 }
@@ -969,7 +1190,8 @@ static Point rest_point(const Work *k, Resting *s, const Motion *motion, const d
     memset(s->x + N, 0, sizeof(double) * N);
     if (NU) {
         memcpy(s->u, motion->torque, sizeof(double) * NU);
-        if (motion->feedback) apply_feedback(motion->feedback, 0, s->x, motion->torque, s->u);
+        const Feedback *f = motion->feedback;
+        if (f) apply_feedback(f->count, f->index, f->gain, f->reference, s->x, motion->torque, s->u);
     }
     const Point a = {s->x, s->x + N, s->z, s->u, motion->theta, &motion->time_step, s->q, s->z, s->lam};
     return a;
@@ -997,7 +1219,7 @@ static double rest_rows(Work *k, Resting *s, const Point *a, double *r) {
     return largest;
 }
 
-/* Slopes of `rest_rows` at the point of its last call, into k->A. */
+/* Slopes of `rest_rows` at the point of its last call, into k->factors.A. */
 static void rest_slopes(Work *k, Resting *s, const Point *a, const Feedback *hold) {
     linearise(k, a, 1);
     for (int i = 0; i < NT; i++) {
@@ -1025,29 +1247,29 @@ static void rest_slopes(Work *k, Resting *s, const Point *a, const Feedback *hol
             row[hold->index[c]] -= s->slopes_nz[e] * hold->gain[input * hold->count + c];
     }
     for (int b = 0; b < NY; b++)
-        for (int c = 0; c < NY; c++) k->A[b][c] = s->full[unknown_row[b]][unknown_row[c]];
+        for (int c = 0; c < NY; c++) k->factors.A[b][c] = s->full[unknown_row[b]][unknown_row[c]];
 }
 
-/* LU of k->A with partial pivoting: forces of constraints have no diagonal, and an equilibrium may be unstable. */
+/* LU of k->factors.A with partial pivoting: forces of constraints have no diagonal, and an equilibrium may be unstable. */
 static int factorise_pivoted(Work *k, int *pivot) {
     for (int p = 0; p < NY; p++) {
         int best = p;
         for (int i = p + 1; i < NY; i++)
-            if (fabs(k->A[i][p]) > fabs(k->A[best][p])) best = i;
+            if (fabs(k->factors.A[i][p]) > fabs(k->factors.A[best][p])) best = i;
         pivot[p] = best;
-        if (!(fabs(k->A[best][p]) > 0) || !isfinite(k->A[best][p])) return SINGULAR;
+        if (!(fabs(k->factors.A[best][p]) > 0) || !isfinite(k->factors.A[best][p])) return SINGULAR;
         for (int c = 0; best != p && c < NY; c++) {
-            const double kept = k->A[p][c];
-            k->A[p][c] = k->A[best][c];
-            k->A[best][c] = kept;
+            const double kept = k->factors.A[p][c];
+            k->factors.A[p][c] = k->factors.A[best][c];
+            k->factors.A[best][c] = kept;
         }
-        const double inverse = k->inverse[p] = 1.0 / k->A[p][p];
-        const double *source = k->A[p];
+        const double inverse = k->factors.inverse[p] = 1.0 / k->factors.A[p][p];
+        const double *source = k->factors.A[p];
         for (int i = p + 1; i < NY; i++) {
-            double *target = k->A[i];
+            double *target = k->factors.A[i];
             const double factor = target[p] *= inverse;
             if (factor == 0.0) continue;
-#pragma omp simd
+            SIMD
             for (int c = p + 1; c < NY; c++) target[c] -= factor * source[c];
         }
     }
@@ -1064,11 +1286,11 @@ static double rest_change(const Work *k, const int *pivot, const double *b, cons
         x[p] = value;
     }
     for (int p = 0; p < NY; p++)
-        for (int i = p + 1; i < NY; i++) x[i] -= k->A[i][p] * x[p];
+        for (int i = p + 1; i < NY; i++) x[i] -= k->factors.A[i][p] * x[p];
     for (int p = NY - 1; p >= 0; p--) {
         double sum = x[p];
-        for (int c = p + 1; c < NY; c++) sum -= k->A[p][c] * x[c];
-        x[p] = sum * k->inverse[p];
+        for (int c = p + 1; c < NY; c++) sum -= k->factors.A[p][c] * x[c];
+        x[p] = sum * k->factors.inverse[p];
     }
     for (int i = 0; i < NY; i++) {
         if (!isfinite(x[i])) return NAN;
@@ -1110,13 +1332,12 @@ static int rest_search(Work *k, Resting *s, const Motion *motion, double *w, dou
  * first node, and torques follow the first step's feedback; a status. Newton with step control: the natural monotonicity
  * test (Deuflhard 2011, section 3.3) or a smaller residual. */
 int yid_rest(const Motion *motion, double *w, Outcome *outcome) {
-    Work *k;
-    double *buffer;
-    if (!room_for((sizeof(Resting) + sizeof(double) - 1) / sizeof(double), &k, &buffer, outcome)) return OUT_OF_MEMORY;
+    Work *k = work_new((sizeof(Resting) + sizeof(double) - 1) / sizeof(double), outcome);
+    if (!k) return OUT_OF_MEMORY;
     prepare(k, motion->theta, &motion->time_step);
-    const int status = rest_search(k, (Resting *)buffer, motion, w, &outcome->error);
+    const int status = rest_search(k, (Resting *)k->room, motion, w, &outcome->error);
     outcome->iterations = k->iterations;
-    YID_FREE(buffer);
     work_free(k);
     return status;
 }
+#endif

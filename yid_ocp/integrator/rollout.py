@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import ModelError
 from yid_ocp.integrator.step import Step, check_shape
-from yid_ocp.integrator.step_model import Directions, Feedback, Gradient, Rollout
+from yid_ocp.integrator.step_model import Directions, Feedback, Gradient, Member, Rollout
 from yid_ocp.parallel import SYMBOLIC
 
 Array = NDArray[np.float64]
@@ -27,6 +27,8 @@ def simulate(
     directions: Directions | None = None,
 ) -> Rollout:
     """Roll a system out, with forward sensitivities where directions are given.
+
+    The same system at other parameters, from other starts or with other inputs goes faster by `simulate_all`.
 
     Parameters
     ----------
@@ -53,6 +55,36 @@ def simulate(
     ModelError
         An array of the wrong shape.
     """
+    return simulate_all(step, [rollout_member(step, theta, start, steps, torque, path, feedback, directions)])[0]
+
+
+def simulate_all(step: Step, members: Sequence[Member]) -> list[Rollout]:
+    """Roll all members out, several at once where that pays; to rounding what `simulate` gives each.
+
+    Parameters
+    ----------
+    step : Step
+    members : sequence of Member
+        From `rollout_member`.
+
+    Returns
+    -------
+    list of Rollout
+    """
+    return step.kernel.rollouts(members)
+
+
+def rollout_member(
+    step: Step,
+    theta: ArrayLike,
+    start: ArrayLike,
+    steps: int,
+    torque: ArrayLike | None = None,
+    path: ArrayLike | None = None,
+    feedback: Feedback | None = None,
+    directions: Directions | None = None,
+) -> Member:
+    """What a rollout is asked about, checked; arguments and errors are those of `simulate`."""
     sizes = step.sizes
     if steps < 1:
         raise ModelError(f"steps = {steps}", allowed="a whole number from 1")
@@ -75,7 +107,7 @@ def simulate(
                 first[fixed] = directions.path[0]
                 directions = Directions(directions.names, first, directions.torque, directions.path)
     values = check_shape("theta", theta, (sizes["ntheta"],))
-    return step.kernel.rollout(values, begin, inputs, course, feedback, directions)
+    return Member(values, begin, inputs, course, feedback, directions)
 
 
 def adjoint_gradient(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import Protocol
@@ -206,6 +206,31 @@ class Feedback:
 
 
 @dataclass(frozen=True)
+class Member:
+    """What a rollout is asked about, one of many.
+
+    Attributes
+    ----------
+    theta : ndarray, shape (ntheta,)
+    start : ndarray, shape (nx,)
+        Initial (q, p, z).
+    torque : ndarray, shape (N, nu)
+        Nominal motor torque of every step [N m].
+    path : ndarray, shape (N + 1, nc)
+        Prescribed coordinates at every node.
+    feedback : Feedback, optional
+    wanted : Directions, optional
+    """
+
+    theta: Array
+    start: Array
+    torque: Array
+    path: Array
+    feedback: Feedback | None = None
+    wanted: Directions | None = None
+
+
+@dataclass(frozen=True)
 class Rollout:
     """A rollout and, where asked for, its forward sensitivities.
 
@@ -307,6 +332,10 @@ class Kernel(Protocol):
         wanted: Directions | None,
     ) -> Rollout:
         """Roll out over len(torque) steps from the state `start`."""
+        ...
+
+    def rollouts(self, members: Sequence[Member]) -> list[Rollout]:
+        """Roll all members out, several at once where that pays; to rounding what `rollout` gives each."""
         ...
 
     def adjoint(

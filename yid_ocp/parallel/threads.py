@@ -12,6 +12,7 @@ from yid_ocp.errors import ConfigError
 
 THREADS = "YID_OCP_THREADS"
 """Environment variable: threads that one process may use; as many as it has processors when absent."""
+_SHARE = threading.local()
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 Key = TypeVar("Key", bound=Hashable)
@@ -27,7 +28,8 @@ def map_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> li
     workers = min(len(entries), threads())
     if workers < 2:
         return [function(entry) for entry in entries]
-    with ThreadPoolExecutor(max_workers=workers) as pool:
+    own = threads() // workers
+    with ThreadPoolExecutor(max_workers=workers, initializer=share_of_threads, initargs=(own,)) as pool:
         return list(pool.map(function, entries))
 
 
@@ -37,7 +39,7 @@ def processors() -> int:
 
 
 def threads() -> int:
-    """How many threads this process may use at once.
+    """How many threads may be used at once from here: of the process, or a share of them within `map_threads`.
 
     Raises
     ------
@@ -47,7 +49,13 @@ def threads() -> int:
     said = os.environ.get(THREADS, "")
     if said and not (said.isdecimal() and int(said)):
         raise ConfigError(f"{THREADS} is '{said}'", where="environment", allowed="a whole number from 1")
-    return int(said) if said else processors()
+    own = int(said) if said else processors()
+    return min(own, getattr(_SHARE, "count", own))
+
+
+def share_of_threads(count: int) -> None:
+    """Leave so many threads, at most, to what the present one does."""
+    _SHARE.count = count
 
 
 # CasADi marks the nodes of expressions while it differentiates them: two threads at once on expressions that share

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.integrator.rollout import adjoint_gradient, simulate
+from yid_ocp.integrator.rollout import adjoint_gradient, rollout_member, simulate_all
 from yid_ocp.integrator.statics import Rest
 from yid_ocp.integrator.step import Directions, Rollout, Step
+from yid_ocp.integrator.step_model import Member
 from yid_ocp.model.system import System
+from yid_ocp.parallel import map_threads
 from yid_ocp.problem.corrections import Inputs
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.functions import ModelFunctions
@@ -23,6 +25,8 @@ from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.problem.unknowns import Unknowns
 
 Array = NDArray[np.float64]
+MOST_MEMORY = 2.0**28
+"""Of the states and their derivatives of episodes that are rolled out at once [bytes]."""
 
 LEAST_GAIN = 0.1
 """Least factor between a recorded torque and the one that acts at which an error of the latter is one of the former."""
@@ -85,6 +89,18 @@ class Start:
     by_unknowns: Array
     rest: Rest | None
     message: str
+
+
+@dataclass(frozen=True)
+class _Prepared:
+    """An episode whose rollout can begin."""
+
+    episode: Episode
+    start: Start
+    inputs: Inputs
+    member: Member
+    wanted: tuple[str, ...]
+    derivatives: bool
 
 
 @dataclass(frozen=True)
@@ -248,6 +264,32 @@ class Predictor:
         self, episode: Episode, theta: Array, offset: Array, derivatives: bool, guess: Array | None = None
     ) -> EpisodeResult | str:
         """Roll one episode out and predict its samples; a text says why where that is impossible."""
+        return self.run_all([(episode, theta, offset, guess)], derivatives)[0]
+
+    def run_all(
+        self, asked: Sequence[tuple[Episode, Array, Array, Array | None]], derivatives: bool
+    ) -> list[EpisodeResult | str]:
+        """Roll several episodes out, together where that pays; each is given as (episode, theta, offset, guess)."""
+
+        def part(some: Sequence[tuple[Episode, Array, Array, Array | None]]) -> list[EpisodeResult | str]:
+            prepared = map_threads(lambda one: self._prepared(*one, derivatives), some)
+            rollouts = iter(simulate_all(self.step, [p.member for p in prepared if not isinstance(p, str)]))
+            pairs = [(p, None if isinstance(p, str) else next(rollouts)) for p in prepared]
+            return map_threads(lambda pair: self._told(*pair), pairs)
+
+        width = len(self.unknowns.parameters) + len(self.start_rows) if derivatives else 0
+        each = [8 * (episode.grid.steps + 1) * self.step.sizes["nx"] * (width + 1) for episode, *_ in asked]
+        found: list[EpisodeResult | str] = []
+        while len(found) < len(asked):
+            held = np.cumsum(each[len(found) :])
+            count = max(int(np.searchsorted(held, MOST_MEMORY, "right")), 1)
+            found += part(asked[len(found) : len(found) + count])
+        return found
+
+    def _prepared(
+        self, episode: Episode, theta: Array, offset: Array, guess: Array | None, derivatives: bool
+    ) -> _Prepared | str:
+        """What an episode's rollout starts from and is driven by."""
         wanted = self.unknowns.parameters if derivatives else ()
         theta = self.own_theta(episode, theta)
         start = self.start(episode, theta, offset, wanted, guess)
@@ -262,9 +304,18 @@ class Predictor:
             by_torque, by_path = (None if by is None else np.pad(by, extra) for by in moved)
             directions = Directions(wanted, by_start, by_torque, by_path)
         feedback = inputs.guided(feedback, driven, episode.measured_arm)
-        rollout = simulate(
+        member = rollout_member(
             self.step, theta, start.state, episode.grid.steps, inputs.torque, inputs.path, feedback, directions
         )
+        return _Prepared(episode, start, inputs, member, wanted, derivatives)
+
+    def _told(self, prepared: _Prepared | str, rollout: Rollout | None) -> EpisodeResult | str:
+        """The samples of a rollout."""
+        if isinstance(prepared, str) or rollout is None:
+            return str(prepared)
+        episode, start, inputs, wanted = prepared.episode, prepared.start, prepared.inputs, prepared.wanted
+        theta, feedback, directions = prepared.member.theta, prepared.member.feedback, prepared.member.wanted
+        driven = self.system.driven_indices
         if not rollout.status.ok:
             return f"{episode.name}: {rollout.status.message}"
         by_applied = None
@@ -292,7 +343,7 @@ class Predictor:
             rollout,
             start.rest,
             tuple(predicted),
-            tuple(sensitivities) if derivatives else None,
+            tuple(sensitivities) if prepared.derivatives else None,
             None if start.rest is None else start.rest.state[: self.system.size],
             correction,
             by_correction,

@@ -287,10 +287,8 @@ class EstimationProblem:
         x = np.asarray(x, float)
         guesses = warm or (None,) * len(self.episodes)
 
-        def one(i: int) -> EpisodeResult | str:
-            return self.predictor.run(self.episodes[i], *self.split(x, i), derivatives, guesses[i])
-
-        results = map_threads(one, range(len(self.episodes)))
+        asked = [(e, *self.split(x, i), guess) for i, (e, guess) in enumerate(zip(self.episodes, guesses, strict=True))]
+        results = self.predictor.run_all(asked, derivatives)
         failures = [result for result in results if isinstance(result, str)]
         if failures:
             return Evaluation(np.inf, np.zeros(0), None, False, failures[0], ())
