@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
 
 import numpy as np
@@ -12,6 +13,10 @@ from yid_ocp.workflow.command import carry_out
 from yid_ocp.workflow.progress import SILENT, BarProgress, PlainProgress, duration_words, shown
 
 ENTRY = Iterate(3, 12.5, np.zeros(1), 0.1, 4, 1.25, "first 2 s")
+
+
+def asked(quiet: bool = False, program: bool = False) -> argparse.Namespace:
+    return argparse.Namespace(quiet=quiet, json=program)
 
 
 def report(progress) -> None:
@@ -116,14 +121,18 @@ def test_a_bar_moves_with_its_stage_and_is_full_when_the_next_begins():
 
 
 def test_what_is_shown_depends_on_who_looks(capsys, monkeypatch):
-    with shown(quiet=True) as progress:
+    with shown(asked(quiet=True)) as progress:
         assert progress is SILENT
         report(progress)
     assert capsys.readouterr().err == ""
-    with shown(quiet=False) as progress:
+    with shown(asked()) as progress:
         assert isinstance(progress, PlainProgress)
+    with shown(asked(program=True)) as progress:
+        assert progress is SILENT
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    with shown(quiet=False) as progress:
+    with shown(asked(program=True)) as progress:
+        assert isinstance(progress, BarProgress)
+    with shown(asked()) as progress:
         assert isinstance(progress, BarProgress)
         report(progress)
 
@@ -141,7 +150,7 @@ def test_a_command_ends_with_its_table_and_its_folder(tmp_path, monkeypatch, cap
         progress.stage("working")
         return Outcome(tmp_path / "runs" / "x")
 
-    outcome = carry_out(work, lambda result: [f"a = {result['a']}", "done"], quiet)
+    outcome = carry_out(work, lambda result: [f"a = {result['a']}", "done"], asked(quiet=quiet))
     captured = capsys.readouterr()
     assert outcome.folder == tmp_path / "runs" / "x"
     if quiet:
@@ -153,5 +162,5 @@ def test_a_command_ends_with_its_table_and_its_folder(tmp_path, monkeypatch, cap
 def test_a_folder_elsewhere_is_named_in_full(tmp_path, monkeypatch, capsys):
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    carry_out(lambda progress: Outcome(tmp_path / "there"), lambda result: [], False)
+    carry_out(lambda progress: Outcome(tmp_path / "there"), lambda result: [], asked())
     assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path / "there")

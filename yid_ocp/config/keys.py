@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
-from yid_ocp.errors import ConfigError, nearest
+from yid_ocp.errors import ConfigError, choices
 from yid_ocp.options import Among, Option, entries_of, members, options_of, stripped, values_of
 
 
@@ -58,9 +57,9 @@ class Sections:
 
     def unknown(self, word: object, where: str) -> ConfigError:
         """That a word chooses nothing."""
-        what = f"there is no {self.noun} '{word}'" if word else f"the key '{self.key}' is missing"
-        hint = nearest(str(word), self.classes) if word else ""
-        return ConfigError(what, where=where, allowed=", ".join(self.classes), hint=hint)
+        if not word:
+            return ConfigError(f"the key '{self.key}' is missing", where=where, allowed=", ".join(self.classes))
+        return ConfigError(f"there is no {self.noun} '{word}'", where=where, **choices(str(word), self.classes))
 
 
 def sections_of(hint: Any) -> Sections | None:
@@ -81,15 +80,16 @@ def sections_of(hint: Any) -> Sections | None:
 
 def unknown_key(root: type, name: str, known: Iterable[str], where: str, within: str = "") -> ConfigError:
     """That a section has no such key, with the nearest one that it has and the sections that have this one."""
-    names = list(known)
-    close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+    said = choices(name, known)
     homes = list(dict.fromkeys(homes_of(root, name)))
-    hints = [f"did you mean '{close[0]}'?"] if close else []
+    hints = [said["hint"]] if said["hint"] else []
     hints += [f"'{name}' is a key of {', '.join(homes[:3])}"] if homes else []
+    if ":" in name:
+        hints = ["put a space behind the colon, as in {" + name.replace(":", ": ") + "}"]
     return ConfigError(
         f"there is no key '{name}'" + (f" in {within}" if within else ""),
         where=where,
-        allowed=", ".join(names),
+        allowed=said["allowed"],
         hint="; ".join(hints),
     )
 

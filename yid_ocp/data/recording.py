@@ -11,7 +11,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from yid_ocp.errors import DataError, nearest
+from yid_ocp.errors import DataError, choices
 from yid_ocp.sensors.base import EffortKind
 
 Array = NDArray[np.float64]
@@ -355,17 +355,18 @@ def check_names(recording: Recording, joints: Iterable[str], points: Iterable[st
     Raises
     ------
     DataError
-        If one is missing; the error names it and the nearest that there is.
+        If one is missing; the error names it and the choices that there is.
     """
     for noun, wanted, known in (("joint", joints, recording.joint_names), ("point", points, recording.point_names)):
         missing = [name for name in dict.fromkeys(wanted) if name not in known]
         if missing:
             listed = ", ".join(f"'{name}'" for name in missing)
+            said = [(name, choices(name, known)) for name in missing]
             raise DataError(
                 f"the recording has no {noun}{'s' if len(missing) > 1 else ''} {listed}",
                 where=f"recording '{recording.name}'",
-                allowed=", ".join(known) or f"no {noun}s were recorded",
-                hint="; ".join(f"'{name}': {nearest(name, known)}" for name in missing) if known else "",
+                allowed=said[0][1]["allowed"] if known else f"no {noun}s were recorded",
+                hint="; ".join(f"'{name}': {own['hint']}" for name, own in said if own["hint"]),
             )
 
 

@@ -77,9 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
     members = batch_members(arguments.configs, arguments.recordings, arguments.overrides)
     workers = given_workers(arguments) or LOCAL
     out = arguments.out or Path("runs") / f"batch-{time.strftime('%Y%m%d-%H%M%S')}"
-    outcome = carry_out(
-        lambda shown: run_batch(members, out, arguments.each, workers, shown), batch_summary, arguments.quiet
-    )
+    outcome = carry_out(lambda shown: run_batch(members, out, arguments.each, workers, shown), batch_summary, arguments)
     return DONE if outcome.ok else FAILED
 
 

@@ -66,7 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
     def proved(shown: Progress) -> BlindOutcome:
         return run_blind(runs, out, arguments.cases, arguments.seed, shown, workers, purpose)
 
-    carry_out(proved, blind_summary, arguments.quiet)
+    carry_out(proved, blind_summary, arguments)
     return DONE
 
 

@@ -19,7 +19,7 @@ from yid_ocp.data.edges import edge_lengths
 from yid_ocp.data.hdf5 import read_recording
 from yid_ocp.data.recording import Recording
 from yid_ocp.effects import make_effect
-from yid_ocp.errors import DataError, ModelError, YidError, nearest
+from yid_ocp.errors import DataError, ModelError, YidError, choices, nearest
 from yid_ocp.files import is_file
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model import FlexibleObject, Grasp, Mechanism, Segment, System, flexible_object
@@ -550,8 +550,7 @@ def _check_sensors(run: Run, recordings: Sequence[Recording]) -> None:
                 f"no recording has a group '{name}'",
                 "sensors",
                 name,
-                allowed=", ".join(sorted(known)),
-                hint=nearest(name, known),
+                **choices(name, sorted(known)),
             )
         if run.sensors[name].kind is not None and name != EFFORT:
             raise run.refuse(

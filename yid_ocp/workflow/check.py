@@ -43,7 +43,7 @@ class CheckOutcome:
 def run(arguments: argparse.Namespace) -> int:
     """The command."""
     settings = load_config(arguments.config, arguments.overrides)
-    outcome = carry_out(lambda shown: run_check(settings, arguments.out, shown), check_summary, arguments.quiet)
+    outcome = carry_out(lambda shown: run_check(settings, arguments.out, shown), check_summary, arguments)
     return WRONG_INPUT if settings.recordings.strict and outcome.result["warnings"] else DONE
 
 

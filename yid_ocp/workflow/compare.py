@@ -56,7 +56,7 @@ def chosen_solvers(run: Run) -> list[Solver]:
 def run(arguments: argparse.Namespace) -> int:
     """The command."""
     settings = load_config(arguments.config, arguments.overrides)
-    outcome = carry_out(lambda shown: run_compare(settings, arguments.out, shown), compare_summary, arguments.quiet)
+    outcome = carry_out(lambda shown: run_compare(settings, arguments.out, shown), compare_summary, arguments)
     return DONE if outcome.ok else FAILED
 
 

@@ -64,7 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.baseline:
         said = tuple(str(Path(folder).expanduser().resolve()) for folder in arguments.baseline)
         settings = replace(settings, diagnosis=replace(settings.diagnosis, baseline=said))
-    carry_out(lambda shown: run_diagnose(settings, arguments.out, shown), diagnose_summary, arguments.quiet)
+    carry_out(lambda shown: run_diagnose(settings, arguments.out, shown), diagnose_summary, arguments)
     return DONE
 
 

@@ -98,7 +98,7 @@ def run(arguments: argparse.Namespace) -> int:
     def judged(shown: Progress) -> IdentifiabilityOutcome:
         return run_identifiability(settings, arguments.out, shown, asked, workers)
 
-    outcome = carry_out(judged, identifiability_summary, arguments.quiet)
+    outcome = carry_out(judged, identifiability_summary, arguments)
     return DONE if outcome.ok else FAILED
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,9 @@ from yid_ocp.data import Recording, preview, read_any, write_recording
 from yid_ocp.data.readers.base import units_of
 from yid_ocp.errors import ConfigError
 from yid_ocp.report.terminal import contents_summary, recording_summary
-from yid_ocp.workflow.command import DONE, print_lines
+from yid_ocp.workflow.command import DONE, print_json, print_lines, tell
 
+FORMAT = "yid-import/1"
 _LISTS = {"joint_topics": "--joint-topic", "joints": "--joints"}
 _MAPPINGS: Mapping[str, tuple[str, Callable[[str], Any]]] = {
     "points": ("--points", str),
@@ -36,7 +37,10 @@ def run(arguments: argparse.Namespace) -> int:
         lines = contents_summary(contents)
         if not own(arguments.file):
             lines += ["", "to import it:", f"  {command_line(arguments.file, options)}"]
-        print_lines(lines)
+        if arguments.json:
+            print_json({"format": FORMAT, "recording": None, **asdict(contents)})
+        else:
+            print_lines(lines)
         return DONE
     if arguments.out is None:
         allowed = "--out RECORDING.h5, or --preview to look only"
@@ -44,10 +48,21 @@ def run(arguments: argparse.Namespace) -> int:
     settings = load_config(arguments.config).import_ if arguments.config else ImportSettings()
     recording = imported(arguments.file, options_of_settings(settings) | given_options(arguments))
     write_recording(recording, arguments.out)
-    if not arguments.quiet:
-        print_lines(recording_summary(recording))
-    print(arguments.out if arguments.quiet else f"recording: {arguments.out}")
+    result = {"format": FORMAT, "recording": arguments.out, **recording_result(recording)}
+    tell(arguments, result, lambda: recording_summary(recording), f"recording: {arguments.out}", arguments.out)
     return DONE
+
+
+def recording_result(recording: Recording) -> dict[str, Any]:
+    """What a recording holds, for programs."""
+    return {
+        "duration": recording.duration,
+        "groups": {
+            getattr(group, "name", "joints"): {"samples": len(group.t), "names": list(group.names)}
+            for group in recording.groups
+        },
+        "notes": list(recording.notes),
+    }
 
 
 def imported(file: str | Path, options: Mapping[str, Any]) -> Recording:

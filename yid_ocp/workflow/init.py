@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from yid_ocp.config.reader import load_config
@@ -15,11 +15,12 @@ from yid_ocp.errors import ConfigError, DataError, OutputError
 from yid_ocp.files import new_file, write_text
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.workflow.build import build_system
-from yid_ocp.workflow.command import DONE, print_lines
+from yid_ocp.workflow.command import DONE, tell
 from yid_ocp.workflow.commented import Object, configuration
 from yid_ocp.workflow.import_recording import given_options, imported, own
 from yid_ocp.workflow.proposal import Branch, Proposal, propose, relative, split_at_rest
 
+FORMAT = "yid-init/1"
 SCHEMA = "yid-ocp.schema.json"
 LINKS = {"cable": 8, "beam": 6, "tree": 4, "y": 4}
 NEEDED = {"cable": ("length", "mass", "radius"), "beam": ("length", "mass"), "tree": (), "y": ()}
@@ -51,9 +52,8 @@ def run(arguments: argparse.Namespace) -> int:
     files = [relative(file, out.parent) for file in made]
     text = configuration(where, item, proposal, files, imports, SCHEMA)
     _write(out, text, {file: raw for file, raw in made.items() if raw is not None})
-    if not arguments.quiet:
-        print_lines(summary(proposal, out))
-    print(out if arguments.quiet else f"configuration: {out}")
+    result = {"format": FORMAT, "configuration": str(out), "recordings": files, "proposal": asdict(proposal)}
+    tell(arguments, result, lambda: summary(proposal, out), f"configuration: {out}", str(out))
     return DONE
 
 

@@ -72,7 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
     """The command."""
     settings = load_config(arguments.config, arguments.overrides)
     asked = (tuple(arguments.entries), arguments.export)
-    carry_out(lambda shown: run_inspect(settings, arguments.out, shown, *asked), inspect_summary, arguments.quiet)
+    carry_out(lambda shown: run_inspect(settings, arguments.out, shown, *asked), inspect_summary, arguments)
     return DONE
 
 

@@ -57,7 +57,7 @@ class PlanOutcome:
 def run(arguments: argparse.Namespace) -> int:
     """The command."""
     settings = load_config(arguments.config, arguments.overrides)
-    outcome = carry_out(lambda shown: run_plan(settings, arguments.out, shown), plan_summary, arguments.quiet)
+    outcome = carry_out(lambda shown: run_plan(settings, arguments.out, shown), plan_summary, arguments)
     return DONE if outcome.ok else FAILED
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import sys
 import time
@@ -141,11 +142,16 @@ def iterate_words(entry: Iterate) -> str:
 
 
 @contextlib.contextmanager
-def shown(quiet: bool) -> Iterator[Progress]:
-    """Progress on standard error while the block runs: bars on a terminal, lines elsewhere, nothing where quiet."""
-    if quiet:
+def shown(arguments: argparse.Namespace) -> Iterator[Progress]:
+    """Progress on standard error while the block runs.
+
+    Bars on a terminal. Elsewhere lines, for logs, or nothing where a program reads the result (`--json`); nothing where
+    it is asked to be quiet.
+    """
+    terminal = sys.stderr.isatty()
+    if arguments.quiet or (arguments.json and not terminal):
         yield SILENT
-    elif not sys.stderr.isatty():
+    elif not terminal:
         yield PlainProgress()
     else:
         from rich.console import Console

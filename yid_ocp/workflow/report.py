@@ -35,7 +35,7 @@ class ReportOutcome:
 
 def run(arguments: argparse.Namespace) -> int:
     """The command."""
-    carry_out(lambda shown: run_report(arguments.runs, arguments.out, shown), history_summary, arguments.quiet)
+    carry_out(lambda shown: run_report(arguments.runs, arguments.out, shown), history_summary, arguments)
     return DONE
 
 

@@ -61,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
     def simulated(shown: Progress) -> SimulateOutcome:
         return run_simulate(settings, arguments.out, shown, arguments.seed, arguments.noise)
 
-    outcome = carry_out(simulated, simulate_summary, arguments.quiet)
+    outcome = carry_out(simulated, simulate_summary, arguments)
     return DONE if outcome.ok else FAILED
 
 

@@ -67,7 +67,7 @@ class SolveOutcome:
 def run(arguments: argparse.Namespace) -> int:
     """The command."""
     settings = load_config(arguments.config, arguments.overrides)
-    outcome = carry_out(lambda shown: run_solve(settings, arguments.out, shown), solve_summary, arguments.quiet)
+    outcome = carry_out(lambda shown: run_solve(settings, arguments.out, shown), solve_summary, arguments)
     return DONE if outcome.ok else FAILED
 
 

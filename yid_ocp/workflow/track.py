@@ -59,7 +59,7 @@ class TrackOutcome:
 def run(arguments: argparse.Namespace) -> int:
     """The command."""
     settings = load_config(arguments.config, arguments.overrides)
-    carry_out(lambda shown: run_track(settings, arguments.out, shown), track_summary, arguments.quiet)
+    carry_out(lambda shown: run_track(settings, arguments.out, shown), track_summary, arguments)
     return DONE
 
 

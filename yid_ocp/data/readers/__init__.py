@@ -14,7 +14,7 @@ from yid_ocp.data.readers.base import PREVIEWS as PREVIEWS
 from yid_ocp.data.readers.base import READERS as READERS
 from yid_ocp.data.readers.base import Contents, Source, rate_of
 from yid_ocp.data.recording import Recording
-from yid_ocp.errors import DataError, nearest
+from yid_ocp.errors import DataError, choices, nearest
 
 for _suffix in (".h5", ".hdf5"):
     READERS.register(_suffix)(read_recording)
@@ -52,8 +52,7 @@ def read_any(path: str | os.PathLike[str], **options: Any) -> Recording:
             raise DataError(
                 f"the reader of '{known_as}' files has no option '{name}'",
                 where=str(path),
-                allowed=", ".join(known) or "none",
-                hint=nearest(name, known),
+                **choices(name, known),
             )
     return reader(path, **options)
 
@@ -100,7 +99,6 @@ def _format_of(path: Path) -> str:
         raise DataError(
             f"there is no reader for '{key}' files",
             where=str(path),
-            allowed=", ".join(READERS),
-            hint=nearest(key, READERS),
+            **choices(key, READERS),
         )
     return key

@@ -23,7 +23,7 @@ from yid_ocp.data.readers.base import (
     renamings,
 )
 from yid_ocp.data.recording import Array, JointGroup, PointGroup, Recording
-from yid_ocp.errors import DataError, nearest
+from yid_ocp.errors import DataError, choices, nearest
 from yid_ocp.files import file_sha256
 
 _JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -319,7 +319,7 @@ def _joints(
     for topic in (*(topics or ()), *((command,) if command else ())):
         if topic not in known:
             what = f"there are no joint states on the topic '{topic}'"
-            raise DataError(what, where=where, allowed=", ".join(known), hint=nearest(topic, known))
+            raise DataError(what, where=where, **choices(topic, known))
     chosen = [topic for topic in (known if topics is None else topics) if topic != command]
     wanted = None if joints is None else renamings(joints, "joint", where)
     found, notes = [], []
@@ -430,9 +430,8 @@ def _named_places(bag: _Bag, points: Mapping[str, str] | None, where: str) -> Pl
     for source in names:
         if source not in present and points is not None:
             trees = [topic.name for topic in bag.topics if topic.kind in _TREES]
-            listed = ", ".join([*present, *(f"{tree}:FRAME" for tree in trees)])
             what = f"there are no points on the topic '{source}'"
-            raise DataError(what, where=where, allowed=listed or "none", hint=nearest(source, present))
+            raise DataError(what, where=where, **choices(source, [*present, *(f"{tree}:FRAME" for tree in trees)]))
     check_point_names(names, where)
     groups: Places = {}
     for message in bag.places:
