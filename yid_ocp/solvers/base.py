@@ -263,13 +263,15 @@ def _solved(
     lower, upper = problem.bounds
     first = off_neutral(problem, problem.start) if start is None else np.clip(np.asarray(start, float), lower, upper)
     best, evaluations, history = _attempt(problem, solver, first, callback)
-    tried = 1
+    tried = number = 1
 
-    def try_from(x: Array, note: str) -> None:
-        nonlocal best, evaluations, tried
+    def try_from(x: Array, what: str, most: int) -> None:
+        nonlocal best, evaluations, tried, number
+        number += 1
+        note = f"start {number} of at most {most}: {what}"
         log.info("starting again: %s", note)
         try:
-            again, more, steps = _attempt(problem, solver, x, callback)
+            again, more, steps = _attempt(problem, solver, x, _noting(callback, note))
         except YidError as error:
             # another start is a chance, never a reason to lose what is there
             log.info("no fit from there: %s", error)
@@ -282,19 +284,25 @@ def _solved(
     for factor in restarts:
         if _good_fit(problem, best[1]):
             break
-        try_from(np.where(problem.positive, np.clip(first * factor, lower, upper), first), f"start x {factor:g}")
+        moved = np.where(problem.positive, np.clip(first * factor, lower, upper), first)
+        try_from(moved, f"initial values x {factor:g}", 1 + len(restarts))
     once = tried == 1 and restarts and problem.disturbed and carries_noise(solver)
     if once and np.any(_doubtful(best[2], best[1], best[0].x, first)):
         factor = RESTARTS[0]
-        try_from(np.where(problem.positive, np.clip(first * factor, lower, upper), first), f"start x {factor:g}")
+        moved = np.where(problem.positive, np.clip(first * factor, lower, upper), first)
+        try_from(moved, f"initial values x {factor:g}", 2)
+    most = number + len(NEARBY)
     for factor in NEARBY if restarts and problem.disturbed and carries_covariance(solver) else ():
         outcome, finish, weighted = best
         if not finish.ok or judge_fit(weighted, finish, limits).explains:
             break
         near = np.where(problem.positive, np.clip(outcome.x * factor, lower, upper), outcome.x)
-        try_from(near, f"best fit x {factor:g}")
-    for near in _other_valleys(best[2], best[1], best[0].x) if restarts and carries_covariance(solver) else ():
-        try_from(near, "another valley")
+        try_from(near, f"best fit x {factor:g}", most)
+    looks = restarts and carries_covariance(solver)
+    valleys = _other_valleys(best[2], best[1], best[0].x) if looks else []
+    most = number + len(valleys)
+    for near in valleys:
+        try_from(near, "another valley", most)
     outcome, finish, weighted = best
     if problem.disturbed and not carries_noise(solver):
         remark = "; weighted by the sensors' noise alone, without the noise that drives the motion"
@@ -329,6 +337,13 @@ def _solved(
     )
 
 
+def _noting(callback: Callback | None, note: str) -> Callback | None:
+    """The callback for a part of the search, whose points say which part it is."""
+    if callback is None:
+        return None
+    return lambda entry: callback(replace(entry, note=", ".join(filter(None, (note, entry.note)))))
+
+
 def _attempt(
     problem: EstimationProblem, solver: Solver, x: Array, callback: Callback | None
 ) -> tuple[tuple[Outcome, Evaluation, EstimationProblem], int, list[Iterate]]:
@@ -342,7 +357,7 @@ def _attempt(
                 shorter = problem.shortened(fraction * longest)
                 if not shorter.evaluate(x, derivatives=False).ok:
                     continue
-                part = solver.run(shorter, x, callback)
+                part = solver.run(shorter, x, _noting(callback, f"first {fraction * longest:.3g} s"))
             except YidError as error:
                 # so short a piece may hold too little for a filter or a node, or nothing to compare with
                 log.info("the first %.3g s are left out: %s", fraction * longest, error)
@@ -355,7 +370,8 @@ def _attempt(
     weighted, warm = problem, None
     for number in range(passes):
         weighted = weighted.weighted_at(x, warm) if passes > 1 else problem
-        outcome = solver.run(weighted, x, callback)
+        which = f"pass {number + 1} of at most {passes}" if passes > 1 else ""
+        outcome = solver.run(weighted, x, _noting(callback, which) if which else callback)
         x, warm, evaluations = outcome.x, outcome.warm, evaluations + outcome.evaluations
         history += outcome.history
         # the second pass is the first about torque offsets that are not guessed
