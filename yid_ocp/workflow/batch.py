@@ -20,6 +20,7 @@ from yid_ocp.config.settings import Run
 from yid_ocp.errors import ConfigError, OutputError, YidError, nearest
 from yid_ocp.files import file_sha256, jsonable, reason, write_json
 from yid_ocp.parallel import LOCAL, Task, TaskResult, Workers, run_tasks
+from yid_ocp.progress import SILENT, Progress
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import Findings
 from yid_ocp.report.terminal import batch_summary
@@ -28,7 +29,6 @@ from yid_ocp.workflow.baseline import read_estimates, refuse_unlike
 from yid_ocp.workflow.build import input_files
 from yid_ocp.workflow.command import DONE, FAILED, carry_out, given_workers
 from yid_ocp.workflow.diagnose import run_diagnose
-from yid_ocp.workflow.progress import SILENT, Progress
 from yid_ocp.workflow.report import history_result
 from yid_ocp.workflow.solve import run_solve
 

@@ -32,13 +32,13 @@ from yid_ocp.diagnosis.blind import (
 from yid_ocp.errors import ConfigError, OutputError, YidError
 from yid_ocp.files import jsonable, write_json, write_text
 from yid_ocp.parallel import LOCAL, Task, Workers, run_tasks, values_of
+from yid_ocp.progress import SILENT, Progress
 from yid_ocp.report.pictures import draw_blind
 from yid_ocp.report.tables import blind_table
 from yid_ocp.report.terminal import blind_summary
 from yid_ocp.version import package_code, versions
 from yid_ocp.workflow.command import DONE, carry_out, given_workers
 from yid_ocp.workflow.experiments import VARIATIONS, Experiment, experiments_of, refuse_unfit
-from yid_ocp.workflow.progress import SILENT, Progress
 
 COMMITMENT, LABELS, RESULT, TABLE = "commitment.json", "sealed/labels.json", "result.json", "table.md"
 CONFIGS, PREPARED, DRAWN, CASES, ANSWERS, BEST = "configs", "prepared", "sealed/drawn", "cases", "answers", "best"

@@ -19,6 +19,7 @@ from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.options import SensorOptions
+from yid_ocp.progress import SILENT, Progress
 from yid_ocp.report.terminal import check_summary
 from yid_ocp.sensors.joints import EFFORT, POSITION, angle_std, is_stated, torque_std
 from yid_ocp.solvers.base import estimates, uncertainty
@@ -26,7 +27,6 @@ from yid_ocp.workflow.build import build_problem, build_step, first_gaps, input_
 from yid_ocp.workflow.command import DONE, WRONG_INPUT, carry_out
 from yid_ocp.workflow.doubts import doubts_result
 from yid_ocp.workflow.folder import new_run_folder
-from yid_ocp.workflow.progress import SILENT, Progress
 from yid_ocp.workflow.refine import discretisation, refine
 
 FORMAT = "yid-check/1"

@@ -12,7 +12,8 @@ from typing import Any, Protocol, TypeVar
 
 from yid_ocp.files import jsonable
 from yid_ocp.parallel import Workers
-from yid_ocp.workflow.progress import Progress, shown
+from yid_ocp.progress import Progress
+from yid_ocp.workflow.progress import shown
 
 DONE, FAILED, WRONG_INPUT = 0, 1, 2
 """Exit codes of commands that ran to their end; the last where they were told to be strict and found something."""

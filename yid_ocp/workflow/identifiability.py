@@ -26,6 +26,7 @@ from yid_ocp.model.system import System
 from yid_ocp.parallel import Workers
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.null_test import GapLimits
+from yid_ocp.progress import SILENT, Progress
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import Findings
 from yid_ocp.report.terminal import identifiability_summary
@@ -35,7 +36,6 @@ from yid_ocp.workflow.command import DONE, FAILED, carry_out, given_workers
 from yid_ocp.workflow.doubts import doubts_result
 from yid_ocp.workflow.elsewhere import Elsewhere
 from yid_ocp.workflow.folder import RunFolder, new_run_folder
-from yid_ocp.workflow.progress import SILENT, Progress
 from yid_ocp.workflow.second_arm import second_arm
 
 FORMAT = "yid-identifiability/1"
@@ -188,10 +188,10 @@ def _information(
     wanted = _wanted(problem, information, asked)
     if not wanted:
         return information
-    progress.stage(f"intervals of {len(wanted)} parameters by profile likelihood")
     if elsewhere is not None and set(wanted) <= set(information.names):
+        progress.stage(f"intervals of {len(wanted)} parameters by profile likelihood")
         return elsewhere.with_profiles(information, wanted)
-    return judged(intervals=wanted)
+    return judged(intervals=wanted, progress=progress)
 
 
 def _ranking(
@@ -210,7 +210,7 @@ def _ranking(
         start=asked.start,
         grasp_std=asked.grasp_std,
         second_arm=None if other is None else with_grasp_offsets(other),
-        progress=progress.stage,
+        progress=progress,
         judge=None if elsewhere is None else elsewhere.judge(),
     )
 

@@ -1,4 +1,4 @@
-"""How a long run is doing: what a command reports, and who shows it."""
+"""How a long run is doing, as a command shows it: bars, lines, and the time that is left."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import contextlib
 import sys
 import time
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
-from yid_ocp.solvers import Iterate
+from yid_ocp.progress import SILENT, Point, Progress
 
 if TYPE_CHECKING:
     import rich.progress
@@ -18,38 +18,6 @@ OFTEN = 5.0
 """Least time between two lines of one tenth of a stage [s]."""
 SOON = 2.0
 """Time that a stage has to last before the rest of it is guessed [s]."""
-
-
-class Progress(Protocol):
-    """Whoever wants to know how a long run is doing."""
-
-    def stage(self, text: str) -> None:
-        """A new part of the work begins."""
-        ...
-
-    def iterate(self, entry: Iterate) -> None:
-        """A solver accepted a point."""
-        ...
-
-    def advance(self, done: int, total: int, text: str) -> None:
-        """So many of so many parts of the stage are done, and what comes next."""
-        ...
-
-
-class Silent:
-    """Progress that nobody sees."""
-
-    def stage(self, text: str) -> None:
-        """Nothing."""
-
-    def iterate(self, entry: Iterate) -> None:
-        """Nothing."""
-
-    def advance(self, done: int, total: int, text: str) -> None:
-        """Nothing."""
-
-
-SILENT = Silent()
 
 
 class TimeLeft:
@@ -92,7 +60,7 @@ class PlainProgress:
         self._tenths, self._last, self._left = 0, time.monotonic(), TimeLeft()
         print(f"{text} ...", file=sys.stderr, flush=True)
 
-    def iterate(self, entry: Iterate) -> None:
+    def iterate(self, entry: Point) -> None:
         """See `Progress`."""
         print(f"  {iterate_words(entry)}", file=sys.stderr, flush=True)
 
@@ -118,7 +86,7 @@ class BarProgress:
         self._text, self._left = text, TimeLeft()
         self._task = self._bars.add_task(text, total=None)
 
-    def iterate(self, entry: Iterate) -> None:
+    def iterate(self, entry: Point) -> None:
         """See `Progress`."""
         if self._task is not None:
             self._bars.update(self._task, description=f"{self._text}: {iterate_words(entry)}")
@@ -135,7 +103,7 @@ class BarProgress:
             self._bars.update(self._task, description=self._text, total=1, completed=1)
 
 
-def iterate_words(entry: Iterate) -> str:
+def iterate_words(entry: Point) -> str:
     """An accepted point in a line."""
     note = f", {entry.note}" if entry.note else ""
     return f"iteration {entry.iteration}, cost {entry.cost:.6g}, {entry.seconds:.1f} s{note}"

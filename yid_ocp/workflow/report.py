@@ -12,6 +12,7 @@ from yid_ocp.analysis.history import History, history
 from yid_ocp.config.settings import Run
 from yid_ocp.errors import ConfigError
 from yid_ocp.files import file_sha256
+from yid_ocp.progress import SILENT, Progress
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import Findings
 from yid_ocp.report.terminal import history_summary
@@ -19,7 +20,6 @@ from yid_ocp.version import versions
 from yid_ocp.workflow.baseline import read_estimates, refuse_unlike
 from yid_ocp.workflow.command import DONE, carry_out
 from yid_ocp.workflow.folder import new_run_folder
-from yid_ocp.workflow.progress import SILENT, Progress
 
 FORMAT = "yid-history/1"
 

@@ -18,13 +18,13 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.options import SensorOptions
 from yid_ocp.problem.prediction import EpisodeResult
+from yid_ocp.progress import SILENT, Progress
 from yid_ocp.report.terminal import simulate_summary
 from yid_ocp.sensors.joints import EFFORT, POSITION, angle_std, by_joint, torque_bias_std, torque_std
 from yid_ocp.workflow.build import build_step, build_system, problem_options, read_recordings
 from yid_ocp.workflow.command import DONE, FAILED, carry_out
 from yid_ocp.workflow.folder import new_run_folder
 from yid_ocp.workflow.held import clamped_points
-from yid_ocp.workflow.progress import SILENT, Progress
 
 FORMAT = "yid-simulate/1"
 DURATION = 5.0  # of a virtual experiment whose configuration does not say [s]

@@ -21,6 +21,7 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.prediction import EpisodeResult
 from yid_ocp.problem.validation import channel_errors
+from yid_ocp.progress import SILENT, Progress
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import Findings
 from yid_ocp.report.terminal import solve_summary
@@ -31,7 +32,6 @@ from yid_ocp.workflow.command import DONE, FAILED, carry_out
 from yid_ocp.workflow.doubts import doubts_result
 from yid_ocp.workflow.folder import new_run_folder
 from yid_ocp.workflow.held_out import guess_doubts, held_out_entry, worse_than_guess
-from yid_ocp.workflow.progress import SILENT, Progress
 from yid_ocp.workflow.refine import Discretisation, counted, discretisation, steadied, wanted
 from yid_ocp.workflow.torque_offsets import torque_offsets
 from yid_ocp.workflow.trajectories import write_trajectories
@@ -105,7 +105,7 @@ def run_solve(run: Run, out: str | Path | None = None, progress: Progress = SILE
         safe = safe_start(problem, run.solver, solution, run.diagnosis.of_a_fit)
         solution, stability = steadied(safe.problem, safe.solution)
         problem = solution.problem or safe.problem
-        solution = with_intervals(problem, solution, progress.stage)
+        solution = with_intervals(problem, solution, progress)
         finer = Discretisation({})
         if solution.evaluation is not None:
             finer = discretisation(run, problem, solution.x, solution.evaluation, wanted(run), progress)

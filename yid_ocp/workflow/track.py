@@ -18,6 +18,7 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.errors import ConfigError
 from yid_ocp.files import file_sha256
 from yid_ocp.model.system import System
+from yid_ocp.progress import SILENT, Progress
 from yid_ocp.report.terminal import track_summary
 from yid_ocp.vision.camera import DepthCamera, FrameTiming, VirtualCamera, VirtualFrames, virtual_frames
 from yid_ocp.vision.fit import ShapeFit
@@ -29,7 +30,6 @@ from yid_ocp.workflow.build import build_system, located, recording_file
 from yid_ocp.workflow.command import DONE, carry_out
 from yid_ocp.workflow.doubts import doubts_result, of_one
 from yid_ocp.workflow.folder import new_run_folder
-from yid_ocp.workflow.progress import SILENT, Progress
 
 FORMAT = "yid-track/1"
 Array = NDArray[np.float64]
