@@ -234,6 +234,11 @@ def _report(parser: argparse.ArgumentParser) -> None:
     _printing(parser, "folder's path")
 
 
+def _completion(parser: argparse.ArgumentParser) -> None:
+    text = 'run `eval "$(yid-ocp completion bash)"` in ~/.bashrc, or ~/.zshrc with zsh; in fish pipe it to `source`'
+    parser.add_argument("shell", choices=("bash", "zsh", "fish"), help=text)
+
+
 def _schema(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="FILE", help="file to write; printed when absent")
 
@@ -269,6 +274,12 @@ COMMANDS: tuple[Command, ...] = (
     Command("track", "measure the object's points in the frames of a depth camera", "track", _doubting),
     Command("import", "turn a file of another tool into a recording", "import_recording", _import),
     Command("export", "turn a recording into CSV, or a run's model into MJCF, URDF, SDF or YAML", "export", _export),
+    Command(
+        "completion",
+        "print what makes a shell complete commands, options, files and settings",
+        "completion",
+        _completion,
+    ),
     Command("schema", "print the JSON Schema of configuration files, for editors", "schema", _schema),
 )
 
@@ -353,6 +364,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         bug; 128 and the signal's number where one ended it, as 130 for an interruption. With `--json` an error is
         printed as `yid-error/1` as well: kind, what, where, allowed, hint and exit_code.
     """
+    if "_ARGCOMPLETE" in os.environ:
+        import_module("yid_ocp.workflow.completion").answer(parser())
     as_json = "--json" in (sys.argv[1:] if argv is None else argv)
     try:
         arguments = parser().parse_args(argv)

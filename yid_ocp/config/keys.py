@@ -94,6 +94,36 @@ def unknown_key(root: type, name: str, known: Iterable[str], where: str, within:
     )
 
 
+def settable(hint: Any, prefix: str, raw: Any, at: str = "") -> Iterator[str]:
+    """Keys with dots that begin with a prefix, up to the next dot, or `=` where a value follows.
+
+    Parameters
+    ----------
+    hint : Any
+        Type of what stands at `at`.
+    prefix : str
+    raw : Any
+        What a file says there: its names count where users choose them.
+    at : str
+        The keys before, each with its dot.
+    """
+    sections, values = sections_of(hint), values_of(hint)
+    named = sections_of(values)
+    below: dict[str, Any] = {}
+    if sections is not None:
+        below = {name: option.hint for name, option in sections.keys(sections.word(raw)).items()}
+    elif named is not None and named.key == "name":
+        below = dict(named.classes)
+    elif values is not None and isinstance(raw, dict):
+        below = dict.fromkeys(raw, values)
+    for name, inner in below.items():
+        path = f"{at}{name}"
+        if prefix.startswith(f"{path}."):
+            yield from settable(inner, prefix, raw.get(name) if isinstance(raw, dict) else None, f"{path}.")
+        elif path.startswith(prefix):
+            yield path + ("=" if sections_of(inner) is None and values_of(inner) is None else ".")
+
+
 def homes_of(hint: Any, name: str, at: str = "") -> Iterator[str]:
     """Sections that have a key, in words; NAME stands for a name that users choose."""
     for inner, step in ((values_of(hint), ".NAME"), (entries_of(hint), "")):

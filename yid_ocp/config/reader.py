@@ -21,6 +21,7 @@ from ruamel.yaml.comments import CommentedMap, CommentedSeq
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent, ScalarEvent
 
+from yid_ocp.config import keys
 from yid_ocp.config.keys import Sections, sections_of, unknown_key
 from yid_ocp.config.settings import Run
 from yid_ocp.errors import ConfigError, nearest
@@ -69,6 +70,18 @@ def load_config(path: str | Path | None = None, overrides: Sequence[str] = (), d
         _override(data, places, override)
     run = _Reader(places, origin, base).build(Run, data, ())
     return dataclasses.replace(run, name=name, file=file, places=places)
+
+
+def settable(prefix: str, path: str | Path | None = None) -> list[str]:
+    """Keys that `overrides` may set and that begin with a prefix; with names that a file has, where one is given.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be read.
+    """
+    data = {} if path is None else _parse(_read(Path(path)), str(path))[0]
+    return list(keys.settable(Run, prefix, data))
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------

@@ -325,6 +325,7 @@ def refit_all(
 
     beside = f" beside {', '.join(effect.label for effect in base)}" if base else ""
     search.progress.stage(f"refitting with each of {len(tried)} effects{beside}")
+    search.progress.advance(0, len(tried), tried[0][0].label)
     return [fit for fit in map_threads(one, tried) if fit is not None]
 
 
