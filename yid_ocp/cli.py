@@ -342,8 +342,16 @@ def _told(as_json: bool, kind: str, what: str, code: int, **parts: str) -> None:
 
 @contextlib.contextmanager
 def _notices() -> Iterator[None]:
-    """Show the library's warnings on standard error while a command runs."""
-    handler = logging.StreamHandler(sys.stderr)
+    """Show the library's warnings on standard error while a command runs, each once however often it is given."""
+    handler, shown = logging.StreamHandler(sys.stderr), set[str]()
+
+    def is_new(record: logging.LogRecord) -> bool:
+        text = record.getMessage()
+        new = text not in shown
+        shown.add(text)
+        return new
+
+    handler.addFilter(is_new)
     handler.setLevel(logging.WARNING)
     handler.setFormatter(logging.Formatter("notice: %(message)s"))
     logger = logging.getLogger("yid_ocp")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import os
 import pathlib
 import subprocess
@@ -203,6 +204,17 @@ def test_errors_are_json_where_that_is_asked_for(cli, pendulum, tmp_path, monkey
     monkeypatch.setattr("yid_ocp.workflow.check.run", stopped)
     ended = cli("check", pendulum, "--json")
     assert (ended.code, json.loads(ended.out)["exit_code"]) == (130, 130)
+
+
+def test_a_notice_is_shown_once(cli, pendulum, monkeypatch):
+    def noted(arguments):
+        for text in ("a coupling is not modelled", "another thing", "a coupling is not modelled"):
+            logging.getLogger("yid_ocp.model").warning(text)
+        return 0
+
+    monkeypatch.setattr("yid_ocp.workflow.check.run", noted)
+    for _ in range(2):
+        assert cli("check", pendulum).err == "notice: a coupling is not modelled\nnotice: another thing\n"
 
 
 @pytest.mark.parametrize(
