@@ -20,6 +20,7 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.null_test import USUAL, GapLimits
 from yid_ocp.progress import SILENT, Progress
+from yid_ocp.shown import Shown, Summary, counted
 from yid_ocp.solvers.base import Solution
 from yid_ocp.solvers.judgement import (
     IDENTIFIABLE,
@@ -35,7 +36,7 @@ from yid_ocp.solvers.judgement import (
     uncertainty,
     verdict,
 )
-from yid_ocp.solvers.words import percent_words
+from yid_ocp.solvers.words import VERDICT_WORDS, finite, parameter_words, percent_words
 
 Array = NDArray[np.float64]
 StartKnowledge = Literal["assumed", "known", "unknown"]
@@ -104,8 +105,8 @@ class Direction:
     words: str
 
 
-@dataclass(frozen=True)
-class Identifiability:
+@dataclass(frozen=True, repr=False)
+class Identifiability(Shown):
     """What a set of recordings can tell about the free parameters.
 
     Attributes
@@ -134,6 +135,14 @@ class Identifiability:
     nuisances: tuple[str, ...]
     chi2_per_dof: float
     profiles: Mapping[str, Profile] = field(default_factory=dict)
+
+    def _summary(self) -> Summary:
+        rows = [("parameter", "value", "unit", "")]
+        rows += [
+            (name, parameter_words(entry.value, finite(entry.std), None), entry.unit, VERDICT_WORDS[entry.verdict])
+            for name, entry in self.parameters.items()
+        ]
+        return Summary(f"{len(self.identifiable)} of {counted(len(self.names), 'parameter')} found", rows)
 
     @property
     def identifiable(self) -> tuple[str, ...]:

@@ -28,6 +28,7 @@ from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.progress import SILENT, Progress
+from yid_ocp.shown import Shown, Summary, counted
 from yid_ocp.solvers.base import Solution
 from yid_ocp.solvers.judgement import WEAK, verdict
 
@@ -98,8 +99,8 @@ class Outcome:
         return bool(self.verdicts) and self.identifiable == len(self.verdicts)
 
 
-@dataclass(frozen=True)
-class WhatIf:
+@dataclass(frozen=True, repr=False)
+class WhatIf(Shown):
     """Changes of an experiment, ranked.
 
     Attributes
@@ -122,6 +123,11 @@ class WhatIf:
     smallest: tuple[Outcome, ...]
     greedy: tuple[Outcome, ...]
     searched: int
+
+    def _summary(self) -> Summary:
+        rows = [("change", "parameters found", "gain [nat]")]
+        rows += [(entry.words, str(entry.identifiable), f"{entry.gain:.3g}") for entry in (self.base, *self.singles)]
+        return Summary(f"{counted(len(self.singles), 'change')}, {self.searched} sets of them judged", rows)
 
 
 @dataclass(frozen=True)

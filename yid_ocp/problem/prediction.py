@@ -13,16 +13,20 @@ from yid_ocp.integrator.statics import Rest
 from yid_ocp.integrator.step import Directions, Rollout, Step
 from yid_ocp.model.system import System
 from yid_ocp.problem.corrections import Inputs
-from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.episodes import Episode, beginning
 from yid_ocp.problem.functions import ModelFunctions
 from yid_ocp.problem.inputs import held_torque, held_torque_slope
 from yid_ocp.problem.lag import Lag
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.noise import Course, Innovations, innovations
 from yid_ocp.problem.options import ProblemOptions
-from yid_ocp.problem.unknowns import Unknowns
+from yid_ocp.problem.unknowns import Unknowns, start_limits
 
 Array = NDArray[np.float64]
+HELD_OUT_START = 0.2
+"""Time from which the start of a held-out recording is estimated, where starts are [s]."""
+HELD_OUT_ITERATIONS = 3
+"""Gauss-Newton steps of that estimate, which is nearly linear."""
 
 
 @dataclass(frozen=True)
@@ -183,6 +187,44 @@ class Predictor:
                 by_theta += rest.by_torque @ inputs.by_first_torque
         state[rows] += offset
         return Start(state, np.hstack([by_theta, by_offset]), rest, "")
+
+    def as_recorded(self, episode: Episode, theta: Array) -> bool:
+        """Whether no effect on an episode's inputs (what a filter follows too) or times is free or not neutral."""
+        wanted = self.unknowns.parameters
+        inputs = self.inputs(episode, theta, wanted)
+        pairs = ((inputs.torque, episode.torque), (inputs.path, episode.path), (inputs.arm, episode.measured_arm))
+        slopes = [x for x in (inputs.by_torque, inputs.by_path, inputs.by_arm, inputs.by_momentum) if x is not None]
+        if inputs.momentum is not None:
+            return False
+        slopes += self.functions.corrections.effort_lag(theta, wanted) or ()
+        for samples in episode.samples:
+            slopes += self.lateness(samples, theta, wanted) or ()
+        return not any(np.any(x) for x in slopes) and all(np.array_equal(a, b) for a, b in pairs)
+
+    def offset_found(self, episode: Episode, theta: Array, std: Array) -> Array:
+        """Offset of an estimated start that the first `HELD_OUT_START` seconds of an episode say, beside its prior.
+
+        Zero where the model cannot be rolled out; `std` is the prior's, (number of estimated rows,).
+        """
+        offset = np.zeros(len(self.unknowns.start))
+        if not len(offset):
+            return offset
+        short = beginning(episode, max(round(HELD_OUT_START / self.step.time_step), 2))
+        weight, guess, limit = 1.0 / std, None, start_limits(self.system, self.unknowns.start)
+        for _ in range(HELD_OUT_ITERATIONS):
+            result = self.run(short, theta, offset, True, guess)
+            if isinstance(result, str) or result.sensitivities is None:
+                return np.zeros(len(self.unknowns.start))
+            guess = result.warm
+            rows, slopes = [weight * offset], [np.diag(weight)]
+            for k, samples in enumerate(short.samples):
+                by_start = result.sensitivities[k][:, :, len(self.unknowns.parameters) :]
+                part = samples.rows(result.predicted[k], by_start)
+                rows.append(part.residual)
+                slopes += [] if part.jacobian is None else [part.jacobian]
+            offset = offset - np.linalg.lstsq(np.vstack(slopes), np.concatenate(rows), rcond=None)[0]
+            offset = np.clip(offset, -limit, limit)
+        return offset
 
     # -- what drives the rollout --------------------------------------------------------------------------------------
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import logging
 import math
 import time
@@ -9,21 +10,27 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cached_property
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 import threadpoolctl
 from numpy.typing import NDArray
 
-from yid_ocp.errors import YidError
+from yid_ocp.errors import ConfigError, YidError
 from yid_ocp.problem.evaluation import Evaluation, WarmStart
 from yid_ocp.problem.null_test import USUAL, GapLimits
 from yid_ocp.problem.prediction import EpisodeResult
 from yid_ocp.problem.problem import EstimationProblem
+from yid_ocp.problem.validation import Series, series
 from yid_ocp.registry import Registry
+from yid_ocp.shown import Shown, Summary, counted
 from yid_ocp.solvers.judgement import Estimate, Fit, covariance_of_fit, estimates, judge_fit, uncertainty
 from yid_ocp.solvers.linear_model import settled
 from yid_ocp.solvers.off_neutral import off_neutral
+from yid_ocp.solvers.words import VERDICT_WORDS, finite, parameter_words
+
+if TYPE_CHECKING:
+    import pandas
 
 log = logging.getLogger(__name__)
 
@@ -67,8 +74,8 @@ class Iterate:
     note: str = ""
 
 
-@dataclass(frozen=True)
-class Solution:
+@dataclass(frozen=True, repr=False)
+class Solution(Shown):
     """Outcome of an identification.
 
     Attributes
@@ -114,6 +121,17 @@ class Solution:
     method: str
     problem: EstimationProblem | None = None
 
+    def _summary(self) -> Summary:
+        free = {name: entry for name, entry in self.parameters.items() if entry.free}
+        words = {name: parameter_words(e.value, finite(e.std), e.interval) for name, e in free.items()}
+        rows = [("parameter", "value", "unit", "")]
+        rows += [(name, words[name], e.unit, VERDICT_WORDS[e.verdict]) for name, e in free.items()]
+        told = [f"{name} = {words[name]} {e.unit}" for name, e in free.items() if e.verdict == "identifiable"][:3]
+        more = f"and {counted(len(free) - len(told), 'more parameter')}" if len(free) > len(told) else ""
+        fit = f"chi2 per degree of freedom {self.fit.chi2_per_dof:.3g}"
+        how = f"{self.status.value.replace('_', ' ')} by {self.method}"
+        return Summary(", ".join(filter(None, (how, *told, more, fit))), rows)
+
     @property
     def std(self) -> dict[str, float]:
         """Standard deviation of every shared free parameter."""
@@ -136,6 +154,30 @@ class Solution:
             problem.predictor.run(episode, *problem.split(self.x, i), False)
             for i, episode in enumerate(problem.episodes)
         )
+
+    def residuals(self) -> tuple[Series, ...]:
+        """Every channel of the recordings beside what the model makes of it at `x`; empty without a point."""
+        pairs = zip(() if self.problem is None else self.problem.episodes, self.predicted, strict=False)
+        return tuple(s for episode, result in pairs if not isinstance(result, str) for s in series(episode, result))
+
+    def to_frame(self) -> pandas.DataFrame:
+        """Parameters as a table of pandas, free ones first: value, std, lower, upper, unit, verdict, free, initial.
+
+        `lower` and `upper` are the 95 % interval, infinite at an open end and where nothing is known.
+
+        Raises
+        ------
+        ConfigError
+            pandas is not installed.
+        """
+        try:
+            pandas = importlib.import_module("pandas")
+        except ImportError as error:
+            raise ConfigError("pandas is not installed", hint="pip install 'yid-ocp[pandas]'") from error
+        entries = sorted(self.parameters.items(), key=lambda entry: not entry[1].free)
+        rows = {name: (e.value, e.std, *e.ends, e.unit, e.verdict, e.free, e.initial) for name, e in entries}
+        columns = ["value", "std", "lower", "upper", "unit", "verdict", "free", "initial"]
+        return pandas.DataFrame.from_dict(rows, orient="index", columns=columns).rename_axis("parameter")
 
 
 Callback = Callable[[Iterate], None]
@@ -171,6 +213,8 @@ class Solver(Protocol):
 
 
 SOLVERS: Registry[type[Solver]] = Registry("solver")
+DEFAULT = "gauss_newton"
+"""The method that is used where none is named."""
 
 
 @dataclass
@@ -214,7 +258,7 @@ REMEDY = "start nearer, widen the bounds, or use gauss_newton"
 
 def solve(
     problem: EstimationProblem,
-    solver: Solver,
+    solver: Solver | None = None,
     start: Sequence[float] | None = None,
     callback: Callback | None = None,
     limits: GapLimits = USUAL,
@@ -231,7 +275,8 @@ def solve(
     Parameters
     ----------
     problem : EstimationProblem
-    solver : Solver
+    solver : Solver, optional
+        `GaussNewton()` when absent.
     start : sequence of float, optional
         Initial unknown vector; the problem's when absent.
     callback : callable, optional
@@ -248,7 +293,7 @@ def solve(
     """
     # the matrices are small: threads of the linear algebra library cost more than they give
     with threadpoolctl.threadpool_limits(1):
-        return _solved(problem, solver, start, callback, limits, RESTARTS if restarts else ())
+        return _solved(problem, solver or SOLVERS[DEFAULT](), start, callback, limits, RESTARTS if restarts else ())
 
 
 def _solved(
