@@ -16,7 +16,6 @@ from yid_ocp.config.keys import Sections, sections_of
 from yid_ocp.config.settings import Run
 from yid_ocp.options import About, Option, entries_of, options_of, stripped, values_of, words
 
-
 HEAD = """\
 # Settings
 

@@ -566,6 +566,9 @@ def load_system(path: str | Path, overrides: Sequence[str] = ()) -> System:
     return build_system(load_config(path, overrides))
 
 
-def load_problem(path: str | Path, overrides: Sequence[str] = ()) -> EstimationProblem:
-    """The estimation problem that a configuration file describes; errors as `load_config` and `build_problem`."""
+def load_problem(path: str | Path | None = None, overrides: Sequence[str] = ()) -> EstimationProblem:
+    """The estimation problem of a configuration file, of the embedded one when absent.
+
+    Parameters and errors as `load_config`; errors as `build_problem`.
+    """
     return build_problem(load_config(path, overrides))
