@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -100,23 +101,34 @@ class Bars:
     def update(self, task, **what):
         self.calls.append(("update", task, what))
 
+    def remove_task(self, task):
+        self.calls.append(("remove", task))
 
-def test_a_bar_moves_with_its_stage_and_is_full_when_the_next_begins():
+    @property
+    def console(self):
+        return SimpleNamespace(print=lambda text, **how: self.calls.append(("print", text)))
+
+
+def test_a_bar_moves_with_its_stage_and_is_a_line_when_the_next_begins(clock):
     bars = Bars()
     progress = BarProgress(bars)
     progress.advance(1, 2, "before any stage")
     progress.stage("solving")
     progress.iterate(ENTRY)
+    clock[0] += 7.0
     progress.stage("tracking")
     progress.advance(1, 4, "frame 1")
+    progress.close()
     progress.close()
     assert bars.calls == [
         ("add", "solving", None),
         ("update", 1, {"description": "solving: iteration 3, cost 12.5, 1.2 s, first 2 s"}),
-        ("update", 1, {"description": "solving", "total": 1, "completed": 1}),
+        ("remove", 1),
+        ("print", "solving: 7 s"),
         ("add", "tracking", None),
-        ("update", 4, {"description": "tracking: 1 of 4, frame 1", "completed": 1, "total": 4}),
-        ("update", 4, {"description": "tracking", "total": 1, "completed": 1}),
+        ("update", 5, {"description": "tracking: 1 of 4, frame 1", "completed": 1, "total": 4}),
+        ("remove", 5),
+        ("print", "tracking: 0 s"),
     ]
 
 

@@ -73,17 +73,17 @@ class PlainProgress:
 
 
 class BarProgress:
-    """A moving bar for the stage that runs."""
+    """A moving bar for the stage that runs, under a line for each that is done: of many bars the last is not seen."""
 
     def __init__(self, bars: rich.progress.Progress) -> None:
         self._bars = bars
         self._task: rich.progress.TaskID | None = None
-        self._text, self._left = "", TimeLeft()
+        self._text, self._left, self._begun = "", TimeLeft(), 0.0
 
     def stage(self, text: str) -> None:
         """See `Progress`."""
         self.close()
-        self._text, self._left = text, TimeLeft()
+        self._text, self._left, self._begun = text, TimeLeft(), time.monotonic()
         self._task = self._bars.add_task(text, total=None)
 
     def iterate(self, entry: Point) -> None:
@@ -98,9 +98,12 @@ class BarProgress:
             self._bars.update(self._task, description=words, completed=done, total=total)
 
     def close(self) -> None:
-        """Mark the running stage as done."""
+        """End the running stage."""
         if self._task is not None:
-            self._bars.update(self._task, description=self._text, total=1, completed=1)
+            self._bars.remove_task(self._task)
+            self._task = None
+            spent = duration_words(time.monotonic() - self._begun)
+            self._bars.console.print(f"{self._text}: {spent}", markup=False, highlight=False)
 
 
 def iterate_words(entry: Point) -> str:
