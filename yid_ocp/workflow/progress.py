@@ -130,7 +130,7 @@ def shown(arguments: argparse.Namespace) -> Iterator[Progress]:
         from rich.progress import Progress as Bars
 
         columns = (BarColumn(bar_width=24), TextColumn("{task.description}", markup=False), TimeElapsedColumn())
-        with Bars(*columns, console=Console(stderr=True)) as bars:
+        with Bars(*columns, console=Console(stderr=True), transient=True) as bars:
             progress = BarProgress(bars)
             yield progress
             progress.close()
