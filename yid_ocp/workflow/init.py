@@ -14,10 +14,12 @@ from yid_ocp.data import Recording, read_recording, write_recording
 from yid_ocp.errors import ConfigError, DataError, OutputError
 from yid_ocp.files import new_file, write_text
 from yid_ocp.model.urdf import read_urdf
+from yid_ocp.progress import Progress
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.command import DONE, tell
 from yid_ocp.workflow.commented import Object, configuration
 from yid_ocp.workflow.import_recording import given_options, imported, own
+from yid_ocp.workflow.progress import shown
 from yid_ocp.workflow.proposal import Branch, Proposal, propose, relative, split_at_rest
 
 FORMAT = "yid-init/1"
@@ -34,7 +36,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise ConfigError(f"the configuration is called '{out.name}'", where="--out", allowed="NAME.yaml")
     read_urdf(arguments.robot)
     item = described(arguments)
-    made = _recordings(arguments, out)
+    with shown(arguments) as progress:
+        made = _recordings(arguments, out, progress)
     recordings = [recording or read_recording(file) for file, recording in made.items()]
     proposal = propose(
         arguments.robot,
@@ -166,7 +169,7 @@ def _grasps(given: Sequence[str]) -> dict[str, str]:
 # -- files ------------------------------------------------------------------------------------------------------------
 
 
-def _recordings(arguments: argparse.Namespace, out: Path) -> dict[Path, Recording | None]:
+def _recordings(arguments: argparse.Namespace, out: Path, progress: Progress) -> dict[Path, Recording | None]:
     """Files of the recordings; with what is to be written there where they are of another tool."""
     options = given_options(arguments)
     made: dict[Path, Recording | None] = {}
@@ -178,7 +181,7 @@ def _recordings(arguments: argparse.Namespace, out: Path) -> dict[Path, Recordin
                 raise ConfigError(f"{file.name} is a recording already", where=flags, hint="leave these options out")
             made[file] = None
         else:
-            recording = imported(file, options)
+            recording = imported(file, options, progress)
             made[out.parent / f"{recording.name}.h5"] = recording
     if len(made) < len(arguments.files):
         raise DataError("two of the files would become one recording", where=", ".join(arguments.files))
