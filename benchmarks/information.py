@@ -16,7 +16,6 @@ recordings: one to estimate on, one held out.
 from __future__ import annotations
 
 import argparse
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -37,6 +36,7 @@ from yid_ocp.virtual.experiment import PointCamera, VirtualExperiment, paper_sys
 from yid_ocp.virtual.injected import injected_experiment
 from yid_ocp.workflow.build import build_problem
 from yid_ocp.workflow.information import found_values
+from yid_ocp.workflow.progress import PlainProgress
 
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "single_arm_vision.yaml"
 SOUGHT = "T3.bend"
@@ -44,10 +44,6 @@ OPTIONS = PlanOptions(
     goal="information", inform=(SOUGHT,), duration=3.5, settle=0.5, knots=28, limits=PlanLimits(spring_angle=0.5)
 )
 NOISE_SEED = 500
-
-
-def told(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
 
 
 def recorded(plan: InformationPlan, seed: int) -> Recording:
@@ -66,7 +62,7 @@ def parameter(starts: int, recordings: int) -> None:
     problem = build_problem(load_config(CONFIG))
     solution = solve(problem, GaussNewton(cost_tolerance=1e-5))
     values = {name: entry.value for name, entry in solution.parameters.items() if name in problem.free}
-    plan = informative(problem, replace(OPTIONS, starts=starts), values, None, told)
+    plan = informative(problem, replace(OPTIONS, starts=starts), values, None, PlainProgress())
     rows: list[tuple[str, ...]] = [("", SOUGHT, "± std", "of it", "true value off by")]
     rows.append(_row("the configuration's recording, 5 s", solution))
     for i in range(recordings):
@@ -111,7 +107,7 @@ def pair(name: str, starts: int) -> None:
     planned = []
     for seed in (0, 100):
         options = replace(OPTIONS, inform=None, separate=labels, starts=starts, seed=seed)
-        plan = informative(problem, options, values, sizes, told)
+        plan = informative(problem, options, values, sizes, PlainProgress())
         for (first, second), (then, now) in plan.distances.items():
             print(f"seed {seed}: {first} beside {second}: {then:.3g} std in the recording, {now:.3g} in the plan")
         movement = PlannedMovement(plan.joints, plan.mover.path, plan.unknowns)
@@ -133,7 +129,7 @@ def pair(name: str, starts: int) -> None:
 
 def _diagnosed(nominal: EstimationProblem, estimate: list[Recording], held_out: list[Recording]) -> Finding:
     problem = EstimationProblem(nominal.step, estimate, nominal.free, nominal.options)
-    return diagnose(problem, "all", held_out, thresholds=Thresholds(), progress=told)
+    return diagnose(problem, "all", held_out, thresholds=Thresholds(), progress=PlainProgress())
 
 
 def main() -> None:

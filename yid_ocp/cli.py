@@ -7,20 +7,23 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import json
 import logging
 import os
+import re
 import sys
 import tempfile
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any
+from typing import Any, NoReturn
 
 from yid_ocp import interruption
-from yid_ocp.errors import OutputError, ResourceError, YidError
+from yid_ocp.errors import ConfigError, OutputError, ResourceError, YidError, choices
 
 WRONG_INPUT, BUG, INTERRUPTED = 2, 3, 130
+ERROR = "yid-error/1"
 
 
 @dataclass(frozen=True)
@@ -56,9 +59,16 @@ def _configured(parser: argparse.ArgumentParser, optional: bool = False) -> None
         action="append",
         default=[],
         dest="overrides",
-        help="replace a setting, for example --set problem.time_step=0.005; may be repeated",
+        help="set a setting, for example problem.time_step=0.005; a section, 'solver={iterations: 9}', merges with "
+        "what stands there, an empty one empties it; may be repeated",
     )
-    parser.add_argument("--quiet", action="store_true", help="print nothing but the run folder's path")
+    _printing(parser, "run folder's path")
+
+
+def _printing(parser: argparse.ArgumentParser, path: str) -> None:
+    parser.add_argument("--quiet", action="store_true", help=f"print nothing but the {path}")
+    text = "print the result as JSON, errors as well, and nothing else on standard output"
+    parser.add_argument("--json", action="store_true", help=text)
 
 
 def _doubting(parser: argparse.ArgumentParser, optional: bool = False) -> None:
@@ -98,9 +108,9 @@ def _identifiability(parser: argparse.ArgumentParser) -> None:
 
 
 def _overrides(parser: argparse.ArgumentParser) -> None:
-    text = "replace a setting in every run; may be repeated"
+    text = "set a setting in every run, as other commands do; may be repeated"
     parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[], dest="overrides", help=text)
-    parser.add_argument("--quiet", action="store_true", help="print nothing but the folder's path")
+    _printing(parser, "folder's path")
 
 
 def _blind(parser: argparse.ArgumentParser) -> None:
@@ -152,7 +162,7 @@ def _import(parser: argparse.ArgumentParser) -> None:
     text = "its section `import` says how; a flag goes before what stands there"
     parser.add_argument("--config", metavar="CONFIG.yaml", help=text)
     _importing(parser)
-    parser.add_argument("--quiet", action="store_true", help="print nothing but the recording's path")
+    _printing(parser, "recording's path")
 
 
 def _importing(parser: argparse.ArgumentParser) -> None:
@@ -205,7 +215,7 @@ def _init(parser: argparse.ArgumentParser) -> None:
     text = "what else holds it, such as right_gripper=w_cable; may be repeated"
     parser.add_argument("--grasp", metavar="FRAME=POINT", action="append", default=[], help=text)
     _importing(parser)
-    parser.add_argument("--quiet", action="store_true", help="print nothing but the configuration's path")
+    _printing(parser, "configuration's path")
 
 
 def _export(parser: argparse.ArgumentParser) -> None:
@@ -216,13 +226,18 @@ def _export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--format", metavar="FORMAT", help=text)
     text = "folder for CSV or MCAP files, or file for the model; its manifest stands beside it"
     parser.add_argument("--out", metavar="PATH", required=True, help=text)
-    parser.add_argument("--quiet", action="store_true", help="print nothing but the files' paths")
+    _printing(parser, "files' paths")
 
 
 def _report(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("runs", metavar="RUN", nargs="+", help="run folders of solve or diagnose, in the order of time")
     parser.add_argument("--out", metavar="DIR", help="folder to make (default: runs/history-report-DATE-TIME)")
-    parser.add_argument("--quiet", action="store_true", help="print nothing but the folder's path")
+    _printing(parser, "folder's path")
+
+
+def _completion(parser: argparse.ArgumentParser) -> None:
+    text = 'run `eval "$(yid-ocp completion bash)"` in ~/.bashrc, or ~/.zshrc with zsh; in fish pipe it to `source`'
+    parser.add_argument("shell", choices=("bash", "zsh", "fish"), help=text)
 
 
 def _schema(parser: argparse.ArgumentParser) -> None:
@@ -260,6 +275,12 @@ COMMANDS: tuple[Command, ...] = (
     Command("track", "measure the object's points in the frames of a depth camera", "track", _doubting),
     Command("import", "turn a file of another tool into a recording", "import_recording", _import),
     Command("export", "turn a recording into CSV or MCAP, a run into MJCF, URDF, SDF, YAML or MCAP", "export", _export),
+    Command(
+        "completion",
+        "print what makes a shell complete commands, options, files and settings",
+        "completion",
+        _completion,
+    ),
     Command("schema", "print the JSON Schema of configuration files, for editors", "schema", _schema),
 )
 
@@ -267,11 +288,37 @@ COMMANDS: tuple[Command, ...] = (
 # -- running ----------------------------------------------------------------------------------------------------------
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser whose errors are those of the rest of the program, with the nearest name that it knows."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
+        """As the parser of the library, but what is left over is an error of the command that does not know it."""
+        found, rest = super().parse_known_args(args, namespace)
+        if rest:
+            flag, flags = rest[0].partition("=")[0], [name for name in self._option_string_actions if name[:2] == "--"]
+            if not flag.startswith("-"):
+                raise ConfigError(f"'{rest[0]}' is one argument too many", where=self.prog, hint=self._help())
+            raise ConfigError(f"there is no option '{flag}'", where=self.prog, **choices(flag, flags))
+        return found, rest
+
+    def error(self, message: str) -> NoReturn:
+        """Raise what the library found wrong."""
+        chosen = re.fullmatch(r"argument (\S+): invalid choice: '?(.*?)'? \(choose from (.*)\)", message, re.DOTALL)
+        if chosen:
+            known = [name.strip(" '") for name in chosen[3].split(",")]
+            noun = "command" if chosen[1] == "COMMAND" else f"choice of {chosen[1]}"
+            raise ConfigError(f"there is no {noun} '{chosen[2]}'", where=self.prog, **choices(chosen[2], known))
+        raise ConfigError(message, where=self.prog, hint=self._help())
+
+    def _help(self) -> str:
+        return f"{self.prog} --help says what it takes"
+
+
 def parser() -> argparse.ArgumentParser:
-    """The argument parser of all commands."""
+    """The argument parser of all commands; its errors are `ConfigError`."""
     from yid_ocp import __version__
 
-    top = argparse.ArgumentParser(prog="yid-ocp", description="Stiffness of flexible objects from robot recordings.")
+    top = _Parser(prog="yid-ocp", description="Stiffness of flexible objects from robot recordings.")
     top.add_argument("--version", action="version", version=f"yid-ocp {__version__}")
     commands = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for row in COMMANDS:
@@ -281,15 +328,31 @@ def parser() -> argparse.ArgumentParser:
     return top
 
 
-def _wrong(error: YidError) -> int:
+def _wrong(error: YidError, as_json: bool) -> int:
     print(f"error: {error}", file=sys.stderr)
+    parts = {"where": error.where, "allowed": error.allowed, "hint": error.hint}
+    _told(as_json, type(error).__name__, error.what, WRONG_INPUT, **parts)
     return WRONG_INPUT
+
+
+def _told(as_json: bool, kind: str, what: str, code: int, **parts: str) -> None:
+    """An error on standard output, where a program reads it."""
+    if as_json and sys.stdout is not None:
+        print(json.dumps({"format": ERROR, "kind": kind, "what": what, **parts, "exit_code": code}, indent=1))
 
 
 @contextlib.contextmanager
 def _notices() -> Iterator[None]:
-    """Show the library's warnings on standard error while a command runs."""
-    handler = logging.StreamHandler(sys.stderr)
+    """Show the library's warnings on standard error while a command runs, each once however often it is given."""
+    handler, shown = logging.StreamHandler(sys.stderr), set[str]()
+
+    def is_new(record: logging.LogRecord) -> bool:
+        text = record.getMessage()
+        new = text not in shown
+        shown.add(text)
+        return new
+
+    handler.addFilter(is_new)
     handler.setLevel(logging.WARNING)
     handler.setFormatter(logging.Formatter("notice: %(message)s"))
     logger = logging.getLogger("yid_ocp")
@@ -307,22 +370,30 @@ def main(argv: Sequence[str] | None = None) -> int:
     -------
     int
         0 done; 1 the solve failed, the run folder says why; 2 the input is wrong, or the system refused something; 3 a
-        bug; 128 and the signal's number where one ended it, as 130 for an interruption.
+        bug; 128 and the signal's number where one ended it, as 130 for an interruption. With `--json` an error is
+        printed as `yid-error/1` as well: kind, what, where, allowed, hint and exit_code.
     """
+    if "_ARGCOMPLETE" in os.environ:
+        import_module("yid_ocp.workflow.completion").answer(parser())
+    as_json = "--json" in (sys.argv[1:] if argv is None else argv)
     try:
         arguments = parser().parse_args(argv)
     except SystemExit as error:
         return int(error.code or 0)
+    except ConfigError as error:
+        return _wrong(error, as_json)
     try:
         with interruption.signals_raised(), _notices():
-            return _carried_out(arguments)
+            return _carried_out(arguments, as_json)
     except KeyboardInterrupt as error:
-        name = str(error) or "SIGINT"
-        print(f"interrupted ({name}); nothing half-finished was left", file=sys.stderr)
-        return error.number + 128 if isinstance(error, interruption.Interrupted) else INTERRUPTED
+        what = f"interrupted ({str(error) or 'SIGINT'}); nothing half-finished was left"
+        code = error.number + 128 if isinstance(error, interruption.Interrupted) else INTERRUPTED
+        print(what, file=sys.stderr)
+        _told(as_json, "Interrupted", what, code)
+        return code
 
 
-def _carried_out(arguments: argparse.Namespace) -> int:
+def _carried_out(arguments: argparse.Namespace, as_json: bool) -> int:
     """Exit code of a command."""
     if sys.stdout is None:  # closed by who started the program
         sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
@@ -330,7 +401,7 @@ def _carried_out(arguments: argparse.Namespace) -> int:
         os.getcwd()
     except OSError as error:
         what = f"the working directory is not there: {error.strerror or error}"
-        return _wrong(OutputError(what, hint="cd to one that is"))
+        return _wrong(OutputError(what, hint="cd to one that is"), as_json)
     try:
         code = int(import_module(f"yid_ocp.workflow.{arguments.module}").run(arguments))
         sys.stdout.flush()
@@ -339,24 +410,29 @@ def _carried_out(arguments: argparse.Namespace) -> int:
         number = interruption.asked()
         if number is not None:  # what a library makes of being interrupted is no cause
             raise interruption.Interrupted(number) from error
-        return _failed(error)
+        return _failed(error, as_json)
 
 
-def _failed(error: Exception) -> int:
+def _failed(error: Exception, as_json: bool) -> int:
     """Say why a command failed; its exit code."""
     if isinstance(error, YidError):
-        return _wrong(error)
+        return _wrong(error, as_json)
     if isinstance(error, BrokenPipeError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python fails again when it ends
-        return _wrong(OutputError("standard output was closed before all was printed", hint="read it to its end"))
+        return _wrong(
+            OutputError("standard output was closed before all was printed", hint="read it to its end"), False
+        )
     if isinstance(error, OSError):
         what = f"the system refused: {error.strerror or error}"
-        return _wrong(OutputError(what, where=str(error.filename or ""), hint="see whether disk and rights allow it"))
+        hint = "see whether disk and rights allow it"
+        return _wrong(OutputError(what, where=str(error.filename or ""), hint=hint), as_json)
     if isinstance(error, MemoryError):
         what = f"there is not enough memory: {error}"
-        return _wrong(ResourceError(what, hint="shorten the run, or take fewer links"))
+        return _wrong(ResourceError(what, hint="shorten the run, or take fewer links"), as_json)
     # whatever else comes up here is a mistake of ours
     with tempfile.NamedTemporaryFile("w", prefix="yid-ocp-", suffix=".log", delete=False, encoding="utf-8") as file:
         traceback.print_exception(error, file=file)
-    print(f"bug: {type(error).__name__}: {error}\n  please report it with {file.name}", file=sys.stderr)
+    what = f"{type(error).__name__}: {error}"
+    print(f"bug: {what}\n  please report it with {file.name}", file=sys.stderr)
+    _told(as_json, "bug", what, BUG, where=file.name)
     return BUG

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from typing import TypedDict
 
 
 class YidError(Exception):
@@ -57,8 +58,19 @@ class ResourceError(YidError):
     """The machine has too little memory for what was asked of it."""
 
 
+MANY, FEW = 40, 8
+"""More names than the first are not listed; of so many that something is near, the second."""
+
+
+class Choices(TypedDict):
+    """What an error says of a name that is not known: its `allowed` and its `hint`."""
+
+    allowed: str
+    hint: str
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Say which known name the given one resembles most, or list them all.
+    """Say which known name the given one resembles most, or list what there is.
 
     Parameters
     ----------
@@ -70,10 +82,44 @@ def nearest(name: str, known: Iterable[str]) -> str:
     Returns
     -------
     str
-        A sentence for the `hint` of an error.
+        A sentence for the `hint` of an error that does not say what is allowed; beside a list, see `choices`.
     """
     names = [str(entry) for entry in known]
-    close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
-    if close:
-        return f"did you mean '{close[0]}'?"
-    return "known: " + (", ".join(sorted(names)) if names else "none")
+    return _meant(name, names) or f"known: {_listed(name, sorted(names)) or 'none'}"
+
+
+def choices(name: str, known: Iterable[str]) -> Choices:
+    """What is allowed in place of a name, and what it resembles most: no name twice, and long lists cut.
+
+    Parameters
+    ----------
+    name, known
+        As in `nearest`.
+
+    Returns
+    -------
+    dict
+        Arguments of an error: `ConfigError(what, where=where, **choices(name, known))`.
+    """
+    names = [str(entry) for entry in known]
+    return {"allowed": _listed(name, names) or "none", "hint": _meant(name, names)}
+
+
+def _close(name: str, names: Sequence[str], count: int) -> list[str]:
+    """The names that resemble one, nearest first, whatever their case."""
+    plain = {entry.lower(): entry for entry in reversed(names)}
+    return [plain[entry] for entry in difflib.get_close_matches(name.lower(), plain, n=count, cutoff=0.5)]
+
+
+def _meant(name: str, names: Sequence[str]) -> str:
+    close = _close(name, names, 1)
+    return f"did you mean '{close[0]}'?" if close else ""
+
+
+def _listed(name: str, names: Sequence[str]) -> str:
+    """All names, or the nearest where they are many."""
+    close = _close(name, names, FEW)
+    if len(names) <= FEW or (not close and len(names) <= MANY):
+        return ", ".join(names)
+    shown = [*close, *(entry for entry in names if entry not in close)][:FEW]
+    return f"{', '.join(shown)} and {len(names) - FEW} more"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from typing import Generic, TypeVar
 
-from yid_ocp.errors import ConfigError, nearest
+from yid_ocp.errors import ConfigError, choices
 
 T = TypeVar("T")
 
@@ -44,9 +44,7 @@ class Registry(Generic[T]):
 
     def __getitem__(self, name: str) -> T:
         if name not in self._entries:
-            raise ConfigError(
-                f"there is no {self.noun} '{name}'", allowed=", ".join(self), hint=nearest(name, self._entries)
-            )
+            raise ConfigError(f"there is no {self.noun} '{name}'", **choices(name, self))
         return self._entries[name]
 
     def __contains__(self, name: object) -> bool:

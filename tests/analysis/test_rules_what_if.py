@@ -27,6 +27,7 @@ from yid_ocp.analysis.what_if import (
 )
 from yid_ocp.errors import SolverError
 from yid_ocp.problem.grid import Grid
+from yid_ocp.progress import SILENT
 
 
 def change(name, **more):
@@ -475,9 +476,9 @@ def pieces(monkeypatch, seen):
 
 
 def test_all_single_changes_the_smallest_sets_and_the_greedy_ones(pieces):
-    found = what_if("problem", progress=print)
+    found = what_if("problem", progress=SILENT)
     assert pieces.settings == [("problem", ("problem", None), "assumed", None, None, 0.1, 11)]
-    assert pieces.progress is print
+    assert pieces.progress is SILENT
     assert pieces.judged == []
     assert found.base.std_relative == pytest.approx({"a": 0.1, "b": 1.0})
     assert [entry.changes for entry in found.smallest] == [("weld",)]

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from heard import Heard
 
 from yid_ocp.analysis import layouts
 from yid_ocp.analysis.identifiability import identifiability
@@ -27,8 +28,8 @@ TRUTH = {"T1.bend": 22.0, "T1.twist": 13.6, "T2.bend": 10.7, "T2.twist": 8.2, "T
 
 @pytest.fixture(scope="module")
 def tube_ranking(held_tube):
-    told: list[str] = []
-    return what_if(held_tube, progress=told.append), told
+    heard = Heard()
+    return what_if(held_tube, progress=heard), heard.stages
 
 
 def test_the_experiment_as_it_is_agrees_with_the_analysis(held_tube, tube_ranking):

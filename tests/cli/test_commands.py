@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 import json
+import logging
+import os
 import pathlib
 import subprocess
 import sys
@@ -163,8 +166,83 @@ def test_set_changes_the_run(cli, pendulum, tmp_path):
 
 def test_a_named_empty_folder_may_be_used(cli, pendulum, tmp_path):
     (tmp_path / "empty").mkdir()
-    assert cli("solve", pendulum, "--out", "empty").code == 0
-    assert (tmp_path / "empty" / "result.json").is_file()
+    done = cli("solve", pendulum, "--out", "empty", "--json")
+    assert done.code == 0
+    assert done.out == (tmp_path / "empty" / "result.json").read_text()
+    assert done.err == f"run folder: {os.path.relpath(tmp_path / 'empty')}\n"
+
+
+def test_errors_are_json_where_that_is_asked_for(cli, pendulum, tmp_path, monkeypatch):
+    wrong = cli("solve", pendulum, "--json", "--set", "solver.iteration=3")
+    assert wrong.code == 2
+    assert json.loads(wrong.out) == {
+        "format": "yid-error/1",
+        "kind": "ConfigError",
+        "what": "there is no key 'iteration'",
+        "where": "--set solver.iteration",
+        "allowed": "name, iterations, step_tolerance, cost_tolerance, damping",
+        "hint": "did you mean 'iterations'?",
+        "exit_code": 2,
+    }
+    assert "did you mean 'iterations'?" in wrong.err
+    assert json.loads(cli("solve", "--json", "--sett", "a").out)["what"] == "there is no option '--sett'"
+    assert cli("solve", "--sett", "a").out == ""
+
+    def broken(arguments):
+        raise ZeroDivisionError("no good")
+
+    monkeypatch.setattr("yid_ocp.workflow.check.run", broken)
+    bug = cli("check", pendulum, "--json")
+    said = json.loads(bug.out)
+    assert (bug.code, said["exit_code"], said["kind"], said["what"]) == (3, 3, "bug", "ZeroDivisionError: no good")
+    assert pathlib.Path(said["where"]).is_file()
+    pathlib.Path(said["where"]).unlink()
+
+    def stopped(arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("yid_ocp.workflow.check.run", stopped)
+    ended = cli("check", pendulum, "--json")
+    assert (ended.code, json.loads(ended.out)["exit_code"]) == (130, 130)
+
+
+def test_a_notice_is_shown_once(cli, pendulum, monkeypatch):
+    def noted(arguments):
+        for text in ("a coupling is not modelled", "another thing", "a coupling is not modelled"):
+            logging.getLogger("yid_ocp.model").warning(text)
+        return 0
+
+    monkeypatch.setattr("yid_ocp.workflow.check.run", noted)
+    for _ in range(2):
+        assert cli("check", pendulum).err == "notice: a coupling is not modelled\nnotice: another thing\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["slove"], ("there is no command 'slove'", "did you mean 'solve'?")),
+        (["check"], ("the following arguments are required: CONFIG.yaml", "where: yid-ocp check", "--help")),
+        (["check", "a.yaml", "b.yaml"], ("'b.yaml' is one argument too many",)),
+        (["solve", "--qiet"], ("there is no option '--qiet'", "where: yid-ocp solve", "did you mean '--quiet'?")),
+        (
+            ["batch", "a.yaml", "--command", "slv"],
+            ("there is no choice of --command 'slv'", "allowed: solve, diagnose"),
+        ),
+    ],
+)
+def test_a_wrong_command_line_is_told_like_all_that_is_wrong(cli, arguments, words):
+    done = cli(*arguments)
+    assert (done.code, done.out) == (2, "")
+    for word in words:
+        assert word in done.err
+
+
+def test_every_command_that_works_prints_json():
+    for row in COMMANDS:
+        if row.name not in ("schema", "completion"):
+            made = argparse.ArgumentParser()
+            row.arguments(made)
+            assert {"--json", "--quiet"} <= set(made._option_string_actions), row.name
 
 
 def test_check(cli, pendulum, tmp_path):

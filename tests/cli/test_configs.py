@@ -86,7 +86,11 @@ def test_configuration_runs(cli, repository, tmp_path, name):
 WITHHELD = {
     "its weight": (("model.object.gravity_fraction=0",), {"kind": "gravity_scale", "location": "object"}),
     "the beam": (
-        ("model.object=null", "parameters={panda_*.damping: {free: true}, effort_offset@*: {free: true}}"),
+        (
+            "model.object=null",
+            "parameters={}",
+            "parameters={panda_*.damping: {free: true}, effort_offset@*: {free: true}}",
+        ),
         {"kind": "point_mass", "location": "gripper"},
     ),
 }

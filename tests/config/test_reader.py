@@ -206,6 +206,66 @@ def test_refused_settings_over_the_file(setting, message):
     assert f"--set {setting.split('=')[0]}" in str(caught.value)
 
 
+SET = """\
+sensors:
+  points: {std: 0.002, use: true}
+  joints.effort: {std: 0.1}
+parameters:
+  T1.bend: {free: true, initial: 5.0}
+solver: {name: gauss_newton, iterations: 7}
+model: {object: {kind: y, links: 3}}
+"""
+
+
+def test_set_merges_sections(written):
+    file = written(SET)
+    run = load_config(file, ["sensors={points: {std: 0.001}, camera: {use: false}}"])
+    assert (run.sensors["points"].std, run.sensors["points"].use) == (0.001, True)
+    assert (run.sensors["joints.effort"].std, run.sensors["camera"].use) == (0.1, False)
+    run = load_config(
+        file, ["parameters.T1.bend.initial=4", "parameters={T1.bend: {bounds: [1, 9]}, T2.*: {free: true}}"]
+    )
+    bend = run.parameters["T1.bend"]
+    assert (bend.free, bend.initial, bend.bounds) == (True, 4.0, (1.0, 9.0))
+    assert run.parameters["T2.*"].free
+    assert load_config(file, ["solver={step_tolerance: 1e-3}"]).solver.iterations == 7
+    assert load_config(file, ["model={gravity: [0, 0, -1]}"]).model.object.links == 3
+
+
+def test_set_replaces_lists_other_kinds_and_what_is_emptied_first(written):
+    file = written(SET)
+    lifted = load_config(file, ["solver={name: lifted}"]).solver
+    assert (lifted.name, lifted.iterations) == ("lifted", type(lifted)().iterations)
+    assert load_config(file, ["model.object={kind: segments, segments: {}}"]).model.object.kind == "segments"
+    assert load_config(file, ["model.object={kind: y}"]).model.object.links == 3
+    assert load_config(file, ["sensors={}"]).sensors == {}
+    assert list(load_config(file, ["sensors=null", "sensors={camera: {use: false}}"]).sensors) == ["camera"]
+    assert load_config(file, ["recordings.estimate=[a.h5]", "recordings.estimate=[b.h5]"]).recordings.estimate[1:] == ()
+
+
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ("sensors.points.sdt=3", ("there is no key 'sdt'", "did you mean 'std'?")),
+        ("sensors.camera.sdt=3", ("sensors.camera.sdt = 3 is not a section", "did you mean 'sensors.camera.std'?")),
+        ("parameters.T2.bend=5", ("is not a section", "add a key, as in parameters.T2.bend.initial")),
+        ("sensors={points: {sdt: 3}}", ("there is no key 'sdt' in sensors.points", "--set sensors", "'std'?")),
+        ("solver={name:lifted}", ("put a space behind the colon, as in {name: lifted}",)),
+        ("parameters.T2.bend.free=maybe", ("--set parameters.T2.bend.free", "true or false")),
+    ],
+)
+def test_what_is_set_wrong_is_told_with_the_nearest_key(written, setting, words):
+    with pytest.raises(ConfigError) as caught:
+        load_config(written(SET), [setting])
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_a_section_that_set_makes_says_where_it_comes_from(written):
+    run = load_config(written(SET), ["parameters.T9.bend.free=true"])
+    assert run.where("parameters", "T9.bend") == "--set parameters.T9.bend.free: parameters.T9.bend"
+
+
 # Numbers that may have any value: places, angles, offsets.
 ANY_NUMBER = {
     "plan.posture.NAME",

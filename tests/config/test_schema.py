@@ -8,7 +8,10 @@ import jsonschema
 import pytest
 from ruamel.yaml import YAML
 
+from yid_ocp.config.examples import EXAMPLES
+from yid_ocp.config.reader import load_config
 from yid_ocp.config.schema import schema, settings_page
+from yid_ocp.errors import ConfigError
 
 
 def test_the_one_beside_the_configurations_is_current(repository):
@@ -29,6 +32,22 @@ def test_the_page_in_the_docs_is_current(repository):
     ):
         assert f"\n{line}\n" in page
     assert "known_start" not in page
+
+
+def test_every_section_of_the_page_has_an_example_that_can_be_read(repository, tmp_path):
+    page = (repository / "docs" / "settings.md").read_text(encoding="utf-8")
+    titles = [line.removeprefix("## ") for line in page.splitlines() if line.startswith("## ")]
+    assert set(titles) == set(EXAMPLES), "every section of docs/settings.md needs an example in config/examples.py"
+    rules = schema()
+    for title, text in EXAMPLES.items():
+        (tmp_path / "run.yaml").write_text(text)
+        try:
+            load_config(tmp_path / "run.yaml")
+        except ConfigError as error:
+            pytest.fail(f"{title}: {error}")
+        jsonschema.validate(YAML(typ="safe", pure=True).load(text), rules)
+        key = title.split(",")[0].split(".")[0]
+        assert title == "The file" or f"{key}:" in text, title
 
 
 def test_the_schema_accepts_every_configuration_and_refuses_typos(repository):

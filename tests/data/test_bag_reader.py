@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from heard import Heard
 from recording_examples import joints_of
 
 from yid_ocp.data.hdf5 import write_recording
@@ -115,9 +116,11 @@ def arm_and_camera() -> Messages:
 
 
 @pytest.mark.parametrize("kind", FORMATS)
-def test_bag_round_trip(kind: str, tmp_path: Path) -> None:
-    path = write_bag(tmp_path, kind, arm_and_camera())
-    recording = read_any(path, sensor="camera")
+def test_bag_round_trip(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, heard = write_bag(tmp_path, kind, arm_and_camera()), Heard()
+    monkeypatch.setattr("yid_ocp.data.readers.bags.TOLD", 3)
+    recording = read_any(path, sensor="camera", progress=heard)
+    assert heard.parts == [(done, 8, "messages") for done in (0, 3, 6)]
     joints = joints_of(recording)
     assert joints.names == ("a", "b")
     assert np.allclose(joints.t, 0.01 * np.arange(5), rtol=0, atol=1e-12)
@@ -133,7 +136,7 @@ def test_bag_round_trip(kind: str, tmp_path: Path) -> None:
     assert recording.name == "run"
     assert recording.sha256 is not None
     write_recording(recording, tmp_path / "run.h5")
-    assert read_any(tmp_path / "run.h5").point_names == ("w_T1", "w_T2")
+    assert read_any(tmp_path / "run.h5", progress=heard).point_names == ("w_T1", "w_T2")
 
 
 def test_bag_order_of_joints_may_change(tmp_path: Path) -> None:

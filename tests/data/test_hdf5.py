@@ -174,7 +174,7 @@ MALFORMED: dict[str, tuple[Callable[[h5py.File], object], str, str]] = {
     "group": (lambda f: rename(f, "joints", "joint"), "no group 'joint'", "did you mean 'joints'"),
     "dataset at the top": (lambda f: f.create_dataset("points", data=[1.0]), "'points' is not a group", ""),
     "dataset": (lambda f: rename(f, "joints/effort", "joints/efort"), "no dataset 'efort'", "did you mean 'effort'"),
-    "dataset of points": (lambda f: rename(f, "points_arm/position", "points_arm/xyz"), "no dataset 'xyz'", "known:"),
+    "dataset of points": (lambda f: rename(f, "points_arm/position", "points_arm/xyz"), "no dataset 'xyz'", ""),
     "attribute": (lambda f: f["joints"].attrs.create("effrt_std", 1.0), "no attribute 'effrt_std'", "'effort_std'"),
     "no t": (lambda f: f["joints"].__delitem__("t"), "dataset 't' is missing", ""),
     "no position": (lambda f: f["points_arm"].__delitem__("position"), "dataset 'position' is missing", ""),

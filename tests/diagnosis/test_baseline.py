@@ -16,9 +16,9 @@ from yid_ocp.diagnosis.hypotheses import CandidateProblem
 from yid_ocp.diagnosis.refit import refit
 from yid_ocp.errors import ConfigError
 from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.simulated import recorded
 from yid_ocp.workflow.build import build_problem
 from yid_ocp.workflow.diagnose import run_diagnose
-from yid_ocp.workflow.simulate import as_recording
 from yid_ocp.workflow.solve import run_solve
 
 BEAM = """
@@ -53,7 +53,7 @@ def swing(folder, name, seed, effects="[]"):
     theta, offset = problem.split(problem.vector(values), 0)
     outcome = problem.predictor.run(problem.episodes[0], theta, offset, False)
     assert not isinstance(outcome, str)
-    made = as_recording(run, problem, problem.episodes[0], outcome, seed)
+    made = recorded(problem.predictor, problem.episodes[0], outcome, problem.theta, seed)
     write_recording(replace(made, truth={}), folder / f"{name}.h5")
 
 

@@ -12,6 +12,7 @@ from yid_ocp.diagnosis.carry_over import carried_over, compared, counting_both, 
 from yid_ocp.diagnosis.hypotheses import CandidateProblem
 from yid_ocp.diagnosis.refit import Search
 from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.progress import SILENT
 
 SPRING = effect("spring@elbow", amplitude("k", lower=-9.0, expected=(0.0, 10.0)), shape("s"))
 SHIFT = effect(
@@ -116,7 +117,7 @@ def test_the_held_out_recordings_are_fitted_with_the_same_effects(monkeypatch):
         return again
 
     monkeypatch.setattr(carry_over, "refit", refitted)
-    search = Search(CandidateProblem(Problem(), (SPRING,), False), Thresholds(), lambda text: None, "store")
+    search = Search(CandidateProblem(Problem(), (SPRING,), False), Thresholds(), SILENT, "store")
     [entry] = carried_over(search, first)
     assert (entry.value, entry.again, entry.agrees) == (2.0, 7.0, False)
     [(episodes, held_out, effects, start, store, name, limits)] = asked
@@ -128,13 +129,13 @@ def test_the_held_out_recordings_are_fitted_with_the_same_effects(monkeypatch):
 @pytest.mark.parametrize(("blocks", "effects"), [(True, (SPRING,)), (False, ())], ids=["in blocks", "no effect"])
 def test_nothing_is_compared_where_there_is_nothing_to_compare(monkeypatch, blocks, effects):
     monkeypatch.setattr(carry_over, "refit", lambda *_: pytest.fail("not asked for"))
-    search = Search(CandidateProblem(Problem(), (SPRING,), blocks), Thresholds(), lambda text: None)
+    search = Search(CandidateProblem(Problem(), (SPRING,), blocks), Thresholds(), SILENT)
     assert carried_over(search, fit(effects)) == ()
 
 
 def test_a_model_that_cannot_be_fitted_there_is_no_evidence(monkeypatch):
     monkeypatch.setattr(carry_over, "refit", lambda *_: None)
-    search = Search(CandidateProblem(Problem(), (SPRING,), False), Thresholds(), lambda text: None)
+    search = Search(CandidateProblem(Problem(), (SPRING,), False), Thresholds(), SILENT)
     assert carried_over(search, fit([SPRING])) == ()
 
 
@@ -147,6 +148,6 @@ def test_noise_that_drives_the_motion_weighs_there_too(monkeypatch):
     monkeypatch.setattr(carry_over, "_shared", lambda turned, fitted: {})
     asked = []
     monkeypatch.setattr(carry_over, "refit", lambda problem, *_: asked.append(problem))
-    carried_over(Search(composed, Thresholds(), lambda text: None), fit([SPRING], values={"k": 4.0}))
+    carried_over(Search(composed, Thresholds(), SILENT), fit([SPRING], values={"k": 4.0}))
     assert asked == ["weighted"]
     assert seen[0]["k"] == 4.0

@@ -25,6 +25,7 @@ from factories import (
     visible,
     window,
 )
+from heard import Heard
 from made_series import series
 
 from yid_ocp.diagnosis.earlier import Earlier
@@ -248,7 +249,7 @@ class Steps:
             "carried": (),
             "events": [NOTHING],
         } | given
-        self.taken, self.said = [], []
+        self.taken, self.heard = [], Heard()
         self.nominal = fit(lost=loss(2.0, 2.1), cost=100.0, values=VALUES)
         object.__setattr__(
             self.nominal,
@@ -292,7 +293,7 @@ class Steps:
         self.effects = [Remembering("friction@elbow"), Remembering("offset@wrist")]
         self.nominal.problem.held_out = held
         self.composed = CandidateProblem("problem", tuple(self.effects), self.given["blocks"])
-        search = Search(self.composed, Thresholds(**limits), self.said.append, "store")
+        search = Search(self.composed, Thresholds(**limits), self.heard, "store")
         return module._diagnosed("problem", search, "solution", module._Clock(), Earlier.of((), ()))
 
 
@@ -335,7 +336,7 @@ def test_a_gap_is_screened_located_and_closed(monkeypatch):
     assert list(found.seconds) == stages
     assert all(0 <= value < 5 for value in found.seconds.values())
     said = ["fitting the nominal model", "looking for events", "screening 2 candidates", "locating the gap"]
-    assert steps.said[:4] == said
+    assert steps.heard.stages[:4] == said
 
 
 NOISE = {"before": outcome(p=0.4, degrees=100.0), "held": outcome(p=0.5)}
@@ -425,7 +426,7 @@ class Valleys:
         return None if cost is None else fit(cost=cost, values=start)
 
     def other(self):
-        search = Search(SimpleNamespace(problem=self.problem), Thresholds(), lambda text: None, "store")
+        search = Search(SimpleNamespace(problem=self.problem), Thresholds(), Heard(), "store")
         return module.elsewhere(search, fit(cost=100.0, values={"k": 2.0, "l": -1.0}))
 
 

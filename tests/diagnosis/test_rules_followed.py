@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 from factories import fit, loss
+from heard import Heard
 
 from yid_ocp.diagnosis import hypotheses
 from yid_ocp.diagnosis.hypotheses import CandidateProblem, Cut
@@ -101,7 +102,7 @@ def test_with_no_margin_nothing_of_it_is_kept():
 
 def run(monkeypatch, *losses, before=()):
     """The nominal fit beside what is left of its held-out recordings, whose losses come one after the other."""
-    margins, said, todo = [], [], list(losses)
+    margins, heard, todo = [], Heard(), list(losses)
 
     def cut(self, values, margin):
         margins.append(margin)
@@ -111,9 +112,9 @@ def run(monkeypatch, *losses, before=()):
     monkeypatch.setattr(
         module, "_settled", lambda composed, *_: todo and fit(lost=loss(todo.pop(0)), problem=composed.problem)
     )
-    search = Search(CandidateProblem("whole", (), False), Thresholds(), said.append)
+    search = Search(CandidateProblem("whole", (), False), Thresholds(), heard)
     first = fit(lost=loss(todo.pop(0)), problem="whole")
-    return (*module._followed(search, first, before), margins, said)
+    return (*module._followed(search, first, before), margins, heard.stages)
 
 
 def test_a_model_that_follows_everything_is_left_alone(monkeypatch):

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from factories import amplitude, costing, effect, evaluation, fit, loss, measurements, shape
+from heard import Heard
 
 from yid_ocp.diagnosis.refit import (
     Refitted,
@@ -267,7 +268,7 @@ def test_a_stored_refit_of_another_problem_is_no_use(solved, values, std, cost):
 
 
 def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
-    asked, said = [], []
+    asked, heard = [], Heard()
     other, third = effect("offset@elbow"), effect("third@x")
 
     def one(problem, effects, start, store, limits):
@@ -276,14 +277,17 @@ def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
         return None if effects[-1] is third else SimpleNamespace(**vars(made) | {"resumed": effects[-1] is other})
 
     monkeypatch.setattr(module, "refit", one)
-    search = Search("problem", LIMITS, said.append, "store")
+    search = Search("problem", LIMITS, heard, "store")
     tried = [(FRICTION, {A: 0.7}), (other, {"k": 3.0}), (third, {})]
     found = refit_all(search, (effect("base@x"),), tried, {"k": 2.0})
     assert [f.effects[-1].kind for f in found] == ["friction", "offset"]
     by_kind = {kinds[-1]: (problem, kinds, start, store, limits) for problem, kinds, start, store, limits in asked}
     assert by_kind["friction"] == ("problem", ["base", "friction"], {"k": 2.0, A: 0.7}, "store", LIMITS)
     assert by_kind["offset"][2] == {"k": 3.0}
-    assert sorted(said) == [
+    assert heard.stages == ["refitting with each of 3 effects beside base@x"]
+    assert [part[:2] for part in heard.parts] == [(0, 3), (1, 3), (2, 3), (3, 3)]
+    assert sorted(text for done, _, text in heard.parts if done) == [
+        "no fit with third@x",
         "refitted with friction@elbow: held-out chi2/n 1.234",
         "resumed the refit with offset@elbow: held-out chi2/n 1.234",
     ]

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from factories import alike, amplitude, effect, fit, loss, score, shape
+from heard import Heard
 
 from yid_ocp.diagnosis import select
 from yid_ocp.diagnosis.refit import Loss, Search
@@ -359,7 +360,7 @@ class Rounds:
     """Refits whose held-out losses are given by the effects' kinds, screened as wanted; remembers what was asked."""
 
     def __init__(self, monkeypatch, losses, p_values=(1e-9, 1e-9, 1e-9), fails=(), absent=()):
-        self.losses, self.fails, self.refits, self.screens, self.said = losses, fails, [], [], []
+        self.losses, self.fails, self.refits, self.screens, self.heard = losses, fails, [], [], Heard()
         self.absent = absent
         kinds = [score(of, p=p, decrease=9.0 - i) for i, (of, p) in enumerate(zip((A, B, C), p_values, strict=True))]
         self.scores = tuple(kinds)
@@ -393,7 +394,7 @@ class Rounds:
         return None if kinds in self.fails else self.fit(effects)
 
     def compose(self, **limits):
-        search = Search(SimpleNamespace(), Thresholds(**limits), self.said.append, None)
+        search = Search(SimpleNamespace(), Thresholds(**limits), self.heard, None)
         nominal = fit((), loss(*self.losses[""]), values={"k": 0.0})
         first, added = compose(search, nominal, self.screened())
         return [f.effects[0].kind for f in first], [entry.effect.kind for entry in added], added
@@ -407,7 +408,7 @@ def test_one_effect_that_leaves_no_gap_is_enough(monkeypatch):
     assert rounds.screens == []
     assert added[0].closure.value == pytest.approx(1 - 0.05 / 2.1)
     assert [of.kind for of in added[0].rivals] == ["a"]
-    assert rounds.said == ["added a@x: 97.6 % of the held-out gap closed"]
+    assert rounds.heard.stages == ["added a@x: 97.6 % of the held-out gap closed"]
 
 
 def test_rivals_are_those_within_reach(monkeypatch):
@@ -438,7 +439,7 @@ def test_effects_are_added_while_the_gap_closes(monkeypatch):
     assert rounds.screens[0][3] == Thresholds()
     assert [entry.closure.value for entry in added] == pytest.approx([1 - 2.1 / 4.1, 1 - 1.1 / 4.1, 1 - 0.6 / 4.1])
     assert [len(entry.fit.effects) for entry in added] == [1, 2, 3]
-    assert "scoring what is left beside a@x, b@x" in rounds.said
+    assert "scoring what is left beside a@x, b@x" in rounds.heard.stages
 
 
 def test_no_more_effects_than_allowed_nor_than_are_significant(monkeypatch):
@@ -532,7 +533,7 @@ def test_an_effect_that_others_make_superfluous_is_left_out_again(monkeypatch):
         (["b"], ["a"], 1.0),
     ], "without each, and others in its place, as both stand in another company than when they were added"
     assert [entry.effect for entry in added] == [B, C]
-    assert "left a@x out again: the others do as well" in rounds.said
+    assert "left a@x out again: the others do as well" in rounds.heard.stages
 
 
 def test_the_last_of_three_may_make_both_others_superfluous(monkeypatch):
@@ -578,7 +579,7 @@ def test_a_later_effect_shows_what_an_earlier_one_stood_in_for(monkeypatch):
     assert added[-1].fit.loss.mean == pytest.approx(1.25)
     assert [e.label for e in added[-1].fit.effects] == ["c@x", "b@x"], "in the order in which they stand"
     assert [len(entry.fit.effects) for entry in added] == [1, 2]
-    assert "put c@x in the place of a@x" in rounds.said
+    assert "put c@x in the place of a@x" in rounds.heard.stages
     assert [of.kind for of in added[0].rivals] == ["c"]
 
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from yid_ocp.errors import ConfigError, ModelError, YidError, nearest
+from yid_ocp.errors import ConfigError, ModelError, YidError, choices, nearest
 from yid_ocp.model import Parameter, Parameters
 
 NUMBERS = st.floats(-1e6, 1e6, allow_nan=False)
@@ -104,3 +104,18 @@ def test_nearest_name():
     assert nearest("left_s3", ["left_s0", "head"]) == "did you mean 'left_s0'?"
     assert nearest("zzz", ["b", "a"]) == "known: a, b"
     assert nearest("zzz", []) == "known: none"
+    assert nearest("W_t1", ["w_T2", "w_T1"]) == "did you mean 'w_T1'?"
+
+
+def test_names_are_listed_once_and_long_lists_are_cut():
+    few, many, more = ["b", "a"], [f"joint_{i}" for i in range(30)], [f"frame_{i}" for i in range(70)]
+    assert choices("zzz", few) == {"allowed": "b, a", "hint": ""}
+    assert choices("zzz", []) == {"allowed": "none", "hint": ""}
+    # nothing is near: all of them, for somebody who looks for a name
+    assert choices("zzz", many) == {"allowed": ", ".join(many), "hint": ""}
+    said = choices("joint_7x", many)
+    assert said["hint"] == "did you mean 'joint_7'?"
+    assert said["allowed"].startswith("joint_7, ")
+    assert said["allowed"].endswith(" and 22 more")
+    assert choices("zzz", more)["allowed"] == ", ".join(more[:8]) + " and 62 more"
+    assert nearest("zzz", more).count("frame_") == 8

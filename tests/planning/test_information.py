@@ -180,7 +180,7 @@ def line(w):
 
 def test_a_straight_line_is_read_at_the_ends_of_its_range():
     search = made_up(line, (straight([[0.0, 0.0]]), [1.0]), 2, -1.0, 1.5)
-    found = search.improve(np.array([[0.1], [-0.05]]), 50, lambda _: None)
+    found = search.improve(np.array([[0.1], [-0.05]]), 50)
     assert found.finished
     np.testing.assert_allclose(np.sort(found.w.ravel()), [-1.0, 1.5], atol=1e-6)
     assert found.value > found.first
@@ -189,7 +189,7 @@ def test_a_straight_line_is_read_at_the_ends_of_its_range():
 def test_a_limit_is_kept_and_used_up():
     # the places are no more than 0.8 apart
     search = made_up(line, (straight([[1.0, -1.0], [-1.0, 1.0]]), [0.8, 0.8]), 2, -1.0, 1.5)
-    found = search.improve(np.array([[0.1], [-0.05]]), 50, lambda _: None)
+    found = search.improve(np.array([[0.1], [-0.05]]), 50)
     assert abs(float(np.diff(found.w.ravel())[0])) == pytest.approx(0.8, abs=5e-3)
     assert search.passed(found.w) <= 0.0
 
@@ -198,7 +198,7 @@ def test_a_curved_limit_is_kept_on_the_way_and_in_the_end():
     # the places lie in a circle of radius 0.6
     search = made_up(line, (lambda w: (np.array([w @ w]), 2 * w[None, :]), [0.36]), 2, -1.0, 1.5)
     for rounds in (1, 2, 50):
-        found = search.improve(np.array([[0.1], [-0.05]]), rounds, lambda _: None)
+        found = search.improve(np.array([[0.1], [-0.05]]), rounds)
         assert search.passed(found.w) <= 0.0
     assert abs(float(np.diff(found.w.ravel())[0])) == pytest.approx(2 * 0.6 / 2**0.5, abs=5e-3)
 

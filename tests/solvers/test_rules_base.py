@@ -91,7 +91,8 @@ def test_a_poor_fit_is_started_again_from_multiples_of_the_start_and_the_best_is
     assert [start for start, _ in solver.runs] == [[1.0], [4.0], [2.0], [10.0]]
     assert solution.x.tolist() == [2.0]
     assert solution.message == "run 3 (best of 4 starts)"
-    assert [entry.note for entry in solution.history] == ["", "start x 4", "start x 2", "start x 10"]
+    notes = ["", *(f"start {n} of at most 4: initial values x {x}" for n, x in ((2, 4), (3, 2), (4, 10)))]
+    assert [entry.note for entry in solution.history] == [entry.note for entry in told] == notes
     assert (solution.evaluations, solution.iterations) == (4, 3)
     assert len(told) == 4
 
@@ -303,7 +304,7 @@ def test_beside_such_noise_a_fit_that_explains_nothing_is_started_again_nearby()
     assert [2.5] in [start for start, _ in solver.runs]
     assert (solution.x.tolist(), solution.fit.explains) == ([2.5], True)
     assert "(best of 2 starts)" in solution.message
-    assert {entry.note for entry in solution.history} == {"", "best fit x 1.25"}
+    assert {entry.note for entry in solution.history} == {"", "start 2 of at most 3: best fit x 1.25"}
     poor = Carrying(*there, [[2.5], [2.1]], [[2.1]], [[3.2], [2.2]], [[2.2]])
     solution = solve(Disturbed(rows), poor)
     assert "(best of 3 starts)" in solution.message

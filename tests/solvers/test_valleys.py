@@ -73,4 +73,4 @@ def test_a_search_that_ends_in_the_wrong_valley_goes_on_from_the_other(monkeypat
     assert alone.x[0] == pytest.approx(ALIAS, rel=0.15), "by itself it stays with the alias"
     found = solve(problem, GaussNewton(iterations=40))
     assert found.x[0] == pytest.approx(TRUE, rel=1e-3)
-    assert "another valley" in {step.note for step in found.history}
+    assert any(step.note.endswith(": another valley") for step in found.history)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import shlex
 from collections.abc import Callable
@@ -62,6 +63,10 @@ import:
 
 def test_what_the_preview_proposes_imports_the_file(odd: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (odd / "plain.csv").write_text("t;q_a;tip_x;tip_y;tip_z\n" + "".join(f"{k};90;900;0;0\n" for k in range(9)))
+    assert main(["import", "plain.csv", "--preview", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["format"], told["recording"]) == ("yid-import/1", None)
+    assert {source["name"] for source in told["sources"]} >= {"t"}
     assert main(["import", "plain.csv", "--preview"]) == 0
     *_, said = capsys.readouterr().out.strip().splitlines()
     assert not (odd / "plain.h5").exists()
@@ -142,7 +147,7 @@ def test_a_bad_import_says_what_is_wrong_and_writes_nothing(
     words = ["import", name] if flags == "--out" else ["import", name, "--out", "made.h5", *flags.split()]
     assert main(words) == 2
     told = capsys.readouterr().err
-    first, *more = told.strip().splitlines()
+    first, *more = (line for line in told.strip().splitlines() if not line.startswith("reading "))
     assert first.startswith("error: ")
     assert said in first
     assert any(line.startswith(("  where: ", "  allowed: ", "  try: ")) for line in more)
@@ -155,5 +160,5 @@ def test_every_flag_is_a_key_of_the_section() -> None:
 
     known: Callable[..., object] = parser().parse_args
     given = vars(known(["import", "x"]))
-    others = {"command", "module", "file", "out", "preview", "config", "quiet"}
+    others = {"command", "module", "file", "out", "preview", "config", "quiet", "json"}
     assert set(given) - others == set(options_of(ImportSettings))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +15,10 @@ from yid_ocp.workflow.command import carry_out
 from yid_ocp.workflow.progress import SILENT, BarProgress, PlainProgress, duration_words, shown
 
 ENTRY = Iterate(3, 12.5, np.zeros(1), 0.1, 4, 1.25, "first 2 s")
+
+
+def asked(quiet: bool = False, program: bool = False) -> argparse.Namespace:
+    return argparse.Namespace(quiet=quiet, json=program)
 
 
 def report(progress) -> None:
@@ -96,35 +102,50 @@ class Bars:
     def update(self, task, **what):
         self.calls.append(("update", task, what))
 
+    def remove_task(self, task):
+        self.calls.append(("remove", task))
 
-def test_a_bar_moves_with_its_stage_and_is_full_when_the_next_begins():
+    @property
+    def console(self):
+        return SimpleNamespace(print=lambda text, **how: self.calls.append(("print", text)))
+
+
+def test_a_bar_moves_with_its_stage_and_is_a_line_when_the_next_begins(clock):
     bars = Bars()
     progress = BarProgress(bars)
     progress.advance(1, 2, "before any stage")
     progress.stage("solving")
     progress.iterate(ENTRY)
+    clock[0] += 7.0
     progress.stage("tracking")
     progress.advance(1, 4, "frame 1")
+    progress.close()
     progress.close()
     assert bars.calls == [
         ("add", "solving", None),
         ("update", 1, {"description": "solving: iteration 3, cost 12.5, 1.2 s, first 2 s"}),
-        ("update", 1, {"description": "solving", "total": 1, "completed": 1}),
+        ("remove", 1),
+        ("print", "solving: 7 s"),
         ("add", "tracking", None),
-        ("update", 4, {"description": "tracking: 1 of 4, frame 1", "completed": 1, "total": 4}),
-        ("update", 4, {"description": "tracking", "total": 1, "completed": 1}),
+        ("update", 5, {"description": "tracking: 1 of 4, frame 1", "completed": 1, "total": 4}),
+        ("remove", 5),
+        ("print", "tracking: 0 s"),
     ]
 
 
 def test_what_is_shown_depends_on_who_looks(capsys, monkeypatch):
-    with shown(quiet=True) as progress:
+    with shown(asked(quiet=True)) as progress:
         assert progress is SILENT
         report(progress)
     assert capsys.readouterr().err == ""
-    with shown(quiet=False) as progress:
+    with shown(asked()) as progress:
         assert isinstance(progress, PlainProgress)
+    with shown(asked(program=True)) as progress:
+        assert progress is SILENT
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    with shown(quiet=False) as progress:
+    with shown(asked(program=True)) as progress:
+        assert isinstance(progress, BarProgress)
+    with shown(asked()) as progress:
         assert isinstance(progress, BarProgress)
         report(progress)
 
@@ -142,7 +163,8 @@ def test_a_command_ends_with_its_table_and_its_folder(tmp_path, monkeypatch, cap
         progress.stage("working")
         return Outcome(tmp_path / "runs" / "x")
 
-    outcome = carry_out(work, lambda result: [Statement(f"a = {result['a']}"), Statement("done")], quiet)
+    said = [Statement("a = 1"), Statement("done")]
+    outcome = carry_out(work, lambda result: said if result == {"a": 1} else [], asked(quiet=quiet))
     captured = capsys.readouterr()
     assert outcome.folder == tmp_path / "runs" / "x"
     if quiet:
@@ -154,5 +176,5 @@ def test_a_command_ends_with_its_table_and_its_folder(tmp_path, monkeypatch, cap
 def test_a_folder_elsewhere_is_named_in_full(tmp_path, monkeypatch, capsys):
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    carry_out(lambda progress: Outcome(tmp_path / "there"), lambda result: [], False)
+    carry_out(lambda progress: Outcome(tmp_path / "there"), lambda result: [], asked())
     assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path / "there")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,11 +13,11 @@ from yid_ocp.model import System
 from yid_ocp.model.system import Spring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
+from yid_ocp.problem.simulated import recorded
 from yid_ocp.report.inspection import _noise_words
 from yid_ocp.report.tables import offset_rows
 from yid_ocp.report.terminal import table
 from yid_ocp.workflow.check import _input_noise
-from yid_ocp.workflow.simulate import as_recording
 from yid_ocp.workflow.torque_offsets import torque_offsets
 
 STEPS, OFFSET, WHITE, ANGLE = 200, 0.2, 0.05, 1e-4
@@ -94,8 +93,7 @@ def test_the_table_has_a_row_for_a_joint_and_a_column_for_a_recording():
 def simulated(problem, seed):
     episode = problem.episodes[0]
     outcome = problem.predictor.run(episode, *problem.split(problem.start, 0), False)
-    run = SimpleNamespace(description="made")
-    return as_recording(run, problem, episode, outcome, seed).joints
+    return recorded(problem.predictor, episode, outcome, problem.theta, seed).joints
 
 
 def test_simulated_torques_are_wrong_as_the_estimation_expects_and_say_so(step):

@@ -15,7 +15,7 @@ from yid_ocp.analysis.profile import with_intervals
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.null_test import USUAL, GapLimits
-from yid_ocp.problem.prediction import EpisodeResult
+from yid_ocp.problem.outcome import EpisodeResult
 from yid_ocp.solvers import GaussNewton, Iterate, Solution, Status, solve
 from yid_ocp.solvers.base import Solver, carries_covariance
 from yid_ocp.solvers.judgement import IDENTIFIABLE, Estimate

@@ -18,13 +18,15 @@ import numpy as np
 import scipy.stats
 from numpy.typing import NDArray
 
+from yid_ocp.shown import Shown, Summary, counted
+
 Array = NDArray[np.float64]
 SMALLEST = 1e-12
 """Smallest eigenvalue of a correlation matrix; what is known better than that follows from rounding."""
 
 
-@dataclass(frozen=True, eq=False)
-class Estimates:
+@dataclass(frozen=True, eq=False, repr=False)
+class Estimates(Shown):
     """What one run says of some parameters.
 
     Attributes
@@ -48,6 +50,12 @@ class Estimates:
     units: Mapping[str, str] = field(default_factory=dict)
     explains: bool = True
     effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+
+    def _summary(self) -> Summary:
+        rows = [("parameter", "value", "unit")]
+        known = zip(self.names, self.values, self.std, strict=True)
+        rows += [(name, f"{value:.4g} ± {std:.2g}", self.units.get(name, "")) for name, value, std in known]
+        return Summary(f"{counted(len(self.names), 'parameter')} of the run '{self.run}'", rows)
 
     @property
     def std(self) -> Array:

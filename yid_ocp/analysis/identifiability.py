@@ -19,6 +19,8 @@ from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.null_test import USUAL, GapLimits
+from yid_ocp.progress import SILENT, Progress
+from yid_ocp.shown import Shown, Summary, counted
 from yid_ocp.solvers.base import Solution
 from yid_ocp.solvers.judgement import (
     IDENTIFIABLE,
@@ -34,7 +36,7 @@ from yid_ocp.solvers.judgement import (
     uncertainty,
     verdict,
 )
-from yid_ocp.solvers.words import percent_words
+from yid_ocp.solvers.words import VERDICT_WORDS, finite, parameter_words, percent_words
 
 Array = NDArray[np.float64]
 StartKnowledge = Literal["assumed", "known", "unknown"]
@@ -103,8 +105,8 @@ class Direction:
     words: str
 
 
-@dataclass(frozen=True)
-class Identifiability:
+@dataclass(frozen=True, repr=False)
+class Identifiability(Shown):
     """What a set of recordings can tell about the free parameters.
 
     Attributes
@@ -134,6 +136,14 @@ class Identifiability:
     chi2_per_dof: float
     profiles: Mapping[str, Profile] = field(default_factory=dict)
 
+    def _summary(self) -> Summary:
+        rows = [("parameter", "value", "unit", "")]
+        rows += [
+            (name, parameter_words(entry.value, finite(entry.std), None), entry.unit, VERDICT_WORDS[entry.verdict])
+            for name, entry in self.parameters.items()
+        ]
+        return Summary(f"{len(self.identifiable)} of {counted(len(self.names), 'parameter')} found", rows)
+
     @property
     def identifiable(self) -> tuple[str, ...]:
         """Names of parameters with that verdict."""
@@ -153,6 +163,7 @@ def identifiability(
     grasp_std: float | None = None,
     intervals: Iterable[str] | Literal["all"] = (),
     limits: GapLimits = USUAL,
+    progress: Progress = SILENT,
 ) -> Identifiability:
     """Which free parameters the problem's recordings determine, and what they leave open.
 
@@ -174,6 +185,8 @@ def identifiability(
         Parameters whose interval by profile likelihood is wanted.
     limits : GapLimits, optional
         What makes a residual at a solution more than noise.
+    progress : Progress, optional
+        Told which interval is next.
 
     Returns
     -------
@@ -193,7 +206,7 @@ def identifiability(
     """
     # the matrices are small: threads of the linear algebra library cost more than they give
     with threadpoolctl.threadpool_limits(1):
-        return _information(problem, solution, start, grasp_std, intervals, limits)
+        return _information(problem, solution, start, grasp_std, intervals, limits, progress)
 
 
 def _information(
@@ -203,6 +216,7 @@ def _information(
     grasp_std: float | None,
     intervals: Iterable[str] | Literal["all"],
     limits: GapLimits,
+    progress: Progress,
 ) -> Identifiability:
     names = parameter_names(problem)
     wanted = names if intervals == "all" else tuple(intervals)
@@ -236,7 +250,7 @@ def _information(
     std = np.array([judged[name].std for name in names])
     plain = np.sqrt(np.diag(covariance)[chosen])
     informed = np.where(plain < UNINFORMED * np.maximum(scale, wide.scales[chosen]), plain, np.inf)
-    profiles, judged = _profiles(view, std, wanted, judged)
+    profiles, judged = _profiles(view, std, wanted, judged, progress)
     return Identifiability(
         _parameters(view, judged),
         names,
@@ -250,7 +264,7 @@ def _information(
 
 
 def _profiles(
-    view: _Sensitivities, std: Array, wanted: Sequence[str], judged: Mapping[str, Estimate]
+    view: _Sensitivities, std: Array, wanted: Sequence[str], judged: Mapping[str, Estimate], progress: Progress
 ) -> tuple[dict[str, Profile], dict[str, Estimate]]:
     """Profile likelihoods of the wanted parameters about the best fit of all unknowns, and what they leave to say."""
     said = dict(judged)
@@ -258,7 +272,9 @@ def _profiles(
         return {}, said
     problem, (best, there), profiles = view.problem, best_fit(view.problem, view.x), {}
     sizes = typical_sizes(problem, view.x)
-    for name in wanted:
+    progress.stage(f"intervals of {len(wanted)} parameters by profile likelihood")
+    for done, name in enumerate(wanted):
+        progress.advance(done, len(wanted), name)
         index, size = problem.names.index(name), sizes[name.split("[")[0]]
         profiles[name] = found = profile_likelihood(problem, best, index, float(std[view.names.index(name)]), there)
         said[name] = sure_of_small(problem, best, index, judged[name], size, there)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -23,6 +23,7 @@ from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem, SensorOptions
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.grid import Grid
+from yid_ocp.progress import SILENT, Progress
 from yid_ocp.sensors import camera_pose
 from yid_ocp.sensors.joints import POSITION, PositionSensor, of_arm
 from yid_ocp.virtual.engine import Simulation, simulate_in_mujoco
@@ -276,20 +277,19 @@ class LayoutBuilder:
     Parameters
     ----------
     setting : Setting
-    progress : callable, optional
-        Told what takes time.
+    progress : Progress, optional
     """
 
-    def __init__(self, setting: Setting, progress: Callable[[str], None] | None = None) -> None:
+    def __init__(self, setting: Setting, progress: Progress = SILENT) -> None:
         self.setting = setting
-        self._progress = progress or (lambda text: None)
+        self._progress = progress
         self._layouts: dict[frozenset[str], Layout | str] = {}
 
     def layout(self, mechanics: frozenset[str]) -> Layout | str:
         """The experiment with changes of mechanics, or why there is none."""
         if mechanics not in self._layouts:
             if mechanics:
-                self._progress("working out " + " and ".join(MECHANICS[name] for name in sorted(mechanics)))
+                self._progress.stage("working out " + " and ".join(MECHANICS[name] for name in sorted(mechanics)))
             try:
                 self._layouts[mechanics] = self._build(mechanics)
             except YidError as error:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
+from yid_ocp.progress import SILENT, Progress
 from yid_ocp.solvers import Solution
 from yid_ocp.solvers.gauss_newton import GaussNewton
 from yid_ocp.solvers.judgement import (
@@ -131,9 +131,7 @@ def profile_likelihood(
     return Profile(problem.names[index], float(x[index]), lower, upper, values, deltas, tuple(notes))
 
 
-def with_intervals(
-    problem: EstimationProblem, solution: Solution, progress: Callable[[str], None] | None = None
-) -> Solution:
+def with_intervals(problem: EstimationProblem, solution: Solution, progress: Progress = SILENT) -> Solution:
     """A solution whose weakly determined parameters have an interval by profile likelihood, and the verdict it allows.
 
     There the cost is no parabola and a standard deviation tells one side at best; so it is with stiffnesses that are
@@ -145,8 +143,7 @@ def with_intervals(
     problem : EstimationProblem
     solution : Solution
         Of this problem.
-    progress : callable, optional
-        Told what takes time.
+    progress : Progress, optional
     """
     usable = solution.evaluation is not None and problem.options.weighting != "paper"
     if not usable or not small(problem):
@@ -160,11 +157,11 @@ def with_intervals(
     }
     if not asked:
         return solution
-    if progress is not None:
-        progress(f"intervals of {', '.join(asked)} by profile likelihood")
+    progress.stage(f"intervals of {', '.join(asked)} by profile likelihood")
     best, there = best_fit(problem, solution.x)
     judged = dict(solution.parameters)
-    for name, size in asked.items():
+    for done, (name, size) in enumerate(asked.items()):
+        progress.advance(done, len(asked), name)
         index = problem.names.index(name)
         entry = sure_of_small(problem, best, index, judged[name], size, there)
         if entry.verdict != "not_identifiable" and not stands_by_itself(entry):

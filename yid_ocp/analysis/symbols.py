@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from yid_ocp.analysis.formulas import Formula, Name, formula, operations
 from yid_ocp.errors import ConfigError, nearest
 from yid_ocp.integrator.discrete import DiscreteEquations
+from yid_ocp.shown import Shown, Summary, counted
 
 SHORT = 80  # operations up to which an equation is written out without being asked for
 MANY = 6  # names of one block that are still listed one by one
@@ -98,8 +99,8 @@ class Entry:
         return [*said, f"  {self.title} = {self.formula.values[0]}"]
 
 
-@dataclass(frozen=True)
-class StepSymbols:
+@dataclass(frozen=True, repr=False)
+class StepSymbols(Shown):
     """The equations of one step by name.
 
     Attributes
@@ -115,6 +116,12 @@ class StepSymbols:
     equations: DiscreteEquations
     rows: tuple[Block, ...]
     columns: tuple[Block, ...]
+
+    def _summary(self) -> Summary:
+        rows = [("block", "entries", "meaning")]
+        rows += [(block.name, str(len(block.names)), block.meaning) for block in (*self.rows, *self.columns)]
+        count = counted(sum(len(block.names) for block in self.rows), "equation")
+        return Summary(f"{count} of a step of {self.equations.system.mechanism.name}", rows)
 
     @staticmethod
     def of(equations: DiscreteEquations) -> StepSymbols:

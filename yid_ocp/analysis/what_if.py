@@ -27,6 +27,8 @@ from yid_ocp.errors import SolverError
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
+from yid_ocp.progress import SILENT, Progress
+from yid_ocp.shown import Shown, Summary, counted
 from yid_ocp.solvers.base import Solution
 from yid_ocp.solvers.judgement import WEAK, verdict
 
@@ -97,8 +99,8 @@ class Outcome:
         return bool(self.verdicts) and self.identifiable == len(self.verdicts)
 
 
-@dataclass(frozen=True)
-class WhatIf:
+@dataclass(frozen=True, repr=False)
+class WhatIf(Shown):
     """Changes of an experiment, ranked.
 
     Attributes
@@ -121,6 +123,11 @@ class WhatIf:
     smallest: tuple[Outcome, ...]
     greedy: tuple[Outcome, ...]
     searched: int
+
+    def _summary(self) -> Summary:
+        rows = [("change", "parameters found", "gain [nat]")]
+        rows += [(entry.words, str(entry.identifiable), f"{entry.gain:.3g}") for entry in (self.base, *self.singles)]
+        return Summary(f"{counted(len(self.singles), 'change')}, {self.searched} sets of them judged", rows)
 
 
 @dataclass(frozen=True)
@@ -157,7 +164,7 @@ def what_if(
     grasp_std: float | None = None,
     second_arm: System | None = None,
     options: WhatIfOptions | None = None,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress = SILENT,
     judge: Judge | None = None,
 ) -> WhatIf:
     """Rank changes of an experiment by how many parameters they would make identifiable.
@@ -176,8 +183,7 @@ def what_if(
     second_arm : System, optional
         The system with one more arm and its grasp; without it that change is not tried.
     options : WhatIfOptions, optional
-    progress : callable, optional
-        Told what takes time.
+    progress : Progress, optional
     judge : callable, optional
         Judges sets of changes elsewhere, as `judged_changes` does there.
 
@@ -197,7 +203,7 @@ def what_if(
     fit = None if solution is None else identifiability(problem, x, start=start, grasp_std=grasp_std)
     inflation = 1.0 if fit is None else max(1.0, fit.chi2_per_dof)
     setting = Setting(problem, x, start, grasp_std, second_arm, options.torque_std, options.seed)
-    outcomes = _Outcomes(setting, LayoutBuilder(setting, progress), inflation, judge)
+    outcomes = _Outcomes(setting, LayoutBuilder(setting, progress), inflation, judge, progress)
     (base,) = outcomes.of_all([()])
     if not base.verdicts:
         raise SolverError(base.message)
@@ -278,11 +284,19 @@ class _Outcomes:
         Factor by which variances are larger than stated.
     judge : callable, optional
         Who works them out instead.
+    progress : Progress, optional
     """
 
-    def __init__(self, setting: Setting, builder: LayoutBuilder, inflation: float, judge: Judge | None = None) -> None:
-        self.setting, self.builder, self.inflation = setting, builder, inflation
-        self._judge = judge or (lambda sets, _: [self._outcome(changes) for changes in sets])
+    def __init__(
+        self,
+        setting: Setting,
+        builder: LayoutBuilder,
+        inflation: float,
+        judge: Judge | None = None,
+        progress: Progress = SILENT,
+    ) -> None:
+        self.setting, self.builder, self.inflation, self.progress = setting, builder, inflation, progress
+        self._judge = judge or self._judged
         self._known: dict[frozenset[str], Outcome] = {}
 
     @property
@@ -297,6 +311,14 @@ class _Outcomes:
         if new:
             self._known |= dict(zip(new, self._judge(list(new.values()), self.inflation), strict=True))
         return [self._known[key] for key in keys]
+
+    def _judged(self, sets: Sequence[Sequence[Change]], _: float) -> list[Outcome]:
+        self.progress.stage(f"judging {len(sets)} experiments")
+        found = []
+        for done, changes in enumerate(sets):
+            self.progress.advance(done, len(sets), "; ".join(change.words for change in changes) or "as it is")
+            found.append(self._outcome(changes))
+        return found
 
     def _outcome(self, changes: Sequence[Change]) -> Outcome:
         names = tuple(change.name for change in changes)

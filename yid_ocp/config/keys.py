@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
-from yid_ocp.errors import ConfigError, nearest
+from yid_ocp.errors import ConfigError, choices
 from yid_ocp.options import Among, Option, entries_of, members, options_of, stripped, values_of
 
 
@@ -58,9 +57,9 @@ class Sections:
 
     def unknown(self, word: object, where: str) -> ConfigError:
         """That a word chooses nothing."""
-        what = f"there is no {self.noun} '{word}'" if word else f"the key '{self.key}' is missing"
-        hint = nearest(str(word), self.classes) if word else ""
-        return ConfigError(what, where=where, allowed=", ".join(self.classes), hint=hint)
+        if not word:
+            return ConfigError(f"the key '{self.key}' is missing", where=where, allowed=", ".join(self.classes))
+        return ConfigError(f"there is no {self.noun} '{word}'", where=where, **choices(str(word), self.classes))
 
 
 def sections_of(hint: Any) -> Sections | None:
@@ -81,17 +80,48 @@ def sections_of(hint: Any) -> Sections | None:
 
 def unknown_key(root: type, name: str, known: Iterable[str], where: str, within: str = "") -> ConfigError:
     """That a section has no such key, with the nearest one that it has and the sections that have this one."""
-    names = list(known)
-    close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+    said = choices(name, known)
     homes = list(dict.fromkeys(homes_of(root, name)))
-    hints = [f"did you mean '{close[0]}'?"] if close else []
+    hints = [said["hint"]] if said["hint"] else []
     hints += [f"'{name}' is a key of {', '.join(homes[:3])}"] if homes else []
+    if ":" in name:
+        hints = ["put a space behind the colon, as in {" + name.replace(":", ": ") + "}"]
     return ConfigError(
         f"there is no key '{name}'" + (f" in {within}" if within else ""),
         where=where,
-        allowed=", ".join(names),
+        allowed=said["allowed"],
         hint="; ".join(hints),
     )
+
+
+def settable(hint: Any, prefix: str, raw: Any, at: str = "") -> Iterator[str]:
+    """Keys with dots that begin with a prefix, up to the next dot, or `=` where a value follows.
+
+    Parameters
+    ----------
+    hint : Any
+        Type of what stands at `at`.
+    prefix : str
+    raw : Any
+        What a file says there: its names count where users choose them.
+    at : str
+        The keys before, each with its dot.
+    """
+    sections, values = sections_of(hint), values_of(hint)
+    named = sections_of(values)
+    below: dict[str, Any] = {}
+    if sections is not None:
+        below = {name: option.hint for name, option in sections.keys(sections.word(raw)).items()}
+    elif named is not None and named.key == "name":
+        below = dict(named.classes)
+    elif values is not None and isinstance(raw, dict):
+        below = dict.fromkeys(raw, values)
+    for name, inner in below.items():
+        path = f"{at}{name}"
+        if prefix.startswith(f"{path}."):
+            yield from settable(inner, prefix, raw.get(name) if isinstance(raw, dict) else None, f"{path}.")
+        elif path.startswith(prefix):
+            yield path + ("=" if sections_of(inner) is None and values_of(inner) is None else ".")
 
 
 def homes_of(hint: Any, name: str, at: str = "") -> Iterator[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import functools
 import io
 import json
@@ -20,6 +21,7 @@ from ruamel.yaml.comments import CommentedMap, CommentedSeq
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent, ScalarEvent
 
+from yid_ocp.config import keys
 from yid_ocp.config.keys import Sections, sections_of, unknown_key
 from yid_ocp.config.settings import Run
 from yid_ocp.errors import ConfigError, nearest
@@ -41,7 +43,8 @@ def load_config(path: str | Path | None = None, overrides: Sequence[str] = (), d
     path : str or Path, optional
         The YAML file; the embedded default when absent.
     overrides : sequence of str
-        `a.b=c` each: the key and a value in YAML that replaces or adds to the file's.
+        `a.b=c` each: the key and a value in YAML that replaces or adds to the file's. A section merges with the one
+        that stands there, key by key, unless it chooses another kind or method, or is empty.
     default : str
         Name of the embedded file.
 
@@ -67,6 +70,18 @@ def load_config(path: str | Path | None = None, overrides: Sequence[str] = (), d
         _override(data, places, override)
     run = _Reader(places, origin, base).build(Run, data, ())
     return dataclasses.replace(run, name=name, file=file, places=places)
+
+
+def settable(prefix: str, path: str | Path | None = None) -> list[str]:
+    """Keys that `overrides` may set and that begin with a prefix; with names that a file has, where one is given.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be read.
+    """
+    data = {} if path is None else _parse(_read(Path(path)), str(path))[0]
+    return list(keys.settable(Run, prefix, data))
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------
@@ -173,7 +188,7 @@ def _override(data: dict[str, Any], places: dict[KeyPath, str], text: str) -> No
         raise ConfigError(
             f"'{text}' does not set anything", where="--set", allowed="KEY=VALUE, for example problem.time_step=0.005"
         )
-    path = _key_path(Run, key.strip().split("."), origin, data)
+    path, hint = _key_path(Run, key.strip().split("."), origin, data)
     try:
         value = _loaded(value_text, origin) if value_text.strip() else None
     except ConfigError as error:
@@ -183,41 +198,67 @@ def _override(data: dict[str, Any], places: dict[KeyPath, str], text: str) -> No
             allowed="a number, text, [list], {key: value}",
         ) from error
     parent = data
-    for part in path[:-1]:
+    for i, part in enumerate(path[:-1]):
         entry = parent.get(part)
         if not isinstance(entry, dict):
             entry = parent[part] = {}
+            places[path[: i + 1]] = origin
         parent = entry
-    for known in [known for known in places if known[: len(path)] == path]:
-        del places[known]
-    parent[path[-1]] = _unwrap(value, path, places, origin)
-    places[path] = origin
+    own: dict[KeyPath, str] = {path: origin}
+    parent[path[-1]] = _merged(hint, parent.get(path[-1]), _unwrap(value, path, own, origin), path, places)
+    places |= own
 
 
-def _key_path(hint: Any, parts: list[str], origin: str, raw: Any) -> tuple[str, ...]:
-    """Split a dotted key by the settings' types: names such as T1.bend keep their dots."""
+def _merged(hint: Any, before: Any, value: Any, path: KeyPath, places: dict[KeyPath, str]) -> Any:
+    """What stands at a key once a value is set there: sections of one kind merge, all else is replaced.
+
+    An empty section replaces too: nothing else would make room for other names than those that stand there.
+    """
+    if not (value and isinstance(before, dict) and isinstance(value, dict)) or _another(hint, before, value):
+        for known in [known for known in places if known[: len(path)] == path]:
+            del places[known]
+        return value
+    sections = sections_of(hint)
+    keys = {} if sections is None else sections.keys(sections.word({**before, **value}))
+    for name, entry in value.items():
+        kind = keys[name].hint if name in keys else values_of(hint)
+        before[name] = _merged(kind, before.get(name), entry, (*path, name), places)
+    return before
+
+
+def _another(hint: Any, before: dict[str, Any], value: dict[str, Any]) -> bool:
+    """Whether a section chooses another kind or method, with other keys, than the one that stands there."""
+    sections = sections_of(hint)
+    return sections is not None and sections.key in value and sections.word(value) != sections.word(before)
+
+
+def _key_path(hint: Any, parts: list[str], origin: str, raw: Any) -> tuple[tuple[str, ...], Any]:
+    """Split a dotted key by the settings' types, and say which type stands there; names such as T1.bend keep dots."""
     if not parts:
-        return ()
+        return (), hint
     sections = sections_of(hint)
     if sections is not None:
         known = sections.keys(sections.word(raw))
         if parts[0] not in known:
             raise unknown_key(Run, parts[0], known, origin)
-        return (parts[0], *_key_path(known[parts[0]].hint, parts[1:], origin, _inner(raw, parts[0])))
+        return _below(parts[0], _key_path(known[parts[0]].hint, parts[1:], origin, _inner(raw, parts[0])))
     values = values_of(hint)
     if values is None:
         raise ConfigError(f"there are no keys below '{parts[0]}'", where=origin, hint="shorten the key")
     inner = sections_of(values)
     if inner is not None and inner.key == "name":
         inner = inner.of(parts[0], origin)
-        own = () if len(parts) == 1 else _key_path(next(iter(inner.classes.values())), parts[1:], origin, None)
-        return (parts[0], *own)
+        return _below(parts[0], _key_path(next(iter(inner.classes.values())), parts[1:], origin, None))
     known = {} if inner is None else inner.keys()
     cut = next((i for i in range(len(parts) - 1, 0, -1) if parts[i] in known), len(parts))
     if isinstance(raw, dict) and ".".join(parts[:-1]) in raw and cut == len(parts) and known:
         raise unknown_key(Run, parts[-1], known, origin)
     name = ".".join(parts[:cut])
-    return (name, *_key_path(values, parts[cut:], origin, _inner(raw, name)))
+    return _below(name, _key_path(values, parts[cut:], origin, _inner(raw, name)))
+
+
+def _below(name: str, found: tuple[tuple[str, ...], Any]) -> tuple[tuple[str, ...], Any]:
+    return (name, *found[0]), found[1]
 
 
 def _inner(raw: Any, name: str) -> Any:
@@ -265,10 +306,12 @@ class _Reader:
     def _section(self, sections: Sections, raw: Any, path: KeyPath) -> Any:
         raw = {} if raw is None else raw
         if not isinstance(raw, dict):
+            keys = list(sections.keys(sections.default))
             raise ConfigError(
                 f"{self._name(path)} = {_shown(raw)} is not a section",
                 where=self.where(path),
-                allowed="keys: " + ", ".join(sections.keys(sections.default)),
+                allowed="keys: " + ", ".join(keys),
+                hint=_key_meant(self._name(path), keys),
             )
         word = sections.word(raw)
         if not isinstance(word, str) or word not in sections.classes:
@@ -312,6 +355,13 @@ class _Reader:
     @staticmethod
     def _name(path: KeyPath) -> str:
         return ".".join(map(str, path)) or "the configuration"
+
+
+def _key_meant(name: str, keys: Sequence[str]) -> str:
+    """The key that may be missing at the end of a name, or misspelt there: names of users may have dots as well."""
+    within, _, last = name.rpartition(".")
+    close = difflib.get_close_matches(last, keys, n=1, cutoff=0.65)
+    return f"did you mean '{within}.{close[0]}'?" if close else f"add a key, as in {name}.{keys[0]}"
 
 
 @functools.cache

@@ -11,9 +11,20 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
+from yid_ocp.config.examples import EXAMPLES
 from yid_ocp.config.keys import Sections, sections_of
 from yid_ocp.config.settings import Run
 from yid_ocp.options import About, Option, entries_of, options_of, stripped, values_of, words
+
+HEAD = """\
+# Settings
+
+Every key of a configuration file. NAME stands for a name of yours or of the model. Units are SI and stand in brackets;
+`needed` keys have no default, and where none is shown it is nothing at all (`null`). Any key may be set on the command
+line as well, `--set problem.time_step=0.005`; a section merges with what stands there, key by key, and an empty one
+empties it. How to choose links, time step and split: [choosing.md](choosing.md); recordings and their units:
+[recordings.md](recordings.md). This page is made from the code; CONTRIBUTING.md has the command.
+"""
 
 
 def schema() -> dict[str, Any]:
@@ -76,15 +87,11 @@ def _about(hint: Any) -> About:
 
 def settings_page() -> str:
     """Every key with what it means, what is allowed and its default, in Markdown."""
-    lines = [
-        "# Settings",
-        "",
-        "Every key of a configuration file. NAME stands for a name of yours or of the model.",
-        "This page is made from the code; CONTRIBUTING.md has the command.",
-    ]
+    lines = HEAD.splitlines()
     tables = {title: (text, rows) for title, text, rows in _tables(Run, "")}
     for title, (text, rows) in tables.items():
         lines += ["", f"## {title}", "", text, "", "| key | meaning | allowed | default |", "|---|---|---|---|", *rows]
+        lines += ["", "```yaml", *EXAMPLES.get(title, "").splitlines(), "```"]
     return "\n".join(lines) + "\n"
 
 

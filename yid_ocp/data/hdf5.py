@@ -24,7 +24,7 @@ from yid_ocp.data.recording import (
     require,
     validate,
 )
-from yid_ocp.errors import DataError, nearest
+from yid_ocp.errors import DataError, choices, nearest
 from yid_ocp.files import file_sha256
 
 FORMAT = "yid-recording/1"
@@ -154,7 +154,7 @@ def _read_group(
     ):
         for name in sorted(found - set(known)):
             what = f"the format has no {noun} '{name}' here"
-            raise DataError(what, where=where, allowed=", ".join(known), hint=nearest(name, known))
+            raise DataError(what, where=where, **choices(name, known))
         for name in sorted(needed - found):
             raise DataError(f"the {noun} '{name}' is missing", where=where, allowed=", ".join(known))
     both = "std" in group and "std" in group.attrs

@@ -11,8 +11,9 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from yid_ocp.errors import DataError, nearest
+from yid_ocp.errors import DataError, choices
 from yid_ocp.sensors.base import EffortKind
+from yid_ocp.shown import Shown, Summary, counted
 
 Array = NDArray[np.float64]
 Clock = Literal["recorded", "nominal"]
@@ -39,8 +40,8 @@ _LARGEST_DISTANCE = 50.0  # beyond any motion capture volume, whereas an object 
 _TIME_TOLERANCE = 1e-9  # a nominal clock is a sum of rounded periods, so its end is seldom exactly the number asked for
 
 
-@dataclass(frozen=True, eq=False)
-class JointGroup:
+@dataclass(frozen=True, eq=False, repr=False)
+class JointGroup(Shown):
     """What a robot measured of its joints; N samples of nj joints on one clock.
 
     Arrays are copied, made float64 and read-only.
@@ -105,13 +106,17 @@ class JointGroup:
         """`effort_kind`; where nobody says, `sample`, which is what drivers of robots publish."""
         return self.effort_kind or "sample"
 
+    def _summary(self) -> Summary:
+        rows = [("joint",), *((name,) for name in self.names)]
+        return Summary(f"{counted(len(self.names), 'joint')}, {_sampled(self.t)}: {', '.join(self.channels)}", rows)
+
     def _rows(self, rows: NDArray[np.bool_]) -> JointGroup:
         changes: dict[str, Any] = {name: value[rows] for name, value in self.channels.items()}
         return replace(self, t=self.t[rows], **changes)
 
 
-@dataclass(frozen=True, eq=False)
-class PointGroup:
+@dataclass(frozen=True, eq=False, repr=False)
+class PointGroup(Shown):
     """Positions of np named points over M frames of one sensor, on its own clock.
 
     Arrays are copied, made float64 and read-only.
@@ -158,6 +163,11 @@ class PointGroup:
                 self, "std", read_only(np.full(self.position.shape, float(self.std)), f"{self.name}/std")
             )
 
+    def _summary(self) -> Summary:
+        seen = np.isfinite(self.position).all(axis=2).sum(axis=0)
+        rows = [("point", "seen"), *((name, str(count)) for name, count in zip(self.names, seen, strict=True))]
+        return Summary(f"{self.name}, {counted(len(self.names), 'point')}, {_sampled(self.t)}, in {self.frame}", rows)
+
     def _rows(self, rows: NDArray[np.bool_]) -> PointGroup:
         std = None if self.std is None else self.std[rows]
         return replace(self, t=self.t[rows], position=self.position[rows], std=std)
@@ -168,8 +178,8 @@ class PointGroup:
         return replace(self, names=tuple(names), position=self.position[:, columns], std=std)
 
 
-@dataclass(frozen=True, eq=False)
-class Recording:
+@dataclass(frozen=True, eq=False, repr=False)
+class Recording(Shown):
     """One run on a robot, or of a virtual experiment, in SI units.
 
     The constructor only stores; `validate(Recording(...))` checks as well.
@@ -210,6 +220,16 @@ class Recording:
         object.__setattr__(self, "notes", tuple(self.notes))
         if self.straight is not None:
             object.__setattr__(self, "straight", read_only(self.straight, "straight"))
+
+    def _summary(self) -> Summary:
+        joints, points = counted(len(self.joint_names), "joint"), counted(len(self.point_names), "point")
+        rows = [("group", "names", "samples", "channels")]
+        if self.joints is not None:
+            own = self.joints
+            rows.append(("joints", ", ".join(own.names), _sampled(own.t), ", ".join(own.channels)))
+        rows += [(g.name, ", ".join(g.names), _sampled(g.t), "position") for g in self.points]
+        span = f", {self.duration:.4g} s" if self.groups else ""
+        return Summary(f"'{self.name}', {joints} and {points}{span}", rows)
 
     @property
     def groups(self) -> tuple[JointGroup | PointGroup, ...]:
@@ -355,18 +375,25 @@ def check_names(recording: Recording, joints: Iterable[str], points: Iterable[st
     Raises
     ------
     DataError
-        If one is missing; the error names it and the nearest that there is.
+        If one is missing; the error names it and the choices that there is.
     """
     for noun, wanted, known in (("joint", joints, recording.joint_names), ("point", points, recording.point_names)):
         missing = [name for name in dict.fromkeys(wanted) if name not in known]
         if missing:
             listed = ", ".join(f"'{name}'" for name in missing)
+            said = [(name, choices(name, known)) for name in missing]
             raise DataError(
                 f"the recording has no {noun}{'s' if len(missing) > 1 else ''} {listed}",
                 where=f"recording '{recording.name}'",
-                allowed=", ".join(known) or f"no {noun}s were recorded",
-                hint="; ".join(f"'{name}': {nearest(name, known)}" for name in missing) if known else "",
+                allowed=said[0][1]["allowed"] if known else f"no {noun}s were recorded",
+                hint="; ".join(f"'{name}': {own['hint']}" for name, own in said if own["hint"]),
             )
+
+
+def _sampled(t: Array) -> str:
+    """How many samples there are, and how fast they come."""
+    rate = (len(t) - 1) / (t[-1] - t[0]) if len(t) > 1 else 0.0
+    return f"{counted(len(t), 'sample')} at {rate:.4g} Hz" if rate else counted(len(t), "sample")
 
 
 def require(ok: bool, what: str, where: str, allowed: str = "", hint: str = "") -> None:

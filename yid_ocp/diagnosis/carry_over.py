@@ -51,7 +51,7 @@ def carried_over(search: Search, fit: Fit) -> tuple[Carried, ...]:
     """
     if search.problem.blocks or not fit.effects:
         return ()
-    search.progress("fitting the held-out recordings with the same effects")
+    search.progress.stage("fitting the held-out recordings with the same effects")
     problem = search.problem.problem
     turned = replace(search.problem, problem=problem.on(problem.held_out, problem.episodes))
     if problem.disturbed:

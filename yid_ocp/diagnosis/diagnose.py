@@ -20,7 +20,7 @@ from yid_ocp.diagnosis.events import NOTHING, Events, find_events, without_event
 from yid_ocp.diagnosis.finding import Finding, absorption
 from yid_ocp.diagnosis.hypotheses import MARGINS, CandidateProblem, Choice, Cut, chosen_effects
 from yid_ocp.diagnosis.localise import Place, attributed, localise, main_places, merged
-from yid_ocp.diagnosis.refit import Fit, Progress, Search, Store, recalled, refit
+from yid_ocp.diagnosis.refit import Fit, Search, Store, recalled, refit
 from yid_ocp.diagnosis.screening import Screened, screen
 from yid_ocp.diagnosis.select import Added, Closure, closure, compose
 from yid_ocp.diagnosis.smoother import Smoothed, smooth
@@ -30,6 +30,7 @@ from yid_ocp.diagnosis.words import cut_short, next_experiment, sentences, short
 from yid_ocp.errors import DataError, SolverError
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.null_test import NullTest, noise_floor, null_test, residual_series
+from yid_ocp.progress import Logged, Progress
 from yid_ocp.solvers import GaussNewton, Solution, solve
 from yid_ocp.solvers.base import RESTARTS
 
@@ -64,8 +65,8 @@ def diagnose(
     thresholds : Thresholds, optional
     solution : Solution, optional
         Of the nominal problem, where it is known.
-    progress : callable, optional
-        Told in words what is going on.
+    progress : Progress, optional
+        Told what is going on; the package's log when absent.
     store : Store, optional
         Of refits that an earlier run of the same diagnosis finished; told of every further one.
     baseline : Estimates or sequence of Estimates, optional
@@ -89,7 +90,7 @@ def diagnose(
     """
     # the matrices are small: threads of the linear algebra library cost more than they give
     with threadpoolctl.threadpool_limits(1):
-        clock, told = _Clock(), progress or log.info
+        clock, told = _Clock(), progress or Logged(log)
         runs = (baseline,) if isinstance(baseline, Estimates) else tuple(baseline)
         earlier = Earlier.of(runs, tuple(without))
         if earlier.known is not None and not problem.options.joint_prior.names:
@@ -104,11 +105,11 @@ def _diagnosed(
     problem: EstimationProblem, search: Search, solution: Solution | None, clock: _Clock, earlier: Earlier = UNTOLD
 ) -> Finding:
     limits, progress = search.limits, search.progress
-    progress("fitting the nominal model")
+    progress.stage("fitting the nominal model")
     nominal = nominal_fit(problem, search.problem, solution, search.store, limits)
     search, nominal, cuts = _followed(search, nominal)
     clock.lap("nominal")
-    progress("looking for events")
+    progress.stage("looking for events")
     whole = _undivided(search.problem, problem)
     search, nominal, events = _without_events(search, nominal, whole)
     clock.lap("events")
@@ -127,7 +128,7 @@ def _diagnosed(
     moved = bool(changed) and not gap
     gap = gap or moved
     if gap and enough:
-        progress("locating the gap")
+        progress.stage("locating the gap")
         smoothed = smooth_fit(nominal, limits)
         # it knows noise of torques by its spectrum only: too little for a verdict to rest on what it explains
         trusted = None if nominal.problem.disturbed else smoothed
@@ -248,7 +249,7 @@ def _without_events(search: Search, nominal: Fit, whole: EstimationProblem) -> t
         if not events:
             return search, nominal, events
         cleaned = replace(composed, problem=without_events(composed.problem, events))
-        search.progress(f"fitting the nominal model without {len(events.found)} events")
+        search.progress.stage(f"fitting the nominal model without {len(events.found)} events")
         name = f"the nominal model without events, round {round_ + 1}"
         again = _settled(cleaned, nominal.values, search.store, name, limits)
         if again is None:
@@ -266,7 +267,7 @@ def _tested(search: Search, nominal: Fit) -> tuple[Search, NullTest, NullTest, S
     effects = tuple(effect.expected(angles) for effect in search.problem.effects)
     composed = replace(search.problem, problem=nominal.problem, effects=effects)
     before, held = fitted_test(nominal, limits), held_out_test(nominal, limits)
-    search.progress(f"screening {len(composed.effects)} candidates")
+    search.progress.stage(f"screening {len(composed.effects)} candidates")
     screened = screen(composed, (), nominal.values, limits)
     return replace(search, problem=composed), before, held, screened
 
@@ -279,7 +280,7 @@ def _followed(search: Search, nominal: Fit, before: tuple[Cut, ...] = ()) -> tup
             break
         composed, cuts = replace(search.problem, problem=nominal.problem).followed(nominal.values, margin)
         for cut in cuts:
-            search.progress(cut_short(cut))
+            search.progress.stage(cut_short(cut))
         names = {cut.recording for cut in cuts}
         found = (*(cut for cut in found if cut.recording not in names), *cuts)
         name = f"the nominal model beside what it can follow ({margin:g})"
@@ -299,7 +300,7 @@ def elsewhere(search: Search, nominal: Fit) -> Fit | None:
     A parameter that few samples tell of has several valleys, and a wrong one of them costs too little to be noticed in
     chi2: what candidates gain there, they gain from the parameter's error.
     """
-    search.progress("fitting the nominal model from other starts")
+    search.progress.stage("fitting the nominal model from other starts")
     problem, limits = search.problem.problem, search.limits
     best = nominal
     for factor in RESTARTS:
@@ -346,7 +347,7 @@ def _composed(
             hint="set problem.weighting: whitened and the noise levels under `sensors`",
         )
     effects = chosen_effects(problem.system, [episode.recording for episode in problem.episodes], candidates)
-    progress(f"composing {len(effects)} candidates into one step")
+    progress.stage(f"composing {len(effects)} candidates into one step")
     return CandidateProblem.of(problem, effects, held_out)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import scipy.stats
@@ -14,6 +14,7 @@ from yid_ocp.diagnosis.counterfactual import Counterfactual, counterfactual
 from yid_ocp.diagnosis.refit import Fit
 from yid_ocp.diagnosis.select import Added
 from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.progress import Progress
 
 
 @dataclass(frozen=True)
@@ -56,13 +57,11 @@ class Earlier:
         found = self.since(fit, limits)
         return () if found is None else found.changed
 
-    def counterfactual(
-        self, nominal: Fit, added: Sequence[Added], progress: Callable[[str], None]
-    ) -> Counterfactual | None:
+    def counterfactual(self, nominal: Fit, added: Sequence[Added], progress: Progress) -> Counterfactual | None:
         """The world without the effects that were found; None where there are none, or nothing of that world."""
         if not added or not self.without:
             return None
-        progress("predicting the world without the effects")
+        progress.stage("predicting the world without the effects")
         return counterfactual(nominal, added[-1].fit, self.without, self.known)
 
 

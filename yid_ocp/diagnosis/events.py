@@ -34,7 +34,7 @@ from yid_ocp.problem.low_pass import LowPass
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.null_test import discoveries, sample_times
 from yid_ocp.problem.options import SensorOptions
-from yid_ocp.problem.prediction import EpisodeResult
+from yid_ocp.problem.outcome import EpisodeResult
 from yid_ocp.sensors.joints import by_joint
 
 Array = NDArray[np.float64]

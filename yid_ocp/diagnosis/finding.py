@@ -21,6 +21,7 @@ from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import Reason
 from yid_ocp.effects import EffectBase
 from yid_ocp.problem.null_test import Floor, NullTest
+from yid_ocp.shown import Shown, Summary
 from yid_ocp.solvers.judgement import known_covariance, uncertainty
 
 FORMAT = "yid-diagnosis/1"
@@ -46,8 +47,8 @@ def absorption(before: Fit, after: Fit) -> tuple[Absorbed, ...]:
     )
 
 
-@dataclass(frozen=True)
-class Finding:
+@dataclass(frozen=True, repr=False)
+class Finding(Shown):
     """What a diagnosis says.
 
     Attributes
@@ -131,6 +132,17 @@ class Finding:
     explained: float = 1.0
     carried: tuple[Carried, ...] = ()
     events: Events = NOTHING
+
+    def _summary(self) -> Summary:
+        effects, closed = ", ".join(effect.label for effect in self.effects), self.closure.value
+        said = f"{100 * closed:.3g} % of the held-out gap closed" if effects and math.isfinite(closed) else ""
+        rows = [("candidate", "parameters", "closure alone", "p")]
+        for entry in which(self)[:8]:
+            values = {name: own for name, own in entry["parameters"].items() if own["value"] is not None}
+            known = ", ".join(f"{name} = {own['value']:.3g} {own['unit']}" for name, own in values.items())
+            alone = "" if entry["closure"] is None else f"{100 * entry['closure']:.3g} %"
+            rows.append((f"{entry['kind']}@{entry['location']}", known, alone, f"{entry['p_value']:.2g}"))
+        return Summary(", ".join(filter(None, (self.verdict.replace("_", " "), effects, said))), rows)
 
     @property
     def effects(self) -> tuple[EffectBase, ...]:

@@ -6,8 +6,10 @@ differences between models are paired. G = max(0, chi2/n - 1) is the gap.
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+import threading
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -23,13 +25,12 @@ from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.null_test import sample_times
 from yid_ocp.problem.validation import channel_errors
+from yid_ocp.progress import Progress
 from yid_ocp.solvers import GaussNewton, Status
 from yid_ocp.solvers.base import Outcome
 from yid_ocp.solvers.judgement import covariance_of_fit, judge_fit, plain_std
 
 Array = NDArray[np.float64]
-
-Progress = Callable[[str], None]
 
 SOLVER = GaussNewton(iterations=25, step_tolerance=1e-3, cost_tolerance=1e-5)
 UNTOLD = 100.0
@@ -146,8 +147,8 @@ class Search:
     ----------
     problem : CandidateProblem
     limits : Thresholds
-    progress : callable
-        Told in words what is going on.
+    progress : Progress
+        Told what is going on.
     store : Store, optional
     """
 
@@ -307,14 +308,24 @@ def refit_all(
         Where all other unknowns begin.
     """
 
+    if not tried:
+        return []
+    done, told = itertools.count(1), threading.Lock()
+
     def one(entry: tuple[EffectBase, Mapping[str, float]]) -> Fit | None:
         effect, step = entry
         fit = refit(search.problem, (*base, effect), {**values, **step}, search.store, limits=search.limits)
+        text = f"no fit with {effect.label}"
         if fit is not None:
-            done = "resumed the refit" if fit.resumed else "refitted"
-            search.progress(f"{done} with {effect.label}: held-out chi2/n {fit.loss.mean:.4g}")
+            how = "resumed the refit" if fit.resumed else "refitted"
+            text = f"{how} with {effect.label}: held-out chi2/n {fit.loss.mean:.4g}"
+        with told:
+            search.progress.advance(next(done), len(tried), text)
         return fit
 
+    beside = f" beside {', '.join(effect.label for effect in base)}" if base else ""
+    search.progress.stage(f"refitting with each of {len(tried)} effects{beside}")
+    search.progress.advance(0, len(tried), tried[0][0].label)
     return [fit for fit in map_in_step(one, tried) if fit is not None]
 
 

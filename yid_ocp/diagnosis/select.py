@@ -240,7 +240,7 @@ def compose(
     while len(added) < limits.effects:
         base = [entry.effect for entry in added]
         if added:
-            search.progress(f"scoring what is left beside {', '.join(e.label for e in base)}")
+            search.progress.stage(f"scoring what is left beside {', '.join(e.label for e in base)}")
             screened = screen(search.problem, base, current.values, limits)
         fits = refit_all(search, base, _significant(screened, limits, places), current.values)
         if not fits:
@@ -255,7 +255,7 @@ def compose(
         rivals = (chosen, *(fit for fit in near if fit is not chosen))
         added.append(Added(chosen.effects[-1], chosen, total, tuple(fit.effects[-1] for fit in rivals)))
         said = "" if np.isnan(total.value) else f": {100 * total.value:.3g} % of the held-out gap closed"
-        search.progress(f"added {chosen.effects[-1].label}{said}")
+        search.progress.stage(f"added {chosen.effects[-1].label}{said}")
         current = chosen
         if current.loss.mean < 1 + limits.smallest_gap:
             break
@@ -310,9 +310,9 @@ def _revised(search: Search, nominal: Fit, kept: tuple[Added, ...], position: in
     if without is None:
         return kept
     if not _needed(without, full, entry.effect, limits):
-        search.progress(f"left {entry.effect.label} out again: the others do as well")
+        search.progress.stage(f"left {entry.effect.label} out again: the others do as well")
         return _rebuilt(search, nominal, [other for other in kept if other is not entry], without)
-    search.progress(f"looking for others in the place of {entry.effect.label}")
+    search.progress.stage(f"looking for others in the place of {entry.effect.label}")
     screened = screen(search.problem, rest, without.values, limits)
     tried = [pair for pair in _significant(screened, limits)[: limits.refits] if pair[0].label != entry.effect.label]
     own = replace(full, effects=(*rest, entry.effect))
@@ -322,7 +322,7 @@ def _revised(search: Search, nominal: Fit, kept: tuple[Added, ...], position: in
     placed = [replace(e, effect=chosen.effects[-1], rivals=rivals) if e is entry else e for e in kept]
     if chosen is own:
         return tuple(placed)
-    search.progress(f"put {chosen.effects[-1].label} in the place of {entry.effect.label}")
+    search.progress.stage(f"put {chosen.effects[-1].label} in the place of {entry.effect.label}")
     return _rebuilt(search, nominal, placed, replace(chosen, effects=tuple(e.effect for e in placed)))
 
 

@@ -32,7 +32,7 @@ from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, apparent_inertia
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.problem.prediction import EpisodeResult
+from yid_ocp.problem.outcome import EpisodeResult
 from yid_ocp.sensors import Sensor
 
 Array = NDArray[np.float64]

@@ -14,7 +14,7 @@ from yid_ocp.effects.base import EFFECTS as EFFECTS
 from yid_ocp.effects.base import EffectBase as EffectBase
 from yid_ocp.effects.base import Quantity as Quantity
 from yid_ocp.effects.base import Reported as Reported
-from yid_ocp.errors import ModelError, nearest
+from yid_ocp.errors import Choices, ModelError, choices
 from yid_ocp.model.system import System
 
 SENSORS = ("joints.position", "joints.effort", "camera", "nominal_clock")
@@ -55,13 +55,11 @@ def make_effect(kind: str, location: str, system: System, values: Mapping[str, f
     cls = EFFECTS[kind]
     places = cls.locations(system)
     if location not in places:
-        known = ", ".join(places[:20]) + (", ..." if len(places) > 20 else "")
-        raise ModelError(
-            f"{kind} does not fit '{location}'",
-            where=f"{kind}@{location}",
-            allowed=known or "nothing in this system",
-            hint=nearest(location, places) if places else "leave it out",
-        )
+        if not places:
+            said = Choices(allowed="nothing in this system", hint="leave it out")
+        else:
+            said = choices(location, places)
+        raise ModelError(f"{kind} does not fit '{location}'", where=f"{kind}@{location}", **said)
     return base.build(kind, location, system, values)
 
 
@@ -88,9 +86,7 @@ def candidates(system: System, sensors_present: Collection[str]) -> list[tuple[s
     """
     present = set(sensors_present)
     for name in sorted(present - set(SENSORS)):
-        raise ModelError(
-            f"there is no kind of sensor '{name}'", allowed=", ".join(SENSORS), hint=nearest(name, SENSORS)
-        )
+        raise ModelError(f"there is no kind of sensor '{name}'", **choices(name, SENSORS))
     unseen = set() if "joints.effort" in present else set(system.prescribed)
     found = []
     for kind in EFFECTS:

@@ -19,12 +19,13 @@ from yid_ocp.integrator.step_model import Feedback as Feedback
 from yid_ocp.integrator.step_model import Kernel, StepModel, StepStatus, newton_tolerance, step_model
 from yid_ocp.integrator.step_model import Rollout as Rollout
 from yid_ocp.model.system import System
+from yid_ocp.shown import Shown, Summary
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
-class Step:
+@dataclass(frozen=True, eq=False, repr=False)
+class Step(Shown):
     """The time step of a system; made by `compile_step`.
 
     Attributes
@@ -39,6 +40,10 @@ class Step:
     model: StepModel
     kernel: Kernel
     compiled: bool
+
+    def _summary(self) -> Summary:
+        how = "compiled" if self.compiled else "interpreted"
+        return Summary(f"{self.time_step:g} s, {self.force_split}, {how}, of {self.system._summary().line}")
 
     @property
     def system(self) -> System:

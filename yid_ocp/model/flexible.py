@@ -15,6 +15,7 @@ from yid_ocp.errors import ModelError, nearest
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Line, Mechanism, Placement
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.rotations import snapped, turn
+from yid_ocp.shown import Shown, Summary, counted
 
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
@@ -118,8 +119,8 @@ class SegmentLayout:
     parent: str | None
 
 
-@dataclass(frozen=True)
-class FlexibleObject:
+@dataclass(frozen=True, repr=False)
+class FlexibleObject(Shown):
     """A generated object: its tree, its elastic joints and where each segment stands.
 
     Frames: `SEGMENT` tip as `w_SEGMENT`, tip of link i as `SEGMENT_i_tip`, the root frame `object_root`, and points by
@@ -129,6 +130,10 @@ class FlexibleObject:
     mechanism: Mechanism
     elastic: tuple[ElasticJoint, ...]
     segments: tuple[SegmentLayout, ...]
+
+    def _summary(self) -> Summary:
+        names, tree = ", ".join(segment.name for segment in self.segments), self.mechanism
+        return Summary(f"{names}, {counted(len(tree.joints), 'joint')}", tree.parameters._summary().rows)
 
     def segment(self, name: str) -> SegmentLayout:
         """Layout of a segment by name."""

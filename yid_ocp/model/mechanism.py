@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import ModelError, nearest
-from yid_ocp.model.parameters import Parameters
+from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.rotations import snapped
+from yid_ocp.shown import Shown, Summary, counted
 
 
 @dataclass(frozen=True)
@@ -160,8 +161,8 @@ class Line:
         raise ModelError("a line has no links")
 
 
-@dataclass(frozen=True)
-class Mechanism:
+@dataclass(frozen=True, repr=False)
+class Mechanism(Shown):
     """A tree of joints in an order in which parents come first.
 
     Attributes
@@ -180,6 +181,14 @@ class Mechanism:
     frames: Mapping[str, Frame]
     parameters: Parameters = field(default_factory=Parameters)
     lines: Mapping[str, Line] = field(default_factory=dict)
+
+    def _summary(self) -> Summary:
+        rows = [("joint", "type", "moves with"), *((j.name, j.kind, self._carrier(j)) for j in self.joints)]
+        joints, frames = counted(len(self.joints), "joint"), counted(len(self.frames), "frame")
+        return Summary(f"{self.name}, {joints} and {frames}", rows)
+
+    def _carrier(self, joint: Joint) -> str:
+        return "the world" if joint.parent < 0 else self.joints[joint.parent].name
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:
@@ -368,3 +377,23 @@ def merged(bodies: Iterable[Inertia]) -> Inertia | None:
         offset = body.com - com
         inertia += body.about_com + body.mass * (ca.dot(offset, offset) * ca.SX.eye(3) - offset @ offset.T)
     return Inertia(mass, com, ca.densify(inertia))
+
+
+def damping_parameters(tree: Mechanism, wanted: Mapping[str, float]) -> dict[str, Parameter]:
+    """Viscous damping of joints of a tree, by joint [N m s/rad]."""
+    found = {}
+    for joint, value in wanted.items():
+        tree.joint_index(joint)
+        text = f"viscous damping of {joint}"
+        found[joint] = Parameter(f"{joint}.damping", value, "N m s/rad", 0.0, math.inf, text)
+    return found
+
+
+def spring_parameters(tree: Mechanism, joint: str, stiffness: float, rest: float) -> tuple[Parameter, Parameter]:
+    """Stiffness and rest of a spring on a joint of a tree, in N m/rad and rad (N/m and m where it slides)."""
+    unit = tree.joints[tree.joint_index(joint)].unit
+    per = "N m/rad" if unit == "rad" else "N/m"
+    return (
+        Parameter(f"{joint}.stiffness", stiffness, per, 0.0, math.inf, f"spring on {joint}"),
+        Parameter(f"{joint}.rest", rest, unit, description=f"where the spring on {joint} is relaxed"),
+    )

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.errors import ConfigError, nearest
+from yid_ocp.shown import Shown, Summary, counted
 
 Vector = NDArray[np.float64]
 
@@ -57,7 +58,7 @@ class Parameter:
             )
 
 
-class Parameters:
+class Parameters(Shown):
     """The ordered, immutable set of a model's parameters; fixes the order of `theta`.
 
     Parameters
@@ -75,6 +76,11 @@ class Parameters:
             raise ConfigError(
                 f"parameter named twice: {', '.join(twice)}", hint="give each part of the model its own name"
             )
+
+    def _summary(self) -> Summary:
+        rows = [("parameter", "value", "unit", "lower", "upper")]
+        rows += [(e.name, f"{e.value:.4g}", e.unit, f"{e.lower:g}", f"{e.upper:g}") for e in self]
+        return Summary(counted(len(self), "parameter"), rows)
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -15,8 +14,9 @@ from numpy.typing import ArrayLike
 from yid_ocp.errors import ModelError, nearest
 from yid_ocp.model.flexible import AXES, ElasticJoint, FlexibleObject, SegmentLayout
 from yid_ocp.model.kinematics import Kinematics
-from yid_ocp.model.mechanism import Frame, Joint, Mechanism, Placement
-from yid_ocp.model.parameters import Parameter, Parameters
+from yid_ocp.model.mechanism import Frame, Joint, Mechanism, Placement, damping_parameters, spring_parameters
+from yid_ocp.model.parameters import Parameters
+from yid_ocp.shown import Shown, Summary, counted
 
 GraspKind = Literal["point", "axis", "weld"]
 EQUATIONS: dict[str, tuple[str, ...]] = {
@@ -298,8 +298,8 @@ class RecordedEffect(Effect, Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class System:
+@dataclass(frozen=True, repr=False)
+class System(Shown):
     """A mechanism with everything that acts on it.
 
     Attributes
@@ -396,11 +396,11 @@ class System:
             raise ModelError(f"gravity = {acceleration}", allowed="three numbers [m/s^2]")
         tree = mechanism if mechanism is not None else Mechanism("system", (), {})
         wanted = dict(damping) if isinstance(damping, Mapping) else dict.fromkeys(tree.joint_names, float(damping))
-        dampers = _damping_parameters(tree, wanted)
+        dampers = damping_parameters(tree, wanted)
         entries = list(dampers.values())
         elastic: list[ElasticJoint] = []
         for joint, spring in (springs or {}).items():
-            stiffness, rest = _spring_parameters(tree, joint, spring)
+            stiffness, rest = spring_parameters(tree, joint, spring.stiffness, spring.rest)
             entries += [stiffness, rest]
             elastic.append(ElasticJoint(joint, joint, "bend", "", stiffness.symbol, ca.SX(0), rest.symbol))
         segments: list[SegmentLayout] = []
@@ -432,6 +432,14 @@ class System:
             system = effect.modify(system)
             system = replace(system, effects=(*system.effects, effect))
         return system
+
+    def _summary(self) -> Summary:
+        kinds = {"driven": len(self.driven), "prescribed": len(self.prescribed)}
+        kinds["passive"] = self.size - sum(kinds.values())
+        moved = ", ".join(f"{count} {kind}" for kind, count in kinds.items() if count)
+        parts = [f"{counted(self.size, 'coordinate')} ({moved})", counted(self.constraint_count, "constraint")]
+        parts += [f"{effect.kind}@{effect.location}" for effect in self.effects]
+        return Summary(f"{self.mechanism.name}, {', '.join(parts)}", self.parameters._summary().rows)
 
     @property
     def size(self) -> int:
@@ -535,25 +543,6 @@ class System:
         """Diagonal of C in phi(q_{k+1}) = C lam_k / h, shape (m, 1)."""
         rows = [grasp.compliance for grasp in self.grasps for _ in range(grasp.equations)]
         return ca.vertcat(*rows) if rows else ca.SX(0, 1)
-
-
-def _damping_parameters(tree: Mechanism, wanted: Mapping[str, float]) -> dict[str, Parameter]:
-    found = {}
-    for joint, value in wanted.items():
-        tree.joint_index(joint)
-        text = f"viscous damping of {joint}"
-        found[joint] = Parameter(f"{joint}.damping", value, "N m s/rad", 0.0, math.inf, text)
-    return found
-
-
-def _spring_parameters(tree: Mechanism, joint: str, spring: Spring) -> tuple[Parameter, Parameter]:
-    """Stiffness and rest of a spring on a joint of the robot."""
-    unit = tree.joints[tree.joint_index(joint)].unit
-    per = "N m/rad" if unit == "rad" else "N/m"
-    return (
-        Parameter(f"{joint}.stiffness", spring.stiffness, per, 0.0, math.inf, f"spring on {joint}"),
-        Parameter(f"{joint}.rest", spring.rest, unit, description=f"where the spring on {joint} is relaxed"),
-    )
 
 
 def _check_names(

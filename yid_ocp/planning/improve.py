@@ -13,7 +13,6 @@ Kraft (1988), DFVLR-FB 88-28 (the inner problem's SLSQP).
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +22,7 @@ from scipy.optimize import minimize
 from yid_ocp.planning.criteria import Criterion
 from yid_ocp.planning.experiment import Experiment
 from yid_ocp.planning.rows import Rows
+from yid_ocp.progress import SILENT, Progress
 
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
@@ -99,7 +99,7 @@ class Search:
         rows = self.experiment.rows(w)
         return (-np.inf, None) if rows is None else (self.criterion.value(rows, False)[0], rows)
 
-    def improve(self, start: Array, rounds: int, told: Callable[[str], None]) -> Improved:
+    def improve(self, start: Array, rounds: int, progress: Progress = SILENT) -> Improved:
         """The best motion from a start that keeps the limits."""
         w, radius = start, FIRST_RADIUS
         value, rows = self.value(w)
@@ -125,7 +125,7 @@ class Search:
                     radius = min(2.0 * radius, WIDEST) if np.abs(step).max() > 0.9 * radius else radius
                     break
                 radius = max(0.3 * radius, 0.5 * LEAST_RADIUS)
-            told(f"round {done}: {value - first:.3g} nat beyond the start")
+            progress.advance(done, rounds, f"{value - first:.3g} nat beyond the start")
             # a motion from which no step gains anything at all is too rough to be improved, as where the object snaps
             finished = gained < GAINED and (done > 1 or gained > 0.0 or still)
             if gained == 0.0:

@@ -23,10 +23,10 @@ from yid_ocp.planning.experiment import Experiment
 from yid_ocp.planning.improve import Improved, Search
 from yid_ocp.planning.mover import Mover
 from yid_ocp.planning.options import PlanOptions
-from yid_ocp.planning.plan import Told
 from yid_ocp.planning.points import Points
 from yid_ocp.planning.rows import Rows
 from yid_ocp.problem import EstimationProblem
+from yid_ocp.progress import SILENT, Progress
 from yid_ocp.solvers.judgement import UNINFORMED, WEAK
 
 Array = NDArray[np.float64]
@@ -174,7 +174,7 @@ def informative(
     options: PlanOptions,
     values: Mapping[str, float] | None = None,
     effects: Mapping[str, Mapping[str, float]] | None = None,
-    told: Told = lambda _: None,
+    progress: Progress = SILENT,
 ) -> InformationPlan:
     """Find the motion of the arms that tells most of parameters, or that tells effects apart, within limits.
 
@@ -189,8 +189,7 @@ def informative(
         Parameters at which to judge; the problem's when absent.
     effects : mapping of label to mapping of quantity to value, optional
         Sizes of effects that are to be separated, where they are known; typical ones otherwise.
-    told : callable, optional
-        Told what is being done.
+    progress : Progress, optional
 
     Returns
     -------
@@ -205,7 +204,7 @@ def informative(
     """
     check(options, "plan")
     known = dict(zip(problem.system.parameters.names, map(float, problem.theta), strict=True)) | dict(values or {})
-    told("building the experiment")
+    progress.stage("building the experiment")
     chosen, rivals = _chosen(problem, options, effects or {})
     composed = problem if not rivals else _composed(problem, rivals, known)
     names = (*problem.free, *(name for effect in rivals for name in effect.amplitudes))
@@ -225,8 +224,8 @@ def informative(
     _check_seen(chosen, rivals, unseen, experiment)
     found = []
     for i, begin in enumerate(begins):
-        told(f"start {i + 1} of {len(begins)}")
-        found.append(search.improve(begin, options.iterations, told))
+        progress.stage(f"improving the motion, start {i + 1} of {len(begins)}")
+        found.append(search.improve(begin, options.iterations, progress))
     return _plan(experiment, limits, search, criterion, found, rivals, unseen)
 
 

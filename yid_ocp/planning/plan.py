@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
@@ -30,6 +32,7 @@ from yid_ocp.planning.path import SplinePath
 from yid_ocp.planning.points import Points
 from yid_ocp.planning.rows import Rows
 from yid_ocp.planning.shooting import Shooting, Shot, failed
+from yid_ocp.progress import SILENT, Progress
 from yid_ocp.virtual.posture import initial_posture
 
 Array = NDArray[np.float64]
@@ -124,15 +127,12 @@ class PlannedMovement:
         return offset, rate, bend
 
 
-Told = Callable[[str], None]
-
-
-def _untold(_: str) -> None:
-    """For whoever does not want to know."""
-
-
 def plan(
-    step: Step, options: PlanOptions, theta: Array | None = None, known: Known | None = None, told: Told = _untold
+    step: Step,
+    options: PlanOptions,
+    theta: Array | None = None,
+    known: Known | None = None,
+    progress: Progress = SILENT,
 ) -> Plan:
     """Plan a motion of a step's prescribed joints.
 
@@ -145,8 +145,7 @@ def plan(
         Parameters of the model; the system's values when absent.
     known : Known, optional
         Covariance of some of them.
-    told : callable, optional
-        Told what is being done.
+    progress : Progress, optional
 
     Returns
     -------
@@ -169,7 +168,7 @@ def plan(
         )
     known = Known() if known is None else known
     values = system.parameters.vector() if theta is None else np.asarray(theta, float)
-    told("finding where the motion begins and ends")
+    progress.stage("finding where the motion begins and ends")
     posture = _posture(system, options, values)
     start = first_rest(step, values, posture)
     point, inside = _points(step, options)
@@ -185,10 +184,10 @@ def plan(
     def attempt(duration: float) -> Plan:
         return _attempt(step, replace(options, duration=duration), values, known, (start, end), (point, inside), place)
 
-    told(f"searching the motion in {options.duration:g} s")
+    progress.stage(f"searching the motion in {options.duration:g} s")
     found = attempt(options.duration)
     if options.shortest:
-        found = _shortest(found, options, step.time_step, attempt, told)
+        found = _shortest(found, options, step.time_step, attempt, progress)
     return found
 
 
@@ -395,7 +394,9 @@ def _outcome(rows: Rows, shot: Shot, known: Known) -> Plan:
     )  # fmt: skip
 
 
-def _shortest(found: Plan, options: PlanOptions, h: float, attempt: Callable[[float], Plan], told: Told) -> Plan:
+def _shortest(
+    found: Plan, options: PlanOptions, h: float, attempt: Callable[[float], Plan], progress: Progress
+) -> Plan:
     """Halve the gap between a duration with which the goal is reached and one with which it is not, in steps of h."""
 
     def good(one: Plan) -> bool:
@@ -404,9 +405,14 @@ def _shortest(found: Plan, options: PlanOptions, h: float, attempt: Callable[[fl
     if not good(found):
         return found
     low, high = 0, round(options.duration / h)
-    while high - low > max(1, round(0.02 / h)):
+    finest = max(1, round(0.02 / h))
+    progress.stage("searching the shortest motion")
+    for done in itertools.count():
+        if high - low <= finest:
+            break
         middle = (low + high) // 2
-        told(f"searching the motion in {middle * h:g} s")
+        left = math.ceil(math.log2((high - low) / finest))
+        progress.advance(done, done + left, f"a motion in {middle * h:g} s")
         tried = attempt(middle * h)
         if good(tried):
             found, high = tried, middle

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.measurements import Measurements, Rows, huber
 from yid_ocp.problem.noise import Innovations
-from yid_ocp.problem.prediction import EpisodeResult
+from yid_ocp.problem.outcome import EpisodeResult
+from yid_ocp.shown import Shown, Summary, counted
 
 Array = NDArray[np.float64]
 WarmStart = tuple[Array | None, ...]
@@ -55,8 +56,8 @@ class ResidualRows:
         return ResidualRows(tuple(groups), slice(0, at), slice(at, at + stated), slice(at + stated, at + stated + weak))
 
 
-@dataclass(frozen=True)
-class Evaluation:
+@dataclass(frozen=True, repr=False)
+class Evaluation(Shown):
     """Residual of a problem at one point.
 
     Attributes
@@ -76,6 +77,11 @@ class Evaluation:
     ok: bool
     message: str
     episodes: tuple[EpisodeResult, ...]
+
+    def _summary(self) -> Summary:
+        slopes = "" if self.jacobian is None else f", by {counted(self.jacobian.shape[1], 'unknown')}"
+        said = f"cost {self.cost:.6g} of {counted(len(self.residual), 'residual')}{slopes}"
+        return Summary(said if self.ok else f"failed, {self.message}")
 
     @property
     def warm(self) -> WarmStart:

@@ -22,6 +22,7 @@ from yid_ocp.problem.lag import Lag
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.noise import Course, Innovations, InputErrors, innovations
 from yid_ocp.problem.options import ProblemOptions
+from yid_ocp.problem.outcome import EpisodeResult, Start
 from yid_ocp.problem.unknowns import Unknowns
 
 Array = NDArray[np.float64]
@@ -30,65 +31,6 @@ MOST_MEMORY = 2.0**28
 
 LEAST_GAIN = 0.1
 """Least factor between a recorded torque and the one that acts at which an error of the latter is one of the former."""
-
-
-@dataclass(frozen=True)
-class EpisodeResult:
-    """Rollout of one episode and its prediction of every sample.
-
-    Attributes
-    ----------
-    rollout : Rollout
-    rest : Rest or None
-        The equilibrium at which it started.
-    predicted : tuple of ndarray, shape (M, k) each
-        Prediction of every sample, in the sensor's unit.
-    sensitivities : tuple of ndarray, shape (M, k, d) each, or None
-    warm : ndarray, shape (n,), or None
-        Configuration at `rest`, from which that of similar parameters is found quickly.
-    correction : ndarray, shape (N, nu), or None
-        What the tracking filter added to the recorded torque [N m], where encoders are measurements.
-    by_correction : ndarray, shape (N, nu, d), or None
-        Its derivative, with `sensitivities`.
-    """
-
-    rollout: Rollout
-    rest: Rest | None
-    predicted: tuple[Array, ...]
-    sensitivities: tuple[Array, ...] | None
-    warm: Array | None = None
-    correction: Array | None = None
-    by_correction: Array | None = None
-
-    @property
-    def push(self) -> Array | None:
-        """`correction` and, after it, its derivative where that is known, shape (N, nu, 1 + d)."""
-        if self.correction is None:
-            return None
-        known = self.correction[:, :, None]
-        return known if self.by_correction is None else np.concatenate([known, self.by_correction], axis=2)
-
-
-@dataclass(frozen=True)
-class Start:
-    """Where a rollout begins.
-
-    Attributes
-    ----------
-    state : ndarray, shape (nx,)
-        (q, p, z)
-    by_unknowns : ndarray, shape (nx, d)
-        Derivative by (wanted parameters, offset of the start).
-    rest : Rest or None
-        The equilibrium, where it is one.
-    message : str
-        What went wrong; empty where all is well.
-    """
-
-    state: Array
-    by_unknowns: Array
-    rest: Rest | None
-    message: str
 
 
 @dataclass(frozen=True)
@@ -202,6 +144,19 @@ class Predictor:
                 by_theta += rest.by_torque @ inputs.by_first_torque
         state[rows] += offset
         return Start(state, np.hstack([by_theta, by_offset]), rest, "")
+
+    def as_recorded(self, episode: Episode, theta: Array) -> bool:
+        """Whether no effect on an episode's inputs (what a filter follows too) or times is free or not neutral."""
+        wanted = self.unknowns.parameters
+        inputs = self.inputs(episode, theta, wanted)
+        pairs = ((inputs.torque, episode.torque), (inputs.path, episode.path), (inputs.arm, episode.measured_arm))
+        slopes = [x for x in (inputs.by_torque, inputs.by_path, inputs.by_arm, inputs.by_momentum) if x is not None]
+        if inputs.momentum is not None:
+            return False
+        slopes += self.functions.corrections.effort_lag(theta, wanted) or ()
+        for samples in episode.samples:
+            slopes += self.lateness(samples, theta, wanted) or ()
+        return not any(np.any(x) for x in slopes) and all(np.array_equal(a, b) for a, b in pairs)
 
     # -- what drives the rollout --------------------------------------------------------------------------------------
 

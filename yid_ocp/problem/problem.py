@@ -15,13 +15,16 @@ from yid_ocp.errors import DataError
 from yid_ocp.integrator.step import Step
 from yid_ocp.model.system import System
 from yid_ocp.parallel import map_threads
-from yid_ocp.problem.episodes import Episode, apparent_inertia, beginning, prepare_episode
+from yid_ocp.problem.episodes import Episode, apparent_inertia, prepare_episode
 from yid_ocp.problem.evaluation import Evaluation, ResidualRows, WarmStart, residual_rows
 from yid_ocp.problem.functions import ModelFunctions
+from yid_ocp.problem.held_out_start import held_out_offset
 from yid_ocp.problem.measurements import Rows, huber
 from yid_ocp.problem.noise import Innovations, InputErrors
 from yid_ocp.problem.options import ProblemOptions
-from yid_ocp.problem.prediction import EpisodeResult, Predictor, Start
+from yid_ocp.problem.outcome import EpisodeResult, Start
+from yid_ocp.problem.prediction import Predictor
+from yid_ocp.problem.simulated import simulated
 from yid_ocp.problem.unknowns import (
     Unknowns,
     check_bounds,
@@ -33,15 +36,12 @@ from yid_ocp.problem.unknowns import (
     stated_rows,
     stated_std,
 )
+from yid_ocp.shown import Shown, Summary, counted
 
 Array = NDArray[np.float64]
-HELD_OUT_START = 0.2
-"""Time from which the start of a held-out recording is estimated, where starts are [s]."""
-HELD_OUT_ITERATIONS = 3
-"""Gauss-Newton steps of that estimate, which is nearly linear."""
 
 
-class EstimationProblem:
+class EstimationProblem(Shown):
     """Find the free parameters that make the model's sensors agree with recordings.
 
     Immutable: `evaluate`, `gradient` and `validate` depend on their arguments alone, whatever was asked before and from
@@ -163,6 +163,14 @@ class EstimationProblem:
         made._set(**{**same, **changes})
         return made
 
+    def _summary(self) -> Summary:
+        free = f"{len(self.free)} of {counted(len(self.system.parameters), 'parameter')} free"
+        seen = sum(int(samples.seen.sum()) for episode in self.episodes for samples in episode.samples)
+        used, held = (counted(len(entries), "recording") for entries in (self.episodes, self.held_out))
+        rows: list[tuple[str, ...]] = [("unknown", "start", "lower", "upper")]
+        rows += [(n, *(f"{v:.4g}" for v in own)) for n, *own in zip(self.names, self.start, *self.bounds, strict=True)]
+        return Summary(f"{self.system.mechanism.name}, {free}, {seen} values of {used}, {held} held out", rows)
+
     # -- what it is made of -------------------------------------------------------------------------------------------
 
     @property
@@ -238,19 +246,7 @@ class EstimationProblem:
     @property
     def as_recorded(self) -> bool:
         """Whether no effect on recorded inputs (what a filter follows too) or times is free or other than neutral."""
-        wanted = self.unknowns.parameters
-        for episode in self.episodes:
-            inputs = self.predictor.inputs(episode, self.theta, wanted)
-            pairs = ((inputs.torque, episode.torque), (inputs.path, episode.path), (inputs.arm, episode.measured_arm))
-            slopes = [x for x in (inputs.by_torque, inputs.by_path, inputs.by_arm, inputs.by_momentum) if x is not None]
-            if inputs.momentum is not None:
-                return False
-            slopes += self.functions.corrections.effort_lag(self.theta, wanted) or ()
-            for samples in episode.samples:
-                slopes += self.predictor.lateness(samples, self.theta, wanted) or ()
-            if any(np.any(x) for x in slopes) or not all(np.array_equal(a, b) for a, b in pairs):
-                return False
-        return True
+        return all(self.predictor.as_recorded(episode, self.theta) for episode in self.episodes)
 
     # -- the unknown vector -------------------------------------------------------------------------------------------
 
@@ -317,12 +313,11 @@ class EstimationProblem:
         x = np.asarray(x, float)
         found: list[tuple[Array, Array] | None] = []
         for i, whitening in enumerate(self.innovations):
-            result = None if whitening is None else self.predictor.run(self.episodes[i], *self.split(x, i), False)
-            if whitening is None or result is None or isinstance(result, str):
+            result = "" if whitening is None else self.predictor.run(self.episodes[i], *self.split(x, i), False)
+            if whitening is None or isinstance(result, str):
                 found.append(None)
-            else:
-                value = self.predictor.torque_offset(self.episodes[i], result, whitening)
-                found.append((value, whitening.bias_std))
+                continue
+            found.append((self.predictor.torque_offset(self.episodes[i], result, whitening), whitening.bias_std))
         return found
 
     def gradient(
@@ -410,10 +405,9 @@ class EstimationProblem:
     def validate(self, x: ArrayLike) -> list[tuple[Episode, EpisodeResult | str]]:
         """Predict the held-out recordings with the shared parameters of `x`; local ones stay at their initial value.
 
-        The episodes come back with the starts that were fitted to their points, as far as they are.
-
-        An `estimated` start is found from each recording's first `HELD_OUT_START` seconds and its prior, one that is
-        fitted to points at these parameters.
+        The episodes come back with the starts that were fitted to their points, as far as they are. An `estimated`
+        start is found from each recording's first `HELD_OUT_START` seconds and its prior, one that is fitted to points
+        at these parameters.
         """
         x = np.asarray(x, float)
         theta = self._held_out_theta(x)
@@ -445,25 +439,30 @@ class EstimationProblem:
     def _held_out_offset(self, episode: Episode, theta: Array, x: Array) -> Array:
         if episode.shares_start_of is not None:
             return self.split(x, episode.shares_start_of)[1]
-        offset = np.zeros(len(self.unknowns.start))
-        if not len(offset):
-            return offset
-        short = beginning(episode, max(round(HELD_OUT_START / self.step.time_step), 2))
-        weight, guess, limit = 1.0 / self.start_std, None, start_limits(self.system, self.unknowns.start)
-        for _ in range(HELD_OUT_ITERATIONS):
-            result = self.predictor.run(short, theta, offset, True, guess)
-            if isinstance(result, str) or result.sensitivities is None:
-                return np.zeros(len(self.unknowns.start))
-            guess = result.warm
-            rows, slopes = [weight * offset], [np.diag(weight)]
-            for k, samples in enumerate(short.samples):
-                by_start = result.sensitivities[k][:, :, len(self.unknowns.parameters) :]
-                part = samples.rows(result.predicted[k], by_start)
-                rows.append(part.residual)
-                slopes += [] if part.jacobian is None else [part.jacobian]
-            offset = offset - np.linalg.lstsq(np.vstack(slopes), np.concatenate(rows), rcond=None)[0]
-            offset = np.clip(offset, -limit, limit)
-        return offset
+        return held_out_offset(self.predictor, episode, theta, self.start_std)
+
+    # -- without data -------------------------------------------------------------------------------------------------
+
+    def simulate(
+        self, values: Mapping[str, float] | None = None, recording: int = 0, seed: int | None = None
+    ) -> Recording:
+        """What the sensors would have recorded with other parameters, moved as one of the recordings was.
+
+        Parameters
+        ----------
+        values : mapping of str to float, optional
+            Parameters that differ from the problem's own values (`theta`), free or not, such as `{"cable.bend": 0.09}`.
+        recording : int
+            Which recording's start, motion or torques and times of samples are taken.
+        seed : int, optional
+            Of noise with the standard deviations of the sensors; none when absent.
+
+        Raises
+        ------
+        ConfigError, SolverError
+            There is no such parameter; the model cannot be rolled out.
+        """
+        return simulated(self.predictor, self.episodes[recording], self.at(values or {}).theta, seed)
 
     # -- problems like this one ---------------------------------------------------------------------------------------
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,8 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.errors import DataError, nearest
 from yid_ocp.problem.episodes import Episode
-from yid_ocp.problem.prediction import EpisodeResult
+from yid_ocp.problem.outcome import EpisodeResult
 from yid_ocp.problem.problem import EstimationProblem
+from yid_ocp.shown import Shown, Summary
 
 Array = NDArray[np.float64]
 
@@ -172,6 +174,57 @@ def _carried(recording: Recording, points: Sequence[str], known: Sequence[str], 
         moved = np.einsum("pk,mkx->mpx", share, paths - _given_frame(recording, known, given))
     result[given:] = here + moved[given:]
     return result
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Series(Shown):
+    """One channel of one recording, measured and predicted, over its M samples.
+
+    Attributes
+    ----------
+    recording, channel, unit : str
+    t : ndarray, shape (M,)
+        On the channel's own clock [s].
+    measured, predicted : ndarray, shape (M, w)
+        w is 3 for a point and 1 for a joint; NaN where nothing was measured.
+    std : ndarray, shape (M, w)
+        Of the sensor's noise; NaN where it is not known.
+    """
+
+    recording: str
+    channel: str
+    unit: str
+    t: Array
+    measured: Array
+    predicted: Array
+    std: Array
+
+    @property
+    def residual(self) -> Array:
+        """Predicted minus measured, shape (M, w)."""
+        return self.predicted - self.measured
+
+    @property
+    def rmse(self) -> float:
+        """Root mean square of the residual; of a point, of its distance."""
+        return float(np.sqrt(np.nanmean(np.sum(self.residual**2, axis=1))))
+
+    def _summary(self) -> Summary:
+        return Summary(f"{self.channel} of '{self.recording}', {len(self.t)} samples, rmse {self.rmse:.3g} {self.unit}")
+
+
+def series(episode: Episode, result: EpisodeResult) -> tuple[Series, ...]:
+    """Every channel of an episode beside its prediction."""
+    found = []
+    for samples, predicted in zip(episode.samples, result.predicted, strict=True):
+        sensor, times = samples.sensor, episode.grid.start + episode.grid.time_step * (samples.node + samples.fraction)
+        width = sensor.width
+        for i, channel in enumerate(sensor.channels):
+            at = slice(i * width, (i + 1) * width)
+            t = times if times.ndim == 1 else times[:, i * width]
+            own = (values[:, at] for values in (samples.value, predicted, samples.std))
+            found.append(Series(episode.name, channel, sensor.unit, t, *own))
+    return tuple(found)
 
 
 def channel_errors(results: Sequence[EpisodeResult], episodes: Sequence[Episode]) -> dict[str, dict[str, Any]]:

@@ -99,7 +99,6 @@ def _points(around: Surroundings, group: PointData, choice: Choice) -> SensorDat
             raise DataError(
                 f"point '{point}' of '{group.name}' marks the frame '{frames[point]}', which the model does not have",
                 where=where,
-                allowed=", ".join(around.system.points),
                 hint=f"{nearest(frames[point], mechanism.frames)} (see sensors.{group.name})",
             )
     if not known:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import logging
 import math
 import time
@@ -9,21 +10,27 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cached_property
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 import threadpoolctl
 from numpy.typing import NDArray
 
-from yid_ocp.errors import YidError
+from yid_ocp.errors import ConfigError, YidError
 from yid_ocp.problem.evaluation import Evaluation, WarmStart
 from yid_ocp.problem.null_test import USUAL, GapLimits
-from yid_ocp.problem.prediction import EpisodeResult
+from yid_ocp.problem.outcome import EpisodeResult
 from yid_ocp.problem.problem import EstimationProblem
+from yid_ocp.problem.validation import Series, series
 from yid_ocp.registry import Registry
+from yid_ocp.shown import Shown, Summary, counted
 from yid_ocp.solvers.judgement import Estimate, Fit, covariance_of_fit, estimates, judge_fit, uncertainty
 from yid_ocp.solvers.linear_model import settled
 from yid_ocp.solvers.off_neutral import off_neutral
+from yid_ocp.solvers.words import VERDICT_WORDS, finite, parameter_words
+
+if TYPE_CHECKING:
+    import pandas
 
 log = logging.getLogger(__name__)
 
@@ -67,8 +74,8 @@ class Iterate:
     note: str = ""
 
 
-@dataclass(frozen=True)
-class Solution:
+@dataclass(frozen=True, repr=False)
+class Solution(Shown):
     """Outcome of an identification.
 
     Attributes
@@ -114,6 +121,17 @@ class Solution:
     method: str
     problem: EstimationProblem | None = None
 
+    def _summary(self) -> Summary:
+        free = {name: entry for name, entry in self.parameters.items() if entry.free}
+        words = {name: parameter_words(e.value, finite(e.std), e.interval) for name, e in free.items()}
+        rows = [("parameter", "value", "unit", "")]
+        rows += [(name, words[name], e.unit, VERDICT_WORDS[e.verdict]) for name, e in free.items()]
+        told = [f"{name} = {words[name]} {e.unit}" for name, e in free.items() if e.verdict == "identifiable"][:3]
+        more = f"and {counted(len(free) - len(told), 'more parameter')}" if len(free) > len(told) else ""
+        fit = f"chi2 per degree of freedom {self.fit.chi2_per_dof:.3g}"
+        how = f"{self.status.value.replace('_', ' ')} by {self.method}"
+        return Summary(", ".join(filter(None, (how, *told, more, fit))), rows)
+
     @property
     def std(self) -> dict[str, float]:
         """Standard deviation of every shared free parameter."""
@@ -136,6 +154,30 @@ class Solution:
             problem.predictor.run(episode, *problem.split(self.x, i), False)
             for i, episode in enumerate(problem.episodes)
         )
+
+    def residuals(self) -> tuple[Series, ...]:
+        """Every channel of the recordings beside what the model makes of it at `x`; empty without a point."""
+        pairs = zip(() if self.problem is None else self.problem.episodes, self.predicted, strict=False)
+        return tuple(s for episode, result in pairs if not isinstance(result, str) for s in series(episode, result))
+
+    def to_frame(self) -> pandas.DataFrame:
+        """Parameters as a table of pandas, free ones first: value, std, lower, upper, unit, verdict, free, initial.
+
+        `lower` and `upper` are the 95 % interval, infinite at an open end and where nothing is known.
+
+        Raises
+        ------
+        ConfigError
+            pandas is not installed.
+        """
+        try:
+            pandas = importlib.import_module("pandas")
+        except ImportError as error:
+            raise ConfigError("pandas is not installed", hint="pip install 'yid-ocp[pandas]'") from error
+        entries = sorted(self.parameters.items(), key=lambda entry: not entry[1].free)
+        rows = {name: (e.value, e.std, *e.ends, e.unit, e.verdict, e.free, e.initial) for name, e in entries}
+        columns = ["value", "std", "lower", "upper", "unit", "verdict", "free", "initial"]
+        return pandas.DataFrame.from_dict(rows, orient="index", columns=columns).rename_axis("parameter")
 
 
 Callback = Callable[[Iterate], None]
@@ -171,6 +213,8 @@ class Solver(Protocol):
 
 
 SOLVERS: Registry[type[Solver]] = Registry("solver")
+DEFAULT = "gauss_newton"
+"""The method that is used where none is named."""
 
 
 @dataclass
@@ -214,7 +258,7 @@ REMEDY = "start nearer, widen the bounds, or use gauss_newton"
 
 def solve(
     problem: EstimationProblem,
-    solver: Solver,
+    solver: Solver | None = None,
     start: Sequence[float] | None = None,
     callback: Callback | None = None,
     limits: GapLimits = USUAL,
@@ -231,7 +275,8 @@ def solve(
     Parameters
     ----------
     problem : EstimationProblem
-    solver : Solver
+    solver : Solver, optional
+        `GaussNewton()` when absent.
     start : sequence of float, optional
         Initial unknown vector; the problem's when absent.
     callback : callable, optional
@@ -248,7 +293,7 @@ def solve(
     """
     # the matrices are small: threads of the linear algebra library cost more than they give
     with threadpoolctl.threadpool_limits(1):
-        return _solved(problem, solver, start, callback, limits, RESTARTS if restarts else ())
+        return _solved(problem, solver or SOLVERS[DEFAULT](), start, callback, limits, RESTARTS if restarts else ())
 
 
 def _solved(
@@ -263,13 +308,15 @@ def _solved(
     lower, upper = problem.bounds
     first = off_neutral(problem, problem.start) if start is None else np.clip(np.asarray(start, float), lower, upper)
     best, evaluations, history = _attempt(problem, solver, first, callback)
-    tried = 1
+    tried = number = 1
 
-    def try_from(x: Array, note: str) -> None:
-        nonlocal best, evaluations, tried
+    def try_from(x: Array, what: str, most: int) -> None:
+        nonlocal best, evaluations, tried, number
+        number += 1
+        note = f"start {number} of at most {most}: {what}"
         log.info("starting again: %s", note)
         try:
-            again, more, steps = _attempt(problem, solver, x, callback)
+            again, more, steps = _attempt(problem, solver, x, _noting(callback, note))
         except YidError as error:
             # another start is a chance, never a reason to lose what is there
             log.info("no fit from there: %s", error)
@@ -282,19 +329,25 @@ def _solved(
     for factor in restarts:
         if _good_fit(problem, best[1]):
             break
-        try_from(np.where(problem.positive, np.clip(first * factor, lower, upper), first), f"start x {factor:g}")
+        moved = np.where(problem.positive, np.clip(first * factor, lower, upper), first)
+        try_from(moved, f"initial values x {factor:g}", 1 + len(restarts))
     once = tried == 1 and restarts and problem.disturbed and carries_noise(solver)
     if once and np.any(_doubtful(best[2], best[1], best[0].x, first)):
         factor = RESTARTS[0]
-        try_from(np.where(problem.positive, np.clip(first * factor, lower, upper), first), f"start x {factor:g}")
+        moved = np.where(problem.positive, np.clip(first * factor, lower, upper), first)
+        try_from(moved, f"initial values x {factor:g}", 2)
+    most = number + len(NEARBY)
     for factor in NEARBY if restarts and problem.disturbed and carries_covariance(solver) else ():
         outcome, finish, weighted = best
         if not finish.ok or judge_fit(weighted, finish, limits).explains:
             break
         near = np.where(problem.positive, np.clip(outcome.x * factor, lower, upper), outcome.x)
-        try_from(near, f"best fit x {factor:g}")
-    for near in _other_valleys(best[2], best[1], best[0].x) if restarts and carries_covariance(solver) else ():
-        try_from(near, "another valley")
+        try_from(near, f"best fit x {factor:g}", most)
+    looks = restarts and carries_covariance(solver)
+    valleys = _other_valleys(best[2], best[1], best[0].x) if looks else []
+    most = number + len(valleys)
+    for near in valleys:
+        try_from(near, "another valley", most)
     outcome, finish, weighted = best
     if problem.disturbed and not carries_noise(solver):
         remark = "; weighted by the sensors' noise alone, without the noise that drives the motion"
@@ -329,6 +382,13 @@ def _solved(
     )
 
 
+def _noting(callback: Callback | None, note: str) -> Callback | None:
+    """The callback for a part of the search, whose points say which part it is."""
+    if callback is None:
+        return None
+    return lambda entry: callback(replace(entry, note=", ".join(filter(None, (note, entry.note)))))
+
+
 def _attempt(
     problem: EstimationProblem, solver: Solver, x: Array, callback: Callback | None
 ) -> tuple[tuple[Outcome, Evaluation, EstimationProblem], int, list[Iterate]]:
@@ -342,7 +402,7 @@ def _attempt(
                 shorter = problem.shortened(fraction * longest)
                 if not shorter.evaluate(x, derivatives=False).ok:
                     continue
-                part = solver.run(shorter, x, callback)
+                part = solver.run(shorter, x, _noting(callback, f"first {fraction * longest:.3g} s"))
             except YidError as error:
                 # so short a piece may hold too little for a filter or a node, or nothing to compare with
                 log.info("the first %.3g s are left out: %s", fraction * longest, error)
@@ -355,7 +415,8 @@ def _attempt(
     weighted, warm = problem, None
     for number in range(passes):
         weighted = weighted.weighted_at(x, warm) if passes > 1 else problem
-        outcome = solver.run(weighted, x, callback)
+        which = f"pass {number + 1} of at most {passes}" if passes > 1 else ""
+        outcome = solver.run(weighted, x, _noting(callback, which) if which else callback)
         x, warm, evaluations = outcome.x, outcome.warm, evaluations + outcome.evaluations
         history += outcome.history
         # the second pass is the first about torque offsets that are not guessed

@@ -13,7 +13,7 @@ from yid_ocp.integrator.rollout import momentum_of, simulate
 from yid_ocp.integrator.step import Feedback, Rollout
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.low_pass import LowPass
-from yid_ocp.problem.prediction import Start
+from yid_ocp.problem.outcome import Start
 from yid_ocp.problem.problem import EstimationProblem
 
 Array = NDArray[np.float64]

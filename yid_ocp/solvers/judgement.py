@@ -89,6 +89,14 @@ class Estimate:
     verdict: str
     interval: Interval | None = None
 
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Both ends of the 95 % interval, infinite where there is none."""
+        if self.interval is None:
+            return self.value - 1.96 * self.std, self.value + 1.96 * self.std
+        lower, upper = self.interval
+        return -math.inf if lower is None else lower, math.inf if upper is None else upper
+
 
 # -- does the model explain the data ----------------------------------------------------------------------------------
 

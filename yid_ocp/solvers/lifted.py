@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from yid_ocp.integrator.step import Directions
 from yid_ocp.options import About, check
-from yid_ocp.problem.prediction import Start
+from yid_ocp.problem.outcome import Start
 from yid_ocp.problem.problem import EstimationProblem
 from yid_ocp.solvers.base import SOLVERS, Callback, Outcome, Recorder, Status, projected_gradient
 from yid_ocp.solvers.linear_model import bounded_step

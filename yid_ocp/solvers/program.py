@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import SolverError, nearest
 from yid_ocp.parallel import SYMBOLIC
+from yid_ocp.shown import Shown, Summary, counted
 from yid_ocp.solvers.terms import Places, Residual, Ridge, Term, assembled, summed
 
 Array = NDArray[np.float64]
@@ -71,8 +72,8 @@ def free_memory() -> float:
     return found[0] if found else math.inf
 
 
-@dataclass(frozen=True, eq=False)
-class NonlinearProgram:
+@dataclass(frozen=True, eq=False, repr=False)
+class NonlinearProgram(Shown):
     """min f(w, p) subject to bounds and constraints, in CasADi.
 
     `nlp[name]` is a block of `variables` or `parameters` as MX of its shape; where there is one recording, `nlp["q"]`
@@ -112,6 +113,11 @@ class NonlinearProgram:
     p: ca.MX
     extras: tuple[Extra, ...] = ()
     _kept: dict[str, Any] = field(default_factory=dict, repr=False)
+
+    def _summary(self) -> Summary:
+        rows = [("block", "entries"), *((name, str(block.index.size)) for name, block in self.variables.items())]
+        equalities = counted(sum(term.size for term in self.constraints), "equation")
+        return Summary(f"{counted(len(self.start), 'variable')}, {equalities}", rows)
 
     # -- what it is made of -------------------------------------------------------------------------------------------
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 PREDICATES: Mapping[str, str] = {
@@ -44,6 +45,11 @@ def parameter_words(value: float, std: float | None, interval: tuple[float | Non
     if interval is not None and interval != (None, None):
         return f"{value:.4g} ({interval_words(*interval)})"
     return f"{value:.4g}" if std is None else f"{value:.4g} ± {std:.2g}"
+
+
+def finite(value: float) -> float | None:
+    """A number, None where it is infinite or unknown, as a standard deviation is that nothing informs."""
+    return value if math.isfinite(value) else None
 
 
 def percent_words(part: float) -> str:

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.effects import make_effect
 from yid_ocp.effects.base import arms, object_joints
-from yid_ocp.errors import ConfigError, ModelError, nearest
+from yid_ocp.errors import ConfigError, ModelError, choices
 from yid_ocp.model.system import System
 from yid_ocp.virtual.experiment import VirtualExperiment, virtual_experiment
 from yid_ocp.virtual.mjcf import mujoco_module
@@ -141,8 +141,7 @@ def injected_experiment(
             raise ConfigError(
                 f"{effect.kind} cannot be done in MuJoCo here",
                 where=effect.label,
-                allowed=", ".join(known),
-                hint=nearest(effect.kind, known),
+                **choices(effect.kind, known),
             )
     described = [make_effect(e.kind, e.location, system, e.values) for e in effects if e.kind in DESCRIBED]
     changed = system.with_effects(described) if described else system

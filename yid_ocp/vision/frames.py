@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from yid_ocp.errors import DataError, OutputError, nearest
+from yid_ocp.errors import DataError, OutputError, choices
 from yid_ocp.files import is_file, new_file
 from yid_ocp.vision.ply import read_ply
 
@@ -241,7 +241,7 @@ def read_frames(
     camera = checked_pose(head.get("pose") if pose is None else pose, where)
     given = str(unit or head.get("unit", "m"))
     if given not in UNITS:
-        raise DataError(f"the unit is '{given}'", where=where, allowed=", ".join(UNITS), hint=nearest(given, UNITS))
+        raise DataError(f"the unit is '{given}'", where=where, **choices(given, UNITS))
     frame = head.get("frame", "camera")
     if frame not in ("camera", "world"):
         raise DataError(f"the frame of the clouds is '{frame}'", where=where, allowed="camera, world")
@@ -318,7 +318,7 @@ def _read_camera(path: Path) -> dict[str, Any]:
         raise DataError("the camera's file is not an object", where=str(path), allowed='{"pose": ..., ...}')
     for key in head:
         if key not in _KEYS:
-            raise DataError(f"unknown key '{key}'", where=str(path), allowed=", ".join(_KEYS), hint=nearest(key, _KEYS))
+            raise DataError(f"unknown key '{key}'", where=str(path), **choices(key, _KEYS))
     if head.get("format", FORMAT) != FORMAT:
         raise DataError(f"the format of the frames is '{head['format']}'", where=str(path), allowed=FORMAT)
     return head

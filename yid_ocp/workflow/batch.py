@@ -21,6 +21,7 @@ from yid_ocp.config.settings import Run
 from yid_ocp.errors import ConfigError, OutputError, YidError, nearest
 from yid_ocp.files import file_sha256, jsonable, reason, write_json
 from yid_ocp.parallel import LOCAL, Task, TaskResult, Workers, run_tasks
+from yid_ocp.progress import SILENT, Progress
 from yid_ocp.report.html import share_script, write_report
 from yid_ocp.report.sections import Findings
 from yid_ocp.report.summaries import batch_summary
@@ -30,7 +31,6 @@ from yid_ocp.workflow.build import input_files
 from yid_ocp.workflow.command import DONE, FAILED, carry_out, given_workers
 from yid_ocp.workflow.diagnose import run_diagnose
 from yid_ocp.workflow.folder import now
-from yid_ocp.workflow.progress import SILENT, Progress
 from yid_ocp.workflow.report import history_result
 from yid_ocp.workflow.solve import run_solve
 
@@ -82,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
     outcome = carry_out(
         lambda shown: run_batch(members, out, arguments.each, workers, shown, _again(arguments, out)),
         batch_summary,
-        arguments.quiet,
+        arguments,
     )
     return DONE if outcome.ok else FAILED
 

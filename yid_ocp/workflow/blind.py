@@ -33,6 +33,7 @@ from yid_ocp.diagnosis.blind import (
 from yid_ocp.errors import ConfigError, OutputError, YidError
 from yid_ocp.files import jsonable, write_json, write_text
 from yid_ocp.parallel import LOCAL, Task, Workers, run_tasks, values_of
+from yid_ocp.progress import SILENT, Progress
 from yid_ocp.report.html import write_report
 from yid_ocp.report.pictures import draw_blind
 from yid_ocp.report.sections import Findings
@@ -42,7 +43,6 @@ from yid_ocp.version import package_code, versions
 from yid_ocp.workflow.command import DONE, carry_out, given_workers
 from yid_ocp.workflow.experiments import VARIATIONS, Experiment, experiments_of, refuse_unfit
 from yid_ocp.workflow.folder import now
-from yid_ocp.workflow.progress import SILENT, Progress
 
 COMMITMENT, LABELS, RESULT, TABLE = "commitment.json", "sealed/labels.json", "result.json", "table.md"
 CONFIGS, PREPARED, DRAWN, CASES, ANSWERS, BEST = "configs", "prepared", "sealed/drawn", "cases", "answers", "best"
@@ -70,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
     def proved(shown: Progress) -> BlindOutcome:
         return run_blind(runs, out, arguments.cases, arguments.seed, shown, workers, purpose)
 
-    carry_out(proved, blind_summary, arguments.quiet)
+    carry_out(proved, blind_summary, arguments)
     return DONE
 
 

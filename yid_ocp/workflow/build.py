@@ -19,7 +19,7 @@ from yid_ocp.data.edges import edge_lengths
 from yid_ocp.data.hdf5 import read_recording
 from yid_ocp.data.recording import Recording
 from yid_ocp.effects import make_effect
-from yid_ocp.errors import DataError, ModelError, YidError, nearest
+from yid_ocp.errors import DataError, ModelError, YidError, choices, nearest
 from yid_ocp.files import is_file
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model import FlexibleObject, Grasp, Mechanism, Segment, System, flexible_object
@@ -550,8 +550,7 @@ def _check_sensors(run: Run, recordings: Sequence[Recording]) -> None:
                 f"no recording has a group '{name}'",
                 "sensors",
                 name,
-                allowed=", ".join(sorted(known)),
-                hint=nearest(name, known),
+                **choices(name, sorted(known)),
             )
         if run.sensors[name].kind is not None and name != EFFORT:
             raise run.refuse(
@@ -567,6 +566,9 @@ def load_system(path: str | Path, overrides: Sequence[str] = ()) -> System:
     return build_system(load_config(path, overrides))
 
 
-def load_problem(path: str | Path, overrides: Sequence[str] = ()) -> EstimationProblem:
-    """The estimation problem that a configuration file describes; errors as `load_config` and `build_problem`."""
+def load_problem(path: str | Path | None = None, overrides: Sequence[str] = ()) -> EstimationProblem:
+    """The estimation problem of a configuration file, of the embedded one when absent.
+
+    Parameters and errors as `load_config`; errors as `build_problem`.
+    """
     return build_problem(load_config(path, overrides))

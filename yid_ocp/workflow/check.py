@@ -20,6 +20,7 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.options import SensorOptions
+from yid_ocp.progress import SILENT, Progress
 from yid_ocp.report.scene import Scene, Told, recorded_scene, scene
 from yid_ocp.report.summaries import check_summary
 from yid_ocp.sensors.joints import EFFORT, POSITION, angle_std, is_stated, torque_std
@@ -28,7 +29,6 @@ from yid_ocp.workflow.build import build_problem, build_step, first_gaps, input_
 from yid_ocp.workflow.command import DONE, WRONG_INPUT, carry_out
 from yid_ocp.workflow.doubts import doubts_result
 from yid_ocp.workflow.folder import new_run_folder
-from yid_ocp.workflow.progress import SILENT, Progress
 from yid_ocp.workflow.refine import discretisation, refine
 
 FORMAT = "yid-check/1"
@@ -45,7 +45,7 @@ class CheckOutcome:
 def run(arguments: argparse.Namespace) -> int:
     """The command."""
     settings = load_config(arguments.config, arguments.overrides)
-    outcome = carry_out(lambda shown: run_check(settings, arguments.out, shown), check_summary, arguments.quiet)
+    outcome = carry_out(lambda shown: run_check(settings, arguments.out, shown), check_summary, arguments)
     return WRONG_INPUT if settings.recordings.strict and outcome.result["warnings"] else DONE
 
 

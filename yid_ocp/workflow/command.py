@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
+from yid_ocp.files import jsonable
 from yid_ocp.parallel import Workers
+from yid_ocp.progress import Progress
 from yid_ocp.report.blocks import Block
 from yid_ocp.report.terminal import lines
-from yid_ocp.workflow.progress import Progress, shown
+from yid_ocp.workflow.progress import shown
 
 DONE, FAILED, WRONG_INPUT = 0, 1, 2
 """Exit codes of commands that ran to their end; the last where they were told to be strict and found something."""
@@ -35,9 +39,11 @@ Left = TypeVar("Left", bound=Outcome)
 
 
 def carry_out(
-    work: Callable[[Progress], Left], summary: Callable[[Mapping[str, Any]], Sequence[Block]], quiet: bool
+    work: Callable[[Progress], Left],
+    summary: Callable[[Mapping[str, Any]], Sequence[Block]],
+    arguments: argparse.Namespace,
 ) -> Left:
-    """Do the work of a command and print for a person what it found and where it is; quietly, only where it is.
+    """Do the work of a command and print what it found and where it is, as `tell` does.
 
     Parameters
     ----------
@@ -45,20 +51,53 @@ def carry_out(
         The work, given the progress to report to.
     summary : callable
         From the result to what is said of it.
-    quiet : bool
+    arguments : Namespace
+        Of the command, with `quiet` and `json`.
 
     Returns
     -------
     Outcome
         Of the work.
     """
-    with shown(quiet) as progress:
+    with shown(arguments) as progress:
         outcome = work(progress)
-    if not quiet:
-        print_lines(lines(summary(outcome.result)))
     near = os.path.relpath(outcome.folder)
-    print(outcome.folder if quiet or near.startswith("..") else f"run folder: {near}")
+    place = str(outcome.folder) if near.startswith("..") else f"run folder: {near}"
+    tell(arguments, outcome.result, lambda: lines(summary(outcome.result)), place, str(outcome.folder))
     return outcome
+
+
+def tell(
+    arguments: argparse.Namespace,
+    result: Mapping[str, Any],
+    texts: Callable[[], Sequence[str]],
+    place: str,
+    path: str,
+) -> None:
+    """Print what a command found: for a person, for a script that needs the place alone, or for a program.
+
+    Parameters
+    ----------
+    arguments : Namespace
+        `json`: the result on standard output and nothing else there, the place on standard error; `quiet`: the path
+        alone.
+    result : mapping
+        The same as in its file.
+    texts : callable
+        What a person reads of it.
+    place : str
+        The last of these lines: where it is.
+    path : str
+        The place as a path, which may have several lines for several files.
+    """
+    if arguments.json:
+        print_json(result)
+        if not arguments.quiet:
+            print(place, file=sys.stderr)
+    elif arguments.quiet:
+        print(path)
+    else:
+        print_lines([*texts(), place])
 
 
 def given_workers(arguments: argparse.Namespace) -> Workers | None:
@@ -74,6 +113,11 @@ def given_workers(arguments: argparse.Namespace) -> Workers | None:
     workers = Workers(arguments.workers, arguments.scheduler)
     workers.check()
     return workers
+
+
+def print_json(result: Mapping[str, Any]) -> None:
+    """Print a result on standard output as it stands in its file."""
+    print(json.dumps(jsonable(result), indent=1, allow_nan=False))
 
 
 def print_lines(texts: Sequence[str]) -> None:

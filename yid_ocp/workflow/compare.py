@@ -12,6 +12,7 @@ from yid_ocp.analysis.published import PUBLISHED, published_sentences
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import Run
 from yid_ocp.problem import EstimationProblem
+from yid_ocp.progress import SILENT, Progress
 from yid_ocp.report.pictures import draw_convergence
 from yid_ocp.report.summaries import compare_summary
 from yid_ocp.solvers import SOLVERS, Iterate
@@ -20,7 +21,6 @@ from yid_ocp.workflow.build import build_problem
 from yid_ocp.workflow.command import DONE, FAILED, carry_out
 from yid_ocp.workflow.doubts import doubts_result
 from yid_ocp.workflow.folder import new_run_folder
-from yid_ocp.workflow.progress import SILENT, Progress
 from yid_ocp.workflow.solve import doubted, solve_result
 
 FORMAT = "yid-compare/1"
@@ -56,7 +56,7 @@ def chosen_solvers(run: Run) -> list[Solver]:
 def run(arguments: argparse.Namespace) -> int:
     """The command."""
     settings = load_config(arguments.config, arguments.overrides)
-    outcome = carry_out(lambda shown: run_compare(settings, arguments.out, shown), compare_summary, arguments.quiet)
+    outcome = carry_out(lambda shown: run_compare(settings, arguments.out, shown), compare_summary, arguments)
     return DONE if outcome.ok else FAILED
 
 
@@ -85,12 +85,13 @@ def run_compare(run: Run, out: str | Path | None = None, progress: Progress = SI
         progress.stage("building the model and its compiled step")
         problem = build_problem(run)
         truth = _truth(problem)
-        current = [""]
+        current, names = [""], [solver.name for solver in solvers]
 
         def iterate(name: str, entry: Iterate) -> None:
             if name != current[0]:
                 current[0] = name
-                progress.stage(f"solving by {name}")
+                count = f", method {names.index(name) + 1} of {len(names)}" if name in names else ""
+                progress.stage(f"solving by {name}{count}")
             folder.log("iterate", method=name, iteration=entry.iteration, cost=entry.cost, seconds=entry.seconds)
             progress.iterate(entry)
 

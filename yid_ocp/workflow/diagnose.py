@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from yid_ocp.diagnosis import Finding, diagnose
 from yid_ocp.diagnosis.baseline import with_baseline
 from yid_ocp.diagnosis.finding import model_result
 from yid_ocp.problem import EstimationProblem
+from yid_ocp.progress import SILENT, Point, Progress
 from yid_ocp.report.scene import Scene, Told, scene
 from yid_ocp.report.summaries import diagnose_summary
 from yid_ocp.sensors.joints import EFFORT, POSITION
@@ -27,9 +28,8 @@ from yid_ocp.workflow.baseline import earlier_runs, recordings_without, refuse_s
 from yid_ocp.workflow.build import build_problem
 from yid_ocp.workflow.command import DONE, carry_out
 from yid_ocp.workflow.doubts import doubts_result
-from yid_ocp.workflow.folder import new_run_folder, used_versions
+from yid_ocp.workflow.folder import RunFolder, new_run_folder, used_versions
 from yid_ocp.workflow.information import next_plan
-from yid_ocp.workflow.progress import SILENT, Progress
 from yid_ocp.workflow.refits import Refits
 from yid_ocp.workflow.torque_offsets import torque_offsets
 from yid_ocp.workflow.trajectories import Prediction, write_diagnosis_trajectories
@@ -61,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.baseline:
         said = tuple(str(Path(folder).expanduser().resolve()) for folder in arguments.baseline)
         settings = replace(settings, diagnosis=replace(settings.diagnosis, baseline=said))
-    carry_out(lambda shown: run_diagnose(settings, arguments.out, shown), diagnose_summary, arguments.quiet)
+    carry_out(lambda shown: run_diagnose(settings, arguments.out, shown), diagnose_summary, arguments)
     return DONE
 
 
@@ -86,11 +86,7 @@ def run_diagnose(run: Run, out: str | Path | None = None, progress: Progress = S
     with new_run_folder(run, out, "diagnose") as folder:
         folder.begin(run, "diagnose", _flags(run))
         refits = Refits(folder, folder.inputs, dump_config(run), used_versions())
-
-        def stage(text: str) -> None:
-            folder.log("stage", text=text)
-            progress.stage(text)
-
+        told_and_kept = _Kept(progress, folder)
         progress.stage("building the model and its compiled step")
         runs = earlier_runs(run)
         without, said = recordings_without(run)
@@ -102,7 +98,7 @@ def run_diagnose(run: Run, out: str | Path | None = None, progress: Progress = S
         if runs:
             problem = with_baseline(problem, together(runs)[0])
         try:
-            finding = _found(run, problem, refits, stage, runs, without)
+            finding = _found(run, problem, refits, told_and_kept, runs, without)
         except KeyboardInterrupt:
             if len(refits):
                 log.warning("%d finished refits are in %s; the same command resumes them", len(refits), refits.file)
@@ -127,11 +123,30 @@ def run_diagnose(run: Run, out: str | Path | None = None, progress: Progress = S
     return DiagnoseOutcome(folder.path, written, finding)
 
 
+@dataclass(frozen=True)
+class _Kept:
+    """Progress that is shown, and entered in the run folder's log."""
+
+    shown: Progress
+    folder: RunFolder
+
+    def stage(self, text: str) -> None:
+        self.folder.log("stage", text=text)
+        self.shown.stage(text)
+
+    def iterate(self, entry: Point) -> None:
+        self.shown.iterate(entry)
+
+    def advance(self, done: int, total: int, text: str) -> None:
+        self.folder.log("part", done=done, total=total, text=text)
+        self.shown.advance(done, total, text)
+
+
 def _found(
     run: Run,
     problem: EstimationProblem,
     refits: Refits,
-    stage: Callable[[str], None],
+    progress: Progress,
     runs: Sequence[Estimates],
     without: Sequence[Recording],
 ) -> Finding:
@@ -139,14 +154,14 @@ def _found(
     nominal: Solution | None = None
     if said.noise_fraction < 1 and problem.held_out:
         # in units of noise the solver would take any fit for a bad one and start again elsewhere
-        stage("solving the nominal model")
-        nominal = solve(problem, run.solver)
+        progress.stage("solving the nominal model")
+        nominal = solve(problem, run.solver, callback=progress.iterate)
     return diagnose(
         in_units_of_noise(problem, run),
         said.candidates,
         thresholds=said,
         solution=nominal,
-        progress=stage,
+        progress=progress,
         store=refits,
         baseline=runs,
         without=without,

@@ -33,7 +33,7 @@ from yid_ocp.errors import DataError
 from yid_ocp.model.cable import Cable
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem, SensorOptions
-from yid_ocp.problem.prediction import EpisodeResult
+from yid_ocp.problem.outcome import EpisodeResult
 from yid_ocp.sensors.joints import EFFORT, POSITION
 
 MODELLED = {

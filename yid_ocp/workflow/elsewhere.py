@@ -29,10 +29,10 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import Run
 from yid_ocp.parallel import Task, Workers, run_tasks, values_of
 from yid_ocp.problem import EstimationProblem
+from yid_ocp.progress import Progress
 from yid_ocp.solvers import Solution
 from yid_ocp.workflow.build import build_problem, build_step, build_system, input_files
 from yid_ocp.workflow.folder import RunFolder
-from yid_ocp.workflow.progress import Progress
 from yid_ocp.workflow.second_arm import second_arm
 
 

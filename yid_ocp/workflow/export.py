@@ -8,12 +8,14 @@ from pathlib import Path
 from yid_ocp.data import read_recording
 from yid_ocp.errors import ConfigError
 from yid_ocp.export.csv import export_csv
+from yid_ocp.export.manifest import FORMAT
 from yid_ocp.export.mcap import export_mcap, recorded_signals
 from yid_ocp.report.summaries import export_summary
 from yid_ocp.report.terminal import lines, recording_summary
-from yid_ocp.workflow.command import DONE, print_lines
+from yid_ocp.workflow.command import DONE, tell
 from yid_ocp.workflow.export_model import FORMATS, export_model
 from yid_ocp.workflow.export_signals import export_run_signals
+from yid_ocp.workflow.import_recording import recording_result
 from yid_ocp.workflow.progress import shown
 
 MCAP = "mcap"
@@ -32,13 +34,13 @@ def run(arguments: argparse.Namespace) -> int:
             )
         if form == MCAP:
             written, notes = export_run_signals(source, arguments.out)
-            print_lines([*([] if arguments.quiet else notes), *map(str, written)])
+            paths = [str(file) for file in written]
+            result = {"format": FORMAT, "file": paths, "kind": form, "notes": notes}
+            tell(arguments, result, lambda: notes, "\n".join(paths), "\n".join(paths))
             return DONE
-        with shown(arguments.quiet) as progress:
+        with shown(arguments) as progress:
             manifest = export_model(source, arguments.out, form or "mjcf", progress)
-        if not arguments.quiet:
-            print_lines(lines(export_summary(manifest)))
-        print(arguments.out)
+        tell(arguments, manifest, lambda: lines(export_summary(manifest)), arguments.out, arguments.out)
         return DONE
     if form not in (None, "csv", MCAP):
         raise ConfigError(
@@ -47,14 +49,15 @@ def run(arguments: argparse.Namespace) -> int:
             allowed=f"csv or {MCAP} of a recording; {', '.join(FORMATS)} of a run folder of `solve` or `diagnose`",
         )
     recording = read_recording(source, allow_nan_effort=True)
+    result, notes = recording_result(recording), []
     if form == MCAP:
         files: tuple[Path, ...] = (Path(arguments.out) / f"{source.stem}.mcap",)
         shift = export_mcap(recorded_signals(recording), files[0])
-        if shift and not arguments.quiet:
-            print_lines([f"{shift:g} s were added to all times, as stamps cannot be negative"])
+        if shift:
+            notes.append(f"{shift:g} s were added to all times, as stamps cannot be negative")
     else:
         files = export_csv(recording, arguments.out)
-    if not arguments.quiet:
-        print_lines(recording_summary(recording))
-    print_lines([str(file) for file in files])
+    paths = [str(file) for file in files]
+    result |= {"format": FORMAT, "file": paths, "kind": form or "csv", "notes": [*result["notes"], *notes]}
+    tell(arguments, result, lambda: [*notes, *recording_summary(recording)], "\n".join(paths), "\n".join(paths))
     return DONE

@@ -15,12 +15,12 @@ from yid_ocp.export.manifest import FORMAT, Said, said_of_effects, said_of_param
 from yid_ocp.export.tree import sdf_model, urdf_model
 from yid_ocp.files import file_sha256, jsonable, write_json, write_text
 from yid_ocp.model.system import System
+from yid_ocp.progress import SILENT, Progress
 from yid_ocp.virtual.mjcf import mujoco_xml
 from yid_ocp.virtual.replay import BANDWIDTH, Error, replay
 from yid_ocp.workflow.baseline import run_result
 from yid_ocp.workflow.build import build_system, parameter_settings, read_recordings
 from yid_ocp.workflow.folder import used_versions
-from yid_ocp.workflow.progress import SILENT, Progress
 
 FORMATS = ("mjcf", "urdf", "sdf", "yaml")
 
@@ -136,7 +136,7 @@ def export_model(
     }
     if form == "mjcf":
         progress.stage("replaying recordings in MuJoCo")
-        manifest["gate"] = _gate(calibrated, system, text)
+        manifest["gate"] = _gate(calibrated, system, text, progress)
     manifest = jsonable(manifest)
     write_text(out, text)
     try:
@@ -238,7 +238,7 @@ def _owner(name: str) -> str:
 # -- the gate ---------------------------------------------------------------------------------------------------------
 
 
-def _gate(calibrated: Calibrated, system: System, text: str) -> dict[str, Any]:
+def _gate(calibrated: Calibrated, system: System, text: str, progress: Progress) -> dict[str, Any]:
     """Errors of the exported model, and of the nominal one, on recordings that neither was fitted to."""
     which = "held_out" if calibrated.run.recordings.held_out else "estimate"
     try:
@@ -248,8 +248,8 @@ def _gate(calibrated: Calibrated, system: System, text: str) -> dict[str, Any]:
         kept = [f"{e.kind}@{e.location}" for e in calibrated.nominal.model.effects]
         present = [f"{e.kind}@{e.location}" for e in system.effects]
         nominal = _with(calibrated.nominal, [label for label in kept if label in present])
-        before = _replayed(mujoco_xml(nominal, emulate=True, actuators=True), nominal, recordings)
-        after = _replayed(text, system, recordings)
+        before = _replayed(mujoco_xml(nominal, emulate=True, actuators=True), nominal, recordings, progress)
+        after = _replayed(text, system, recordings, progress, 1)
     except (DataError, ModelError) as error:
         return {"status": "not done", "reason": error.what}
     channels = {
@@ -272,10 +272,13 @@ def _gate(calibrated: Calibrated, system: System, text: str) -> dict[str, Any]:
     }
 
 
-def _replayed(text: str, system: System, recordings: Sequence[Recording]) -> dict[str, Error]:
-    """Errors over all recordings together."""
+def _replayed(
+    text: str, system: System, recordings: Sequence[Recording], progress: Progress, round_: int = 0
+) -> dict[str, Error]:
+    """Errors over all recordings together; in the first or second of two rounds."""
     found: dict[str, list[Error]] = {}
-    for recording in recordings:
+    for i, recording in enumerate(recordings):
+        progress.advance(round_ * len(recordings) + i, 2 * len(recordings), recording.name)
         for name, error in replay(text, system, recording).items():
             found.setdefault(name, []).append(error)
     return {name: _together(errors) for name, errors in found.items()}

@@ -21,12 +21,12 @@ from yid_ocp import interruption
 from yid_ocp.config.settings import Run, dump_config
 from yid_ocp.errors import OutputError
 from yid_ocp.files import file_sha256, jsonable, reason, write_text
+from yid_ocp.progress import Progress
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import Findings
 from yid_ocp.version import versions
 from yid_ocp.workflow.build import input_files
 from yid_ocp.workflow.plugins import plugin_versions
-from yid_ocp.workflow.progress import Progress
 
 log = logging.getLogger(__name__)
 _UNFINISHED, _LOCK, _NAMES = ".partial", "lock", 1000

@@ -13,7 +13,7 @@ from yid_ocp.model.cable import Cable
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.measurements import Measurements
-from yid_ocp.problem.prediction import EpisodeResult
+from yid_ocp.problem.outcome import EpisodeResult
 from yid_ocp.problem.validation import linear_carry, move_with_clamps, stay
 
 Array = NDArray[np.float64]

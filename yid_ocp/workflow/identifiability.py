@@ -26,6 +26,7 @@ from yid_ocp.model.system import System
 from yid_ocp.parallel import Workers
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.null_test import GapLimits
+from yid_ocp.progress import SILENT, Progress
 from yid_ocp.report.summaries import identifiability_summary
 from yid_ocp.solvers import Iterate, Solution, Status, solve
 from yid_ocp.workflow.build import build_problem, build_step, build_system
@@ -33,7 +34,6 @@ from yid_ocp.workflow.command import DONE, FAILED, carry_out, given_workers
 from yid_ocp.workflow.doubts import doubts_result
 from yid_ocp.workflow.elsewhere import Elsewhere
 from yid_ocp.workflow.folder import RunFolder, new_run_folder
-from yid_ocp.workflow.progress import SILENT, Progress
 from yid_ocp.workflow.second_arm import second_arm
 
 FORMAT = "yid-identifiability/1"
@@ -109,7 +109,7 @@ def run(arguments: argparse.Namespace) -> int:
     def judged(shown: Progress) -> IdentifiabilityOutcome:
         return run_identifiability(settings, arguments.out, shown, asked, workers)
 
-    outcome = carry_out(judged, identifiability_summary, arguments.quiet)
+    outcome = carry_out(judged, identifiability_summary, arguments)
     return DONE if outcome.ok else FAILED
 
 
@@ -196,10 +196,10 @@ def _information(
     wanted = _wanted(problem, information, asked)
     if not wanted:
         return information
-    progress.stage(f"intervals of {len(wanted)} parameters by profile likelihood")
     if elsewhere is not None and set(wanted) <= set(information.names):
+        progress.stage(f"intervals of {len(wanted)} parameters by profile likelihood")
         return elsewhere.with_profiles(information, wanted)
-    return judged(intervals=wanted)
+    return judged(intervals=wanted, progress=progress)
 
 
 def _ranking(
@@ -218,7 +218,7 @@ def _ranking(
         start=asked.start,
         grasp_std=asked.grasp_std,
         second_arm=None if other is None else with_grasp_offsets(other),
-        progress=progress.stage,
+        progress=progress,
         judge=None if elsewhere is None else elsewhere.judge(),
     )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,12 @@ from yid_ocp.config.settings import ImportSettings
 from yid_ocp.data import Recording, preview, read_any, write_recording
 from yid_ocp.data.readers.base import units_of
 from yid_ocp.errors import ConfigError
+from yid_ocp.progress import SILENT, Progress
 from yid_ocp.report.terminal import contents_summary, recording_summary
-from yid_ocp.workflow.command import DONE, print_lines
+from yid_ocp.workflow.command import DONE, print_json, print_lines, tell
+from yid_ocp.workflow.progress import shown
 
+FORMAT = "yid-import/1"
 _LISTS = {"joint_topics": "--joint-topic", "joints": "--joints"}
 _MAPPINGS: Mapping[str, tuple[str, Callable[[str], Any]]] = {
     "points": ("--points", str),
@@ -31,26 +34,43 @@ _SWITCHES = {("header", False): "--no-header", ("skip_bad_lines", True): "--skip
 def run(arguments: argparse.Namespace) -> int:
     """The command."""
     if arguments.preview:
-        contents = preview(arguments.file)
+        with shown(arguments) as progress:
+            progress.stage(f"reading {arguments.file}")
+            contents = preview(arguments.file, progress)
         options = {**contents.options, **given_options(arguments)}
         lines = contents_summary(contents)
         if not own(arguments.file):
             lines += ["", "to import it:", f"  {command_line(arguments.file, options)}"]
-        print_lines(lines)
+        if arguments.json:
+            print_json({"format": FORMAT, "recording": None, **asdict(contents)})
+        else:
+            print_lines(lines)
         return DONE
     if arguments.out is None:
         allowed = "--out RECORDING.h5, or --preview to look only"
         raise ConfigError("nothing says where to write the recording", where="--out", allowed=allowed)
     settings = load_config(arguments.config).import_ if arguments.config else ImportSettings()
-    recording = imported(arguments.file, options_of_settings(settings) | given_options(arguments))
-    write_recording(recording, arguments.out)
-    if not arguments.quiet:
-        print_lines(recording_summary(recording))
-    print(arguments.out if arguments.quiet else f"recording: {arguments.out}")
+    with shown(arguments) as progress:
+        recording = imported(arguments.file, options_of_settings(settings) | given_options(arguments), progress)
+        write_recording(recording, arguments.out)
+    result = {"format": FORMAT, "recording": arguments.out, **recording_result(recording)}
+    tell(arguments, result, lambda: recording_summary(recording), f"recording: {arguments.out}", arguments.out)
     return DONE
 
 
-def imported(file: str | Path, options: Mapping[str, Any]) -> Recording:
+def recording_result(recording: Recording) -> dict[str, Any]:
+    """What a recording holds, for programs."""
+    return {
+        "duration": recording.duration,
+        "groups": {
+            getattr(group, "name", "joints"): {"samples": len(group.t), "names": list(group.names)}
+            for group in recording.groups
+        },
+        "notes": list(recording.notes),
+    }
+
+
+def imported(file: str | Path, options: Mapping[str, Any], progress: Progress = SILENT) -> Recording:
     """A recording of a file of another tool, whose `source` says the file's hash.
 
     Parameters
@@ -58,13 +78,15 @@ def imported(file: str | Path, options: Mapping[str, Any]) -> Recording:
     file : str or Path
     options : mapping of str to object
         Named options of its reader.
+    progress : Progress, optional
 
     Raises
     ------
     DataError
         As `read_any`.
     """
-    recording = read_any(file, **options)
+    progress.stage(f"reading {file}")
+    recording = read_any(file, progress=progress, **options)
     if recording.sha256 is None or own(file):
         return recording
     return replace(recording, source=f"{recording.source} (SHA-256 {recording.sha256})")

@@ -11,8 +11,8 @@ from typing import Any
 from yid_ocp.config.settings import Run
 from yid_ocp.errors import DataError
 from yid_ocp.planning.information import InformationPlan, informative
+from yid_ocp.progress import Progress
 from yid_ocp.workflow.build import build_problem, located
-from yid_ocp.workflow.progress import Progress
 
 MOST = 3
 """Effects that one motion is asked to separate, the likeliest ones."""
@@ -76,7 +76,7 @@ def informed(run: Run, progress: Progress) -> tuple[InformationPlan, dict[str, A
         known = {name: value for name, value in found.items() if name in problem.system.parameters}
         source = {"run": str(folder), "parameters": free | known}
     with located(run, "plan"):
-        plan = informative(problem, run.plan, source["parameters"], sizes, progress.stage)
+        plan = informative(problem, run.plan, source["parameters"], sizes, progress)
     return plan, source
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from yid_ocp.config.reader import load_config
@@ -14,12 +14,15 @@ from yid_ocp.data import Recording, read_recording, write_recording
 from yid_ocp.errors import ConfigError, DataError, OutputError
 from yid_ocp.files import new_file, write_text
 from yid_ocp.model.urdf import read_urdf
+from yid_ocp.progress import Progress
 from yid_ocp.workflow.build import build_system
-from yid_ocp.workflow.command import DONE, print_lines
+from yid_ocp.workflow.command import DONE, tell
 from yid_ocp.workflow.commented import Object, configuration
 from yid_ocp.workflow.import_recording import given_options, imported, own
+from yid_ocp.workflow.progress import shown
 from yid_ocp.workflow.proposal import Branch, Proposal, propose, relative, split_at_rest
 
+FORMAT = "yid-init/1"
 SCHEMA = "yid-ocp.schema.json"
 LINKS = {"cable": 8, "beam": 6, "tree": 4, "y": 4}
 NEEDED = {"cable": ("length", "mass", "radius"), "beam": ("length", "mass"), "tree": (), "y": ()}
@@ -33,7 +36,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise ConfigError(f"the configuration is called '{out.name}'", where="--out", allowed="NAME.yaml")
     read_urdf(arguments.robot)
     item = described(arguments)
-    made = _recordings(arguments, out)
+    with shown(arguments) as progress:
+        made = _recordings(arguments, out, progress)
     recordings = [recording or read_recording(file) for file, recording in made.items()]
     proposal = propose(
         arguments.robot,
@@ -51,9 +55,8 @@ def run(arguments: argparse.Namespace) -> int:
     files = [relative(file, out.parent) for file in made]
     text = configuration(where, item, proposal, files, imports, SCHEMA)
     _write(out, text, {file: raw for file, raw in made.items() if raw is not None})
-    if not arguments.quiet:
-        print_lines(summary(proposal, out))
-    print(out if arguments.quiet else f"configuration: {out}")
+    result = {"format": FORMAT, "configuration": str(out), "recordings": files, "proposal": asdict(proposal)}
+    tell(arguments, result, lambda: summary(proposal, out), f"configuration: {out}", str(out))
     return DONE
 
 
@@ -166,7 +169,7 @@ def _grasps(given: Sequence[str]) -> dict[str, str]:
 # -- files ------------------------------------------------------------------------------------------------------------
 
 
-def _recordings(arguments: argparse.Namespace, out: Path) -> dict[Path, Recording | None]:
+def _recordings(arguments: argparse.Namespace, out: Path, progress: Progress) -> dict[Path, Recording | None]:
     """Files of the recordings; with what is to be written there where they are of another tool."""
     options = given_options(arguments)
     made: dict[Path, Recording | None] = {}
@@ -178,7 +181,7 @@ def _recordings(arguments: argparse.Namespace, out: Path) -> dict[Path, Recordin
                 raise ConfigError(f"{file.name} is a recording already", where=flags, hint="leave these options out")
             made[file] = None
         else:
-            recording = imported(file, options)
+            recording = imported(file, options, progress)
             made[out.parent / f"{recording.name}.h5"] = recording
     if len(made) < len(arguments.files):
         raise DataError("two of the files would become one recording", where=", ".join(arguments.files))

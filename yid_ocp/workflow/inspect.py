@@ -27,12 +27,12 @@ from yid_ocp.integrator.statics import Statics
 from yid_ocp.integrator.step import Step
 from yid_ocp.integrator.step_model import StepLinearization
 from yid_ocp.problem import EstimationProblem
+from yid_ocp.progress import SILENT, Progress
 from yid_ocp.report.sparsity import draw_patterns
 from yid_ocp.report.summaries import inspect_summary
 from yid_ocp.workflow.build import build_problem, build_step, parameter_settings
 from yid_ocp.workflow.command import DONE, carry_out
 from yid_ocp.workflow.folder import new_run_folder
-from yid_ocp.workflow.progress import SILENT, Progress
 
 FORMAT = "yid-inspect/1"
 SHOWN_STEPS = 2  # of the NLP in its picture: what comes after looks the same
@@ -72,7 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
     """The command."""
     settings = load_config(arguments.config, arguments.overrides)
     asked = (tuple(arguments.entries), arguments.export)
-    carry_out(lambda shown: run_inspect(settings, arguments.out, shown, *asked), inspect_summary, arguments.quiet)
+    carry_out(lambda shown: run_inspect(settings, arguments.out, shown, *asked), inspect_summary, arguments)
     return DONE
 
 

@@ -26,13 +26,13 @@ from yid_ocp.planning.plan import Known, Plan, plan
 from yid_ocp.problem.grid import make_grid
 from yid_ocp.problem.inputs import prescribed_path
 from yid_ocp.problem.low_pass import LowPass
+from yid_ocp.progress import SILENT, Progress
 from yid_ocp.report.scene import Scene, Told, scene
 from yid_ocp.report.summaries import plan_summary
 from yid_ocp.workflow.build import build_cable, build_step, located, parameter_settings, read_recordings
 from yid_ocp.workflow.command import DONE, FAILED, carry_out
 from yid_ocp.workflow.folder import new_run_folder
 from yid_ocp.workflow.information import information_result, informed, refuse_other_effects, run_result
-from yid_ocp.workflow.progress import SILENT, Progress
 
 FORMAT = "yid-plan/1"
 EFFORT_STD, POINT_STD = 0.1, 1e-3  # stated in the recording of a plan, for whoever estimates on it [N m], [m]
@@ -56,7 +56,7 @@ class PlanOutcome:
 def run(arguments: argparse.Namespace) -> int:
     """The command."""
     settings = load_config(arguments.config, arguments.overrides)
-    outcome = carry_out(lambda shown: run_plan(settings, arguments.out, shown), plan_summary, arguments.quiet)
+    outcome = carry_out(lambda shown: run_plan(settings, arguments.out, shown), plan_summary, arguments)
     return DONE if outcome.ok else FAILED
 
 
@@ -90,7 +90,7 @@ def run_plan(run: Run, out: str | Path | None = None, progress: Progress = SILEN
             theta, known, source = identified(run, step)
             options = replace(run.plan, posture=start_posture(run, step))
             with located(run, "plan"):
-                found = plan(step, options, theta, known, progress.stage)
+                found = plan(step, options, theta, known, progress)
         recording = as_recording(run, found)
         write_recording(recording, folder.path / "recording.h5")
         export_csv(recording, folder.path / "csv")

@@ -1,14 +1,15 @@
-"""How a long run is doing: what a command reports, and who shows it."""
+"""How a long run is doing, as a command shows it: bars, lines, and the time that is left."""
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import sys
 import time
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
-from yid_ocp.solvers import Iterate
+from yid_ocp.progress import SILENT, Point, Progress
 
 if TYPE_CHECKING:
     import rich.progress
@@ -17,38 +18,6 @@ OFTEN = 5.0
 """Least time between two lines of one tenth of a stage [s]."""
 SOON = 2.0
 """Time that a stage has to last before the rest of it is guessed [s]."""
-
-
-class Progress(Protocol):
-    """Whoever wants to know how a long run is doing."""
-
-    def stage(self, text: str) -> None:
-        """A new part of the work begins."""
-        ...
-
-    def iterate(self, entry: Iterate) -> None:
-        """A solver accepted a point."""
-        ...
-
-    def advance(self, done: int, total: int, text: str) -> None:
-        """So many of so many parts of the stage are done, and what comes next."""
-        ...
-
-
-class Silent:
-    """Progress that nobody sees."""
-
-    def stage(self, text: str) -> None:
-        """Nothing."""
-
-    def iterate(self, entry: Iterate) -> None:
-        """Nothing."""
-
-    def advance(self, done: int, total: int, text: str) -> None:
-        """Nothing."""
-
-
-SILENT = Silent()
 
 
 class TimeLeft:
@@ -91,7 +60,7 @@ class PlainProgress:
         self._tenths, self._last, self._left = 0, time.monotonic(), TimeLeft()
         print(f"{text} ...", file=sys.stderr, flush=True)
 
-    def iterate(self, entry: Iterate) -> None:
+    def iterate(self, entry: Point) -> None:
         """See `Progress`."""
         print(f"  {iterate_words(entry)}", file=sys.stderr, flush=True)
 
@@ -104,20 +73,20 @@ class PlainProgress:
 
 
 class BarProgress:
-    """A moving bar for the stage that runs."""
+    """A moving bar for the stage that runs, under a line for each that is done: of many bars the last is not seen."""
 
     def __init__(self, bars: rich.progress.Progress) -> None:
         self._bars = bars
         self._task: rich.progress.TaskID | None = None
-        self._text, self._left = "", TimeLeft()
+        self._text, self._left, self._begun = "", TimeLeft(), 0.0
 
     def stage(self, text: str) -> None:
         """See `Progress`."""
         self.close()
-        self._text, self._left = text, TimeLeft()
+        self._text, self._left, self._begun = text, TimeLeft(), time.monotonic()
         self._task = self._bars.add_task(text, total=None)
 
-    def iterate(self, entry: Iterate) -> None:
+    def iterate(self, entry: Point) -> None:
         """See `Progress`."""
         if self._task is not None:
             self._bars.update(self._task, description=f"{self._text}: {iterate_words(entry)}")
@@ -129,23 +98,31 @@ class BarProgress:
             self._bars.update(self._task, description=words, completed=done, total=total)
 
     def close(self) -> None:
-        """Mark the running stage as done."""
+        """End the running stage."""
         if self._task is not None:
-            self._bars.update(self._task, description=self._text, total=1, completed=1)
+            self._bars.remove_task(self._task)
+            self._task = None
+            spent = duration_words(time.monotonic() - self._begun)
+            self._bars.console.print(f"{self._text}: {spent}", markup=False, highlight=False)
 
 
-def iterate_words(entry: Iterate) -> str:
+def iterate_words(entry: Point) -> str:
     """An accepted point in a line."""
     note = f", {entry.note}" if entry.note else ""
     return f"iteration {entry.iteration}, cost {entry.cost:.6g}, {entry.seconds:.1f} s{note}"
 
 
 @contextlib.contextmanager
-def shown(quiet: bool) -> Iterator[Progress]:
-    """Progress on standard error while the block runs: bars on a terminal, lines elsewhere, nothing where quiet."""
-    if quiet:
+def shown(arguments: argparse.Namespace) -> Iterator[Progress]:
+    """Progress on standard error while the block runs.
+
+    Bars on a terminal. Elsewhere lines, for logs, or nothing where a program reads the result (`--json`); nothing where
+    it is asked to be quiet.
+    """
+    terminal = sys.stderr.isatty()
+    if arguments.quiet or (arguments.json and not terminal):
         yield SILENT
-    elif not sys.stderr.isatty():
+    elif not terminal:
         yield PlainProgress()
     else:
         from rich.console import Console
@@ -153,7 +130,7 @@ def shown(quiet: bool) -> Iterator[Progress]:
         from rich.progress import Progress as Bars
 
         columns = (BarColumn(bar_width=24), TextColumn("{task.description}", markup=False), TimeElapsedColumn())
-        with Bars(*columns, console=Console(stderr=True)) as bars:
+        with Bars(*columns, console=Console(stderr=True), transient=True) as bars:
             progress = BarProgress(bars)
             yield progress
             progress.close()

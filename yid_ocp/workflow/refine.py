@@ -17,10 +17,10 @@ from yid_ocp.errors import YidError
 from yid_ocp.integrator.step import at_time_step
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
+from yid_ocp.progress import SILENT, Progress
 from yid_ocp.solvers import Solution, Status
 from yid_ocp.solvers.judgement import typical_sizes
 from yid_ocp.workflow.build import build_step, build_system, finer_factor
-from yid_ocp.workflow.progress import SILENT, Progress
 
 Array = NDArray[np.float64]
 What = Literal["links", "time_step"]

@@ -13,6 +13,7 @@ from yid_ocp.analysis.history import History, history
 from yid_ocp.config.settings import Run
 from yid_ocp.errors import ConfigError
 from yid_ocp.files import file_sha256
+from yid_ocp.progress import SILENT, Progress
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import Findings
 from yid_ocp.report.summaries import history_summary
@@ -20,7 +21,6 @@ from yid_ocp.version import versions
 from yid_ocp.workflow.baseline import read_estimates, refuse_unlike
 from yid_ocp.workflow.command import DONE, carry_out
 from yid_ocp.workflow.folder import new_run_folder, now
-from yid_ocp.workflow.progress import SILENT, Progress
 
 FORMAT = "yid-history/1"
 
@@ -36,7 +36,7 @@ class ReportOutcome:
 
 def run(arguments: argparse.Namespace) -> int:
     """The command."""
-    carry_out(lambda shown: run_report(arguments.runs, arguments.out, shown), history_summary, arguments.quiet)
+    carry_out(lambda shown: run_report(arguments.runs, arguments.out, shown), history_summary, arguments)
     return DONE
 
 

@@ -19,8 +19,9 @@ from yid_ocp.data.doubt import Doubt
 from yid_ocp.model.cable import Cable
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
-from yid_ocp.problem.prediction import EpisodeResult
+from yid_ocp.problem.outcome import EpisodeResult
 from yid_ocp.problem.validation import channel_errors
+from yid_ocp.progress import SILENT, Progress
 from yid_ocp.report.summaries import solve_summary
 from yid_ocp.solvers import Iterate, Solution, Status, solve
 from yid_ocp.solvers.judgement import distrusted, known_covariance
@@ -29,7 +30,6 @@ from yid_ocp.workflow.command import DONE, FAILED, carry_out
 from yid_ocp.workflow.doubts import doubts_result
 from yid_ocp.workflow.folder import new_run_folder
 from yid_ocp.workflow.held_out import guess_doubts, held_out_entry, worse_than_guess
-from yid_ocp.workflow.progress import SILENT, Progress
 from yid_ocp.workflow.refine import Discretisation, counted, discretisation, steadied, wanted
 from yid_ocp.workflow.torque_offsets import torque_offsets
 from yid_ocp.workflow.trajectories import write_trajectories
@@ -65,7 +65,7 @@ class SolveOutcome:
 def run(arguments: argparse.Namespace) -> int:
     """The command."""
     settings = load_config(arguments.config, arguments.overrides)
-    outcome = carry_out(lambda shown: run_solve(settings, arguments.out, shown), solve_summary, arguments.quiet)
+    outcome = carry_out(lambda shown: run_solve(settings, arguments.out, shown), solve_summary, arguments)
     return DONE if outcome.ok else FAILED
 
 
@@ -103,7 +103,7 @@ def run_solve(run: Run, out: str | Path | None = None, progress: Progress = SILE
         safe = safe_start(problem, run.solver, solution, run.diagnosis.of_a_fit)
         solution, stability = steadied(safe.problem, safe.solution)
         problem = solution.problem or safe.problem
-        solution = with_intervals(problem, solution, progress.stage)
+        solution = with_intervals(problem, solution, progress)
         finer = Discretisation({})
         if solution.evaluation is not None:
             finer = discretisation(run, problem, solution.x, solution.evaluation, wanted(run), progress)

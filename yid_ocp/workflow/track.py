@@ -18,6 +18,7 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.errors import ConfigError
 from yid_ocp.files import file_sha256
 from yid_ocp.model.system import System
+from yid_ocp.progress import SILENT, Progress
 from yid_ocp.report.scene import Told
 from yid_ocp.report.scene import scene as moving
 from yid_ocp.report.summaries import track_summary
@@ -31,7 +32,6 @@ from yid_ocp.workflow.build import build_system, located, recording_file
 from yid_ocp.workflow.command import DONE, carry_out
 from yid_ocp.workflow.doubts import doubts_result, of_one
 from yid_ocp.workflow.folder import new_run_folder
-from yid_ocp.workflow.progress import SILENT, Progress
 
 FORMAT = "yid-track/1"
 Array = NDArray[np.float64]
@@ -61,7 +61,7 @@ class TrackOutcome:
 def run(arguments: argparse.Namespace) -> int:
     """The command."""
     settings = load_config(arguments.config, arguments.overrides)
-    carry_out(lambda shown: run_track(settings, arguments.out, shown), track_summary, arguments.quiet)
+    carry_out(lambda shown: run_track(settings, arguments.out, shown), track_summary, arguments)
     return DONE
 
 

@@ -14,7 +14,7 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.null_test import residual_series
-from yid_ocp.problem.prediction import EpisodeResult
+from yid_ocp.problem.outcome import EpisodeResult
 
 Array = NDArray[np.float64]
 

@@ -19,7 +19,7 @@ from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.model.cable import Cable
 from yid_ocp.model.system import System
 from yid_ocp.problem.episodes import Episode
-from yid_ocp.problem.prediction import EpisodeResult
+from yid_ocp.problem.outcome import EpisodeResult
 from yid_ocp.sensors.base import Choice
 
 Array = NDArray[np.float64]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import os
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
@@ -14,7 +15,8 @@ from yid_ocp.data.readers.base import PREVIEWS as PREVIEWS
 from yid_ocp.data.readers.base import READERS as READERS
 from yid_ocp.data.readers.base import Contents, Source, rate_of
 from yid_ocp.data.recording import Recording
-from yid_ocp.errors import DataError, nearest
+from yid_ocp.errors import DataError, choices, nearest
+from yid_ocp.progress import SILENT, Progress
 
 for _suffix in (".h5", ".hdf5"):
     READERS.register(_suffix)(read_recording)
@@ -23,13 +25,15 @@ for _format in iter_modules(__path__):
     import_module(f"{__name__}.{_format.name}")
 
 
-def read_any(path: str | os.PathLike[str], **options: Any) -> Recording:
+def read_any(path: str | os.PathLike[str], *, progress: Progress = SILENT, **options: Any) -> Recording:
     """Read a recording of any known format, chosen by its suffix.
 
     Parameters
     ----------
     path : path-like
         An HDF5 recording, a CSV file, a rosbag, an MCAP file, a ROS 2 bag folder, a C3D file or a LeRobot dataset.
+    progress : Progress, optional
+        Told of files that take long.
     **options
         Named options of the reader in `READERS`.
 
@@ -46,25 +50,25 @@ def read_any(path: str | os.PathLike[str], **options: Any) -> Recording:
     path = Path(path)
     known_as = _format_of(path)
     reader = READERS[known_as]
-    known = [name for name in inspect.signature(reader).parameters if name != "path"]
+    known = [name for name in inspect.signature(reader).parameters if name not in ("path", "progress")]
     for name in options:
         if name not in known:
             raise DataError(
                 f"the reader of '{known_as}' files has no option '{name}'",
                 where=str(path),
-                allowed=", ".join(known) or "none",
-                hint=nearest(name, known),
+                **choices(name, known),
             )
-    return reader(path, **options)
+    return reader(path, **options, **_told(reader, progress))
 
 
-def preview(path: str | os.PathLike[str]) -> Contents:
+def preview(path: str | os.PathLike[str], progress: Progress = SILENT) -> Contents:
     """Look into a file of any known format: what it holds, and the options with which `read_any` makes a recording.
 
     Parameters
     ----------
     path : path-like
         As `read_any`.
+    progress : Progress, optional
 
     Returns
     -------
@@ -78,13 +82,18 @@ def preview(path: str | os.PathLike[str]) -> Contents:
     path = Path(path)
     known_as = _format_of(path)
     if known_as in PREVIEWS:
-        return PREVIEWS[known_as](path)
+        return PREVIEWS[known_as](path, **_told(PREVIEWS[known_as], progress))
     recording = read_any(path)
     sources = (
         Source(getattr(g, "name", "joints"), "group", len(g.t), rate_of(g.t), ", ".join(g.names))
         for g in recording.groups
     )
     return Contents(tuple(sources), {}, ("a recording already", *recording.notes))
+
+
+def _told(reader: Callable[..., Any], progress: Progress) -> dict[str, Any]:
+    """The progress as an argument, for readers of files that may take long."""
+    return {"progress": progress} if "progress" in inspect.signature(reader).parameters else {}
 
 
 def _format_of(path: Path) -> str:
@@ -100,7 +109,6 @@ def _format_of(path: Path) -> str:
         raise DataError(
             f"there is no reader for '{key}' files",
             where=str(path),
-            allowed=", ".join(READERS),
-            hint=nearest(key, READERS),
+            **choices(key, READERS),
         )
     return key

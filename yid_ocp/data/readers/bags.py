@@ -23,9 +23,11 @@ from yid_ocp.data.readers.base import (
     renamings,
 )
 from yid_ocp.data.recording import Array, JointGroup, PointGroup, Recording
-from yid_ocp.errors import DataError, nearest
+from yid_ocp.errors import DataError, choices, nearest
 from yid_ocp.files import file_sha256
+from yid_ocp.progress import SILENT, Progress
 
+TOLD = 5000  # messages from one word of progress to the next
 _JOINT_STATE = "sensor_msgs/msg/JointState"
 _POINT_STAMPED = "geometry_msgs/msg/PointStamped"
 _POSES = (
@@ -89,6 +91,7 @@ def read_bag(
     gears: Mapping[str, float] | None = None,
     sensor: str = "unknown",
     description: str = "",
+    progress: Progress = SILENT,
 ) -> Recording:
     """Read a ROS 1 bag, a ROS 2 bag folder or an MCAP file.
 
@@ -137,7 +140,7 @@ def read_bag(
     if pose_axes is not None and not 0 < pose_axes < float("inf"):
         raise DataError(f"pose_axes = {pose_axes:g}", where=str(path), allowed="a distance above 0 [m]")
     trees = tuple(source for source in points or () if ":" in source)
-    bag = _bag(path, trees)
+    bag = _bag(path, trees, progress)
     groups, notes, used = _joints(bag, joint_topics, command_topic, joints, str(path))
     seen = _named_places(bag, points, str(path))
     if not groups and not seen:
@@ -170,7 +173,7 @@ def read_bag(
 @PREVIEWS.register(".mcap")
 @PREVIEWS.register(".db3")
 @PREVIEWS.register("folder")
-def preview_bag(path: str | os.PathLike[str]) -> Contents:
+def preview_bag(path: str | os.PathLike[str], progress: Progress = SILENT) -> Contents:
     """What a bag holds: its topics, what they would become, and units that their values look like.
 
     Raises
@@ -180,7 +183,7 @@ def preview_bag(path: str | os.PathLike[str]) -> Contents:
     """
     path = Path(path)
     file_sha256(path)
-    bag = _bag(path, None)
+    bag = _bag(path, None, progress)
     names = _names_of(bag)
     options: dict[str, Any] = {}
     notes: list[str] = []
@@ -211,7 +214,7 @@ def preview_bag(path: str | os.PathLike[str]) -> Contents:
 # -- reading ----------------------------------------------------------------------------------------------------------
 
 
-def _bag(path: Path, trees: Sequence[str] | None) -> _Bag:
+def _bag(path: Path, trees: Sequence[str] | None, progress: Progress) -> _Bag:
     """Decode what can be used of a bag; of trees of transforms the named frames, all of them for None."""
     try:
         from rosbags.highlevel import AnyReader
@@ -231,8 +234,11 @@ def _bag(path: Path, trees: Sequence[str] | None) -> _Bag:
                 key = (c.topic, c.msgtype)
                 counted[key] = counted.get(key, 0) + c.msgcount
             wanted = [connection for connection in reader.connections if connection.msgtype in wanted_kinds]
+            total = sum(connection.msgcount for connection in wanted)
             # an empty selection would mean all topics, images included
-            for connection, logged, data in reader.messages(wanted) if wanted else ():
+            for done, (connection, logged, data) in enumerate(reader.messages(wanted) if wanted else ()):
+                if done % TOLD == 0:
+                    progress.advance(done, total, "messages")
                 content: Any = reader.deserialize(data, connection.msgtype)
                 if connection.msgtype in _TREES:
                     places += [
@@ -319,7 +325,7 @@ def _joints(
     for topic in (*(topics or ()), *((command,) if command else ())):
         if topic not in known:
             what = f"there are no joint states on the topic '{topic}'"
-            raise DataError(what, where=where, allowed=", ".join(known), hint=nearest(topic, known))
+            raise DataError(what, where=where, **choices(topic, known))
     chosen = [topic for topic in (known if topics is None else topics) if topic != command]
     wanted = None if joints is None else renamings(joints, "joint", where)
     found, notes = [], []
@@ -430,9 +436,8 @@ def _named_places(bag: _Bag, points: Mapping[str, str] | None, where: str) -> Pl
     for source in names:
         if source not in present and points is not None:
             trees = [topic.name for topic in bag.topics if topic.kind in _TREES]
-            listed = ", ".join([*present, *(f"{tree}:FRAME" for tree in trees)])
             what = f"there are no points on the topic '{source}'"
-            raise DataError(what, where=where, allowed=listed or "none", hint=nearest(source, present))
+            raise DataError(what, where=where, **choices(source, [*present, *(f"{tree}:FRAME" for tree in trees)]))
     check_point_names(names, where)
     groups: Places = {}
     for message in bag.places:

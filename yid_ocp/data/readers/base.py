@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from yid_ocp.data.recording import JOINT_CHANNELS, Array, JointGroup, PointGroup, Recording, validate
-from yid_ocp.errors import DataError, nearest
+from yid_ocp.errors import DataError, choices
 from yid_ocp.registry import Registry
 
 Reader = Callable[..., Recording]
@@ -109,7 +109,7 @@ def units_of(words: Iterable[str]) -> dict[str, str]:
         of = next((si for si, known in _TO_SI.items() if _spaceless(word) in map(_spaceless, known)), None)
         if of is None:
             known = [unit for table in _TO_SI.values() for unit in table]
-            raise DataError(f"'{word}' is no unit", where="units", allowed=", ".join(known), hint=nearest(word, known))
+            raise DataError(f"'{word}' is no unit", where="units", **choices(word, known))
         units |= {quantity: word for quantity, si in _QUANTITIES.items() if si == of}
     return units
 
@@ -126,13 +126,12 @@ def _factors(units: Mapping[str, str], where: str) -> dict[str, float]:
             raise DataError(
                 f"a unit is given for '{quantity}', which is no quantity",
                 where=where,
-                allowed=", ".join(_QUANTITIES),
-                hint=nearest(quantity, _QUANTITIES),
+                **choices(quantity, _QUANTITIES),
             )
         known = {_spaceless(name): factor for name, factor in _TO_SI[_QUANTITIES[quantity]].items()}
         if _spaceless(unit) not in known:
             what, names = f"'{unit}' is not a unit of '{quantity}'", tuple(_TO_SI[_QUANTITIES[quantity]])
-            raise DataError(what, where=where, allowed=", ".join(names), hint=nearest(unit, names))
+            raise DataError(what, where=where, **choices(unit, names))
         factors[quantity] = known[_spaceless(unit)]
     return factors
 
@@ -221,8 +220,7 @@ def _chosen_joints(group: JointGroup, chosen: Mapping[str, str], where: str) -> 
             raise DataError(
                 f"there is no joint '{name}'",
                 where=where,
-                allowed=", ".join(group.names),
-                hint=nearest(name, group.names),
+                **choices(name, group.names),
             )
     at = [group.names.index(name) for name in chosen]
     channels: dict[str, Any] = {name: values[:, at] for name, values in group.channels.items()}
@@ -233,9 +231,7 @@ def _chosen_points(groups: Sequence[PointGroup], chosen: Mapping[str, str], wher
     known = [name for group in groups for name in group.names]
     for name in chosen:
         if name not in known:
-            raise DataError(
-                f"there is no point '{name}'", where=where, allowed=", ".join(known), hint=nearest(name, known)
-            )
+            raise DataError(f"there is no point '{name}'", where=where, **choices(name, known))
     check_point_names(chosen, where)
     kept = []
     for group in groups:
@@ -267,8 +263,7 @@ def _torque_factors(
                 raise DataError(
                     f"{word} is given for '{pattern}', which is no joint",
                     where=where,
-                    allowed=", ".join(names),
-                    hint=nearest(pattern, names),
+                    **choices(pattern, names),
                 )
             if not (math.isfinite(value) and value != 0):
                 raise DataError(f"{word} of '{pattern}' is {value:g}", where=where, allowed="a number that is not zero")

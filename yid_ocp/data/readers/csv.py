@@ -23,7 +23,7 @@ from yid_ocp.data.readers.base import (
     rate_of,
 )
 from yid_ocp.data.recording import JOINT_CHANNELS, Array, Clock, JointGroup, PointGroup, Recording
-from yid_ocp.errors import DataError, nearest
+from yid_ocp.errors import DataError, choices, nearest
 from yid_ocp.files import file_sha256
 
 _PREFIXES = {"q_": "position", **{f"{channel}_": channel for channel in JOINT_CHANNELS}}
@@ -316,7 +316,7 @@ def _meanings(header: Sequence[str], columns: Mapping[str, str], where: str) -> 
         found = {name: match for name in header if (match := re.fullmatch(pattern, name))}
         if not found:
             what = f"there is no column '{key}'"
-            raise DataError(what, where=where, allowed=", ".join(header), hint=nearest(key, header))
+            raise DataError(what, where=where, **choices(key, header))
         for name, match in found.items():
             given[name] = meaning.replace("*", match.group(1)) if "*" in key else meaning
     meanings: list[tuple[str, str] | None] = []

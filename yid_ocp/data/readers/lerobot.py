@@ -14,7 +14,7 @@ import numpy as np
 
 from yid_ocp.data.readers.base import PREVIEWS, READERS, Contents, Source, finished, guessed_units
 from yid_ocp.data.recording import Array, JointGroup, Recording
-from yid_ocp.errors import DataError, nearest
+from yid_ocp.errors import DataError, choices
 from yid_ocp.files import file_sha256
 
 _STATE, _ACTION = "observation.state", "action"
@@ -144,8 +144,7 @@ def _dataset(folder: Path) -> _Dataset:
     if not (math.isfinite(rate) and rate > 0):
         raise DataError(f"the dataset has {rate:g} frames a second", where=where, allowed="a number above 0")
     if _STATE not in features:
-        hint = nearest(_STATE, features)
-        raise DataError(f"the dataset has no {_STATE}", where=where, allowed=", ".join(features), hint=hint)
+        raise DataError(f"the dataset has no {_STATE}", where=where, **choices(_STATE, features))
     return _Dataset(folder, rate, features, episodes, info)
 
 

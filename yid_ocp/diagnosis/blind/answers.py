@@ -9,11 +9,12 @@ from yid_ocp.diagnosis.blind.ensemble import Case, Ensemble, Label
 from yid_ocp.diagnosis.diagnose import diagnose, nominal_fit
 from yid_ocp.diagnosis.finding import Finding
 from yid_ocp.diagnosis.hypotheses import CandidateProblem, Choice, chosen_effects
-from yid_ocp.diagnosis.refit import Progress, refit
+from yid_ocp.diagnosis.refit import refit
 from yid_ocp.diagnosis.select import closure
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects.base import Quantity
 from yid_ocp.model.system import System
+from yid_ocp.progress import Progress
 
 
 def answer(

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
-from yid_ocp.problem.prediction import EpisodeResult
+from yid_ocp.problem.outcome import EpisodeResult
 from yid_ocp.registry import Registry
 from yid_ocp.report.scene import Scene
 from yid_ocp.solvers import Solution

@@ -16,7 +16,7 @@ from yid_ocp.diagnosis.smoother import Smoothed
 from yid_ocp.diagnosis.words import fall_sentences
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.null_test import residual_series
-from yid_ocp.problem.prediction import EpisodeResult
+from yid_ocp.problem.outcome import EpisodeResult
 from yid_ocp.report import charts, figures
 from yid_ocp.report.charts import Change, Ranked, Row
 from yid_ocp.report.figures import Curve

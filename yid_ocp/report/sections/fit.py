@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from yid_ocp.problem.episodes import Episode
-from yid_ocp.problem.prediction import EpisodeResult
+from yid_ocp.problem.outcome import EpisodeResult
 from yid_ocp.report import figures
 from yid_ocp.report.figures import Curve
 from yid_ocp.report.sections.base import Findings, section

@@ -1,0 +1,50 @@
+"""What the site has beside the pages in this folder: a start page, and a page for every public object."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+import yid_ocp
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+SECTIONS = {
+    "Start": ("index.md", "tutorial.md", "choosing.md", "recordings.md", "settings.md", "real_data.md"),
+    "Questions": ("diagnosis.md", "identifiability.md", "comparison.md", "plan.md", "vision.md"),
+    "Tools": ("export.md", "extending.md", "inspection.md", "program.md", "workers.md"),
+    "Inside": ("theory.md", "architecture.md"),
+}
+
+
+def public() -> list[str]:
+    """Names of the front door, classes first."""
+    names = [name for name in yid_ocp.__all__ if not name.startswith("_")]
+    return sorted(names, key=lambda name: (name[0].islower(), name.lower()))
+
+
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """Fill the navigation."""
+    config.nav = [{title: list(pages)} for title, pages in SECTIONS.items()]
+    config.nav.append({"Python": [{name: f"api/{name}.md"} for name in public()]})
+    return config
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add what is generated: the README as start page, and a page for every public object from its docstring."""
+    readme = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+    files.append(File.generated(config, "index.md", content=readme.replace("](docs/", "](")))
+    for name in public():
+        entry = getattr(yid_ocp, name)
+        text = f"# {name}\n\n`yid_ocp.{name}`\n\n::: {entry.__module__}.{entry.__qualname__}\n"
+        text += "    options: {heading_level: 2}\n"
+        files.append(File.generated(config, f"api/{name}.md", content=text))
+    return files
+
+
+def on_page_markdown(markdown: str, **_: object) -> str:
+    """Files of the repository that are no pages are named, not linked."""
+    outside = r"\[([^\]]*)\]\((?!https?:|#|[\w/-]+\.(?:md|png)(?:#[\w-]+)?\))[^)]*\)"
+    return re.sub(outside, r"\1", markdown)

@@ -1,0 +1,103 @@
+"""Objects in a line and in a notebook's cell."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from small_problems import joints, pendulum_step, recording, seen, taken
+
+import yid_ocp as yid
+from yid_ocp.model import Segment, flexible_object
+from yid_ocp.problem import EstimationProblem, ProblemOptions
+from yid_ocp.shown import MOST, Shown, Summary, counted
+
+
+class Thing(Shown):
+    def __init__(self, line, rows=()):
+        self.said = Summary(line, rows)
+
+    def _summary(self):
+        return self.said
+
+
+def test_a_line_and_a_table():
+    thing = Thing("a < b", [("name", "value"), ("x & y", "1")])
+    assert repr(thing) == "<Thing: a < b>"
+    table = "<table><tr><th>name</th><th>value</th></tr><tr><td>x &amp; y</td><td>1</td></tr></table>"
+    assert thing._repr_html_() == f"<p><b>Thing</b>: a &lt; b</p>{table}"
+    assert "<table>" not in Thing("alone", [("head",)])._repr_html_()
+
+
+def test_long_tables_are_cut():
+    rows = [("name", "value"), *((f"r{i}", "") for i in range(MOST + 5))]
+    text = Thing("long", rows)._repr_html_()
+    assert text.count("<tr>") == MOST + 2
+    assert "<td>and 5 more</td><td></td>" in text
+
+
+def test_one_thing_and_several():
+    assert (counted(1, "joint"), counted(0, "joint"), counted(2, "joint")) == ("1 joint", "0 joints", "2 joints")
+
+
+def test_recordings_show_what_they_hold():
+    t = 0.01 * np.arange(101)
+    hidden = np.zeros((101, 2, 3))
+    hidden[5, 1] = np.nan
+    made = recording(joints(("a", "b"), t, np.zeros((101, 2)), effort=np.zeros((101, 2))), seen(("x", "y"), t, hidden))
+    assert repr(made) == "<Recording: 'made', 2 joints and 2 points, 1 s>"
+    assert repr(made.joints) == "<JointGroup: 2 joints, 101 samples at 100 Hz: position, effort>"
+    assert repr(made.points[0]) == "<PointGroup: points, 2 points, 101 samples at 100 Hz, in world>"
+    assert "<td>a, b</td><td>101 samples at 100 Hz</td><td>position, effort</td>" in made._repr_html_()
+    assert "<td>y</td><td>100</td>" in made.points[0]._repr_html_()
+    assert repr(recording()) == "<Recording: 'made', 0 joints and 0 points>"
+
+
+@pytest.fixture(scope="module")
+def shown(urdf_folder):
+    """Everything that a small estimation has, by class."""
+    step = pendulum_step(urdf_folder, prescribed=("shoulder",))
+    made = taken(step, 1)
+    options = ProblemOptions(path_cutoff=np.inf)
+    problem = EstimationProblem(step, [made], ["elbow.stiffness", "elbow.damping"], options, held_out=[taken(step, 2)])
+    solution = yid.solve(problem)
+    tube = flexible_object([Segment("tube", length=0.4, mass=0.1, radius=0.01, links=2)])
+    system = step.system
+    things = [made, step, system, system.mechanism, system.parameters, tube, problem, solution, solution.evaluation]
+    things += [*solution.residuals()[:1], yid.identifiability(problem, solution), yid.StepSymbols.of(step.equations)]
+    return {type(thing).__name__: thing for thing in things}
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("Recording", "1 joint and 2 points"),
+        ("System", "double_pendulum, 2 coordinates (1 prescribed, 1 passive), 0 constraints"),
+        ("Step", "0.01 s, symmetric, interpreted, of double_pendulum"),
+        ("Mechanism", "double_pendulum, 2 joints and"),
+        ("FlexibleObject", "tube, 6 joints"),
+        ("EstimationProblem", "2 of 6 parameters free"),
+        ("Solution", "by gauss_newton"),
+        ("Evaluation", "by 2 unknowns"),
+        ("Series", "of 'run_1'"),
+        ("Identifiability", "of 2 parameters found"),
+        ("StepSymbols", "4 equations of a step of double_pendulum"),
+    ],
+)
+def test_public_objects_are_short(shown, name, words):
+    text = repr(shown[name])
+    assert words in text
+    assert len(text) < 260
+    assert "array" not in text
+    assert "\n" not in text
+    html = shown[name]._repr_html_()
+    assert html.startswith(f"<p><b>{name}</b>: ")
+    assert len(re.findall("<tr>", html)) <= MOST + 2
+
+
+def test_all_public_classes_that_hold_arrays_show_themselves():
+    exempt = {"Status", "YidError", "Grasp", "Segment", "ProblemOptions", "SensorOptions"}
+    exempt |= {"GaussNewton", "Lifted", "MultipleShooting", "SingleShooting", "SteepestDescent"}
+    classes = {name for name in yid.__all__ if isinstance(getattr(yid, name), type)}
+    assert {name for name in classes - exempt if not issubclass(getattr(yid, name), Shown)} == set()

@@ -1,0 +1,168 @@
+"""What a problem's sensors would have recorded at given parameters: its rollout as a recording."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate
+from yid_ocp.errors import SolverError
+from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.options import SensorOptions
+from yid_ocp.problem.outcome import EpisodeResult
+from yid_ocp.problem.prediction import Predictor
+from yid_ocp.sensors.joints import EFFORT, POSITION, angle_std, by_joint, torque_bias_std, torque_std
+
+Array = NDArray[np.float64]
+
+
+def recorded(
+    predictor: Predictor,
+    episode: Episode,
+    outcome: EpisodeResult,
+    theta: Array,
+    seed: int | None = None,
+    description: str = "",
+) -> Recording:
+    """The rollout of an episode as a recording with its sensors' clocks and noise levels.
+
+    Parameters
+    ----------
+    predictor : Predictor
+    episode : Episode
+    outcome : EpisodeResult
+        Of this predictor.
+    theta : ndarray, shape (ntheta,)
+        At which it was predicted.
+    seed : int, optional
+        Of noise as the estimation takes it: by recorded or configured standard deviations, of driven joints also those
+        of torques that nobody states and of their constant offsets; none when absent.
+    """
+    rng = None if seed is None else np.random.default_rng(seed)
+    system, source = predictor.system, episode.recording
+    groups = []
+    for samples, predicted in zip(episode.samples, outcome.predicted, strict=True):
+        if samples.sensor.points:
+            t = episode.grid.start + predictor.step.time_step * (samples.node + samples.fraction)
+            shape = (len(t), len(samples.sensor.points), 3)
+            std = np.where(np.isfinite(samples.std), samples.std, np.nanmedian(samples.std)).reshape(shape)
+            position = np.where(samples.weight > 0, predicted, np.nan).reshape(shape)
+            original = next(group for group in source.points if group.name == samples.sensor.group)
+            groups.append(
+                PointGroup(
+                    original.name, samples.sensor.points, t, _noisy(position, std, rng), std,
+                    original.sensor, original.frame, original.pose,
+                )
+            )  # fmt: skip
+    groups = [_with_clamps(group, predictor, source) for group in groups]
+    own = predictor.own_theta(episode, theta)
+    truth = dict(zip(system.parameters.names, map(float, own), strict=True))
+    text = f"{description} Simulated with the inputs of {episode.name}.".strip()
+    joints = _joints(predictor, episode, outcome, rng)
+    made = Recording(joints, tuple(groups), text, "yid_ocp simulate", f"{episode.name}_simulated", truth=truth)
+    return validate(replace(made, straight=_straight(made, source)))
+
+
+def simulated(predictor: Predictor, episode: Episode, theta: Array, seed: int | None = None) -> Recording:
+    """What the sensors of an episode would have recorded at theta; see `EstimationProblem.simulate`."""
+    refit = predictor.options.initial_state == "fitted_to_points"
+    fresh = predictor.fitted(replace(episode, start=None), theta) if refit else episode
+    found = predictor.run(fresh, theta, np.zeros(len(predictor.unknowns.start)), False)
+    if isinstance(found, str):
+        raise SolverError(f"the model cannot be rolled out: {found}", where=episode.name, hint="take other values")
+    return recorded(predictor, fresh, found, theta, seed)
+
+
+def _with_clamps(group: PointGroup, predictor: Predictor, source: Recording) -> PointGroup:
+    """A group with the points that clamps follow, as they were recorded: what moves the object, not what it does."""
+    original = next(entry for entry in source.points if entry.name == group.name)
+    followed = dict.fromkeys(point for path in predictor.options.clamps for point in (path.origin, path.towards))
+    names = tuple(name for name in followed if name in original.names and name not in group.names)
+    if not names:
+        return group
+    at = [original.names.index(name) for name in names]
+    near = np.searchsorted(original.t, group.t - 1e-9).clip(0, len(original.t) - 1)
+    position = np.concatenate([group.position, original.position[near][:, at]], axis=1)
+    assert group.std is not None
+    std = np.concatenate([group.std, np.full((len(group.t), len(at), 3), np.median(group.std))], axis=1)
+    return replace(group, names=(*group.names, *names), position=position, std=std)
+
+
+def _straight(made: Recording, source: Recording) -> Array | None:
+    """Where the points of the first group were while the object was held straight, where the source says it."""
+    if source.straight is None or not made.points or made.points[0].name != source.points[0].name:
+        return None
+    return source.straight[[source.points[0].names.index(name) for name in made.points[0].names]]
+
+
+def _joints(
+    predictor: Predictor, episode: Episode, outcome: EpisodeResult, rng: np.random.Generator | None
+) -> JointGroup | None:
+    system, source = predictor.system, episode.recording.joints
+    if source is None or not (system.driven or system.prescribed):
+        return None
+    names = tuple(name for name in (*system.driven, *system.prescribed) if name in source.names)
+    at = [system.mechanism.joint_index(name) for name in names]
+    position = outcome.rollout.state[:, at]
+    held = {name: outcome.rollout.torque[:, i] for i, name in enumerate(system.driven)}
+    held |= {name: outcome.rollout.effort[:, i] for i, name in enumerate(system.prescribed)}
+    effort = np.stack([np.append(held[name], held[name][-1]) for name in names], axis=1)
+    levels = _levels(predictor, episode, names)
+    position, effort = (
+        _noisy(values, np.broadcast_to(0.0 if std is None else std, values.shape), rng)
+        for values, std in ((position, levels.angle), (effort, levels.torque))
+    )
+    # constant over the recording, for every joint one draw
+    bias = np.zeros(len(names)) if levels.bias is None else np.asarray(levels.bias)
+    return JointGroup(
+        names,
+        episode.grid.times,
+        position,
+        effort=effort + _noisy(np.zeros(len(names)), bias, rng),
+        position_std=levels.angle,
+        effort_std=levels.torque,
+        effort_bias_std=levels.bias,
+        # of prescribed joints it is the effort at the nodes
+        effort_kind="command" if system.driven else "sample",
+    )
+
+
+@dataclass(frozen=True)
+class _Levels:
+    """Standard deviations of what joints record, (nj,) each [rad], [N m]; None where nothing says so."""
+
+    angle: Array | None
+    torque: Array | None
+    bias: Array | None
+
+
+def _levels(predictor: Predictor, episode: Episode, names: tuple[str, ...]) -> _Levels:
+    """Noise as the estimation takes it: of driven joints that of what drives the motion, else what is stated."""
+    joints, driven = episode.recording.joints, predictor.system.driven
+    assert joints is not None
+    effort, position = (predictor.options.sensors.get(group, SensorOptions()) for group in (EFFORT, POSITION))
+    joint_angles = joints.position_std if position.std is None else position.std
+    torques = joints.effort_std if effort.std is None else effort.std
+    if episode.errors is None:
+        angle, torque = (
+            None if given is None else by_joint(given, joints.names, names, f"sensors.{group}.std")
+            for group, given in ((POSITION, joint_angles), (EFFORT, torques))
+        )
+        return _Levels(angle, torque, None)
+    at, rest = [names.index(name) for name in driven], [i for i, name in enumerate(names) if name not in driven]
+    other = tuple(names[i] for i in rest)
+    angle, torque, bias = np.zeros((3, len(names)))
+    angle[at] = angle_std(joints, driven, position, episode.name)
+    torque[at] = torque_std(joints, driven, effort, episode.name)
+    bias[at] = torque_bias_std(joints, driven, effort)
+    if other:
+        stated = ((angle, joint_angles, POSITION), (torque, torques, EFFORT))
+        for target, std, group in stated:
+            target[rest] = by_joint(0.0 if std is None else std, joints.names, other, f"sensors.{group}.std")
+    return _Levels(angle, torque, bias)
+
+
+def _noisy(values: Array, std: Array, rng: np.random.Generator | None) -> Array:
+    return values if rng is None else values + np.where(np.isfinite(std), std, 0.0) * rng.standard_normal(values.shape)

@@ -1,0 +1,68 @@
+"""The command `completion`, and the answers to a shell that completes: commands, options, files, keys of `--set`."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from yid_ocp.errors import ConfigError, YidError
+
+FORMATS = ("mjcf", "urdf", "sdf", "yaml", "csv")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """The command."""
+    try:
+        library = importlib.import_module("argcomplete")
+    except ImportError as error:
+        what = "completion needs a package that is not installed"
+        raise ConfigError(what, where="argcomplete", hint="pip install 'yid-ocp[completion]'") from error
+    print(library.shellcode(["yid-ocp"], shell=arguments.shell).strip())
+    return 0
+
+
+def answer(parser: argparse.ArgumentParser) -> None:
+    """Tell the shell that asks what may stand next, and end; without the package nothing is told.
+
+    Parameters
+    ----------
+    parser : ArgumentParser
+        Of all commands.
+    """
+    try:
+        library = importlib.import_module("argcomplete")
+    except ImportError:
+        return
+    configurations = library.FilesCompleter(("yaml", "yml"))
+    completers: Mapping[str, Callable[..., Any]] = {
+        "config": configurations,
+        "configs": configurations,
+        "runs": library.DirectoriesCompleter(),
+        "baseline": library.DirectoriesCompleter(),
+        "source": library.FilesCompleter(("h5", "hdf5")),
+        "format": library.ChoicesCompleter(FORMATS),
+        "overrides": _settings,
+    }
+    for command in _commands(parser):
+        for action in command._actions:
+            if action.dest in completers and action.nargs != 0:
+                action.completer = completers[action.dest]  # type: ignore[attr-defined]
+    library.autocomplete(parser, always_complete_options="long")
+
+
+def _commands(parser: argparse.ArgumentParser) -> list[argparse.ArgumentParser]:
+    group = next(action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
+    return list(group.choices.values())
+
+
+def _settings(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> list[str]:
+    """Keys of `--set` that begin so, with names that the given configuration has."""
+    from yid_ocp.config.reader import settable  # it takes a second, which no other completion needs
+
+    given = getattr(parsed_args, "config", None) or next(iter(getattr(parsed_args, "configs", None) or ()), None)
+    try:
+        return settable(prefix, given)
+    except YidError:
+        return settable(prefix)
