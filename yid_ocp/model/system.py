@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -13,10 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from yid_ocp.errors import ModelError, nearest
+from yid_ocp.model.drives import PositionServos, Servo, Spring, joint_dampers, joint_servos, joint_spring, weightless
 from yid_ocp.model.flexible import AXES, ElasticJoint, FlexibleObject, SegmentLayout
 from yid_ocp.model.kinematics import Kinematics
 from yid_ocp.model.mechanism import Frame, Joint, Mechanism, Placement
-from yid_ocp.model.parameters import Parameter, Parameters
+from yid_ocp.model.parameters import Parameters
 
 GraspKind = Literal["point", "axis", "weld"]
 EQUATIONS: dict[str, tuple[str, ...]] = {
@@ -108,14 +108,6 @@ class Grasp:
 
 
 @dataclass(frozen=True)
-class Spring:
-    """A spring 1/2 stiffness (q - rest)^2 on one joint of a robot, in N m/rad and rad (N/m and m where it slides)."""
-
-    stiffness: float
-    rest: float = 0.0
-
-
-@dataclass(frozen=True)
 class MidpointState:
     """What a term may depend on: the midpoint of one step.
 
@@ -129,7 +121,7 @@ class MidpointState:
     z, z_rate : casadi.SX, shape (nz, 1)
         The same of all internal coordinates.
     u : casadi.SX, shape (nu, 1)
-        Motor torques held over the step [N m].
+        Motor torques held over the step [N m], or what servos are commanded [rad or m].
     constraint_force : casadi.SX, shape (m, 1)
         lam_k / h [N or N m].
     internal : mapping of str to int
@@ -313,7 +305,9 @@ class System:
         Viscous coefficients of joints that are not elastic [N m s/rad].
     grasps : tuple of Grasp
     driven : tuple of str
-        Joints with a motor torque, in the order of u.
+        Joints with an input, in the order of u: a motor torque, or what a servo is commanded.
+    servos : mapping of joint name to Servo
+        Of all driven joints, or of none.
     prescribed : tuple of str
         Joints whose coordinate is known, in the order of s.
     gravity : casadi.SX, shape (3, 1)
@@ -338,6 +332,7 @@ class System:
     damping: Mapping[str, ca.SX] = field(default_factory=dict)
     grasps: tuple[Grasp, ...] = ()
     driven: tuple[str, ...] = ()
+    servos: Mapping[str, Servo] = field(default_factory=dict)
     prescribed: tuple[str, ...] = ()
     gravity: ca.SX = field(default_factory=lambda: ca.SX(ca.DM([0.0, 0.0, -9.81])))
     time_scale: ca.SX = field(default_factory=lambda: ca.SX(1))
@@ -360,6 +355,7 @@ class System:
         points: Sequence[str] | None = None,
         effects: Sequence[Effect] = (),
         springs: Mapping[str, Spring] | None = None,
+        servos: PositionServos | None = None,
     ) -> System:
         """Put robot, objects, grasps and effects together.
 
@@ -381,6 +377,9 @@ class System:
         effects : sequence of Effect
         springs : mapping of str to Spring, optional
             By joint of the robot; become the parameters `JOINT.stiffness` and `JOINT.rest`.
+        servos : PositionServos, optional
+            What the inputs of driven joints command; adds the parameters `JOINT.servo_gain`, `servo_damping`,
+            `servo_delay` and `servo_torque_limit`.
 
         Returns
         -------
@@ -396,13 +395,16 @@ class System:
             raise ModelError(f"gravity = {acceleration}", allowed="three numbers [m/s^2]")
         tree = mechanism if mechanism is not None else Mechanism("system", (), {})
         wanted = dict(damping) if isinstance(damping, Mapping) else dict.fromkeys(tree.joint_names, float(damping))
-        dampers = _damping_parameters(tree, wanted)
+        dampers = joint_dampers(tree, wanted)
         entries = list(dampers.values())
         elastic: list[ElasticJoint] = []
         for joint, spring in (springs or {}).items():
-            stiffness, rest = _spring_parameters(tree, joint, spring)
+            stiffness, rest = joint_spring(tree, joint, spring)
             entries += [stiffness, rest]
             elastic.append(ElasticJoint(joint, joint, "bend", "", stiffness.symbol, ca.SX(0), rest.symbol))
+        moved, own = ({}, []) if servos is None else joint_servos(tree, driven, servos.commands)
+        entries += own
+        tree = weightless(tree) if servos is not None and servos.gravity_compensation else tree
         segments: list[SegmentLayout] = []
         for item, frame, placement in objects:
             tree = tree.joined(item.mechanism, frame, placement)
@@ -417,6 +419,7 @@ class System:
             {joint: parameter.symbol for joint, parameter in dampers.items()},
             tuple(grasps),
             tuple(driven),
+            moved,
             tuple(prescribed),
             ca.SX(ca.DM(acceleration)),
             segments=tuple(segments),
@@ -485,6 +488,7 @@ class System:
             mechanism=self.mechanism.mapped(change),
             elastic=elastic,
             damping={joint: change(value) for joint, value in self.damping.items()},
+            servos={joint: servo.mapped(change) for joint, servo in self.servos.items()},
             grasps=tuple(grasp.mapped(change) for grasp in self.grasps),
             gravity=change(self.gravity),
             time_scale=change(self.time_scale),
@@ -511,11 +515,12 @@ class System:
             force[index] = force[index] - coefficient * v[index]
         return ca.vertcat(*force)
 
-    def input_force(self, u: ca.SX) -> ca.SX:
-        """B u, the motor torques placed on their coordinates, shape (n, 1) [N m]."""
+    def input_force(self, u: ca.SX, q: ca.SX, v: ca.SX) -> ca.SX:
+        """Torques of motors and servos placed on their coordinates, shape (n, 1) [N m]."""
         force = [ca.SX(0)] * self.size
-        for row, index in enumerate(self.driven_indices):
-            force[index] = u[row]
+        for row, (joint, index) in enumerate(zip(self.driven, self.driven_indices, strict=True)):
+            servo = self.servos.get(joint)
+            force[index] = u[row] if servo is None else servo.torque(u[row], q[index], v[index])
         return ca.vertcat(*force)
 
     def constraints(self, kinematics: Kinematics) -> ca.SX:
@@ -535,25 +540,6 @@ class System:
         """Diagonal of C in phi(q_{k+1}) = C lam_k / h, shape (m, 1)."""
         rows = [grasp.compliance for grasp in self.grasps for _ in range(grasp.equations)]
         return ca.vertcat(*rows) if rows else ca.SX(0, 1)
-
-
-def _damping_parameters(tree: Mechanism, wanted: Mapping[str, float]) -> dict[str, Parameter]:
-    found = {}
-    for joint, value in wanted.items():
-        tree.joint_index(joint)
-        text = f"viscous damping of {joint}"
-        found[joint] = Parameter(f"{joint}.damping", value, "N m s/rad", 0.0, math.inf, text)
-    return found
-
-
-def _spring_parameters(tree: Mechanism, joint: str, spring: Spring) -> tuple[Parameter, Parameter]:
-    """Stiffness and rest of a spring on a joint of the robot."""
-    unit = tree.joints[tree.joint_index(joint)].unit
-    per = "N m/rad" if unit == "rad" else "N/m"
-    return (
-        Parameter(f"{joint}.stiffness", spring.stiffness, per, 0.0, math.inf, f"spring on {joint}"),
-        Parameter(f"{joint}.rest", spring.rest, unit, description=f"where the spring on {joint} is relaxed"),
-    )
 
 
 def _check_names(

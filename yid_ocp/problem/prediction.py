@@ -15,7 +15,7 @@ from yid_ocp.model.system import System
 from yid_ocp.problem.corrections import Inputs
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.functions import ModelFunctions
-from yid_ocp.problem.inputs import held_torque, held_torque_slope
+from yid_ocp.problem.inputs import held_inputs, held_inputs_slope
 from yid_ocp.problem.lag import Lag
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.noise import Course, Innovations, innovations
@@ -197,7 +197,7 @@ class Predictor:
             Parameters by which to differentiate.
         """
         inputs = self._corrected(episode, theta, wanted)
-        if not self.system.driven or self.options.feedback != "lqr":
+        if not self.system.driven or self.system.servos or self.options.feedback != "lqr":
             return inputs
         shift = self.functions.momentum_shift
         if not shift.active(theta, wanted):
@@ -218,12 +218,12 @@ class Predictor:
             where = (joints, self.system.driven, episode.grid, episode.name)
             delay, by_delay = corrections.torque_delay(theta, wanted)
             if corrections.delays_torque:
-                torque = held_torque(*where, delay)
+                torque = held_inputs(*where, delay, self.system.servos)
             readings = np.pad(np.vstack([torque, first]), ((0, 0), (0, nc)))
             _, true, _, by_theta, by_reading = corrections.true(np.zeros_like(readings), readings, theta, wanted)
             by_theta = by_theta[:, :nu].copy()
             if corrections.delays_torque and wanted:
-                slope = by_reading[:-1, :nu] * held_torque_slope(*where, delay)
+                slope = by_reading[:-1, :nu] * held_inputs_slope(*where, delay, self.system.servos)
                 by_theta[:-1] += slope[:, :, None] * by_delay
             torque, first, by_torque, by_first = true[:-1, :nu], true[-1, :nu], by_theta[:-1], by_theta[-1]
         lag = corrections.torque_lag(theta, wanted)
