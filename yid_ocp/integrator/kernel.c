@@ -610,9 +610,10 @@ static void sensitivity_step(Work *k, const Point *a, const Directions *dir, con
     for (int r = 0; r < N; r++)
         for (int c = 0; c < loads; c++) p1[(size_t)r * d + loaded + c] += columns->load_p1[(size_t)r * loads + c];
     if (input)
-        for (int r = 0; r < N; r++)
+        /* internal coordinates may follow an input too, as play behind a servo does */
+        for (int r = 0; r < N + NZ; r++)
             for (int j = 0; j < NU; j++) {
-                const double f = k->Ru[r][j], g = k->Pu[r][j];
+                const double f = k->Ru[r][j], g = r < N ? k->Pu[r][j] : 0.0;
                 for (int c = 0; f != 0.0 && c < d; c++) rows[(size_t)r * d + c] += f * input[(size_t)j * d + c];
                 for (int c = 0; g != 0.0 && c < d; c++) p1[(size_t)r * d + c] += g * input[(size_t)j * d + c];
             }

@@ -35,7 +35,7 @@ IGNORED = frozenset({"reading", "torque_gain", "torque_offset", "torque_delay", 
 """Those between sensors, or recorded torques, and the mechanics."""
 
 _JOINTS_PER_BODY = 6  # as many as MuJoCo allows
-_ROTOR = 1e-4  # [kg m^2] of a motor behind play, as little as the simulator takes
+_ROTOR = 5e-4  # [kg m^2] of a motor behind play, as little as lets it rest at a stop
 _AXIS_LEVER = 0.1  # [m] between the two points that keep two axes parallel
 
 
@@ -208,9 +208,9 @@ def _joint_attributes(joint: Joint, terms: JointTerms) -> dict[str, str]:
 
 
 def _play_attributes(width: float, time_step: float) -> dict[str, str]:
-    """A joint with stops at half the width either way, as firm as a grasp."""
+    """A joint with stops at half the width either way."""
     ends = {"limited": "true", "range": _text([-width / 2, width / 2])}
-    return {**ends, "solreflimit": _text([2 * time_step, 1.0]), "solimplimit": "0.99 0.999 0.0001 0.5 2"}
+    return {**ends, "solreflimit": _text([5 * time_step, 1.0]), "solimplimit": "0.99 0.999 0.0001 0.5 2"}
 
 
 def _add_grasps(system: System, value: Evaluator, root: ElementTree.Element, time_step: float) -> None:

@@ -66,6 +66,7 @@ def configuration(
         *_others(proposal),
         _line("    ", "mode", proposal.mode, proposal.mode_why),
         *_mode_words(proposal),
+        *_servos(proposal),
         *_object(item, proposal),
         *_grasps(proposal),
         *_damping(item),
@@ -137,6 +138,16 @@ def _mode_words(proposal: Proposal) -> list[str]:
         else "prescribed moves it as its encoders say"
     )
     return [f"{' ' * COLUMN}# {other}"]
+
+
+def _servos(proposal: Proposal) -> list[str]:
+    if proposal.mode != "servo":
+        return []
+    return [
+        "    servo:                                  # their gains, dampings, delays and limits are parameters, below",
+        _line("      ", "commands", "held", "until the next one; interpolated where the controller goes in between"),
+        _line("      ", "gravity_compensation", "false", "true where the controller carries the arm's own weight"),
+    ]
 
 
 def _object(item: Object, proposal: Proposal) -> list[str]:
@@ -317,6 +328,12 @@ def _parameters(item: Object, proposal: Proposal) -> list[str]:
         lines.append(_line("  ", f"{branch.name}.bend", said, "bending rigidity [N m^2], where the search starts"))
         said = f"{{free: true, initial: {_number(DAMPING_TIME * bend)}}}"
         lines.append(_line("  ", f"{branch.name}.damping", said, "[N m^2 s]"))
+    if proposal.mode == "servo":
+        said = "{free: true}"
+        lines.append(_line("  ", '"*.servo_gain"', said, "begins at a twentieth of a radian for the effort limit"))
+        lines.append(_line("  ", '"*.servo_damping"', said, "begins at a tenth of a second times the gain"))
+        lines.append(_line("  ", '"*.servo_delay"', said, "from a command to its torque [s]"))
+        lines.append('  # "*.servo_torque_limit": {initial: 3.0}   # the URDF\'s effort limit where nothing is said')
     if _by_effort(proposal):
         for joint in proposal.joints:
             still = joint in proposal.still
