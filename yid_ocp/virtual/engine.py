@@ -214,7 +214,7 @@ def simulate_in_mujoco(
         controller: Controller | Commander
         if system.servos:
             controller = Commander(scene, motion)
-            _settle_servos(scene, nominal_damping)
+            settle_servos(scene, nominal_damping, controller.first)
         else:
             controller = Controller(scene, motion, settle(scene, nominal_damping))
         if injected is not None:
@@ -350,35 +350,35 @@ class Commander:
 
     def __init__(self, scene: Scene, motion: Movement) -> None:
         self._scene, self._motion = scene, motion
-        self._first = scene.data.qpos[scene.driven].copy()
-        scene.data.ctrl[:] = self._first
+        self.first = scene.data.qpos[scene.driven].copy()
 
     def act(self, t: float) -> Array:
         """Give the commands of time t [s] and return them, shape (nu,) [rad or m]."""
-        commands = np.asarray(self._first + self._motion.at(t)[0])
+        commands = np.asarray(self.first + self._motion.at(t)[0])
         self._scene.data.ctrl[:] = commands
         return commands
 
 
 def command_always(scene: Scene, commands: Array) -> None:
-    """Let servos have been commanded the same for long, those whose commands act late as well."""
+    """Let actuators have been commanded the same for long, those that act late as well."""
     model, data = scene.model, scene.data
     data.ctrl[:] = commands
-    if hasattr(scene.mujoco, "mj_initCtrlHistory"):
+    if hasattr(scene.mujoco, "mj_initCtrlHistory") and hasattr(model, "actuator_delay"):
         for i in map(int, np.flatnonzero(np.asarray(model.actuator_delay))):
             before = np.full((int(model.actuator_history[i, 0]), 1), commands[i])
             scene.mujoco.mj_initCtrlHistory(model, data, i, None, before)
 
 
-def _settle_servos(scene: Scene, damping: Array) -> None:
-    """Bring the scene to rest under what its servos are commanded now; joints damp as `damping` says, only more."""
+def settle_servos(scene: Scene, damping: Array, commands: Array) -> None:
+    """Bring the scene to rest under what its servos are commanded; joints damp as `damping` says, only more."""
     model, data = scene.model, scene.data
-    commands = data.ctrl.copy()
+    data.ctrl[:] = commands
     held = copy.copy(model)
     held.dof_damping[:] = damping
     others = np.setdiff1d(np.arange(model.nv), scene.driven)
     held.dof_damping[others] *= _SETTLING_FACTOR
-    held.actuator_delay[:] = 0.0
+    if hasattr(held, "actuator_delay"):
+        held.actuator_delay[:] = 0.0
     block = max(1, round(0.1 / model.opt.timestep))
     for _ in range(math.ceil(_SETTLING_LIMIT / (block * model.opt.timestep))):
         scene.mujoco.mj_step(held, data, nstep=block)

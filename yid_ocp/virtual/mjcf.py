@@ -150,7 +150,7 @@ def _bodies(
         if joint.name in gears:
             motor, name = elements[j], joint.name
             motor.set("name", f"{name}_motor")
-            moved.set("armature", _text([_ROTOR]))
+            moved.attrib.setdefault("armature", _text([_ROTOR]))
             ElementTree.SubElement(motor, "inertial", pos="0 0 0", mass="1e-6", diaginertia="1e-9 1e-9 1e-9")
             elements[j] = ElementTree.SubElement(motor, "body", {"name": f"{name}_body"})
             kind = {"name": f"{name}_play", "type": attributes["type"], "axis": attributes["axis"]}

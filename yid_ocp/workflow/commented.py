@@ -71,7 +71,7 @@ def configuration(
         *_grasps(proposal),
         *_damping(item),
         *_points(item, proposal),
-        *_offsets(proposal),
+        *_effects(proposal),
         "",
         *_recordings(recordings),
         *_imports(imports),
@@ -230,11 +230,16 @@ def _by_effort(proposal: Proposal) -> bool:
     return proposal.mode == "prescribed" and not proposal.places
 
 
-def _offsets(proposal: Proposal) -> list[str]:
-    if not _by_effort(proposal):
+def _effects(proposal: Proposal) -> list[str]:
+    """What the arm has beside the numbers of its URDF, whatever moves it."""
+    if proposal.mode == "servo":
+        kind, words = "rotor_inertia", "what rotors add through their gears, free below"
+    elif _by_effort(proposal):
+        kind, words = "effort_offset", "the zero of every torque sensor, free below"
+    else:
         return []
-    lines = ["  effects:                                  # the zero of every torque sensor, free below"]
-    return [*lines, *(f"    - {{kind: effort_offset, location: {_text(joint)}}}" for joint in proposal.joints)]
+    lines = [f"  effects:                                  # {words}"]
+    return [*lines, *(f"    - {{kind: {kind}, location: {_text(joint)}}}" for joint in proposal.joints)]
 
 
 # -- data -------------------------------------------------------------------------------------------------------------
@@ -333,6 +338,7 @@ def _parameters(item: Object, proposal: Proposal) -> list[str]:
         lines.append(_line("  ", '"*.servo_gain"', said, "begins at a twentieth of a radian for the effort limit"))
         lines.append(_line("  ", '"*.servo_damping"', said, "begins at a tenth of a second times the gain"))
         lines.append(_line("  ", '"*.servo_delay"', said, "from a command to its torque [s]"))
+        lines.append(_line("  ", '"rotor_inertia@*.armature"', said, "of the servos' motors, at the joint [kg m^2]"))
         lines.append('  # "*.servo_torque_limit": {initial: 3.0}   # the URDF\'s effort limit where nothing is said')
     if _by_effort(proposal):
         for joint in proposal.joints:

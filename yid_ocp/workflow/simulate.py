@@ -244,7 +244,11 @@ def _joints(
 
 
 def _commanded(
-    problem: EstimationProblem, episode: Episode, position: Array, names: tuple[str, ...], rng: np.random.Generator | None
+    problem: EstimationProblem,
+    episode: Episode,
+    position: Array,
+    names: tuple[str, ...],
+    rng: np.random.Generator | None,
 ) -> JointGroup:
     """Joints of servos at every node, with what they were commanded there."""
     source, times = episode.recording.joints, episode.grid.times
