@@ -12,7 +12,7 @@ from small_problems import PENDULUM, H, joints, pendulum_step, recording
 from yid_ocp.data.recording import Recording
 from yid_ocp.effects import SENSORS, candidates, make_effect
 from yid_ocp.errors import DataError
-from yid_ocp.integrator.rollout import simulate
+from yid_ocp.integrator.rollout import applied_torque, simulate
 from yid_ocp.integrator.statics import Statics
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model.drives import KNEE, PositionServos
@@ -102,6 +102,16 @@ def test_it_rests_where_its_servos_balance_the_weight(step) -> None:
     held = Statics(step).solve(command, theta)
     np.testing.assert_allclose(held.state[:2], command, atol=1e-3)
     assert np.all((held.torque - command) * sag > 0)
+
+
+def test_the_torque_along_a_rollout_is_what_moves_it(step) -> None:
+    made = problem_of(step, commanded(), ["shoulder.damping"])
+    [result] = made.evaluate(made.start, False).episodes
+    torque = applied_torque(step, made.theta, result.rollout)
+    q = result.rollout.state[:, :2]
+    rate, middle = np.diff(q, axis=0) / H, (q[1:] + q[:-1]) / 2
+    demand = np.array([60.0, 25.0]) * (result.rollout.torque - middle) - np.array([4.0, 1.5]) * rate
+    np.testing.assert_allclose(torque, demand / (1 + (np.abs(demand) / [9.0, 3.0]) ** KNEE) ** (1 / KNEE), rtol=1e-9)
 
 
 def test_a_controller_that_carries_the_arm_leaves_no_sag(urdf_folder) -> None:
