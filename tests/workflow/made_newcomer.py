@@ -80,7 +80,8 @@ parameters:
 """
 SERVO_POSTURE = {"pan": 0.0, "lift": 0.4, "elbow": 1.0, "wrist_flex": 0.3, "wrist_roll": 0.0}
 SERVO_POINTS = {"w_rod": "tip", "rod:50%": "middle"}
-SERVO_TRUTH = {"rod.bend": 0.03, "rod.damping": 4e-4} | {
+SERVO_TRUTH = {"cable.bend": 0.03, "cable.damping": 4e-4}
+SERVOS = {
     f"{joint}.servo_{name}": value
     for joint in ("lift", "elbow", "wrist_flex")
     for name, value in {"gain": 45.0, "damping": 2.0, "delay": 0.03}.items()

@@ -83,6 +83,8 @@ class Backlash(EffectBase):
         row, index = state.internal[name], state.system.mechanism.joint_index(self.location)
         # its value after the step: a mean over the step would have it ring
         play = state.z[row] + state.h / 2 * state.z_rate[row]
+        if self.location not in state.system.servos:  # the joint is held for a while, and nothing takes the play up
+            return Terms(internal={name: play})
         servo, command = state.system.servos[self.location], state.u[state.system.driven.index(self.location)]
         free, geared = (servo.torque(command, state.q[index] + give, state.v[index]) for give in (0, play))
         taken = play - self["width"] / 2 * ca.tanh(geared / PLAY_TORQUE)
