@@ -39,6 +39,8 @@ from yid_ocp.workflow.solve import run_solve
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "servo_arm.yaml"
 JOINTS = ("pan", "lift", "elbow", "wrist_flex", "wrist_roll")
 POSTURE = {"pan": 0.0, "lift": 0.4, "elbow": 1.0, "wrist_flex": 0.3, "wrist_roll": 0.0}
+# play shows where the torque changes its sign: with the forearm about upright
+UPRIGHT = {**POSTURE, "lift": 0.2, "elbow": -0.1, "wrist_flex": 0.0}
 OBJECT = {"rod.bend": 0.03, "rod.damping": 4e-4}
 SERVO = {"servo_gain": 45.0, "servo_damping": 2.0, "servo_delay": 0.03}
 TRUTH = OBJECT | {f"{joint}.{name}": value for joint in JOINTS for name, value in SERVO.items()}
@@ -46,7 +48,7 @@ CASES: Mapping[str, tuple[InjectedEffect, ...]] = {
     "clean": (),
     "servo_gain": (InjectedEffect("servo_gain", "lift", {"scale": 0.8}),),
     "servo_delay": (InjectedEffect("servo_delay", "elbow", {"delay": 0.02}),),
-    "servo_saturation": (InjectedEffect("servo_saturation", "lift", {"limit": 1.2}),),
+    "servo_saturation": (InjectedEffect("servo_saturation", "lift", {"limit": 1.25}),),
     "backlash": (InjectedEffect("backlash", "elbow", {"width": 0.02}),),
 }
 DURATION, RATE = 3.0, 50.0  # [s], [Hz]
@@ -78,10 +80,11 @@ class Found:
 
 def recorded(system: System, seed: int, effects: Sequence[InjectedEffect] = ()) -> Recording:
     """One motion of the arm in MuJoCo: commands, noisy angles, markers."""
+    posture = UPRIGHT if any(effect.kind == "backlash" for effect in effects) else POSTURE
     excitation = Excitation(speed=2.5, duration=DURATION, band=(0.3, 2.0))
     experiment = VirtualExperiment(
-        motion=multisine(system, TRUTH, seed=seed, posture=POSTURE, excitation=excitation),
-        posture=POSTURE,
+        motion=multisine(system, TRUTH, seed=seed, posture=posture, excitation=excitation),
+        posture=posture,
         simulation=Simulation(DURATION, rate=RATE, time_step=INNER_STEP),
         noise=ArmNoise(position=ANGLE_STD),
         camera=PointCamera(std=POINT_STD, rate=RATE, gaps=False, missing=0.0, pose=np.eye(4)),

@@ -11,7 +11,7 @@ from yid_ocp.errors import ModelError
 from yid_ocp.export.manifest import said_of_effects, said_of_parameters
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
-from yid_ocp.model.drives import PositionServos
+from yid_ocp.model.drives import KNEE, PositionServos
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.virtual.engine import Simulation
@@ -125,7 +125,7 @@ def test_export_says_that_a_servo_is_native_in_mjcf_alone(arm: System) -> None:
     pan, lift = model.actuator("pan"), model.actuator("lift")
     assert (pan.gainprm[0], pan.biasprm[1], pan.biasprm[2]) == pytest.approx((32.0, -32.0, -1.6))
     assert model.actuator_delay[pan.id] == pytest.approx(0.045)
-    limit = (3.0**-8 + 0.9**-8) ** (-1 / 8)
+    limit = (3.0**-KNEE + 0.9**-KNEE) ** (-1 / KNEE)
     assert lift.forcerange == pytest.approx([-limit, limit])
 
 

@@ -124,7 +124,7 @@ def test_a_rod_on_an_arm_of_servos(desk: Path) -> None:
     check_truth(solved, SERVO_TRUTH)
     for name, value in SERVOS.items():
         found = solved["parameters"][name]
-        assert abs(found["value"] - value) < max(2 * found["std"], 0.01 * value), (name, found)
+        assert abs(found["value"] - value) < max(2 * found["std"], 0.02 * value), (name, found)
     told = carried_out("diagnosed", "diagnose", "rod.yaml")
     assert told["verdict"] == "no_gap"
     assert main(["export", "solved", "--out", "rod.xml"]) == 0

@@ -14,7 +14,7 @@ from yid_ocp.model.system import System
 POSITION = frozenset({"joints.position"})
 UNKNOWN_LIMIT = 100.0
 """What stands for the effort limit of a joint that has none [N m or N]."""
-WEAKEST = 0.05
+WEAKEST = 0.1
 """Part of a joint's effort limit below which none is looked for."""
 
 
@@ -67,13 +67,13 @@ class ServoDelay(EffectBase):
 
 @EFFECTS.register("servo_saturation")
 class ServoSaturation(EffectBase):
-    """A servo whose torque is limited further: demand / (1 + |demand/limit|^8)^(1/8).
+    """A servo whose torque is limited further: demand / (1 + |demand/limit|^16)^(1/16).
 
-    Kept inside as limit^-8, which adds to the model's own limit, is neutral at zero and has a slope there: of the
-    largest torques first. The corner is within 1 % of a clip from 1.4 times the limit on.
+    Kept inside as limit^-16, which adds to the model's own limit, is neutral at zero and has a slope there: of the
+    largest torques first. From a tenth beside the limit on it is within 1.2 % of a clip.
     """
 
-    equation = "torque = demand / (1 + (demand/limit)^8)^(1/8)"
+    equation = "torque = demand / (1 + (demand/limit)^16)^(1/16)"
     depends_on = "how hard it accelerates"
     needs: ClassVar[frozenset[str]] = POSITION
 
@@ -88,11 +88,11 @@ class ServoSaturation(EffectBase):
         joint = system.mechanism.joints[system.mechanism.joint_index(location)]
         known = joint.effort_limit if 0 < joint.effort_limit < NO_LIMIT else UNKNOWN_LIMIT
         torque = "N m" if joint.unit == "rad" else "N"
-        highest, text = (WEAKEST * known) ** -KNEE, "largest torque of the servo, to the power -8"
+        highest, text = (WEAKEST * known) ** -KNEE, "largest torque of the servo, to the power -16"
         reported = f"limit {torque}"
         return (
             Quantity(
-                "tightness", f"({torque})^-8", 0.0, 0.0, highest, (0.0, highest), text, reciprocal=reported, power=KNEE
+                "tightness", f"({torque})^-16", 0.0, 0.0, highest, (0.0, highest), text, reciprocal=reported, power=KNEE
             ),
         )
 

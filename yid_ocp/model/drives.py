@@ -13,7 +13,7 @@ from yid_ocp.model.mechanism import Joint, Mechanism
 from yid_ocp.model.parameters import Parameter
 
 Commands = Literal["held", "interpolated"]
-KNEE = 8
+KNEE = 16
 """Power p of a servo's torque limit, demand / (1 + |demand/limit|^p)^(1/p): a clip whose corner is rounded off."""
 NO_LIMIT = 2e4
 """Effort limits from here on are a file's way to say that there is none [N m or N]."""
