@@ -12,7 +12,7 @@ from yid_ocp.model.drives import KNEE, NO_LIMIT, Servo
 from yid_ocp.model.system import System
 
 POSITION = frozenset({"joints.position"})
-UNKNOWN_LIMIT = 100.0
+UNKNOWN_LIMIT = 10.0
 """What stands for the effort limit of a joint that has none [N m or N]."""
 WEAKEST = 0.1
 """Part of a joint's effort limit below which none is looked for."""
