@@ -124,12 +124,12 @@ class VirtualExperiment:
         None for no camera.
     injected : EngineTerms, optional
         What is at work beside the system's description.
-    play : mapping of joint to float
-        Width of the play of gears behind servos [rad].
     seed : int
         Of all noise; each sensor has its own stream, so that leaving one out changes no other.
     name, description : str
         Of the recording; how it was made is appended to the description.
+    play : mapping of joint to float
+        Width of the play of gears behind servos [rad].
     """
 
     motion: Motion | None = None
@@ -138,10 +138,10 @@ class VirtualExperiment:
     noise: ArmNoise = field(default_factory=ArmNoise)
     camera: PointCamera | None = field(default_factory=PointCamera)
     injected: EngineTerms | None = None
-    play: Mapping[str, float] = field(default_factory=dict)
     seed: int = 0
     name: str = "virtual"
     description: str = ""
+    play: Mapping[str, float] = field(default_factory=dict)
 
 
 def virtual_experiment(
