@@ -10,8 +10,8 @@ from yid_ocp.effects import make_effect
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
+from yid_ocp.model.drives import Spring
 from yid_ocp.model.kinematics import forward_kinematics
-from yid_ocp.model.system import Spring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.sensors.joints import EffortSensor

@@ -19,9 +19,9 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.errors import WorkerError
 from yid_ocp.parallel import Task, Workers, run_tasks
 from yid_ocp.parallel.cluster import cluster as connected
+from yid_ocp.progress import Silent
 from yid_ocp.version import fingerprint
 from yid_ocp.workflow.blind import run_blind
-from yid_ocp.progress import Silent
 
 distributed = pytest.importorskip("distributed", reason="clusters need Dask: pip install 'yid-ocp[cluster]'")
 

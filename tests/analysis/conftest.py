@@ -12,7 +12,7 @@ from yid_ocp.data import Recording
 from yid_ocp.data.recording import JointGroup, PointGroup
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Grasp, Segment, System, flexible_object
-from yid_ocp.model.system import Spring
+from yid_ocp.model.drives import Spring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.workflow.build import load_problem

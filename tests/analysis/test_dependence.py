@@ -15,8 +15,8 @@ from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.integrator.statics import Statics
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Segment, System, flexible_object
+from yid_ocp.model.drives import Spring
 from yid_ocp.model.rotations import roll_pitch_yaw, transform
-from yid_ocp.model.system import Spring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 

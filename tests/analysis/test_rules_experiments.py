@@ -27,8 +27,8 @@ from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import DataError, SolverError
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Grasp, System
+from yid_ocp.model.drives import Spring
 from yid_ocp.model.kinematics import forward_kinematics
-from yid_ocp.model.system import Spring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.model.y_object import y_object
 from yid_ocp.problem import EstimationProblem, ProblemOptions

@@ -23,7 +23,7 @@ from yid_ocp.analysis.inspection import (
 )
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Grasp, Segment, System, flexible_object
-from yid_ocp.model.system import Spring
+from yid_ocp.model.drives import Spring
 from yid_ocp.model.urdf import read_urdf
 
 

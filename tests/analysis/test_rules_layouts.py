@@ -22,7 +22,7 @@ from yid_ocp.analysis.layouts import (
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Segment, System, flexible_object
-from yid_ocp.model.system import Spring
+from yid_ocp.model.drives import Spring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import SensorOptions
 from yid_ocp.problem.grid import Grid

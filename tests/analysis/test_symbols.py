@@ -12,7 +12,7 @@ from yid_ocp.analysis.symbols import StepSymbols, latex_text
 from yid_ocp.errors import ConfigError
 from yid_ocp.integrator.discrete import discrete_equations
 from yid_ocp.model import Grasp
-from yid_ocp.model.system import Spring
+from yid_ocp.model.drives import Spring
 
 
 @pytest.fixture(scope="module")

@@ -27,6 +27,13 @@ QUICK = {
     "single_arm_vision": COARSE,
     "baxter_arm": ("problem.duration=2.0",),
     "double_pendulum": ("problem.duration=3.0",),
+    "servo_arm": (
+        "problem.duration=0.5",
+        "model.object.segments.rod.links=2",
+        "solver.iterations=3",
+        "problem.compiler=false",
+        *UNREFINED,
+    ),
     "panda_beam": ("problem.duration=1.5", "model.object.segments.beam.links=2", "solver.iterations=3"),
     **dict.fromkeys(("springs_series_ends", "springs_series_joint", "springs_torsion"), ()),
     "soft_beam": (

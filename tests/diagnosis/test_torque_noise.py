@@ -16,8 +16,8 @@ from yid_ocp.diagnosis.smoother_model import INTERVAL, MEMORY, linear_model
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model import System
+from yid_ocp.model.drives import Spring
 from yid_ocp.model.kinematics import forward_kinematics
-from yid_ocp.model.system import Spring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers import GaussNewton, solve

@@ -14,7 +14,7 @@ from yid_ocp.effects import make_effect
 from yid_ocp.export.latex import write_sheet
 from yid_ocp.integrator.discrete import discrete_equations
 from yid_ocp.model import System
-from yid_ocp.model.system import Spring
+from yid_ocp.model.drives import Spring
 from yid_ocp.model.urdf import read_urdf
 
 

@@ -41,7 +41,7 @@ def test_equations_are_slot_derivatives_of_the_discrete_lagrangian(
     system = SYSTEMS[name](parts, urdf_folder)
     e = discrete_equations(system, force_split, constraint_force)
     action = discrete_lagrangian(system, e.q0, e.q1, e.h)
-    force = system.input_force(e.u) + system.viscous_force((e.q1 - e.q0) / e.h)
+    force = system.input_force(e.u, (e.q0 + e.q1) / 2, (e.q1 - e.q0) / e.h) + system.viscous_force((e.q1 - e.q0) / e.h)
     push = FORCE_LEFT[force_split] * e.h * force
 
     def closed(q: ca.SX) -> ca.SX:

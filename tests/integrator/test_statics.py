@@ -11,8 +11,9 @@ from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.statics import HOLD_STIFFNESS, HOLD_STIFFNESS_WITH_TORQUE, Statics, relaxed
 from yid_ocp.integrator.step import compile_alike, compile_step
 from yid_ocp.model import Grasp, Segment, System, flexible_object, forward_kinematics
+from yid_ocp.model.drives import Spring
 from yid_ocp.model.rotations import roll_pitch_yaw
-from yid_ocp.model.system import Spring, floating_clamp
+from yid_ocp.model.system import floating_clamp
 from yid_ocp.model.urdf import read_urdf
 
 

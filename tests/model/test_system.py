@@ -69,7 +69,7 @@ def test_forces_and_energy(robot):
     system = System.build(robot, objects=objects, driven=["swing", "spin"], damping={"slide": 0.7})
     theta, n = system.parameters.vector(), system.size
     x, u = ca.SX.sym("x", n), ca.SX.sym("u", 2)
-    outputs = [system.viscous_force(x), system.input_force(u), system.elastic_energy(x)]
+    outputs = [system.viscous_force(x), system.input_force(u, x, x), system.elastic_energy(x)]
     viscous, driven, energy = ca.Function("f", [x, u, system.parameters.symbols], outputs)(
         np.arange(1.0, n + 1), [5.0, 6.0], theta
     )

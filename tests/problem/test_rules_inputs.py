@@ -15,8 +15,8 @@ from yid_ocp.errors import DataError
 from yid_ocp.model.cable import ClampPath
 from yid_ocp.problem.grid import Grid
 from yid_ocp.problem.inputs import (
-    held_torque,
-    held_torque_slope,
+    held_inputs,
+    held_inputs_slope,
     joint_loads,
     measured_angles,
     point_course,
@@ -57,12 +57,12 @@ def driven(effort, t=None, kind="command"):
     ],
 )
 def test_a_torque_is_held_from_sample_to_sample_and_averaged_over_a_step(grid, expected):
-    found = held_torque(driven([1.0, 2.0, 4.0, 8.0]), ("a",), grid, "run")
+    found = held_inputs(driven([1.0, 2.0, 4.0, 8.0]), ("a",), grid, "run")
     np.testing.assert_allclose(found[:, 0], expected)
 
 
 def test_an_uneven_clock_weighs_samples_by_how_long_they_are_held():
-    found = held_torque(driven([1.0, 5.0, 9.0], [0.0, 0.15, 0.2]), ("a",), Grid(0.0, 0.2, 1), "run")
+    found = held_inputs(driven([1.0, 5.0, 9.0], [0.0, 0.15, 0.2]), ("a",), Grid(0.0, 0.2, 1), "run")
     np.testing.assert_allclose(found, [[(0.15 * 1.0 + 0.05 * 5.0) / 0.2]])
 
 
@@ -70,7 +70,7 @@ def test_an_uneven_clock_weighs_samples_by_how_long_they_are_held():
     ("delay", "expected"), [(0.0, [1, 2, 4]), (0.1, [1, 1, 2]), (0.05, [1, 1.5, 3]), (-0.1, [2, 4, 8])]
 )
 def test_a_delayed_torque_acts_later(delay, expected):
-    found = held_torque(driven([1.0, 2.0, 4.0, 8.0]), ("a",), Grid(0.0, 0.1, 3), "run", np.array([delay]))
+    found = held_inputs(driven([1.0, 2.0, 4.0, 8.0]), ("a",), Grid(0.0, 0.1, 3), "run", np.array([delay]))
     np.testing.assert_allclose(found[:, 0], expected)
 
 
@@ -89,7 +89,7 @@ UNEVEN = np.array([0.0, 0.1, 0.25, 0.3, 0.45, 0.5, 0.65])
 @pytest.mark.parametrize("delay", [0.0, 0.02])
 def test_sampled_torque_is_a_smooth_course_whose_mean_a_step_takes(kind, delay):
     grid = Grid(0.05, 0.02, 20)
-    found = held_torque(driven(cubic(UNEVEN), UNEVEN, kind), ("a",), grid, "run", np.array([delay]))
+    found = held_inputs(driven(cubic(UNEVEN), UNEVEN, kind), ("a",), grid, "run", np.array([delay]))
     expected = np.diff(summed_cubic(grid.times - delay)) / 0.02
     np.testing.assert_allclose(found[:, 0], expected, rtol=1e-12)
 
@@ -97,12 +97,12 @@ def test_sampled_torque_is_a_smooth_course_whose_mean_a_step_takes(kind, delay):
 def test_mean_torque_keeps_the_mean_over_every_recorded_interval():
     effort = np.random.default_rng(2).normal(size=12)
     t = 0.1 * np.arange(12)
-    fine = held_torque(driven(effort, t, "mean"), ("a",), Grid(0.0, 0.025, 44), "run")[:, 0]
+    fine = held_inputs(driven(effort, t, "mean"), ("a",), Grid(0.0, 0.025, 44), "run")[:, 0]
     np.testing.assert_allclose(fine.reshape(11, 4).mean(axis=1), effort[:11], rtol=1e-12)
     times = np.append(t, 1.2)
     smooth = np.diff(times + times**2 - 7 * times**3) / 0.1
     grid = Grid(0.0, 0.05, 22)
-    found = held_torque(driven(smooth, t, "mean"), ("a",), grid, "run")[:, 0]
+    found = held_inputs(driven(smooth, t, "mean"), ("a",), grid, "run")[:, 0]
     times = grid.times
     np.testing.assert_allclose(found, np.diff(times + times**2 - 7 * times**3) / 0.05, rtol=1e-9)
 
@@ -110,9 +110,9 @@ def test_mean_torque_keeps_the_mean_over_every_recorded_interval():
 @pytest.mark.parametrize(("kind", "first", "last"), [("command", 1, 5), ("sample", 1, 5), ("mean", 0.5, 5.5)])
 def test_beyond_the_recording_torque_is_held(kind, first, last):
     made = driven([1.0, 2.0, 3.0, 4.0, 5.0], kind=kind)
-    before = held_torque(made, ("a",), Grid(-0.5, 0.1, 3), "run")[:, 0]
+    before = held_inputs(made, ("a",), Grid(-0.5, 0.1, 3), "run")[:, 0]
     np.testing.assert_allclose(before, first, rtol=1e-12)
-    after = held_torque(made, ("a",), Grid(0.55, 0.1, 3), "run")[:, 0]
+    after = held_inputs(made, ("a",), Grid(0.55, 0.1, 3), "run")[:, 0]
     np.testing.assert_allclose(after, last, rtol=1e-12)
 
 
@@ -120,29 +120,29 @@ def test_beyond_the_recording_torque_is_held(kind, first, last):
 @pytest.mark.parametrize("delay", [0.03, 0.17, -0.04])
 def test_the_slope_by_the_delay_is_that_of_differences(delay, kind):
     made, grid = driven([1.0, 2.0, 4.0, 8.0, 5.0, 1.0], kind=kind), Grid(0.1, 0.1, 3)
-    ends = [held_torque(made, ("a",), grid, "run", np.array([delay + sign * 1e-6])) for sign in (1, -1)]
-    found = held_torque_slope(made, ("a",), grid, "run", np.array([delay]))
+    ends = [held_inputs(made, ("a",), grid, "run", np.array([delay + sign * 1e-6])) for sign in (1, -1)]
+    found = held_inputs_slope(made, ("a",), grid, "run", np.array([delay]))
     np.testing.assert_allclose(found, (ends[0] - ends[1]) / 2e-6, rtol=1e-6, atol=1e-6)
 
 
 def test_at_a_jump_the_slope_is_the_mean_of_both_sides():
     made, grid = driven([1.0, 2.0, 4.0, 8.0, 5.0, 1.0]), Grid(0.1, 0.1, 3)
-    sides = [held_torque_slope(made, ("a",), grid, "run", np.array([delay])) for delay in (1e-3, -1e-3)]
-    np.testing.assert_allclose(held_torque_slope(made, ("a",), grid, "run", np.zeros(1)), np.mean(sides, axis=0))
+    sides = [held_inputs_slope(made, ("a",), grid, "run", np.array([delay])) for delay in (1e-3, -1e-3)]
+    np.testing.assert_allclose(held_inputs_slope(made, ("a",), grid, "run", np.zeros(1)), np.mean(sides, axis=0))
     # beyond the ends the torque is held, and so does not change
-    beyond = held_torque_slope(made, ("a",), Grid(0.7, 0.1, 2), "run", np.zeros(1))
+    beyond = held_inputs_slope(made, ("a",), Grid(0.7, 0.1, 2), "run", np.zeros(1))
     np.testing.assert_array_equal(beyond, np.zeros((2, 1)))
-    before = held_torque_slope(made, ("a",), Grid(-0.7, 0.1, 2), "run", np.zeros(1))
+    before = held_inputs_slope(made, ("a",), Grid(-0.7, 0.1, 2), "run", np.zeros(1))
     np.testing.assert_array_equal(before, np.zeros((2, 1)))
 
 
 def test_nothing_driven_needs_no_torque_and_a_driven_joint_does():
     silent = joints(["a"], [0.0, 0.1], np.zeros((2, 1)))
-    assert held_torque(silent, (), Grid(0.0, 0.1, 3), "run").shape == (3, 0)
+    assert held_inputs(silent, (), Grid(0.0, 0.1, 3), "run").shape == (3, 0)
     with pytest.raises(DataError, match="no joint effort"):
-        held_torque(silent, ("a",), Grid(0.0, 0.1, 3), "run")
+        held_inputs(silent, ("a",), Grid(0.0, 0.1, 3), "run")
     with pytest.raises(DataError, match="'b' of the model is not recorded"):
-        held_torque(driven([1.0, 2.0]), ("b",), Grid(0.0, 0.1, 3), "run")
+        held_inputs(driven([1.0, 2.0]), ("b",), Grid(0.0, 0.1, 3), "run")
 
 
 def test_measured_angles_have_no_kinks_between_samples():

@@ -53,7 +53,7 @@ def test_starts_in_static_equilibrium_of_the_symbolic_equations(runs: Runs, arms
     q, u = ca.SX.sym("q", system.size), ca.SX.sym("u", len(system.driven))
     kinematics = forward_kinematics(system.mechanism, q)
     rigid = rigid_body(kinematics, ca.SX(ca.DM.zeros(system.size)), system.gravity)
-    force = rigid.by_q - ca.gradient(system.elastic_energy(q), q) + system.input_force(u)
+    force = rigid.by_q - ca.gradient(system.elastic_energy(q), q) + system.input_force(u, q, q)
     jacobian = ca.jacobian(system.constraints(kinematics), q)
     function = ca.Function("statics", [q, u, system.parameters.symbols], [force, jacobian])
     load, gradient = (

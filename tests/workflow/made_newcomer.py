@@ -60,6 +60,39 @@ PANDA_POINTS = {f"w_b{i}": f"marker_{i}" for i in range(1, 5)}
 PANDA_TRUTH = {f"{name}.bend": value for name, value in PANDA_BENDS.items()}
 
 
+SERVO = """\
+model:
+  robot: default:servo_arm.urdf
+  arms: {{mode: servo}}
+  object:
+    kind: segments
+    mount: {{frame: gripper}}
+    segments:
+      rod: {{length: 0.4, mass: 0.04, radius: 0.003, links: {links}, joint_order: xy, rigidity: true, clamped: true}}
+  damping: {{pan: 0.05, object: 4.0e-4}}
+  points: [w_rod, "rod:50%"]
+  effects: [{effects}]
+parameters:
+  rod.bend: {{initial: 0.03}}
+  "*.servo_gain": {{initial: 45.0}}
+  "*.servo_damping": {{initial: 2.0}}
+  "*.servo_delay": {{initial: 0.03}}
+"""
+SERVO_POSTURE = {"pan": 0.0, "lift": 0.4, "elbow": 1.0, "wrist_flex": 0.3, "wrist_roll": 0.0}
+SERVO_POINTS = {"w_rod": "tip", "rod:50%": "middle"}
+SERVO_TRUTH = {"cable.bend": 0.03, "cable.damping": 4e-4}
+SERVOS = {
+    f"{joint}.servo_{name}": value
+    for joint in ("lift", "elbow", "wrist_flex")
+    for name, value in {"gain": 45.0, "damping": 2.0, "delay": 0.03}.items()
+}
+
+
+def servo_text(links: int = 12) -> str:
+    rotors = (f"{{kind: rotor_inertia, location: {joint}, values: {{armature: 0.01}}}}" for joint in SERVO_POSTURE)
+    return SERVO.format(links=links, effects=", ".join(rotors))
+
+
 def ur5_text(links: int = 16) -> str:
     return UR5.format(links=links)
 
@@ -73,13 +106,19 @@ def panda_text(links: int = 10) -> str:
 
 
 def simulated(
-    folder: Path, text: str, posture: Mapping[str, float], points: Mapping[str, str], seed: int, duration: float
+    folder: Path,
+    text: str,
+    posture: Mapping[str, float],
+    points: Mapping[str, str],
+    seed: int,
+    duration: float,
+    excitation: Excitation | None = None,
 ) -> Recording:
     """Joints at 100 Hz without efforts, points at 50 Hz to half a millimetre under names of their own."""
     file = folder / "truth.yaml"
     file.write_text(text)
     system = build_system(load_config(file))
-    excitation = Excitation(speed=1.0, duration=duration, band=(0.3, 1.5))
+    excitation = excitation or Excitation(speed=1.0, duration=duration, band=(0.3, 1.5))
     experiment = VirtualExperiment(
         motion=multisine(system, None, seed=seed, posture=posture, excitation=excitation),
         posture=posture,
@@ -95,7 +134,7 @@ def simulated(
 
 
 def write_mcap(recording: Recording, folder: Path) -> Path:
-    """A bag with the joints on one topic, every point on one of its own, and a topic that nobody needs."""
+    """A bag with the joints on one topic, their commands on another, every point on its own, and one nobody needs."""
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -113,6 +152,10 @@ def write_mcap(recording: Recording, folder: Path) -> Path:
     for t, row in zip(joints.t, joints.position, strict=True):
         state = types["sensor_msgs/msg/JointState"](header(t, ""), list(joints.names), row, none, none)
         messages.append((t, "/joint_states", "sensor_msgs/msg/JointState", state))
+    commands = () if joints.position_command is None else joints.position_command
+    for t, row in zip(joints.t, commands, strict=False):
+        asked = types["sensor_msgs/msg/JointState"](header(t, ""), list(joints.names), row, none, none)
+        messages.append((t, "/joint_commands", "sensor_msgs/msg/JointState", asked))
     for group in recording.points:
         for t, row in zip(group.t, group.position, strict=True):
             for name, place in zip(group.names, row, strict=True):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import jsonschema
@@ -15,7 +16,7 @@ from yid_ocp.cli import main
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.schema import schema
 from yid_ocp.data import JointGroup, PointGroup, Recording, read_recording, write_recording
-from yid_ocp.workflow.build import build_system
+from yid_ocp.workflow.build import build_system, parameter_settings
 
 RATE = 125.0
 LENGTH = 0.5
@@ -140,6 +141,38 @@ def test_efforts_beside_points_are_left_alone(bench: Path) -> None:
     run = load_config("run.yaml")
     assert run.sensors["joints.effort"].use is False
     assert not run.model.effects
+
+
+def test_commands_without_efforts_are_followed_by_servos(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made = moved(np.arange(0, 2, 1 / RATE))
+    assert made.joints is not None
+    commands = np.vstack([made.joints.position[6:], np.tile(made.joints.position[-1:], (6, 1))])
+    write_recording(replace(made, joints=replace(made.joints, position_command=commands)), bench / "one.h5")
+    assert init(*CABLE) == 0
+    assert "mode: servo: commanded positions were recorded" in capsys.readouterr().out
+    run = load_config("run.yaml")
+    assert run.model.arms.mode == "servo"
+    assert run.model.arms.servo.commands == "held"
+    system = build_system(run)
+    assert set(system.servos) == set(system.driven) == {"roll", "pitch"}
+    free = {name for name, said in parameter_settings(run, system.parameters).items() if said.free}
+    own = ("{}.servo_gain", "{}.servo_damping", "{}.servo_delay", "rotor_inertia@{}.armature")
+    assert free == {"cable.bend", "cable.damping", *(name.format(joint) for joint in ("roll", "pitch") for name in own)}
+    # a copy of the measured angles is no command, and efforts say more than commands
+    for changes in ({"position_command": made.joints.position}, {"effort": np.ones_like(commands)}):
+        other = replace(made.joints, **{"position_command": commands, **changes})
+        write_recording(replace(made, joints=other), bench / "one.h5")
+        assert init(*CABLE, "--replace") == 0
+        assert load_config("run.yaml").model.arms.mode == "prescribed"
+
+
+def test_a_servo_arm_without_commands_is_told_what_is_missing(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert init(*CABLE) == 0
+    assert main(["check", "run.yaml", "--out", "checked", "--set", "model.arms.mode=servo"]) == 2
+    said = capsys.readouterr().err
+    assert "no commanded positions" in said
+    assert "joints/position_command" in said
+    assert "prescribed" in said
 
 
 def test_a_tree_gets_its_markers_where_they_are(bench: Path) -> None:

@@ -13,10 +13,15 @@ from made_newcomer import (
     PANDA_POINTS,
     PANDA_POSTURE,
     PANDA_TRUTH,
+    SERVO_POINTS,
+    SERVO_POSTURE,
+    SERVO_TRUTH,
+    SERVOS,
     UR5_POINTS,
     UR5_POSTURE,
     UR5_TRUTH,
     panda_text,
+    servo_text,
     simulated,
     ur5_text,
     write_mcap,
@@ -24,9 +29,11 @@ from made_newcomer import (
 
 from yid_ocp.cli import main
 from yid_ocp.config.reader import load_config
+from yid_ocp.virtual.motion import Excitation
 from yid_ocp.workflow.build import load_problem
 
 UR5_NUMBERS = ("--object", "cable", "--length", "1", "--mass", "0.1", "--radius", "0.005")
+ROD_NUMBERS = ("--object", "cable", "--length", "0.4", "--mass", "0.04", "--radius", "0.003", "--links", "12")
 CROSS_NUMBERS = ("--object", "tree", "--branches", "4", "--length", "0.4", "--mass", "0.03", "--radius", "0.004")
 
 
@@ -95,3 +102,33 @@ def test_a_cross_on_a_panda(desk: Path) -> None:
     assert not checked["warnings"]
     assert not checked["doubts"]
     check_truth(carried_out("solved", "solve", "cross.yaml"), PANDA_TRUTH)
+
+
+@pytest.mark.slow
+def test_a_rod_on_an_arm_of_servos(desk: Path) -> None:
+    """Commands and angles are all that the arm says; what it holds is called a cable until somebody names it."""
+    excitation = Excitation(speed=2.5, duration=3.0, band=(0.3, 2.0))
+    bags = [
+        write_mcap(
+            simulated(desk, servo_text(), SERVO_POSTURE, SERVO_POINTS, seed, 3.0, excitation), desk / f"run_{seed}"
+        )
+        for seed in (3, 4)
+    ]
+    for bag in bags:
+        carried_out(f"{bag.stem}.h5", "import", str(bag), "--command-topic", "/joint_commands", "--sensor", "mocap")
+    carried_out("rod.yaml", "init", "default:servo_arm.urdf", "run_3.h5", "run_4.h5", *ROD_NUMBERS)
+    assert load_config("rod.yaml").model.arms.mode == "servo"
+    checked = carried_out("checked", "check", "rod.yaml")
+    assert not checked["doubts"]
+    solved = carried_out("solved", "solve", "rod.yaml")
+    check_truth(solved, SERVO_TRUTH)
+    for name, value in SERVOS.items():
+        found = solved["parameters"][name]
+        assert abs(found["value"] - value) < max(2 * found["std"], 0.02 * value), (name, found)
+    told = carried_out("diagnosed", "diagnose", "rod.yaml")
+    assert told["verdict"] == "no_gap"
+    assert main(["export", "solved", "--out", "rod.xml"]) == 0
+    manifest = json.loads(Path("rod.xml.manifest.json").read_text())
+    assert manifest["parameters"]["lift.servo_gain"]["status"] == "native"
+    assert manifest["gate"]["status"] == "done"
+    assert manifest["gate"]["fall"] > 0.8

@@ -10,7 +10,7 @@ import pytest
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
-from yid_ocp.model.system import Spring
+from yid_ocp.model.drives import Spring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.simulated import recorded

@@ -44,7 +44,7 @@ class Frequencies:
 
 def held_still(system: System) -> System:
     """The same system with its driven joints prescribed."""
-    return replace(system, driven=(), prescribed=(*system.driven, *system.prescribed))
+    return replace(system, driven=(), servos={}, prescribed=(*system.driven, *system.prescribed))
 
 
 def natural_frequencies(

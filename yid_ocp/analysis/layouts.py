@@ -304,7 +304,7 @@ class LayoutBuilder:
             found.append("weld")
         if setting.second_arm is not None:
             found.append("second_arm")
-        if system.driven:
+        if system.driven and not system.servos:
             found += ["motion", "travel"]
         measured = any(s.sensor.efforts for e in setting.problem.episodes for s in e.samples)
         if (system.driven or system.prescribed) and not measured and setting.problem.episodes[0].recording.joints:
@@ -316,7 +316,7 @@ class LayoutBuilder:
         base = setting.problem
         system, recordings, notes = self._experiment(mechanics)
         if "torque" in mechanics:
-            system = replace(system, driven=(), prescribed=(*system.prescribed, *system.driven))
+            system = replace(system, driven=(), servos={}, prescribed=(*system.prescribed, *system.driven))
         if mechanics - {"motion", "travel"} or system is not base.system:
             step = compile_alike(base.step, system, use_compiler=False)
         else:

@@ -140,7 +140,7 @@ class StepSymbols(Shown):
             Block("q0", joints, e.q0, "coordinates before the step", "q" + k),
             Block("p0", joints, e.p0, "momenta before the step", "p" + k),
             Block("z0", internal, e.z0, "internal coordinates before the step", "z" + k),
-            Block("u", system.driven, e.u, "motor torques", "u" + k),
+            Block("u", system.driven, e.u, "commands of servos" if system.servos else "motor torques", "u" + k),
             Block("theta", system.parameters.names, e.theta, "parameters", r"\theta_{#}"),
             Block("time_step", ("h",), e.time_step, "time step", "h"),
             Block("q1", joints, e.q1, "coordinates after the step", "q" + after),

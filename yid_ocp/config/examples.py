@@ -36,6 +36,12 @@ model:
     locked: {panda_joint3: 0.4}              # [rad]
     exclude_links: [panda_hand]
 """,
+    "model.arms.servo": """\
+model:
+  arms:
+    mode: servo
+    servo: {commands: interpolated, gravity_compensation: true}
+""",
     "model.frames.NAME": """\
 model:
   frames:

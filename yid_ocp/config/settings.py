@@ -21,6 +21,7 @@ from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import ConfigError
 from yid_ocp.integrator.discrete import ConstraintForce, ForceSplit
 from yid_ocp.model.cable import CableOptions
+from yid_ocp.model.drives import Commands
 from yid_ocp.options import About, Among, options_of, stripped
 from yid_ocp.planning.options import PlanOptions
 from yid_ocp.problem.null_test import GapLimits
@@ -34,7 +35,7 @@ Quadruple = tuple[float, float, float, float]
 Interval = tuple[float, float]
 FilePath = Annotated[str, About("a file, relative to the configuration", path=True)]
 RecordingPath = Annotated[str, About("a recording, relative to the configuration, or default:NAME.h5", path=True)]
-ArmMode = Literal["driven", "prescribed", "passive"]
+ArmMode = Literal["driven", "prescribed", "servo", "passive"]
 GraspName = Literal["point", "axis", "weld"]
 
 
@@ -160,6 +161,18 @@ class EffectSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ServoSettings:
+    """How position servos take commands; their numbers are parameters, JOINT.servo_gain and so on."""
+
+    commands: Annotated[
+        Commands, About("what a servo follows between two commands: the last one held, or straight lines")
+    ] = "held"
+    gravity_compensation: Annotated[
+        bool, About("whether the controller carries the robot's own weight, so that the servos need not")
+    ] = False
+
+
+@dataclass(frozen=True, kw_only=True)
 class ArmSettings:
     """Which joints of the robot move, and what is known of them."""
 
@@ -167,10 +180,12 @@ class ArmSettings:
     mode: Annotated[
         ArmMode,
         About(
-            "driven by measured effort, prescribed (moved as measured) or passive; with a grasp and "
-            "recorded torques, prescribed arms are states that their encoders correct"
+            "driven by measured effort, prescribed (moved as measured), servo (moved by position servos that follow "
+            "recorded commands) or passive; with a grasp and recorded torques, prescribed arms are states that their "
+            "encoders correct"
         ),
     ] = "driven"
+    servo: Annotated[ServoSettings, About("of the mode servo")] = field(default_factory=ServoSettings)
     passive: Annotated[tuple[str, ...], About("joints among them that nothing drives, whatever the mode")] = ()
     locked: Annotated[Mapping[str, float], About("value of joints that do not move", "rad or m")] = field(
         default_factory=dict

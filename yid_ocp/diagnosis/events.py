@@ -278,7 +278,7 @@ def _before_fall(history: History, falls: Sequence[Fall], limits: Thresholds) ->
 def _allowed(problem: EstimationProblem, run: Run, nodes: NDArray[np.int64], limits: Thresholds) -> tuple[Array, Array]:
     """What the model of every coordinate's torque may be wrong by, and what friction may hold, shape (M, n)."""
     episode, result, theta = run
-    terms = torque_terms(problem.system, theta, result.rollout, episode.grid.time_step, nodes)
+    terms = torque_terms(problem.step, theta, result.rollout, nodes)
     joints = episode.recording.joints
     # a torque is known at no better time than that of a sample
     late = 0.0 if joints is None else float(np.median(np.diff(joints.t)))
@@ -462,7 +462,8 @@ def _floor(problem: EstimationProblem, episode: Episode, joint: str, quantity: s
     joints, options = episode.recording.joints, problem.options
     system = problem.system
     assert joints is not None
-    if joint not in system.prescribed and (joint not in system.driven or quantity == "position"):
+    by_torque = joint in system.driven and joint not in system.servos
+    if joint not in system.prescribed and (not by_torque or quantity == "position"):
         return None
     group = f"joints.{quantity}"
     choice = options.sensors.get(group, SensorOptions())
@@ -541,9 +542,9 @@ def _beside_neighbours(t: Array, values: Array) -> Array:
 def without_events(problem: EstimationProblem, events: Events) -> EstimationProblem:
     """The problem with what events explain taken out, as far as that can be done.
 
-    Forces at driven joints act beside the recorded torque. Samples of prescribed joints' efforts in the window of an
-    event of that joint, samples that are wrong themselves, and all that follows a fall do not count. Forces on an
-    object stay in.
+    Forces at joints that recorded torques drive act beside these. Samples of prescribed joints' efforts in the window
+    of an event of that joint, samples that are wrong themselves, and all that follows a fall do not count. Forces on an
+    object and at servos stay in.
     """
 
     def cleaned(episode: Episode) -> Episode:
@@ -554,7 +555,7 @@ def without_events(problem: EstimationProblem, events: Events) -> EstimationProb
         torque = episode.torque.copy()
         times = episode.grid.times[:-1] - episode.grid.start + episode.grid.time_step / 2
         for event in own:
-            if event.pulse is not None and event.channel in problem.system.driven:
+            if event.pulse is not None and event.channel in set(problem.system.driven) - set(problem.system.servos):
                 torque[:, problem.system.driven.index(event.channel)] += event.pulse.values(times)
         smear = 1 / problem.options.path_cutoff
         parts = [_counting(episode, samples, own, fall, smear) for samples in episode.samples]

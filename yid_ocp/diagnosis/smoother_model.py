@@ -27,6 +27,7 @@ from yid_ocp.diagnosis.pushes import forces_of_pushes, weights_of_segments
 from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
 from yid_ocp.effects.base import grasp_names, robot_joints
 from yid_ocp.integrator.linear import Loads, linear_steps, live_states
+from yid_ocp.integrator.rollout import applied_torque
 from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
@@ -316,7 +317,8 @@ def _loads(course: _Course) -> Array:
         values = np.array(ca.Function("springs", [system.parameters.symbols], [symbols])(course.theta)).ravel()
         for (index, _), stiffness, rest in zip(springs, values[::2], values[1::2], strict=True):
             load[index] = stiffness * float(np.sqrt(np.mean((q[:, index] - rest) ** 2)))
-    for indices, force in ((system.driven_indices, rollout.torque), (system.prescribed_indices, rollout.effort)):
+    torque = applied_torque(course.problem.step, course.theta, rollout)
+    for indices, force in ((system.driven_indices, torque), (system.prescribed_indices, rollout.effort)):
         if len(indices):
             load[list(indices)] = np.sqrt(np.mean(force**2, axis=0))
     return load

@@ -8,6 +8,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from yid_ocp.integrator.rollout import applied_torque
+from yid_ocp.integrator.step import Step
 from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body
 from yid_ocp.model.system import MidpointState, System
@@ -38,21 +40,18 @@ class TorqueTerms:
     held: Array
 
 
-def torque_terms(
-    system: System, theta: Array, rollout: Rollout, time_step: float, nodes: NDArray[np.int64]
-) -> TorqueTerms:
+def torque_terms(step: Step, theta: Array, rollout: Rollout, nodes: NDArray[np.int64]) -> TorqueTerms:
     """Terms of M(q) a + c(q, v) + g(q) = tau along a rollout, accelerations by differences of its nodes.
 
     Parameters
     ----------
-    system : System
+    step : Step
     theta : ndarray, shape (ntheta,)
     rollout : Rollout
-    time_step : float
-        [s]
     nodes : ndarray of int, shape (M,)
         At which the terms are wanted, in order.
     """
+    system, time_step = step.system, step.time_step
     n = system.size
     q, z = rollout.state[:, :n], rollout.state[:, 2 * n :]
     v = np.gradient(q, time_step, axis=0)
@@ -60,7 +59,8 @@ def torque_terms(
     function = _function(system, time_step).map(len(nodes))
     squares, needed, held = (np.array(part).T for part in function(*(x[nodes].T for x in (q, v, a, z)), theta))
     applied = np.zeros((len(nodes), n))
-    for indices, effort in ((system.driven_indices, rollout.torque), (system.prescribed_indices, rollout.effort)):
+    torque = applied_torque(step, theta, rollout)
+    for indices, effort in ((system.driven_indices, torque), (system.prescribed_indices, rollout.effort)):
         if indices:
             applied[:, list(indices)] = effort[np.minimum(nodes, len(effort) - 1)]
     rate = np.gradient(needed, time_step * nodes, axis=0) if len(nodes) > 1 else np.zeros_like(needed)

@@ -12,8 +12,8 @@ from typing import ClassVar
 
 import casadi as ca
 
-from yid_ocp.effects.base import EFFECTS, EffectBase, Quantity, arms, robot_joints, strength
-from yid_ocp.model.system import NodeState, System
+from yid_ocp.effects.base import EFFECTS, EffectBase, Quantity, arms, on_joint, robot_joints, strength
+from yid_ocp.model.system import MidpointState, NodeState, System, Terms
 
 PLAY_TORQUE = 0.2
 """Torque by which the play of a gear is taken up to three quarters [N m]."""
@@ -55,16 +55,40 @@ class SeriesElasticity(EffectBase):
 
 @EFFECTS.register("backlash")
 class Backlash(EffectBase):
-    """A gear with play, the encoder on the motor's side: measured angle = q + width/2 tanh(effort/`PLAY_TORQUE`)."""
+    """A gear with play, the encoder on the motor's side: measured angle = q + width/2 tanh(effort/`PLAY_TORQUE`).
+
+    A servo acts on what its encoder reads: there the play z that is taken up solves z = width/2 tanh(torque(q + z)/
+    `PLAY_TORQUE`) in every step, an internal coordinate without a memory.
+    """
 
     equation = "measured angle = q + width/2 tanh(effort/0.2 N m)"
     depends_on = "how hard it pulls at its ends"
-    needs: ClassVar[frozenset[str]] = frozenset({"joints.position", "joints.effort"})
+    needs: ClassVar[frozenset[str]] = frozenset({"joints.position"})
 
     @classmethod
     def locations(cls, system: System) -> tuple[str, ...]:
         """Arm joints that are driven or prescribed."""
-        return _recorded(system)
+        return _recorded(system) or tuple(name for name in robot_joints(system) if name in system.servos)
+
+    @classmethod
+    def internal_names(cls, location: str, system: System) -> tuple[str, ...]:
+        """Of a servo's joint the play that is taken up."""
+        return ("play",) if location in system.servos else ()
+
+    def terms(self, state: MidpointState) -> Terms:
+        """See the class."""
+        if not self.internal:
+            return Terms()
+        [name] = self.internal
+        row, index = state.internal[name], state.system.mechanism.joint_index(self.location)
+        # its value after the step: a mean over the step would have it ring
+        play = state.z[row] + state.h / 2 * state.z_rate[row]
+        if self.location not in state.system.servos:  # the joint is held for a while, and nothing takes the play up
+            return Terms(internal={name: play})
+        servo, command = state.system.servos[self.location], state.u[state.system.driven.index(self.location)]
+        free, geared = (servo.torque(command, state.q[index] + give, state.v[index]) for give in (0, play))
+        taken = play - self["width"] / 2 * ca.tanh(geared / PLAY_TORQUE)
+        return Terms(force=on_joint(state.system, self.location, geared - free), internal={name: taken})
 
     @classmethod
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
@@ -73,11 +97,14 @@ class Backlash(EffectBase):
 
     def measure(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
         """See the class."""
+        for name in self.internal if channel == f"joints.position.{self.location}" else ():
+            return output + state.z[state.internal[name]]
         return output + self._give(channel, _effort(state, self.location))
 
     def correct(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
         """See the class."""
-        return reading - self._give(channel, effort)
+        # a servo's coordinate follows from the motion, and its command is of the motor's side
+        return reading if self.internal else reading - self._give(channel, effort)
 
     def _give(self, channel: str, effort: ca.SX) -> ca.SX:
         if channel != f"joints.position.{self.location}":
@@ -221,7 +248,7 @@ class EffortLag(EffectBase):
 
 
 def _recorded(system: System) -> tuple[str, ...]:
-    known = {*system.driven, *system.prescribed}
+    known = {*system.driven, *system.prescribed} - set(system.servos)
     return tuple(name for name in robot_joints(system) if name in known)
 
 

@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.errors import ConfigError, nearest
+from yid_ocp.model.drives import NO_LIMIT
 from yid_ocp.model.flexible import ElasticJoint
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Inertia, Mechanism, Placement, merged
@@ -35,8 +36,6 @@ ASPECTS = (
 """What equations of the library depend on, in the order in which sentences name it."""
 BAXTER_LIMIT = 50.0
 """Effort limit of the joints that the ranges of arms are about [N m]; they grow with that of a stronger joint."""
-NO_LIMIT = 2e4
-"""Effort limits from here on are a file's way to say that there is none [N m]."""
 SAME_PLACE = 1e-6
 """Points of arms that are nearer to each other than this wherever the arm stands are one [m]."""
 
@@ -61,6 +60,8 @@ class Quantity:
     reciprocal : str
         `name unit` under which 1/value is reported, for a stiffness whose neutral value is infinite, or a factor that
         goes through infinity when it changes its sign.
+    power : int
+        p where the value is that of the reported one to the power -p.
     """
 
     name: str
@@ -72,12 +73,19 @@ class Quantity:
     description: str
     shape: bool = False
     reciprocal: str = ""
+    power: int = 1
 
     @property
     def reported(self) -> tuple[str, str]:
         """Name and unit in reports."""
         name, _, unit = self.reciprocal.partition(" ")
         return (name, unit) if self.reciprocal else (self.name, self.unit)
+
+    def turned(self, value: float) -> float:
+        """The reported value behind a value that is not zero; the same as it is without a reciprocal."""
+        if not self.reciprocal:
+            return value
+        return 1 / value if self.power == 1 else value ** (-1 / self.power)
 
 
 @dataclass(frozen=True)
@@ -194,7 +202,7 @@ class EffectBase(ABC):
     ) -> dict[str, Reported]:
         """The quantities as people read them, a compliance as the stiffness that it is the reciprocal of.
 
-        The standard deviation of 1/C is std(C)/C^2 (delta method).
+        The standard deviation of C^(-1/p) is C^(-1/p) std(C)/(p C) (delta method).
 
         Parameters
         ----------
@@ -213,7 +221,9 @@ class EffectBase(ABC):
             std = float((stds or {}).get(entry.name, math.nan))
             name, unit = quantity.reported
             if quantity.reciprocal:
-                value, std = (1 / value, std / value**2) if value else (math.inf, math.nan)
+                known = bool(value)
+                turned = quantity.turned(value) if known else math.inf
+                value, std = turned, abs(turned * std / (quantity.power * value)) if known else math.nan
             result[name] = Reported(value, std, unit)
         return result
 
@@ -265,7 +275,7 @@ def build(kind: str, location: str, system: System, values: Mapping[str, float] 
             if not (value > 0 or (signed and value < 0)):
                 kind_of = "a number other than zero" if signed else "a positive number"
                 raise ConfigError(f"{name} = {value}", where=label, allowed=f"{kind_of} {quantity.reported[1]}")
-            value = 1 / value
+            value = value**-quantity.power
         given[quantity.name] = float(value)
     entries = (
         Parameter(f"{label}.{q.name}", given.get(q.name, q.neutral), q.unit, q.lower, q.upper, q.description)

@@ -46,6 +46,7 @@ _MJCF = {
     "armature": "armature of joints",
     "dry_friction": "frictionloss of joints, which sticks at rest where the model creeps",
     "cubic_stiffness": "polynomial stiffness of joints",
+    "servo": "position actuators: gainprm, biasprm, forcerange and delay",
     "torque_gain": "gainprm of actuators",
     "torque_offset": "biasprm of actuators",
     "torque_delay": "delay of actuators",

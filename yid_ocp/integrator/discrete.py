@@ -89,7 +89,7 @@ class DiscreteEquations:
     lam : casadi.SX, shape (m, 1)
         Multipliers of the step [N s].
     u : casadi.SX, shape (nu, 1)
-        Motor torques held over the step [N m].
+        Motor torques held over the step [N m], or what servos are commanded [rad or m].
     theta : casadi.SX, shape (ntheta, 1)
     time_step : casadi.SX
         Recorded step [s]; the step in the equations is this times `System.time_scale`.
@@ -318,7 +318,7 @@ def _summed_terms(system: System, at: _Symbols, kinematics: Kinematics) -> _Summ
     rows = {name: i for i, name in enumerate(names)}
     state = MidpointState(system, kinematics, at.qm, at.vm, at.zm, at.z_rate, at.u, at.pull_rate, rows, at.h)
     energy = -system.elastic_energy(at.qm)
-    force, viscous = system.input_force(at.u), system.viscous_force(at.vm)
+    force, viscous = system.input_force(at.u, at.qm, at.vm), system.viscous_force(at.vm)
     equations: dict[str, ca.SX] = {}
     at_rest: dict[str, ca.SX] = {}
     closed: list[ClosedForce] = []

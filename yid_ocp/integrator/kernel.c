@@ -658,12 +658,13 @@ static void sensitivity_step(Work *k, const Point *a, int d, int members, const 
     for (int r = 0; r < N; r++)
         for (int c = 0; c < loads; c++) p1[(size_t)r * d + loaded + c] += columns->load_p1[(size_t)r * loads + c];
     if (input)
-        for (int r = 0; r < N; r++)
+        /* internal coordinates may follow an input too, as play behind a servo does */
+        for (int r = 0; r < N + NZ; r++)
             for (int j = 0; j < NU; j++) {
-                const real f = k->Ru[r][j], g = k->Pu[r][j];
-                const int f_acts = any(f != 0), g_acts = any(g != 0);
+                const real f = k->Ru[r][j];
+                const int f_acts = any(f != 0), g_acts = r < N && any(k->Pu[r][j] != 0);
                 for (int c = 0; f_acts && c < d; c++) rows[(size_t)r * d + c] += f * input[(size_t)j * d + c];
-                for (int c = 0; g_acts && c < d; c++) p1[(size_t)r * d + c] += g * input[(size_t)j * d + c];
+                for (int c = 0; g_acts && c < d; c++) p1[(size_t)r * d + c] += k->Pu[r][j] * input[(size_t)j * d + c];
             }
     memset(joined, 0, sizeof(real) * NT * d);
     if (path)

@@ -110,6 +110,20 @@ def rollout_member(
     return Member(values, begin, inputs, course, feedback, directions)
 
 
+def applied_torque(step: Step, theta: ArrayLike, rollout: Rollout) -> NDArray[np.float64]:
+    """Torque at driven joints in every step, shape (N, nu) [N m]: the input itself, or what servos make of it."""
+    system, h = step.system, step.time_step
+    if not system.servos:
+        return rollout.torque
+    e, driven = step.equations, list(system.driven_indices)
+    q = rollout.state[:, : system.size]
+    with SYMBOLIC:
+        force = ca.densify(system.input_force(e.u, e.q0, e.q1)[driven])
+        function = ca.Function("applied", [e.u, e.q0, e.q1, e.theta], [force])
+    middle, rate = (q[1:] + q[:-1]) / 2, np.diff(q, axis=0) / h
+    return np.array(function.map(len(rate))(rollout.torque.T, middle.T, rate.T, np.asarray(theta, float))).T
+
+
 def adjoint_gradient(
     step: Step,
     theta: ArrayLike,

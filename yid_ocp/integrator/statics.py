@@ -30,7 +30,7 @@ class Rest:
     state : ndarray, shape (nx,)
         (q, p, z); p is half a step's pull of the constraints, so that the next step stays at rest.
     torque : ndarray, shape (nu,)
-        Motor torque that holds the posture [N m].
+        Motor torque that holds the posture [N m], or command of its servos [rad or m].
     constraint_force : ndarray, shape (m,)
         [N or N m]
     by_theta : ndarray, shape (nx, len(names))
@@ -62,6 +62,10 @@ class Rest:
 HOLD_STIFFNESS = 1e5
 HOLD_STIFFNESS_WITH_TORQUE = 1e3
 
+# A servo holds its joint itself, and what it is commanded is known: nothing is left to make up for. Not zero, so that
+# derivatives by the command are those by the posture over it.
+HOLD_STIFFNESS_WITH_COMMAND = 1e-9
+
 MOST_ITERATIONS = 300  # of the search for the lowest energy
 
 SINGULAR = 1e-14  # reciprocal of the condition beyond which equations have no solution of their own
@@ -92,8 +96,8 @@ class Statics:
         self._inner_slopes: Once[None, ca.Function] = Once(
             lambda _: ca.Function("inner", e.arguments, [ca.jacobian(e.internal_at_rest, e.theta)])
         )
-        potential = system.elastic_energy(e.q0) + e.rigid.potential
-        self._potential = ca.Function("potential", [e.q0, e.q1, e.z0, e.z1, e.theta], [potential])
+        potential = system.elastic_energy(e.q0) + e.rigid.potential + _servo_energy(system, e.u, e.q0)
+        self._potential = ca.Function("potential", [e.q0, e.q1, e.z0, e.z1, e.u, e.theta], [potential])
 
     @property
     def equations(self) -> RestEquations:
@@ -117,7 +121,8 @@ class Statics:
             Known coordinates, driven then prescribed [rad or m].
         theta : array_like, shape (ntheta,)
         torque : array_like, shape (nu,), optional
-            Measured torque at the posture [N m]; the holding spring then only makes up for noise.
+            Measured torque at the posture [N m]; the holding spring then only makes up for noise. Of servos what they
+            are commanded: the posture is then where the search begins.
         guess : array_like, shape (n,), optional
             Configuration to start from; the undeformed object when absent.
         names : sequence of str
@@ -133,7 +138,7 @@ class Statics:
         step, system = self.step, self.step.system
         given = check_shape("posture", posture, (len(self.known),))
         theta = check_shape("theta", theta, (len(system.parameters),))
-        stiffness = HOLD_STIFFNESS if torque is None else HOLD_STIFFNESS_WITH_TORQUE
+        stiffness = hold_stiffness(system, torque is not None)
         held = np.zeros(step.sizes["nu"]) if torque is None else check_shape("torque", torque, (step.sizes["nu"],))
         hold = _Hold(given, held, stiffness)
         best: tuple[bool, float, float, Array] | None = None
@@ -156,7 +161,8 @@ class Statics:
         give = hold.give(q, system)
         state, by_theta, by_posture = self._differentiate(w, q, theta, hold, tuple(names))
         message = self._explain(state, theta, error) if failed else "at rest"
-        if not failed and np.max(np.abs(give), initial=0.0) > HOLD_LIMIT:
+        by_itself = bool(system.servos) and torque is not None
+        if not failed and not by_itself and np.max(np.abs(give), initial=0.0) > HOLD_LIMIT:
             joint = int(np.argmax(np.abs(give)))
             failed = True
             # with a torque given, any of the three may be wrong
@@ -202,10 +208,10 @@ class Statics:
 
     def _energy(self, q: Any, z: Array, hold: _Hold, theta: Array) -> Any:
         """Potential energy of a configuration, that of the holding springs included."""
-        energy = self._potential(q, q, z, z, theta)
-        if not len(hold.held):
-            return energy
         give = hold.give(q, self.step.system)
+        energy = self._potential(q, q, z, z, hold.held + hold.stiffness * give, theta)
+        if not len(hold.held) or self.step.system.servos:
+            return energy
         return energy + hold.stiffness / 2 * ca.sumsqr(give) + ca.dot(hold.held, give)
 
     def _lowest_energy(self, theta: Array, hold: _Hold) -> Array | None:
@@ -315,6 +321,20 @@ class Statics:
             if distance > 1e-4:
                 text += f"; grasp '{grasp.name}' is out of reach by {1e3 * distance:.3g} mm"
         return text
+
+
+def _servo_energy(system: System, u: ca.SX, q: ca.SX) -> ca.SX:
+    """Sum of 1/2 gain (u - q)^2 over all servos [J]; their limits tell which of several equilibria is lowest as little
+    as their dampers do."""
+    at = zip(system.driven, system.driven_indices, ca.vertsplit(u), strict=True) if system.servos else ()
+    return sum((0.5 * system.servos[name].gain * (part - q[i]) ** 2 for name, i, part in at), ca.SX(0))
+
+
+def hold_stiffness(system: System, known: bool) -> float:
+    """Stiffness of what holds driven joints where they were measured, their inputs known or not [N m/rad, or 1]."""
+    if not known:
+        return HOLD_STIFFNESS
+    return HOLD_STIFFNESS_WITH_COMMAND if system.servos else HOLD_STIFFNESS_WITH_TORQUE
 
 
 @dataclass(frozen=True)

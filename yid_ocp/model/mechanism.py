@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import ModelError, nearest
-from yid_ocp.model.parameters import Parameter, Parameters
+from yid_ocp.model.parameters import Parameters
 from yid_ocp.model.rotations import snapped
 from yid_ocp.shown import Shown, Summary, counted
 
@@ -377,23 +377,3 @@ def merged(bodies: Iterable[Inertia]) -> Inertia | None:
         offset = body.com - com
         inertia += body.about_com + body.mass * (ca.dot(offset, offset) * ca.SX.eye(3) - offset @ offset.T)
     return Inertia(mass, com, ca.densify(inertia))
-
-
-def damping_parameters(tree: Mechanism, wanted: Mapping[str, float]) -> dict[str, Parameter]:
-    """Viscous damping of joints of a tree, by joint [N m s/rad]."""
-    found = {}
-    for joint, value in wanted.items():
-        tree.joint_index(joint)
-        text = f"viscous damping of {joint}"
-        found[joint] = Parameter(f"{joint}.damping", value, "N m s/rad", 0.0, math.inf, text)
-    return found
-
-
-def spring_parameters(tree: Mechanism, joint: str, stiffness: float, rest: float) -> tuple[Parameter, Parameter]:
-    """Stiffness and rest of a spring on a joint of a tree, in N m/rad and rad (N/m and m where it slides)."""
-    unit = tree.joints[tree.joint_index(joint)].unit
-    per = "N m/rad" if unit == "rad" else "N/m"
-    return (
-        Parameter(f"{joint}.stiffness", stiffness, per, 0.0, math.inf, f"spring on {joint}"),
-        Parameter(f"{joint}.rest", rest, unit, description=f"where the spring on {joint} is relaxed"),
-    )

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from yid_ocp.errors import ModelError, nearest
+from yid_ocp.model.drives import PositionServos, Servo, Spring, joint_dampers, joint_servos, joint_spring, weightless
 from yid_ocp.model.flexible import AXES, ElasticJoint, FlexibleObject, SegmentLayout
 from yid_ocp.model.kinematics import Kinematics
-from yid_ocp.model.mechanism import Frame, Joint, Mechanism, Placement, damping_parameters, spring_parameters
+from yid_ocp.model.mechanism import Frame, Joint, Mechanism, Placement
 from yid_ocp.model.parameters import Parameters
 from yid_ocp.shown import Shown, Summary, counted
 
@@ -108,14 +109,6 @@ class Grasp:
 
 
 @dataclass(frozen=True)
-class Spring:
-    """A spring 1/2 stiffness (q - rest)^2 on one joint of a robot, in N m/rad and rad (N/m and m where it slides)."""
-
-    stiffness: float
-    rest: float = 0.0
-
-
-@dataclass(frozen=True)
 class MidpointState:
     """What a term may depend on: the midpoint of one step.
 
@@ -129,7 +122,7 @@ class MidpointState:
     z, z_rate : casadi.SX, shape (nz, 1)
         The same of all internal coordinates.
     u : casadi.SX, shape (nu, 1)
-        Motor torques held over the step [N m].
+        Motor torques held over the step [N m], or what servos are commanded [rad or m].
     constraint_force : casadi.SX, shape (m, 1)
         lam_k / h [N or N m].
     internal : mapping of str to int
@@ -313,7 +306,9 @@ class System(Shown):
         Viscous coefficients of joints that are not elastic [N m s/rad].
     grasps : tuple of Grasp
     driven : tuple of str
-        Joints with a motor torque, in the order of u.
+        Joints with an input, in the order of u: a motor torque, or what a servo is commanded.
+    servos : mapping of joint name to Servo
+        Of all driven joints, or of none.
     prescribed : tuple of str
         Joints whose coordinate is known, in the order of s.
     gravity : casadi.SX, shape (3, 1)
@@ -338,6 +333,7 @@ class System(Shown):
     damping: Mapping[str, ca.SX] = field(default_factory=dict)
     grasps: tuple[Grasp, ...] = ()
     driven: tuple[str, ...] = ()
+    servos: Mapping[str, Servo] = field(default_factory=dict)
     prescribed: tuple[str, ...] = ()
     gravity: ca.SX = field(default_factory=lambda: ca.SX(ca.DM([0.0, 0.0, -9.81])))
     time_scale: ca.SX = field(default_factory=lambda: ca.SX(1))
@@ -360,6 +356,7 @@ class System(Shown):
         points: Sequence[str] | None = None,
         effects: Sequence[Effect] = (),
         springs: Mapping[str, Spring] | None = None,
+        servos: PositionServos | None = None,
     ) -> System:
         """Put robot, objects, grasps and effects together.
 
@@ -381,6 +378,9 @@ class System(Shown):
         effects : sequence of Effect
         springs : mapping of str to Spring, optional
             By joint of the robot; become the parameters `JOINT.stiffness` and `JOINT.rest`.
+        servos : PositionServos, optional
+            What the inputs of driven joints command; adds the parameters `JOINT.servo_gain`, `servo_damping`,
+            `servo_delay` and `servo_torque_limit`.
 
         Returns
         -------
@@ -396,13 +396,16 @@ class System(Shown):
             raise ModelError(f"gravity = {acceleration}", allowed="three numbers [m/s^2]")
         tree = mechanism if mechanism is not None else Mechanism("system", (), {})
         wanted = dict(damping) if isinstance(damping, Mapping) else dict.fromkeys(tree.joint_names, float(damping))
-        dampers = damping_parameters(tree, wanted)
+        dampers = joint_dampers(tree, wanted)
         entries = list(dampers.values())
         elastic: list[ElasticJoint] = []
         for joint, spring in (springs or {}).items():
-            stiffness, rest = spring_parameters(tree, joint, spring.stiffness, spring.rest)
+            stiffness, rest = joint_spring(tree, joint, spring)
             entries += [stiffness, rest]
             elastic.append(ElasticJoint(joint, joint, "bend", "", stiffness.symbol, ca.SX(0), rest.symbol))
+        moved, own = ({}, []) if servos is None else joint_servos(tree, driven, servos.commands)
+        entries += own
+        tree = weightless(tree) if servos is not None and servos.gravity_compensation else tree
         segments: list[SegmentLayout] = []
         for item, frame, placement in objects:
             tree = tree.joined(item.mechanism, frame, placement)
@@ -417,6 +420,7 @@ class System(Shown):
             {joint: parameter.symbol for joint, parameter in dampers.items()},
             tuple(grasps),
             tuple(driven),
+            moved,
             tuple(prescribed),
             ca.SX(ca.DM(acceleration)),
             segments=tuple(segments),
@@ -493,6 +497,7 @@ class System(Shown):
             mechanism=self.mechanism.mapped(change),
             elastic=elastic,
             damping={joint: change(value) for joint, value in self.damping.items()},
+            servos={joint: servo.mapped(change) for joint, servo in self.servos.items()},
             grasps=tuple(grasp.mapped(change) for grasp in self.grasps),
             gravity=change(self.gravity),
             time_scale=change(self.time_scale),
@@ -519,11 +524,12 @@ class System(Shown):
             force[index] = force[index] - coefficient * v[index]
         return ca.vertcat(*force)
 
-    def input_force(self, u: ca.SX) -> ca.SX:
-        """B u, the motor torques placed on their coordinates, shape (n, 1) [N m]."""
+    def input_force(self, u: ca.SX, q: ca.SX, v: ca.SX) -> ca.SX:
+        """Torques of motors and servos placed on their coordinates, shape (n, 1) [N m]."""
         force = [ca.SX(0)] * self.size
-        for row, index in enumerate(self.driven_indices):
-            force[index] = u[row]
+        for row, (joint, index) in enumerate(zip(self.driven, self.driven_indices, strict=True)):
+            servo = self.servos.get(joint)
+            force[index] = u[row] if servo is None else servo.torque(u[row], q[index], v[index])
         return ca.vertcat(*force)
 
     def constraints(self, kinematics: Kinematics) -> ca.SX:

@@ -101,6 +101,13 @@ class Experiment:
                 allowed="a robot whose arms move",
                 hint="set model.robot and model.arms",
             )
+        if system.servos:
+            raise ConfigError(
+                "motions are not planned for arms of servos, whose commands are not their motion",
+                where="model.arms.mode",
+                allowed="driven, prescribed",
+                hint="set model.arms.mode: prescribed for the plan",
+            )
         moved = replace(system, driven=(), prescribed=(*system.driven, *system.prescribed))
         step = problem.step if not system.driven else compile_alike(problem.step, moved)
         known = dict(zip(system.parameters.names, map(float, problem.theta), strict=True)) | dict(values)

@@ -139,8 +139,10 @@ class InputCorrections:
         for i, joint in enumerate(self.joints):
             # the last effect is the nearest to the reading
             true_effort, true_angle = effort[i], angle[i]
+            # a servo is commanded what its encoder is to read
+            channel = "joints.position" if joint in self.system.servos else "joints.effort"
             for effect in reversed(self._effects):
-                true_effort = effect.correct(f"joints.effort.{joint}", true_effort, true_effort)
+                true_effort = effect.correct(f"{channel}.{joint}", true_effort, true_effort)
             for effect in reversed(self._effects):
                 true_angle = effect.correct(f"joints.position.{joint}", true_angle, true_effort)
             efforts.append(true_effort)
@@ -149,6 +151,9 @@ class InputCorrections:
 
     def _delay(self, channel: str, camera: bool) -> ca.SX:
         total = sum((effect.delay(channel, camera) for effect in self._effects), ca.SX(0))
+        kind, _, joint = channel.partition(".")
+        if kind == "torque" and joint in self.system.servos:
+            total += self.system.servos[joint].delay
         # a delay is in true time, a recording in its own
         return total / self.system.time_scale
 

@@ -15,7 +15,7 @@ from yid_ocp.integrator.lqr import lqr_filter, proportional_filter
 from yid_ocp.integrator.step import Feedback, Step, check_shape
 from yid_ocp.problem.functions import ModelFunctions
 from yid_ocp.problem.grid import Grid, make_grid
-from yid_ocp.problem.inputs import held_torque, joint_loads, measured_angles, prescribed_path
+from yid_ocp.problem.inputs import held_inputs, joint_loads, measured_angles, prescribed_path
 from yid_ocp.problem.low_pass import LowPass
 from yid_ocp.problem.measurements import Measurements, paper_weighting, placed
 from yid_ocp.problem.noise import InputErrors, input_errors
@@ -36,6 +36,7 @@ class Episode:
     recording : Recording
     grid : Grid
     torque : ndarray, shape (N, nu)
+        Of motors, or what servos are commanded.
     path : ndarray, shape (N + 1, nc)
     posture : ndarray, shape (nk,)
         Known coordinates (driven, then prescribed) at node 0.
@@ -113,7 +114,7 @@ def prepare_episode(functions: ModelFunctions, recording: Recording, options: Pr
     torque = np.zeros((grid.steps, 0))
     if recording.joints is not None:
         read = (recording.joints, system.driven, grid, recording.name)
-        torque, arm = held_torque(*read), measured_angles(*read, LowPass(math.inf))
+        torque, arm = held_inputs(*read, servos=system.servos), measured_angles(*read, LowPass(math.inf))
         smooth = measured_angles(*read, low_pass) if options.feedback == "lqr" else arm
     samples = _samples(step, recording, options, theta, grid)
     known = (*system.driven, *system.prescribed)
@@ -143,7 +144,7 @@ def prepare_episode(functions: ModelFunctions, recording: Recording, options: Pr
 def _tracked(episode: Episode, functions: ModelFunctions, options: ProblemOptions, theta: Array) -> Episode:
     """The episode with the tracking filter of its driven joints, its gains worked out at given parameters."""
     step = functions.step
-    if not step.system.driven or options.feedback == "none":
+    if not step.system.driven or step.system.servos or options.feedback == "none":
         return episode
     if options.feedback == "proportional":
         return replace(episode, feedback=proportional_filter(step, episode.measured_arm, options.gains))

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.errors import DataError, nearest
 from yid_ocp.model.cable import ClampPath
+from yid_ocp.model.drives import Servo
 from yid_ocp.model.system import System
 from yid_ocp.problem.grid import Grid
 from yid_ocp.problem.low_pass import LowPass
@@ -20,13 +21,19 @@ from yid_ocp.sensors import camera_pose, joint_columns
 Array = NDArray[np.float64]
 
 
-def held_torque(
-    joints: JointGroup, driven: tuple[str, ...], grid: Grid, where: str, delay: Array | None = None
+def held_inputs(
+    joints: JointGroup,
+    driven: tuple[str, ...],
+    grid: Grid,
+    where: str,
+    delay: Array | None = None,
+    servos: Mapping[str, Servo] | None = None,
 ) -> Array:
-    """Mean over every step of the torque that the recorded effort stands for, shape (steps, nu) [N m].
+    """Mean over every step of what moves driven joints, shape (steps, nu): torques [N m], or commands [rad or m].
 
-    What is held from sample to sample (`command`) jumps; through samples goes a cubic spline, and where means over the
-    recorded intervals are given, the derivative of one through their sums, which keeps every mean.
+    An effort that is held from sample to sample (`command`) jumps, and so do commands that are held; through samples of
+    efforts goes a cubic spline, and where means over the recorded intervals are given, the derivative of one through
+    their sums, which keeps every mean.
 
     Parameters
     ----------
@@ -36,52 +43,84 @@ def held_torque(
     where : str
         Name of the recording.
     delay : ndarray, shape (nu,), optional
-        How much later than recorded each effort acts [s].
+        How much later than recorded each of them acts [s].
+    servos : mapping of joint to Servo, optional
+        Of all driven joints, which then follow commands.
 
     Raises
     ------
     DataError
-        No effort recorded, or a joint that is missing.
+        No effort recorded, or no commands where servos move the arms, or a joint that is missing.
     """
     if not driven:
         return np.zeros((grid.steps, 0))
+    late = np.zeros(len(driven)) if delay is None else delay
+    courses = _courses(joints, driven, where, servos or {})
+    total = [_summed(course, grid.times - shift) for course, shift in zip(courses, late, strict=True)]
+    return np.asarray(np.diff(np.stack(total, axis=1), axis=0) / grid.time_step)
+
+
+def held_inputs_slope(
+    joints: JointGroup,
+    driven: tuple[str, ...],
+    grid: Grid,
+    where: str,
+    delay: Array,
+    servos: Mapping[str, Servo] | None = None,
+) -> Array:
+    """Derivative of `held_inputs` by each joint's delay, shape (steps, nu); at a jump the mean of two sides."""
+    result = []
+    for course, shift in zip(_courses(joints, driven, where, servos or {}), delay, strict=True):
+        sides = (course(np.clip(grid.times - shift + near, *course.x[[0, -1]])) for near in (-1e-9, 1e-9))
+        result.append(-np.diff(sum(sides)) / 2 / grid.time_step)
+    return np.stack(result, axis=1)
+
+
+def _courses(
+    joints: JointGroup, driven: tuple[str, ...], where: str, servos: Mapping[str, Servo]
+) -> list[scipy.interpolate.PPoly]:
+    """What moves each joint over time, between the first sample and the end of what the last one stands for."""
+    t = joints.t
+    # the last sample stands for as long as the one before it
+    edges = np.append(t, 2 * t[-1] - t[-2])
+    if servos:
+        if joints.position_command is None:
+            raise DataError(
+                "the recording has no commanded positions, which the arms' servos follow",
+                where=f"{where}: joints/position_command",
+                allowed="the commanded position of every joint beside the measured one",
+                hint="import them (the action of a LeRobot dataset, --command-topic of a bag), "
+                "or prescribe the arms' motion instead (model.arms.mode: prescribed)",
+            )
+        rows = joints.position_command[:, joint_columns(joints, driven, where)].T
+        held = [servos[name].commands == "held" for name in driven]
+        return [_held(row, edges) if jumps else _straight(row, t) for row, jumps in zip(rows, held, strict=True)]
     if joints.effort is None:
         raise DataError(
             "the recording has no joint effort, which drives the model",
             where=f"{where}: joints/effort",
             hint="prescribe the arms' motion instead (model.arms.mode: prescribed)",
         )
-    late = np.zeros(len(driven)) if delay is None else delay
-    courses = _torque_courses(joints, driven, where)
-    total = [_summed(course, grid.times - shift) for course, shift in zip(courses, late, strict=True)]
-    return np.asarray(np.diff(np.stack(total, axis=1), axis=0) / grid.time_step)
-
-
-def held_torque_slope(joints: JointGroup, driven: tuple[str, ...], grid: Grid, where: str, delay: Array) -> Array:
-    """Derivative of `held_torque` by each joint's delay, shape (steps, nu) [N m/s]; at a jump the mean of two sides."""
-    result = []
-    for course, shift in zip(_torque_courses(joints, driven, where), delay, strict=True):
-        sides = (course(np.clip(grid.times - shift + near, *course.x[[0, -1]])) for near in (-1e-9, 1e-9))
-        result.append(-np.diff(sum(sides)) / 2 / grid.time_step)
-    return np.stack(result, axis=1)
-
-
-def _torque_courses(joints: JointGroup, driven: tuple[str, ...], where: str) -> list[scipy.interpolate.PPoly]:
-    """Torque of each joint over time, between the first sample and the end of what the last one stands for."""
-    assert joints.effort is not None
-    effort, t = joints.effort[:, joint_columns(joints, driven, where)], joints.t
+    effort = joints.effort[:, joint_columns(joints, driven, where)]
     if joints.effort_taken_as == "sample":
         return [scipy.interpolate.CubicSpline(t, column) for column in effort.T]
-    # the last sample stands for as long as the one before it
-    edges = np.append(t, 2 * t[-1] - t[-2])
     if joints.effort_taken_as == "command":
-        return [scipy.interpolate.PPoly(column[None, :], edges) for column in effort.T]
+        return [_held(column, edges) for column in effort.T]
     sums = np.vstack([np.zeros((1, len(driven))), np.cumsum(effort * np.diff(edges)[:, None], axis=0)])
     return [scipy.interpolate.CubicSpline(edges, column).derivative() for column in sums.T]
 
 
+def _held(values: Array, edges: Array) -> scipy.interpolate.PPoly:
+    return scipy.interpolate.PPoly(values[None, :], edges)
+
+
+def _straight(values: Array, t: Array) -> scipy.interpolate.PPoly:
+    """Straight lines between samples."""
+    return scipy.interpolate.PPoly(np.stack([np.diff(values) / np.diff(t), values[:-1]]), t)
+
+
 def _summed(course: scipy.interpolate.PPoly, t: Array) -> Array:
-    """Integral of a torque up to times, shape of t; before its first moment and after its last it is held."""
+    """Integral of an input up to times, shape of t; before its first moment and after its last it is held."""
     inside = np.clip(t, *course.x[[0, -1]])
     return np.asarray(course.antiderivative()(inside) + course(inside) * (t - inside))
 

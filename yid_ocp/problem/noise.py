@@ -124,7 +124,7 @@ def input_errors(
     sensors: Mapping[str, SensorOptions],
     samples: Sequence[Measurements],
 ) -> InputErrors | None:
-    """Errors of the torques and angles that drive a recording's rollout; None where there are none.
+    """Errors of the torques and angles that drive a recording's rollout; None where there are none, as of commands.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ def input_errors(
         Of the recording.
     """
     joints, driven = recording.joints, system.driven
-    if joints is None or joints.effort is None or not driven:
+    if joints is None or joints.effort is None or not driven or system.servos:
         return None
     effort, position = (sensors.get(group, SensorOptions()) for group in (EFFORT, POSITION))
     std = torque_std(joints, driven, effort, recording.name)

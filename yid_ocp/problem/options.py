@@ -110,7 +110,9 @@ class ProblemOptions:
             "at rest at the first posture; that plus a free offset with a prior; fitted to the first measured points"
         ),
     ] = "equilibrium"
-    feedback: Annotated[Literal["none", "proportional", "lqr"], About("tracking filter of driven arms")] = "lqr"
+    feedback: Annotated[
+        Literal["none", "proportional", "lqr"], About("tracking filter of driven arms; arms with servos have none")
+    ] = "lqr"
     gains: Annotated[
         tuple[Annotated[float, Ge(0)], ...],
         Len(1),

@@ -17,7 +17,7 @@ from yid_ocp.parallel import map_threads
 from yid_ocp.problem.corrections import Inputs
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.functions import ModelFunctions
-from yid_ocp.problem.inputs import held_torque, held_torque_slope
+from yid_ocp.problem.inputs import held_inputs, held_inputs_slope
 from yid_ocp.problem.lag import Lag
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.noise import Course, Innovations, InputErrors, innovations
@@ -171,7 +171,7 @@ class Predictor:
             Parameters by which to differentiate.
         """
         inputs = self._corrected(episode, theta, wanted)
-        if not self.system.driven or self.options.feedback != "lqr":
+        if not self.system.driven or self.system.servos or self.options.feedback != "lqr":
             return inputs
         shift = self.functions.momentum_shift
         if not shift.active(theta, wanted):
@@ -191,8 +191,8 @@ class Predictor:
             assert joints is not None
             where = (joints, self.system.driven, episode.grid, episode.name)
             delay, by_delay = corrections.torque_delay(theta, wanted)
-            torque = held_torque(*where, delay)
-            by_recorded = held_torque_slope(*where, delay)[:, :, None] * by_delay
+            torque = held_inputs(*where, delay, self.system.servos)
+            by_recorded = held_inputs_slope(*where, delay, self.system.servos)[:, :, None] * by_delay
         if errors is not None:
             # what multiplies or follows a reading would else take its noise for torque, and shrink to be rid of it
             torque, first = torque - errors.read, first - errors.read[0]

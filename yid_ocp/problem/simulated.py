@@ -106,6 +106,8 @@ def _joints(
     names = tuple(name for name in (*system.driven, *system.prescribed) if name in source.names)
     at = [system.mechanism.joint_index(name) for name in names]
     position = outcome.rollout.state[:, at]
+    if system.servos:
+        return _commanded(predictor, episode, position, names, rng)
     held = {name: outcome.rollout.torque[:, i] for i, name in enumerate(system.driven)}
     held |= {name: outcome.rollout.effort[:, i] for i, name in enumerate(system.prescribed)}
     effort = np.stack([np.append(held[name], held[name][-1]) for name in names], axis=1)
@@ -127,6 +129,27 @@ def _joints(
         # of prescribed joints it is the effort at the nodes
         effort_kind="command" if system.driven else "sample",
     )
+
+
+def _commanded(
+    predictor: Predictor,
+    episode: Episode,
+    position: Array,
+    names: tuple[str, ...],
+    rng: np.random.Generator | None,
+) -> JointGroup:
+    """Joints of servos at every node, with what they were commanded there."""
+    source, times = episode.recording.joints, episode.grid.times
+    assert source is not None
+    assert source.position_command is not None
+    commands = source.position_command[:, [source.names.index(name) for name in names]]
+    rows = np.clip(np.searchsorted(source.t, times + 1e-9) - 1, 0, len(source.t) - 1)
+    between = np.stack([np.interp(times, source.t, column) for column in commands.T], axis=1)
+    held = [predictor.system.servos[name].commands == "held" for name in names]
+    std = angle_std(source, names, predictor.options.sensors.get(POSITION, SensorOptions()), episode.name)
+    noisy = _noisy(position, np.broadcast_to(std, position.shape), rng)
+    given = np.where(held, commands[rows], between)
+    return JointGroup(names, times, noisy, position_command=given, position_std=std)
 
 
 @dataclass(frozen=True)

@@ -132,12 +132,13 @@ def stated_rows(unknowns: Unknowns, options: ProblemOptions, std: Array) -> Arra
 def start_names(system: System, options: ProblemOptions, free: Sequence[str], theta: Array) -> tuple[str, ...]:
     """Estimated rows of an initial state.
 
-    Where starts are estimated, q and p of the coordinates that are neither driven, nor prescribed, nor follow their
-    load at once; in any case the internal coordinates that nothing tells, of effects that are free or not neutral.
+    Where starts are estimated, q and p of the coordinates that are neither driven by torques, nor prescribed, nor
+    follow their load at once; in any case the internal coordinates that nothing tells, of effects that are free or not
+    neutral.
     """
     found: list[str] = []
     if options.initial_state == "estimated":
-        known = set(system.driven_indices) | set(system.prescribed_indices)
+        known = {*(() if system.servos else system.driven_indices), *system.prescribed_indices}
         known |= {system.mechanism.joint_index(joint) for joint in system.compliant}
         coordinates = [name for i, name in enumerate(system.mechanism.joint_names) if i not in known]
         found = [*(f"q.{name}" for name in coordinates), *(f"p.{name}" for name in coordinates)]

@@ -114,7 +114,7 @@ def _tracked(problem: EstimationProblem, episode: Episode, theta: Array, start: 
 
 def _tracking(problem: EstimationProblem, episode: Episode, theta: Array) -> Feedback | None:
     feedback = episode.feedback
-    if feedback is None and problem.system.driven:
+    if feedback is None and problem.system.driven and not problem.system.servos:
         smooth = LowPass(problem.options.path_cutoff)(episode.grid.times, episode.measured_arm)
         return lqr_filter(problem.step, smooth, episode.torque, theta, arms=problem.functions.arms)
     return feedback

@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import SolverError
 from yid_ocp.integrator.stage import stage
-from yid_ocp.integrator.statics import HOLD_STIFFNESS, HOLD_STIFFNESS_WITH_TORQUE
+from yid_ocp.integrator.statics import hold_stiffness
 from yid_ocp.parallel import SYMBOLIC
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.measurements import Measurements
@@ -374,7 +374,7 @@ class _Maker:
             statics = problem.functions.statics
             rest = statics.equations
             sought, held = rest.inputs[0], rest.inputs[2]
-            stiffness = HOLD_STIFFNESS_WITH_TORQUE if problem.system.driven else HOLD_STIFFNESS
+            stiffness = hold_stiffness(problem.system, bool(problem.system.driven))
             symbols = rest.inputs[3:]
             values = [ca.SX(stiffness), self._freed.theta, ca.SX(self._step.time_step)]
             balance, state = ca.substitute([rest.residual, rest.state], symbols, values)

@@ -133,8 +133,8 @@ class SimulatedRun:
     q, v : ndarray, shape (N + 1, n)
         In configuration order [rad or m].
     effort : ndarray, shape (N + 1, nu)
-        Torque at t_k, or its mean from t_k to t_{k+1}, as `effort_kind` says [N m]; the last row was computed and not
-        applied.
+        Torque at t_k, or its mean from t_k to t_{k+1}, as `effort_kind` says [N m], or what servos were commanded at
+        t_k; the last row was computed and not applied.
     points : ndarray, shape (N + 1, np, 3)
         Of `system.points` in the world [m].
     frame_t : ndarray, shape (M,)
@@ -164,8 +164,11 @@ def simulate_in_mujoco(
     posture: Mapping[str, float] | None = None,
     frame_times: ArrayLike = (),
     injected: EngineTerms | None = None,
+    play: Mapping[str, float] | None = None,
 ) -> SimulatedRun:
     """Let the controller follow a motion in MuJoCo, from static equilibrium at the initial posture.
+
+    Position servos are MuJoCo's own: they are commanded the motion about the posture, and rest where that leaves them.
 
     Parameters
     ----------
@@ -182,6 +185,8 @@ def simulate_in_mujoco(
     injected : EngineTerms, optional
         What is at work beside the system's description. MuJoCo knows one such callback for the whole process: no other
         simulation may run meanwhile in another thread.
+    play : mapping of joint to float, optional
+        Width of the play of gears behind servos [rad].
 
     Raises
     ------
@@ -199,17 +204,21 @@ def simulate_in_mujoco(
             allowed=f"the driven joints ({', '.join(system.driven) or 'none'}), nothing prescribed",
         )
     mujoco = mujoco_module()
-    model = compiled_model(mujoco_xml(system, values, time_step=chosen.time_step))
+    model = compiled_model(mujoco_xml(system, values, time_step=chosen.time_step, play=play))
     nominal_damping = np.array(model.dof_damping)
     with _at_work(mujoco, model, injected):
         scene = Scene.of(system, mujoco, model)
         start = initial_posture(system, values) if posture is None else posture
         scene.data.qpos[:] = model.qpos_spring
         scene.data.qpos[[model.joint(name).id for name in start]] = list(start.values())
-        balance = settle(scene, nominal_damping)
+        controller: Controller | Commander
+        if system.servos:
+            controller = Commander(scene, motion)
+            settle_servos(scene, nominal_damping, controller.first)
+        else:
+            controller = Controller(scene, motion, settle(scene, nominal_damping))
         if injected is not None:
             injected.begin(scene.data)
-        controller = Controller(scene, motion, balance)
         frames = np.round(np.asarray(frame_times, float) / chosen.time_step).astype(int)
         result = _play(scene, controller, chosen, frames)
         lost = scene.data.warning[_BAD_ACCELERATION].number > 0
@@ -279,11 +288,7 @@ def settle(scene: Scene, damping: Array) -> Array:
         elif calm < _REST:
             break
     else:
-        raise ModelError(
-            f"the object does not come to rest in {_SETTLING_LIMIT:g} s (largest velocity {calm:.2g} rad/s)",
-            where="settling before the motion",
-            hint="give every coordinate some damping and enough stiffness to stand",
-        )
+        raise _restless(data)
     balance = _HOLD_STIFFNESS * (held.qpos_spring[driven] - data.qpos[driven])
     data.qvel[:], data.qacc_warmstart[:], data.time = 0.0, 0.0, 0.0
     return balance
@@ -310,6 +315,12 @@ class Controller:
         zero = np.zeros(len(scene.driven))
         self._load = balance - self._arm_torque(self._rest[scene.driven], zero, zero)
 
+    def act(self, t: float) -> Array:
+        """Apply the torques of time t [s] and return them, shape (nu,) [N m]."""
+        torque = self.torque(t)
+        self._scene.data.qfrc_applied[self._scene.driven] = torque
+        return torque
+
     def torque(self, t: float) -> Array:
         """Torques at time t [s] from the scene's state then, shape (nu,) [N m]."""
         data, driven = self._scene.data, self._scene.driven
@@ -327,21 +338,82 @@ class Controller:
         return np.array(shadow.qfrc_inverse[driven])
 
 
-def _play(scene: Scene, controller: Controller, simulation: Simulation, frames: Integers) -> SimulatedRun:
+class Commander:
+    """Commands of position servos: a motion about the posture in which the scene is now.
+
+    Parameters
+    ----------
+    scene : Scene
+        In the posture that is commanded first.
+    motion : Movement
+    """
+
+    def __init__(self, scene: Scene, motion: Movement) -> None:
+        self._scene, self._motion = scene, motion
+        self.first = scene.data.qpos[scene.driven].copy()
+
+    def act(self, t: float) -> Array:
+        """Give the commands of time t [s] and return them, shape (nu,) [rad or m]."""
+        commands = np.asarray(self.first + self._motion.at(t)[0])
+        self._scene.data.ctrl[:] = commands
+        return commands
+
+
+def command_always(scene: Scene, commands: Array) -> None:
+    """Let actuators have been commanded the same for long, those that act late as well."""
+    model, data = scene.model, scene.data
+    data.ctrl[:] = commands
+    if hasattr(scene.mujoco, "mj_initCtrlHistory") and hasattr(model, "actuator_delay"):
+        for i in map(int, np.flatnonzero(np.asarray(model.actuator_delay))):
+            before = np.full((int(model.actuator_history[i, 0]), 1), commands[i])
+            scene.mujoco.mj_initCtrlHistory(model, data, i, None, before)
+
+
+def settle_servos(scene: Scene, damping: Array, commands: Array) -> None:
+    """Bring the scene to rest under what its servos are commanded; joints damp as `damping` says, only more."""
+    model, data = scene.model, scene.data
+    data.ctrl[:] = commands
+    held = copy.copy(model)
+    held.dof_damping[:] = damping
+    others = np.setdiff1d(np.arange(model.nv), scene.driven)
+    held.dof_damping[others] *= _SETTLING_FACTOR
+    if hasattr(held, "actuator_delay"):
+        held.actuator_delay[:] = 0.0
+    block = max(1, round(0.1 / model.opt.timestep))
+    for _ in range(math.ceil(_SETTLING_LIMIT / (block * model.opt.timestep))):
+        scene.mujoco.mj_step(held, data, nstep=block)
+        if np.abs(data.qvel).max() < _REST:
+            break
+    else:
+        raise _restless(data)
+    posture = data.qpos.copy()
+    scene.mujoco.mj_resetData(model, data)
+    data.qpos[:] = posture
+    command_always(scene, commands)
+
+
+def _restless(data: Any) -> ModelError:
+    calm = float(np.abs(data.qvel).max())
+    return ModelError(
+        f"the object does not come to rest in {_SETTLING_LIMIT:g} s (largest velocity {calm:.2g} rad/s)",
+        where="settling before the motion",
+        hint="give every coordinate some damping and enough stiffness to stand",
+    )
+
+
+def _play(scene: Scene, controller: Controller | Commander, simulation: Simulation, frames: Integers) -> SimulatedRun:
     """Simulate period by period of the controller, the torque held in each; `frames` count the simulator's steps."""
     mujoco, model, data = scene.mujoco, scene.model, scene.data
     inner, steps, periods = simulation.inner_steps, simulation.samples, simulation.controller_periods
     q, v, torques, points, error, seen = [], [], [], [], [], []
     for tick in range(steps * periods + 1):
         mujoco.mj_kinematics(model, data)
-        torque = controller.torque(tick / (simulation.rate * periods))
-        torques.append(torque)
+        torques.append(controller.act(tick / (simulation.rate * periods)))
         if tick % periods == 0:
             q.append(data.qpos[scene.order])
             v.append(data.qvel[scene.order])
             points.append(data.site_xpos[scene.sites])
             error.append([np.linalg.norm(data.site_xpos[a] - data.site_xpos[b]) for a, b in scene.ends])
-        data.qfrc_applied[scene.driven] = torque
         done = tick * inner
         for frame in frames[(frames >= done) & (frames < done + inner)]:
             if frame > done:

@@ -128,6 +128,8 @@ class VirtualExperiment:
         Of all noise; each sensor has its own stream, so that leaving one out changes no other.
     name, description : str
         Of the recording; how it was made is appended to the description.
+    play : mapping of joint to float
+        Width of the play of gears behind servos [rad].
     """
 
     motion: Motion | None = None
@@ -139,6 +141,7 @@ class VirtualExperiment:
     seed: int = 0
     name: str = "virtual"
     description: str = ""
+    play: Mapping[str, float] = field(default_factory=dict)
 
 
 def virtual_experiment(
@@ -188,6 +191,7 @@ def virtual_experiment(
         posture=posture,
         frame_times=times,
         injected=chosen.injected,
+        play=chosen.play,
     )
     groups = []
     if held:
@@ -197,7 +201,7 @@ def virtual_experiment(
     theta = system.parameters.vector(values)
     names = system.parameters.names
     truth = {n: float(theta[i]) for i, n in enumerate(names) if n.rpartition(".")[2] in _TRUE_QUANTITIES}
-    made = _how_it_was_made(chosen, len(system.driven), seen=len(run.frame_t) > 0)
+    made = _how_it_was_made(chosen, system, seen=len(run.frame_t) > 0)
     joints = _joints(system, run, chosen, streams)
     text = f"{chosen.description} {made}".strip()
     source = "yid_ocp virtual experiment"
@@ -220,6 +224,16 @@ def _joints(system: System, run: SimulatedRun, experiment: VirtualExperiment, st
         for name, std in (("effort", noise.effort), ("effort_bias", noise.effort_bias))
     )
     offset = bias * streams["effort_bias"].standard_normal(len(driven))
+    if system.servos:
+        return JointGroup(
+            names=tuple(system.driven),
+            t=run.t,
+            position=_noisy(run.q[:, driven], noise.position, streams["position"]),
+            velocity=_noisy(run.v[:, driven], noise.velocity, streams["velocity"]),
+            position_command=run.effort,
+            position_std=noise.position,
+            velocity_std=noise.velocity,
+        )
     return JointGroup(
         names=tuple(system.driven),
         t=run.t,
@@ -260,18 +274,22 @@ def _camera_points(
     return PointGroup("points_camera", visible, run.frame_t, position, std, "camera", pose=pose)
 
 
-def _how_it_was_made(experiment: VirtualExperiment, joints: int, seen: bool) -> str:
+def _how_it_was_made(experiment: VirtualExperiment, system: System, seen: bool) -> str:
     simulation, noise, camera = experiment.simulation, experiment.noise, experiment.camera
+    held, sampled = 1e3 / (simulation.rate * simulation.controller_periods), 1e3 / simulation.rate
+    input_, efforts = f"commands of position servos held over each {held:g} ms, recorded every {sampled:g} ms", ""
+    if not system.servos:
+        input_ = f"torque held over each {held:g} ms and recorded as {simulation.effort_kind} every {sampled:g} ms"
+        efforts = f"effort {_listed(noise.effort)} N m, "
     made = (
-        f"Virtual experiment in MuJoCo {mujoco_module().__version__} "
-        f"(implicitfast, {1e3 * simulation.time_step:g} ms inner step): multi-sine motion of {joints} joints "
-        f"from static equilibrium, torque held over each {1e3 / (simulation.rate * simulation.controller_periods):g} ms"
-        f" and recorded as {simulation.effort_kind} every {1e3 / simulation.rate:g} ms, "
-        f"seed {experiment.seed}. White noise: "
+        f"Virtual experiment in MuJoCo {mujoco_module().__version__} (implicitfast, "
+        f"{1e3 * simulation.time_step:g} ms inner step): multi-sine motion of {len(system.driven)} joints "
+        f"from static equilibrium, {input_}, seed {experiment.seed}. White noise: "
         f"joint position {noise.position:g} rad, velocity {noise.velocity:g} rad/s, "
-        f"effort {_listed(noise.effort)} N m, arm points {1e3 * noise.points:g} mm; "
-        f"constant offset of the effort {_listed(noise.effort_bias)} N m"
+        f"{efforts}arm points {1e3 * noise.points:g} mm"
     )
+    if not system.servos:
+        made += f"; constant offset of the effort {_listed(noise.effort_bias)} N m"
     if camera is None or not seen:
         return made + "; no camera."
     return made + f", camera {1e3 * camera.std:g} mm at about {camera.rate:g} Hz."

@@ -36,7 +36,7 @@ SMOOTHING = 0.02
 FARTHEST = 1.0
 """Distance of a payload's mass from its frame [m]."""
 
-# a change of the system's description
+# a change of the system's description; servos are MuJoCo's own actuators, which delay and clip
 DESCRIBED: tuple[str, ...] = (
     "density",
     "point_mass",
@@ -46,6 +46,9 @@ DESCRIBED: tuple[str, ...] = (
     "bend_anisotropy",
     "gravity_tilt",
     "grasp_offset",
+    "servo_gain",
+    "servo_delay",
+    "servo_saturation",
 )
 # a term that MuJoCo's own model has
 MODELLED: tuple[str, ...] = ("kelvin_voigt", "joint_viscous", "rotor_inertia", "payload")
@@ -145,11 +148,14 @@ def injected_experiment(
             )
     described = [make_effect(e.kind, e.location, system, e.values) for e in effects if e.kind in DESCRIBED]
     changed = system.with_effects(described) if described else system
+    # a servo acts on what its encoder reads: gears with play are part of the mechanics
+    play = {e.location: e.values["width"] for e in effects if e.kind == "backlash" and e.location in system.servos}
     inner = [e for e in effects if e.kind not in DESCRIBED and e.kind not in SENSOR_ERRORS]
     injected = InjectedTerms(changed, values, inner) if inner else None
-    made = virtual_experiment(changed, values, replace(experiment or VirtualExperiment(), injected=injected))
+    chosen = replace(experiment or VirtualExperiment(), injected=injected, play=play)
+    made = virtual_experiment(changed, values, chosen)
     for effect in effects:
-        if effect.kind in SENSOR_ERRORS:
+        if effect.kind in SENSOR_ERRORS and effect.location not in play:
             made = with_sensor_error(made, system, effect)
     return made
 
@@ -391,7 +397,8 @@ def with_sensor_error(recording: Recording, system: System, effect: InjectedEffe
         return replace(recording, points=points)
     joints = recording.joints
     assert joints is not None
-    assert joints.effort is not None
+    if joints.effort is None:
+        raise ModelError("the recording has no efforts", where=effect.label, allowed="arms that torques move")
     return replace(recording, joints=_joint_error(joints, system, effect))
 
 

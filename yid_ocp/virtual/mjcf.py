@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from yid_ocp.errors import ConfigError, DataError, ModelError
+from yid_ocp.model.drives import KNEE, NO_LIMIT
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement, merged
 from yid_ocp.model.system import System
 from yid_ocp.virtual.terms import ASPECTS, Evaluator, JointTerms, actuation, effect_aspects, joint_terms
@@ -24,7 +25,7 @@ Array = NDArray[np.float64]
 NATIVE = frozenset(
     {
         *("stiffness", "rest", "damping", "geometry", "inertia", "weight"),
-        *("gravity", "grasp", "sprung_joint", "armature", "cubic_stiffness"),
+        *("gravity", "grasp", "sprung_joint", "armature", "cubic_stiffness", "servo"),
     }
 )
 """Aspects of an effect for which MuJoCo has a term of its own."""
@@ -34,6 +35,7 @@ IGNORED = frozenset({"reading", "torque_gain", "torque_offset", "torque_delay", 
 """Those between sensors, or recorded torques, and the mechanics."""
 
 _JOINTS_PER_BODY = 6  # as many as MuJoCo allows
+_ROTOR = 5e-4  # [kg m^2] of a motor behind play, as little as lets it rest at a stop
 _AXIS_LEVER = 0.1  # [m] between the two points that keep two axes parallel
 
 
@@ -45,6 +47,7 @@ def mujoco_xml(
     integrator: str = "implicitfast",
     emulate: bool = False,
     actuators: bool = False,
+    play: Mapping[str, float] | None = None,
 ) -> str:
     """The system as a MuJoCo model (MJCF).
 
@@ -68,7 +71,10 @@ def mujoco_xml(
         tendon for a compliant point grasp. Refused otherwise.
     actuators : bool
         Whether every driven joint has an actuator of its name whose control is the recorded torque, with gain, offset,
-        delay and lag between that and the torque that acts; without, true torques go in as `qfrc_applied`.
+        delay and lag between that and the torque that acts; without, true torques go in as `qfrc_applied`. A servo
+        always is an actuator, whose control is the command.
+    play : mapping of joint name to float, optional
+        Width of the play of gears [rad]: the joint is then the motor's side, and a joint `NAME_play` follows it.
 
     Returns
     -------
@@ -104,11 +110,12 @@ def mujoco_xml(
     sites = _sites(system, tree, value)
     base = ElementTree.SubElement(ElementTree.SubElement(root, "worldbody"), "body", name="world_base")
     ElementTree.SubElement(base, "inertial", pos="0 0 0", mass="0", diaginertia="0 0 0")  # Pinocchio asks for one
-    elements = _bodies(tree, weights, joint_terms(system, value), sites, base)
+    gears = {name: _play_attributes(width, time_step) for name, width in (play or {}).items()}
+    elements = _bodies(tree, weights, joint_terms(system, value), sites, base, gears)
     for name, frame in sites:
         ElementTree.SubElement(elements[frame.joint], "site", {"name": name, **_pose(frame.placement)})
     _add_grasps(system, value, root, time_step)
-    if actuators:
+    if actuators or system.servos:
         _add_actuators(system, value, ElementTree.SubElement(root, "actuator"), time_step)
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
@@ -120,8 +127,12 @@ def _bodies(
     terms: Mapping[str, JointTerms],
     sites: list[tuple[str, Frame]],
     world: ElementTree.Element,
+    gears: Mapping[str, Mapping[str, str]],
 ) -> dict[int, ElementTree.Element]:
-    """Add bodies with their joints and masses; the body of every joint by its index, -1 for the world."""
+    """Add bodies with their joints and masses; the body of every joint by its index, -1 for the world.
+
+    `gears` has attributes of the joint between a motor and what it moves, by the motor's joint.
+    """
     carried = {frame.joint: name for name, frame in reversed(sites)}
     elements: dict[int, ElementTree.Element] = {-1: world}
     for j, joint in enumerate(tree.joints):
@@ -135,7 +146,15 @@ def _bodies(
                 elements[joint.parent], "body", {"name": f"{joint.name}_body", **_pose(joint.placement)}
             )
         attributes = _joint_attributes(joint, terms.get(joint.name, JointTerms()))
-        ElementTree.SubElement(elements[j], "joint", attributes)
+        moved = ElementTree.SubElement(elements[j], "joint", attributes)
+        if joint.name in gears:
+            motor, name = elements[j], joint.name
+            motor.set("name", f"{name}_motor")
+            moved.attrib.setdefault("armature", _text([_ROTOR]))
+            ElementTree.SubElement(motor, "inertial", pos="0 0 0", mass="1e-6", diaginertia="1e-9 1e-9 1e-9")
+            elements[j] = ElementTree.SubElement(motor, "body", {"name": f"{name}_body"})
+            kind = {"name": f"{name}_play", "type": attributes["type"], "axis": attributes["axis"]}
+            ElementTree.SubElement(elements[j], "joint", {**kind, **gears[name]})
         if len(elements[j].findall("joint")) > _JOINTS_PER_BODY:
             raise ModelError(
                 "more than six joints without mass sit at one place",
@@ -188,6 +207,12 @@ def _joint_attributes(joint: Joint, terms: JointTerms) -> dict[str, str]:
     return attributes
 
 
+def _play_attributes(width: float, time_step: float) -> dict[str, str]:
+    """A joint with stops at half the width either way."""
+    ends = {"limited": "true", "range": _text([-width / 2, width / 2])}
+    return {**ends, "solreflimit": _text([5 * time_step, 1.0]), "solimplimit": "0.99 0.999 0.0001 0.5 2"}
+
+
 def _add_grasps(system: System, value: Evaluator, root: ElementTree.Element, time_step: float) -> None:
     equality = ElementTree.SubElement(root, "equality")
     firm = {"solref": _text([2 * time_step, 1.0]), "solimp": "0.9999 0.9999 0.001 0.5 2"}
@@ -213,19 +238,28 @@ def _add_grasps(system: System, value: Evaluator, root: ElementTree.Element, tim
 
 
 def _add_actuators(system: System, value: Evaluator, actuator: ElementTree.Element, time_step: float) -> None:
-    """Actuators from recorded torques to those that act."""
+    """Actuators from recorded torques to those that act, and position servos."""
     for joint, found in actuation(system, value).items():
-        attributes = {"name": joint, "joint": joint, "gainprm": _text([found.gain])}
-        if found.offset:
-            attributes |= {"biastype": "affine", "biasprm": _text([-found.offset, 0.0, 0.0])}
+        attributes, servo = {"name": joint, "joint": joint}, system.servos.get(joint)
+        gain, bias, delay, between = found.gain, [-found.offset, 0.0, 0.0], found.delay, "linear"
+        if servo is not None:
+            own, damping, late, tightness = (float(value(x)[0]) for x in servo.parts)
+            gain, bias, delay = own * gain, [own * bias[0], -own, -damping], delay + late
+            between = "zoh" if servo.commands == "held" else "linear"
+            limit = tightness ** (-1 / KNEE) if tightness > 0 else math.inf
+            if limit < NO_LIMIT:
+                attributes |= {"forcelimited": "true", "forcerange": _text([-limit, limit])}
+        attributes["gainprm"] = _text([gain])
+        if any(bias):
+            attributes |= {"biastype": "affine", "biasprm": _text(bias)}
         if found.lag > 0:
             attributes |= {"dyntype": "filterexact", "dynprm": _text([found.lag])}
-        if found.delay > 0:
+        if delay > 0:
             if not hasattr(mujoco_module().MjModel, "actuator_delay"):
                 what, allowed = f"the torque of '{joint}' acts late", "MuJoCo with delays of actuators (3.5 or newer)"
                 raise ModelError(what, where="mujoco_xml", allowed=allowed)
-            samples = math.ceil(found.delay / time_step) + 1
-            attributes |= {"delay": _text([found.delay]), "nsample": str(samples), "interp": "linear"}
+            samples = math.ceil(delay / time_step) + 1
+            attributes |= {"delay": _text([delay]), "nsample": str(samples), "interp": between}
         ElementTree.SubElement(actuator, "general", attributes)
 
 

@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter1d
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import ModelError
 from yid_ocp.model.system import System
-from yid_ocp.virtual.engine import Controller, Scene, settle
+from yid_ocp.virtual.engine import Controller, Scene, command_always, settle, settle_servos
 from yid_ocp.virtual.mjcf import compiled_model, mujoco_module
 
 Array = NDArray[np.float64]
@@ -53,8 +53,9 @@ def replay(text: str, system: System, recording: Recording) -> dict[str, Error]:
     """Let a model that was exported play a recording.
 
     Driven joints get the recorded torque as the control of their actuators, and beside it a weak pull to the recorded
-    angles (`BANDWIDTH`), without which any error of a torque lets an arm drift away. Prescribed joints follow the
-    recorded angles; the torque that this takes is compared with the recorded one.
+    angles (`BANDWIDTH`), without which any error of a torque lets an arm drift away. Position servos get what they were
+    commanded and nothing else. Prescribed joints follow the recorded angles; the torque that this takes is compared
+    with the recorded one.
 
     Parameters
     ----------
@@ -84,19 +85,23 @@ def replay(text: str, system: System, recording: Recording) -> dict[str, Error]:
         what = f"'{recording.name}' does not say how the joints moved"
         raise ModelError(what, where="replay", allowed="recorded angles of all driven or prescribed joints")
     columns = [joints.names.index(name) for name in moved]
-    if system.driven and joints.effort is None:
+    if system.servos and joints.position_command is None:
+        raise ModelError(f"'{recording.name}' has no commands", where="replay", allowed="recorded commanded positions")
+    if system.driven and not system.servos and joints.effort is None:
         raise ModelError(f"'{recording.name}' has no torques", where="replay", allowed="recorded torques")
     t, position = joints.t - joints.t[0], joints.position[:, columns]
     effort = None if joints.effort is None else joints.effort[:, columns]
     scene = Scene.of(system, mujoco, model)
     scene.data.qpos[:] = model.qpos_spring
     scene.data.qpos[scene.driven] = position[:_START].mean(axis=0)
+    if system.servos:
+        assert joints.position_command is not None
+        played = _commanded(scene, system, t, joints.position_command[:, columns])
+        return _errors(system, recording, joints, columns, played)
     balance = settle(scene, np.array(model.dof_damping))
     noisy = joints.position_std is not None and bool(np.any(np.asarray(joints.position_std) > 0))
     path = _Path(moved, t, position, _SMOOTHED if noisy else 0.0)
     played = _driven(scene, path, t, effort) if system.driven else _prescribed(scene, path, t, balance)
-    if not (np.isfinite(played.values).all() and np.isfinite(played.points).all()):
-        raise ModelError("the replay diverged", where=recording.name, hint="take a shorter time step")
     return _errors(system, recording, joints, columns, played)
 
 
@@ -132,11 +137,7 @@ def _driven(scene: Scene, path: _Path, t: Array, effort: Array | None) -> _Playe
     values, points = np.empty((steps, len(at))), np.empty((steps, len(scene.sites), 3))
     if model.na:  # torques that follow are what they were before
         data.act[:] = effort[0][np.array(model.actuator_actnum) > 0]
-    if hasattr(mujoco, "mj_initCtrlHistory"):
-        late = np.asarray(getattr(model, "actuator_delay", np.zeros(model.nu)))
-        for i in map(int, np.flatnonzero(late)):
-            before = np.full((int(model.actuator_history[i, 0]), 1), effort[0][i])
-            mujoco.mj_initCtrlHistory(model, data, i, None, before)
+    command_always(scene, effort[0])
     inertia = np.zeros((model.nv, model.nv))
     last = np.searchsorted(t, np.arange(steps) * model.opt.timestep + 1e-9, side="right") - 1
     for k in range(steps):
@@ -152,6 +153,22 @@ def _driven(scene: Scene, path: _Path, t: Array, effort: Array | None) -> _Playe
         data.qfrc_applied[at] = arm @ demand
         mujoco.mj_step(model, data)
     return _Played(np.arange(steps) * model.opt.timestep, values, points)
+
+
+def _commanded(scene: Scene, system: System, t: Array, commands: Array) -> _Played:
+    mujoco, model, data, at = scene.mujoco, scene.model, scene.data, scene.driven
+    settle_servos(scene, np.array(model.dof_damping), commands[0])
+    steps = round(t[-1] / model.opt.timestep)
+    times = np.arange(steps) * model.opt.timestep
+    held = commands[np.searchsorted(t, times + 1e-9, side="right") - 1]
+    given = np.where([system.servos[name].commands == "held" for name in system.driven], held, _at(times, t, commands))
+    values, points = np.empty((steps, len(at))), np.empty((steps, len(scene.sites), 3))
+    for k in range(steps):
+        mujoco.mj_kinematics(model, data)
+        values[k], points[k] = data.qpos[at], data.site_xpos[scene.sites]
+        data.ctrl[:] = given[k]
+        mujoco.mj_step(model, data)
+    return _Played(times, values, points)
 
 
 def _full_inertia(mujoco: Any, model: Any, data: Any, full: Array) -> None:
@@ -179,6 +196,8 @@ def _prescribed(scene: Scene, path: _Path, t: Array, balance: Array) -> _Played:
 def _errors(
     system: System, recording: Recording, joints: JointGroup, columns: list[int], played: _Played
 ) -> dict[str, Error]:
+    if not (np.isfinite(played.values).all() and np.isfinite(played.points).all()):
+        raise ModelError("the replay diverged", where=recording.name, hint="take a shorter time step")
     found: dict[str, Error] = {}
     t = joints.t - joints.t[0]
     inside = t <= played.t[-1] + 1e-9

@@ -36,6 +36,7 @@ ASPECTS: Mapping[str, str] = {
     "torque_offset": "constant part of a recorded torque that does not act",
     "torque_delay": "torque that acts later than recorded",
     "torque_lag": "torque that follows its record",
+    "servo": "gain, damping, delay and limit of position servos",
     "clock": "a clock that runs fast or slow",
     "reading": "what a sensor reads; the motion does not depend on it",
     "memory": "forces with a memory",
@@ -75,7 +76,10 @@ class JointTerms:
 
 @dataclass(frozen=True)
 class Actuation:
-    """Torque that acts at a driven joint: gain x recorded - offset, so late, following with a time constant [s]."""
+    """What acts at a driven joint: gain x recorded - offset, so late, following with a time constant [s].
+
+    It is a torque, or what the joint's servo is commanded.
+    """
 
     gain: float = 1.0
     offset: float = 0.0
@@ -135,6 +139,7 @@ def description_aspects(system: System, symbols: ca.SX) -> set[str]:
             *(grasp.relaxation for grasp in held if grasp.relaxation is not None),
         ),
         "sprung_joint": system.compliant.values(),
+        "servo": (part for servo in system.servos.values() for part in servo.parts),
         "clock": (system.time_scale,),
     }
     return {name for name, parts in entered.items() if any(_depends(part, symbols) for part in parts)}
@@ -216,9 +221,10 @@ def actuation(system: System, value: Evaluator) -> dict[str, Actuation]:
 def _actuation(system: System, effects: Iterable[Effect], joint: str, value: Evaluator) -> Actuation:
     """As the estimation has it: the last effect is the nearest to the reading."""
     reading, known = ca.SX.sym("reading"), [e for e in effects if isinstance(e, RecordedEffect)]
-    true = reading
+    true, servo = reading, system.servos.get(joint)
+    channel = f"joints.{'effort' if servo is None else 'position'}.{joint}"
     for effect in reversed(known):
-        true = effect.correct(f"joints.effort.{joint}", true, true)
+        true = effect.correct(channel, true, true)
     late = sum((effect.delay(f"torque.{joint}", False) for effect in known), ca.SX(0))
     lag = sum((effect.lag(f"torque.{joint}") for effect in known), ca.SX(0))
     gain = ca.jacobian(true, reading)

@@ -24,9 +24,9 @@ from yid_ocp.files import is_file
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model import FlexibleObject, Grasp, Mechanism, Segment, System, flexible_object
 from yid_ocp.model.cable import Cable, cable_system, length_values, read_vertices
+from yid_ocp.model.drives import PositionServos, Spring
 from yid_ocp.model.parameters import Parameters
 from yid_ocp.model.rotations import placement_matrix, roll_pitch_yaw
-from yid_ocp.model.system import Spring
 from yid_ocp.model.urdf import read_urdf, robot_file
 from yid_ocp.model.y_object import Y_FOOT, y_segments
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
@@ -109,12 +109,13 @@ def build_system(run: Run, finer: int = 1) -> System:
             carrier,
             objects=[(item, frame, place) for item, (_, frame, place) in zip(items, objects, strict=True)],
             grasps=grasps,
-            driven=moved if mode == "driven" else (),
+            driven=moved if mode in ("driven", "servo") else (),
             prescribed=held.joint_names if held is not None else moved if mode == "prescribed" else (),
             damping=damping,
             gravity=model.gravity,
             points=model.points,
             springs={name: Spring(s.stiffness, s.rest) for name, s in model.springs.items()},
+            servos=PositionServos(**vars(model.arms.servo)) if mode == "servo" else None,
         )
     if any(said.straight for said in model.frames.values()) and run.recordings.estimate:
         # where markers sit when nobody says which recording is meant

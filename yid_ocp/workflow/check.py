@@ -162,7 +162,7 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
         if recorded < 0.5 * rate:
             warnings.append(f"{episode.name}: joints come at {recorded:.4g} Hz, the model steps at {rate:.4g} Hz")
         moves = system.driven or any(samples.sensor.efforts for samples in episode.samples)
-        if moves and joints.effort is not None and joints.effort_kind is None:
+        if moves and not system.servos and joints.effort is not None and joints.effort_kind is None:
             warnings.append(
                 f"{episode.name}: nothing says whether joints/effort is a sample, a mean or a command (attribute "
                 f"effort_kind); it is taken as a {joints.effort_taken_as}"

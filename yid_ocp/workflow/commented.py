@@ -66,11 +66,12 @@ def configuration(
         *_others(proposal),
         _line("    ", "mode", proposal.mode, proposal.mode_why),
         *_mode_words(proposal),
+        *_servos(proposal),
         *_object(item, proposal),
         *_grasps(proposal),
         *_damping(item),
         *_points(item, proposal),
-        *_offsets(proposal),
+        *_effects(proposal),
         "",
         *_recordings(recordings),
         *_imports(imports),
@@ -137,6 +138,16 @@ def _mode_words(proposal: Proposal) -> list[str]:
         else "prescribed moves it as its encoders say"
     )
     return [f"{' ' * COLUMN}# {other}"]
+
+
+def _servos(proposal: Proposal) -> list[str]:
+    if proposal.mode != "servo":
+        return []
+    return [
+        "    servo:                                  # their gains, dampings, delays and limits are parameters, below",
+        _line("      ", "commands", "held", "until the next one; interpolated where the controller goes in between"),
+        _line("      ", "gravity_compensation", "false", "true where the controller carries the arm's own weight"),
+    ]
 
 
 def _object(item: Object, proposal: Proposal) -> list[str]:
@@ -219,11 +230,16 @@ def _by_effort(proposal: Proposal) -> bool:
     return proposal.mode == "prescribed" and not proposal.places
 
 
-def _offsets(proposal: Proposal) -> list[str]:
-    if not _by_effort(proposal):
+def _effects(proposal: Proposal) -> list[str]:
+    """What the arm has beside the numbers of its URDF, whatever moves it."""
+    if proposal.mode == "servo":
+        kind, words = "rotor_inertia", "what rotors add through their gears, free below"
+    elif _by_effort(proposal):
+        kind, words = "effort_offset", "the zero of every torque sensor, free below"
+    else:
         return []
-    lines = ["  effects:                                  # the zero of every torque sensor, free below"]
-    return [*lines, *(f"    - {{kind: effort_offset, location: {_text(joint)}}}" for joint in proposal.joints)]
+    lines = [f"  effects:                                  # {words}"]
+    return [*lines, *(f"    - {{kind: {kind}, location: {_text(joint)}}}" for joint in proposal.joints)]
 
 
 # -- data -------------------------------------------------------------------------------------------------------------
@@ -317,6 +333,13 @@ def _parameters(item: Object, proposal: Proposal) -> list[str]:
         lines.append(_line("  ", f"{branch.name}.bend", said, "bending rigidity [N m^2], where the search starts"))
         said = f"{{free: true, initial: {_number(DAMPING_TIME * bend)}}}"
         lines.append(_line("  ", f"{branch.name}.damping", said, "[N m^2 s]"))
+    if proposal.mode == "servo":
+        said = "{free: true}"
+        lines.append(_line("  ", '"*.servo_gain"', said, "begins at a twentieth of a radian for the effort limit"))
+        lines.append(_line("  ", '"*.servo_damping"', said, "begins at a tenth of a second times the gain"))
+        lines.append(_line("  ", '"*.servo_delay"', said, "from a command to its torque [s]"))
+        lines.append(_line("  ", '"rotor_inertia@*.armature"', said, "of the servos' motors, at the joint [kg m^2]"))
+        lines.append('  # "*.servo_torque_limit": {initial: 3.0}   # the URDF\'s effort limit where nothing is said')
     if _by_effort(proposal):
         for joint in proposal.joints:
             still = joint in proposal.still

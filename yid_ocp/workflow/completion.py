@@ -9,7 +9,7 @@ from typing import Any
 
 from yid_ocp.errors import ConfigError, YidError
 
-FORMATS = ("mjcf", "urdf", "sdf", "yaml", "csv")
+FORMATS = ("mjcf", "urdf", "sdf", "yaml", "csv", "mcap")
 
 
 def run(arguments: argparse.Namespace) -> int:

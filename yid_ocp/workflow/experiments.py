@@ -184,11 +184,11 @@ def refuse_unfit(run: Run) -> None:
             hint="leave sensors.*.std and diagnosis.noise_fraction out",
         )
     system = build_system(run)
-    if not system.driven or system.prescribed:
+    if not system.driven or system.prescribed or system.servos:
         raise ConfigError(
             "a blind proof moves driven arms",
             where=run.where("model", "arms", "mode"),
-            allowed="a robot whose arms are driven, nothing prescribed",
+            allowed="a robot whose arms are driven by torques, nothing prescribed",
         )
 
 

@@ -30,9 +30,9 @@ def export_run_signals(folder: str | Path, out: str | Path) -> tuple[list[Path],
 
     Topics: `/measured/...`, `/predicted/...` (of a diagnosis `/nominal/...` and `/with_effects/...`) and
     `/residual/...`, predicted minus measured, with `joints/QUANTITY` or `points/GROUP/POINT` behind; the whole
-    configuration as `/predicted/joint_states`, what moves it as `/predicted/driven_efforts` and
-    `/predicted/prescribed_efforts`. Of a diagnosis also `/unknown/joint_states` (forces), `/unknown/push/SEGMENT`,
-    `/unknown/offset/GRASP`, `/unknown/bias/POINT` and `/events/CHANNEL`.
+    configuration as `/predicted/joint_states`, what moves it as `/predicted/driven_efforts` (of servos as
+    `/predicted/commands`) and `/predicted/prescribed_efforts`. Of a diagnosis also `/unknown/joint_states` (forces),
+    `/unknown/push/SEGMENT`, `/unknown/offset/GRASP`, `/unknown/bias/POINT` and `/events/CHANNEL`.
 
     Parameters
     ----------
@@ -91,8 +91,11 @@ def _of_recording(group: h5py.Group, predictions: Mapping[str, str]) -> Iterator
     if "q" in group:
         joints, t = _texts(group.attrs["joints"]), np.array(group["t"])
         yield Signal("/predicted/joint_states", "joints", t, {"position": np.array(group["q"])}, joints)
+        if "command" in group:
+            values = {"position": np.array(group["command"])}
+            yield Signal("/predicted/commands", "joints", t[:-1], values, _texts(group.attrs["driven"]))
         for key, names in (("torque", "driven"), ("effort", "prescribed")):
-            if names in group.attrs and len(group.attrs[names]):
+            if key in group and len(group.attrs[names]):
                 values = {"effort": np.array(group[key])}
                 yield Signal(f"/predicted/{names}_efforts", "joints", t[:-1], values, _texts(group.attrs[names]))
     for sensor in group.values():

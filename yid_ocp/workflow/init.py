@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
     _refuse_existing([out, *(file for file, raw in made.items() if raw is not None)], arguments.replace)
     imports = given_options(arguments)
     robot = arguments.robot
-    where = robot if robot.startswith("package:") else relative(robot, out.parent)
+    where = robot if robot.startswith(("package:", "default:")) else relative(robot, out.parent)
     files = [relative(file, out.parent) for file in made]
     text = configuration(where, item, proposal, files, imports, SCHEMA)
     _write(out, text, {file: raw for file, raw in made.items() if raw is not None})

@@ -34,6 +34,8 @@ REST_WINDOW = 0.1
 """Over which speeds are taken [s]; up to twice that of slow sensors."""
 STILL = 0.02
 """A joint that turns less than this says nothing of its own friction [rad]."""
+COPIED = 1e-6
+"""Commands nearer to the measured angles than this part of the motion are a copy of them."""
 MOVED = 0.1
 """Joints that turn less than this together do not move [rad]."""
 GRAVITY = 9.81
@@ -273,6 +275,8 @@ def _mode(recording: Recording, closed: bool) -> tuple[str, str]:
             allowed="points on the object, or efforts of the joints that move it",
             hint="import points too (`yid-ocp import FILE --preview` lists what there is)",
         )
+    if joints.effort is None and _commanded(joints):
+        return "servo", "commanded positions were recorded and no efforts: the arm's servos follow them"
     if joints.effort is None:
         return "prescribed", "no efforts were recorded, so the arm moves as its encoders say"
     if closed:
@@ -280,6 +284,15 @@ def _mode(recording: Recording, closed: bool) -> tuple[str, str]:
     if seen:
         return "prescribed", f"the object hangs on the arm and {seen} see it, so the arm moves as its encoders say"
     return "prescribed", "nothing sees the object, so what it does is read from the efforts that moving the arm takes"
+
+
+def _commanded(joints: JointGroup) -> bool:
+    """Whether commanded positions were recorded, and are not the measured ones once more."""
+    commands = joints.position_command
+    if commands is None:
+        return False
+    apart = np.sqrt(np.mean((commands - joints.position) ** 2))
+    return bool(apart > COPIED * np.std(joints.position - joints.position.mean(axis=0)))
 
 
 def _start(recordings: Sequence[Recording], joints: Sequence[str]) -> tuple[str, str]:

@@ -30,9 +30,9 @@ def write_trajectories(
     """Trajectories, predictions and the unknowns with their covariance, as `yid-trajectories/1`.
 
     `unknowns/`: names, x, covariance. `recordings/NAME/`: `t` (N+1,) [s], `q`, `p` (N+1, n), `multipliers` (N, m)
-    [N s], `torque` (N, nu) [N m], `effort` (N, nc) [N m], the attributes `joints` (n names), `driven` (nu) and
-    `prescribed` (nc), and for every sensor `GROUP/` with `t`, `measured`, `predicted`, `std` and the attributes
-    `channels`, `unit`.
+    [N s], `torque` (N, nu) [N m] or what servos are commanded, `command` (N, nu) [rad or m], `effort` (N, nc) [N m],
+    the attributes `joints` (n names), `driven` (nu) and `prescribed` (nc), and for every sensor `GROUP/` with `t`,
+    `measured`, `predicted`, `std` and the attributes `channels`, `unit`.
 
     Raises
     ------
@@ -62,7 +62,7 @@ def write_trajectories(
                 "q": rollout.state[:, :n],
                 "p": rollout.state[:, n : 2 * n],
                 "multipliers": rollout.multipliers,
-                "torque": rollout.torque,
+                "command" if problem.system.servos else "torque": rollout.torque,
                 "effort": rollout.effort,
             }
             _store(group, arrays)

@@ -58,5 +58,5 @@ def _internal(label: str, values: Mapping[str, float], quantities: Sequence[Quan
         name, _ = quantity.reported
         if name in values:
             value = values[name]
-            found[f"{label}.{quantity.name}"] = 1 / value if quantity.reciprocal else value
+            found[f"{label}.{quantity.name}"] = quantity.turned(value)
     return found

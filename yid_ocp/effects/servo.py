@@ -1,0 +1,110 @@
+"""Position servos that are not what their data sheet says: weaker or stronger, later, with less torque."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import ClassVar
+
+import casadi as ca
+
+from yid_ocp.effects.base import EFFECTS, EffectBase, Quantity, robot_joints
+from yid_ocp.model.drives import KNEE, NO_LIMIT, Servo
+from yid_ocp.model.system import System
+
+POSITION = frozenset({"joints.position"})
+UNKNOWN_LIMIT = 10.0
+"""What stands for the effort limit of a joint that has none [N m or N]."""
+WEAKEST = 0.1
+"""Part of a joint's effort limit below which none is looked for."""
+
+
+@EFFECTS.register("servo_gain")
+class ServoGain(EffectBase):
+    """What a servo demands times scale, of errors and rates alike: another gain, supply voltage or motor."""
+
+    equation = "demand = scale (gain (u - q) - damping v)"
+    depends_on = "how hard it accelerates"
+    needs: ClassVar[frozenset[str]] = POSITION
+
+    @classmethod
+    def locations(cls, system: System) -> tuple[str, ...]:
+        """Joints with a servo."""
+        return _commanded(system)
+
+    @classmethod
+    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
+        """Scale [1]."""
+        return (Quantity("scale", "1", 1.0, 0.05, 20.0, (0.3, 3.0), "true over nominal torque of the servo"),)
+
+    def modify(self, system: System) -> System:
+        """See the class."""
+        servo, scale = system.servos[self.location], self["scale"]
+        return _with(system, self.location, replace(servo, gain=servo.gain * scale, damping=servo.damping * scale))
+
+
+@EFFECTS.register("servo_delay")
+class ServoDelay(EffectBase):
+    """Commands act later than the model's servo has it."""
+
+    equation = "the command that acts at t was given at t - servo_delay - delay"
+    depends_on = "when it is read"
+    needs: ClassVar[frozenset[str]] = POSITION
+
+    @classmethod
+    def locations(cls, system: System) -> tuple[str, ...]:
+        """Joints with a servo."""
+        return _commanded(system)
+
+    @classmethod
+    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
+        """Delay [s]."""
+        return (Quantity("delay", "s", 0.0, -0.2, 0.5, (0.0, 0.2), "how late commands act beyond the servo's delay"),)
+
+    def delay(self, channel: str, camera: bool) -> ca.SX:
+        """See the class."""
+        return self["delay"] if channel == f"torque.{self.location}" else ca.SX(0)
+
+
+@EFFECTS.register("servo_saturation")
+class ServoSaturation(EffectBase):
+    """A servo whose torque is limited further: demand / (1 + |demand/limit|^16)^(1/16).
+
+    Kept inside as limit^-16, which adds to the model's own limit, is neutral at zero and has a slope there: of the
+    largest torques first. From a tenth beside the limit on it is within 1.2 % of a clip.
+    """
+
+    equation = "torque = demand / (1 + (demand/limit)^16)^(1/16)"
+    depends_on = "how hard it accelerates"
+    needs: ClassVar[frozenset[str]] = POSITION
+
+    @classmethod
+    def locations(cls, system: System) -> tuple[str, ...]:
+        """Joints with a servo."""
+        return _commanded(system)
+
+    @classmethod
+    def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
+        """Tightness, reported as the limit, from some per cent of the joint's effort limit on."""
+        joint = system.mechanism.joints[system.mechanism.joint_index(location)]
+        known = joint.effort_limit if 0 < joint.effort_limit < NO_LIMIT else UNKNOWN_LIMIT
+        torque = "N m" if joint.unit == "rad" else "N"
+        highest, text = (WEAKEST * known) ** -KNEE, "largest torque of the servo, to the power -16"
+        reported = f"limit {torque}"
+        return (
+            Quantity(
+                "tightness", f"({torque})^-16", 0.0, 0.0, highest, (0.0, highest), text, reciprocal=reported, power=KNEE
+            ),
+        )
+
+    def modify(self, system: System) -> System:
+        """See the class."""
+        servo = system.servos[self.location]
+        return _with(system, self.location, replace(servo, tightness=servo.tightness + self["tightness"]))
+
+
+def _commanded(system: System) -> tuple[str, ...]:
+    return tuple(name for name in robot_joints(system) if name in system.servos)
+
+
+def _with(system: System, joint: str, servo: Servo) -> System:
+    return replace(system, servos={**system.servos, joint: servo})

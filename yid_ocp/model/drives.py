@@ -1,0 +1,160 @@
+"""What holds and moves single joints of a robot: springs, dampers, position servos."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import casadi as ca
+
+from yid_ocp.model.mechanism import Joint, Mechanism
+from yid_ocp.model.parameters import Parameter
+
+Commands = Literal["held", "interpolated"]
+KNEE = 16
+"""Power p of a servo's torque limit, demand / (1 + |demand/limit|^p)^(1/p): a clip whose corner is rounded off."""
+NO_LIMIT = 2e4
+"""Effort limits from here on are a file's way to say that there is none [N m or N]."""
+FULL_TORQUE_AT = 0.05
+"""Error at which a servo that nobody knows better gives all of its torque [rad or m]."""
+DAMPING_TIME = 0.1
+"""Damping over gain of such a servo [s]."""
+UNKNOWN_GAIN = 50.0
+"""Gain of a servo without an effort limit [N m/rad or N/m]."""
+LONGEST_DELAY = 0.5
+"""Of a command [s]."""
+
+
+@dataclass(frozen=True)
+class Spring:
+    """A spring 1/2 stiffness (q - rest)^2 on one joint of a robot, in N m/rad and rad (N/m and m where it slides)."""
+
+    stiffness: float
+    rest: float = 0.0
+
+
+@dataclass(frozen=True)
+class PositionServos:
+    """How an arm's controller takes commanded positions.
+
+    Attributes
+    ----------
+    commands : "held" or "interpolated"
+        What servos follow between two commands.
+    gravity_compensation : bool
+        Whether the controller carries the robot's own weight.
+    """
+
+    commands: Commands = "held"
+    gravity_compensation: bool = False
+
+
+@dataclass(frozen=True)
+class Servo:
+    """A position servo on one joint, whose input is a commanded coordinate u.
+
+        demand = gain (u(t - delay) - q) - damping dq/dt       torque = demand / (1 + tightness demand^p)^(1/p)
+
+    with p = `KNEE` and tightness = limit^-p, to which further limits add.
+
+    Attributes
+    ----------
+    gain : casadi.SX
+        [N m/rad or N/m]
+    damping : casadi.SX
+        [N m s/rad or N s/m]
+    delay : casadi.SX
+        [s]
+    tightness : casadi.SX
+        [(N m)^-p]
+    commands : "held" or "interpolated"
+        What it follows between two commands.
+    """
+
+    gain: ca.SX
+    damping: ca.SX
+    delay: ca.SX
+    tightness: ca.SX
+    commands: Commands = "held"
+
+    def torque(self, command: ca.SX, q: ca.SX, v: ca.SX) -> ca.SX:
+        """Torque at a coordinate and its rate [N m or N]."""
+        demand = self.gain * (command - q) - self.damping * v
+        return demand / (1 + self.tightness * demand**KNEE) ** (1 / KNEE)
+
+    @property
+    def parts(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
+        """Gain, damping, delay and tightness."""
+        return self.gain, self.damping, self.delay, self.tightness
+
+    def mapped(self, change: Callable[[ca.SX], ca.SX]) -> Servo:
+        """Every expression replaced by what `change` makes of it."""
+        gain, damping, delay, tightness = map(change, self.parts)
+        return Servo(gain, damping, delay, tightness, self.commands)
+
+
+def joint_dampers(tree: Mechanism, wanted: Mapping[str, float]) -> dict[str, Parameter]:
+    """Parameter `JOINT.damping` of every joint that is named."""
+    found = {}
+    for joint, value in wanted.items():
+        tree.joint_index(joint)
+        text = f"viscous damping of {joint}"
+        found[joint] = Parameter(f"{joint}.damping", value, "N m s/rad", 0.0, math.inf, text)
+    return found
+
+
+def joint_spring(tree: Mechanism, joint: str, spring: Spring) -> tuple[Parameter, Parameter]:
+    """Stiffness and rest of a spring on a joint of the robot."""
+    unit = tree.joints[tree.joint_index(joint)].unit
+    per = "N m/rad" if unit == "rad" else "N/m"
+    return (
+        Parameter(f"{joint}.stiffness", spring.stiffness, per, 0.0, math.inf, f"spring on {joint}"),
+        Parameter(f"{joint}.rest", spring.rest, unit, description=f"where the spring on {joint} is relaxed"),
+    )
+
+
+def joint_servos(
+    tree: Mechanism, joints: Sequence[str], commands: Commands = "held"
+) -> tuple[dict[str, Servo], list[Parameter]]:
+    """A servo on every joint that is named, and their parameters `JOINT.servo_gain`, `servo_damping`, ...
+
+    Values are those of a servo that gives its joint's effort limit at an error of `FULL_TORQUE_AT`.
+    """
+    servos, entries = {}, []
+    for joint in joints:
+        at = tree.joints[tree.joint_index(joint)]
+        own = _servo_parameters(at)
+        gain, damping, delay, limit = (entry.symbol for entry in own)
+        servos[joint] = Servo(gain, damping, delay, limit**-KNEE, commands)
+        entries += own
+    return servos, entries
+
+
+def _servo_parameters(joint: Joint) -> list[Parameter]:
+    known = 0 < joint.effort_limit < NO_LIMIT
+    limit = joint.effort_limit if known else NO_LIMIT
+    gain = limit / FULL_TORQUE_AT if known else UNKNOWN_GAIN
+    torque, per = ("N m", "N m/rad") if joint.unit == "rad" else ("N", "N/m")
+    rate = per.replace("/", " s/")
+    rows: tuple[tuple[str, float, str, float, float, str], ...] = (
+        ("gain", gain, per, 0.0, math.inf, "torque per error of the angle"),
+        ("damping", DAMPING_TIME * gain, rate, 0.0, math.inf, "torque against the rate"),
+        ("delay", 0.0, "s", 0.0, LONGEST_DELAY, "from a command to its torque"),
+        ("torque_limit", limit, torque, 1e-3, math.inf, "largest torque"),
+    )
+    return [
+        Parameter(f"{joint.name}.servo_{name}", value, unit, lower, upper, f"{text}, servo of {joint.name}")
+        for name, value, unit, lower, upper, text in rows
+    ]
+
+
+def weightless(tree: Mechanism) -> Mechanism:
+    """The robot with its own weight carried by its servos: gravity pulls on none of its bodies."""
+    none = ca.SX(0)
+    joints = tuple(
+        replace(joint, bodies=tuple(replace(body, gravity_fraction=none) for body in joint.bodies))
+        for joint in tree.joints
+    )
+    return replace(tree, joints=joints)
