@@ -128,5 +128,6 @@ def cell_class(table: Table) -> list[str]:
     kinds = []
     for cells in columns:
         numbers, longest = all(map(_NUMBER.match, cells)), max(map(len, cells), default=0)
-        kinds.append("" if not any(cells) else "number" if numbers else "long" if longest > LONG else "text")
+        named = any(cells) or head[len(kinds)]
+        kinds.append("" if not named else "number" if numbers else "long" if longest > LONG else "text")
     return kinds
