@@ -23,7 +23,7 @@ COMMANDS = {
     "identifiability": ("--what-if", "--intervals", "all"),
     "inspect": ("--entry", "p1[elbow]"),
     "diagnose": ("--set", "diagnosis.candidates=[joint_coulomb, effort_offset]", "--set", "diagnosis.effects=1"),
-    "compare": ("--set", "compare.methods=[gauss_newton, single_shooting]"),
+    "compare": ("--set", "compare.methods={gauss_newton: {}, single_shooting: {}}"),
 }
 SIZES = [(1400, "light"), (400, "dark")]
 PROBE = """
