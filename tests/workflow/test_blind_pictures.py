@@ -8,7 +8,9 @@ from PIL import Image
 from yid_ocp.diagnosis.blind import Mark, score
 from yid_ocp.errors import OutputError
 from yid_ocp.files import jsonable
+from yid_ocp.report.html import write_report
 from yid_ocp.report.pictures import draw_blind
+from yid_ocp.report.sections import Findings
 from yid_ocp.report.tables import blind_markdown
 
 
@@ -44,3 +46,14 @@ def test_the_table_has_rates_with_intervals_by_size_and_by_experiment():
 def test_a_folder_that_is_not_there_is_said(tmp_path):
     with pytest.raises(OutputError, match="cannot be written"):
         draw_blind(tmp_path / "nowhere", jsonable(score(MARKS)))
+
+
+@pytest.mark.parametrize(("marks", "pictures"), [(MARKS, 3), ([], 0)], ids=["all", "none"])
+def test_the_page_shows_what_was_detected_and_what_is_kept(tmp_path, marks, pictures):
+    result = jsonable(score(marks)) | {"seed": 1, "purpose": "report", "versions": {}}
+    assert write_report(tmp_path / "report.html", Findings("blind", "", result))
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert page.count('<div class="plot"') == pictures
+    assert f"{len(marks)} cases of seed 1" in page
+    assert ("of 5 clean recordings, 0 gave a false alarm" in page) == bool(marks)
+    assert page.count("case_000") >= len(marks)

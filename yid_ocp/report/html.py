@@ -125,8 +125,9 @@ def cell_class(table: Table) -> list[str]:
     """How the columns of a table are set, those without an entry left out as None: numbers to the right."""
     head, *body = table.rows
     columns = [[row[i] for row in body] for i in range(len(head))]
-    kinds = []
+    kinds: list[str] = []
     for cells in columns:
         numbers, longest = all(map(_NUMBER.match, cells)), max(map(len, cells), default=0)
-        kinds.append("" if not any(cells) else "number" if numbers else "long" if longest > LONG else "text")
+        named = any(cells) or head[len(kinds)]
+        kinds.append("" if not named else "number" if numbers else "long" if longest > LONG else "text")
     return kinds
