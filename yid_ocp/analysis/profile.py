@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from yid_ocp.parallel import map_in_step
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.solvers import Solution
@@ -163,14 +164,16 @@ def with_intervals(
     if progress is not None:
         progress(f"intervals of {', '.join(asked)} by profile likelihood")
     best, there = best_fit(problem, solution.x)
-    judged = dict(solution.parameters)
-    for name, size in asked.items():
-        index = problem.names.index(name)
-        entry = sure_of_small(problem, best, index, judged[name], size, there)
-        if entry.verdict != "not_identifiable" and not stands_by_itself(entry):
-            entry = by_profile(entry, profile_likelihood(problem, best, index, entry.std, there).interval, size)
-        judged[name] = entry
-    return replace(solution, parameters=judged)
+
+    def judged(name: str) -> Estimate:
+        index, size = problem.names.index(name), asked[name]
+        entry = sure_of_small(problem, best, index, solution.parameters[name], size, there)
+        if entry.verdict == "not_identifiable" or stands_by_itself(entry):
+            return entry
+        return by_profile(entry, profile_likelihood(problem, best, index, entry.std, there).interval, size)
+
+    found = dict(zip(asked, map_in_step(judged, asked), strict=True))
+    return replace(solution, parameters={**solution.parameters, **found})
 
 
 def sure_of_small(
