@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pinocchio as pin
@@ -19,9 +20,11 @@ from numpy.typing import NDArray
 
 from yid_ocp.data.hdf5 import read_recording
 from yid_ocp.data.recording import Recording
+from yid_ocp.integrator import compiled
 from yid_ocp.integrator.lqr import lqr_filter
 from yid_ocp.integrator.statics import Statics
 from yid_ocp.integrator.step import Directions, Feedback, Rollout, Step, compile_step
+from yid_ocp.integrator.step_model import Member
 from yid_ocp.model import System
 from yid_ocp.model.urdf import urdf_text
 from yid_ocp.problem import EstimationProblem
@@ -129,6 +132,21 @@ class Bench:
             self.keep["warm"] = self.problem().evaluate(x, False).warm
         return self.keep["warm"]
 
+    def members(self, count: int, directions: Directions | None = None) -> list[Member]:
+        """Members that differ in their stiffnesses, each from its own equilibrium, over all steps; made once."""
+        key = f"members {count} {directions is None}"
+        if key not in self.keep:
+            rng, posture = np.random.default_rng(0), self.recording.joints
+            assert posture is not None
+            thetas = [
+                self.system.parameters.vector({name: x * rng.uniform(0.6, 1.6) for name, x in VALUES.items()})
+                for _ in range(count)
+            ]
+            starts = [Statics(self.step).solve(posture.position[0], theta).state for theta in thetas]
+            common = self.torque, self.path, self.feedback, directions
+            self.keep[key] = [Member(*pair, *common) for pair in zip(thetas, starts, strict=True)]
+        return self.keep[key]
+
     def rollout(self, steps: int, directions: Directions | None = None) -> Rollout:
         """Track the recording over the first steps."""
         torque, path = self.torque[:steps], self.path[: steps + 1]
@@ -178,6 +196,30 @@ def sensitivities_500(bench: Bench) -> int:
     """The same with forward sensitivities by six stiffnesses: what a Gauss-Newton iteration costs in the main."""
     bench.rollout(500, bench.directions("six", STIFFNESSES, everything=False))
     return 1
+
+
+def step_of_eight(bench: Bench) -> int:
+    """One step of one of eight members that march together: rollouts of 500."""
+    return _together(bench, None)
+
+
+def step_of_eight_with_sensitivities(bench: Bench) -> int:
+    """The same with forward sensitivities by six stiffnesses."""
+    return _together(bench, bench.directions("six", STIFFNESSES, everything=False))
+
+
+def _together(bench: Bench, directions: Directions | None) -> int:
+    members = bench.members(8, directions)
+    with mock.patch.object(compiled, "WORTH", 0):  # so few steps would not be worth the compilation
+        found = bench.step.kernel.rollouts(members)
+    assert all(rollout.status.ok for rollout in found)
+    return sum(len(member.torque) for member in members)
+
+
+def sensitivities_of_one(bench: Bench) -> int:
+    """One step with forward sensitivities by six stiffnesses of one member alone, which the above is compared with."""
+    sensitivities_500(bench)
+    return 500
 
 
 def adjoint_500(bench: Bench) -> int:
@@ -254,6 +296,9 @@ WORKLOADS: tuple[Workload, ...] = (
     Workload(jacobians_called_from_python, "call"),
     Workload(rollout_500, "run"),
     Workload(sensitivities_500, "run"),
+    Workload(step_of_eight, "step of a member"),
+    Workload(step_of_eight_with_sensitivities, "step of a member"),
+    Workload(sensitivities_of_one, "step"),
     Workload(adjoint_500, "run"),
     Workload(gradient_500, "run"),
     Workload(gauss_newton_iteration, "iteration"),
@@ -267,6 +312,8 @@ RATIOS: dict[str, tuple[str, str]] = {
     "jacobians_called_from_python_{n}_over_step": ("jacobians_called_from_python", "step"),
     "rollout_500_{n}_over_step": ("rollout_500", "step"),
     "sensitivities_500_{n}_over_step": ("sensitivities_500", "step"),
+    "step_of_eight_{n}_over_step": ("step_of_eight", "step"),
+    "sensitivities_of_eight_{n}_over_alone": ("step_of_eight_with_sensitivities", "sensitivities_of_one"),
     "adjoint_{n}_over_step": ("adjoint_500", "step"),
     "gradient_500_{n}_over_step": ("gradient_500", "step"),
     "gauss_newton_iteration_{n}_over_step": ("gauss_newton_iteration", "step"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 from typing import Protocol
 
 
@@ -72,6 +73,29 @@ class Logged(Silent):
     def advance(self, done: int, total: int, text: str) -> None:
         """See `Progress`."""
         self._log.info("%d of %d, %s", done, total, text)
+
+
+class Parts:
+    """Parts of a stage that are done side by side, counted as they end.
+
+    Parameters
+    ----------
+    progress : Progress
+    total : int
+        How many there are.
+    first : str
+        One that is begun with.
+    """
+
+    def __init__(self, progress: Progress, total: int, first: str) -> None:
+        self._progress, self._total, self._count, self._lock = progress, total, 0, threading.Lock()
+        progress.advance(0, total, first)
+
+    def done(self, text: str) -> None:
+        """One more is done; from any thread."""
+        with self._lock:
+            self._count += 1
+            self._progress.advance(self._count, self._total, text)
 
 
 SILENT = Silent()

@@ -324,6 +324,7 @@ def parts():
         cable = staticmethod(cable)
         clamped_cable = staticmethod(clamped_cable)
         closed_loop = staticmethod(closed_loop)
+        builders = BUILDERS
         make_case = staticmethod(make_case)
         tip = staticmethod(tip)
 

@@ -16,10 +16,11 @@ from yid_ocp.analysis.profile import Profile, best_fit, profile_likelihood, sure
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ConfigError, SolverError, nearest
 from yid_ocp.model.system import System
+from yid_ocp.parallel import map_in_step
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.null_test import USUAL, GapLimits
-from yid_ocp.progress import SILENT, Progress
+from yid_ocp.progress import SILENT, Parts, Progress
 from yid_ocp.shown import Shown, Summary, counted
 from yid_ocp.solvers.base import Solution
 from yid_ocp.solvers.judgement import (
@@ -267,20 +268,23 @@ def _profiles(
     view: _Sensitivities, std: Array, wanted: Sequence[str], judged: Mapping[str, Estimate], progress: Progress
 ) -> tuple[dict[str, Profile], dict[str, Estimate]]:
     """Profile likelihoods of the wanted parameters about the best fit of all unknowns, and what they leave to say."""
-    said = dict(judged)
     if not wanted:
-        return {}, said
-    problem, (best, there), profiles = view.problem, best_fit(view.problem, view.x), {}
+        return {}, dict(judged)
+    problem, (best, there) = view.problem, best_fit(view.problem, view.x)
     sizes = typical_sizes(problem, view.x)
     progress.stage(f"intervals of {len(wanted)} parameters by profile likelihood")
-    for done, name in enumerate(wanted):
-        progress.advance(done, len(wanted), name)
+    parts = Parts(progress, len(wanted), wanted[0])
+
+    def one(name: str) -> tuple[Profile, Estimate]:
         index, size = problem.names.index(name), sizes[name.split("[")[0]]
-        profiles[name] = found = profile_likelihood(problem, best, index, float(std[view.names.index(name)]), there)
-        said[name] = sure_of_small(problem, best, index, judged[name], size, there)
-        if said[name].verdict == judged[name].verdict:
-            said[name] = by_profile(judged[name], found.interval, size)
-    return profiles, said
+        found = profile_likelihood(problem, best, index, float(std[view.names.index(name)]), there)
+        said = sure_of_small(problem, best, index, judged[name], size, there)
+        parts.done(name)
+        return found, by_profile(judged[name], found.interval, size) if said.verdict == judged[name].verdict else said
+
+    pairs = dict(zip(wanted, map_in_step(one, wanted), strict=True))
+    profiles = {name: profile for name, (profile, _) in pairs.items()}
+    return profiles, {**judged, **{name: said for name, (_, said) in pairs.items()}}
 
 
 def _parameters(view: _Sensitivities, judged: Mapping[str, Estimate]) -> dict[str, ParameterInformation]:

@@ -9,9 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from yid_ocp.parallel import map_in_step
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.progress import SILENT, Progress
+from yid_ocp.progress import SILENT, Parts, Progress
 from yid_ocp.solvers import Solution
 from yid_ocp.solvers.gauss_newton import GaussNewton
 from yid_ocp.solvers.judgement import (
@@ -159,15 +160,18 @@ def with_intervals(problem: EstimationProblem, solution: Solution, progress: Pro
         return solution
     progress.stage(f"intervals of {', '.join(asked)} by profile likelihood")
     best, there = best_fit(problem, solution.x)
-    judged = dict(solution.parameters)
-    for done, (name, size) in enumerate(asked.items()):
-        progress.advance(done, len(asked), name)
-        index = problem.names.index(name)
-        entry = sure_of_small(problem, best, index, judged[name], size, there)
+    parts = Parts(progress, len(asked), next(iter(asked)))
+
+    def judged(name: str) -> Estimate:
+        index, size = problem.names.index(name), asked[name]
+        entry = sure_of_small(problem, best, index, solution.parameters[name], size, there)
         if entry.verdict != "not_identifiable" and not stands_by_itself(entry):
             entry = by_profile(entry, profile_likelihood(problem, best, index, entry.std, there).interval, size)
-        judged[name] = entry
-    return replace(solution, parameters=judged)
+        parts.done(name)
+        return entry
+
+    found = dict(zip(asked, map_in_step(judged, asked), strict=True))
+    return replace(solution, parameters={**solution.parameters, **found})
 
 
 def sure_of_small(

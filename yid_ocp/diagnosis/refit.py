@@ -6,9 +6,7 @@ differences between models are paired. G = max(0, chi2/n - 1) is the gap.
 
 from __future__ import annotations
 
-import itertools
 import math
-import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -25,7 +23,7 @@ from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.null_test import sample_times
 from yid_ocp.problem.validation import channel_errors
-from yid_ocp.progress import Progress
+from yid_ocp.progress import Parts, Progress
 from yid_ocp.solvers import GaussNewton, Status
 from yid_ocp.solvers.base import Outcome
 from yid_ocp.solvers.judgement import covariance_of_fit, judge_fit, plain_std
@@ -310,7 +308,9 @@ def refit_all(
 
     if not tried:
         return []
-    done, told = itertools.count(1), threading.Lock()
+    beside = f" beside {', '.join(effect.label for effect in base)}" if base else ""
+    search.progress.stage(f"refitting with each of {len(tried)} effects{beside}")
+    parts = Parts(search.progress, len(tried), tried[0][0].label)
 
     def one(entry: tuple[EffectBase, Mapping[str, float]]) -> Fit | None:
         effect, step = entry
@@ -319,13 +319,9 @@ def refit_all(
         if fit is not None:
             how = "resumed the refit" if fit.resumed else "refitted"
             text = f"{how} with {effect.label}: held-out chi2/n {fit.loss.mean:.4g}"
-        with told:
-            search.progress.advance(next(done), len(tried), text)
+        parts.done(text)
         return fit
 
-    beside = f" beside {', '.join(effect.label for effect in base)}" if base else ""
-    search.progress.stage(f"refitting with each of {len(tried)} effects{beside}")
-    search.progress.advance(0, len(tried), tried[0][0].label)
     return [fit for fit in map_in_step(one, tried) if fit is not None]
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
-from yid_ocp.parallel.threads import share_of_threads
+from yid_ocp.parallel.threads import share_of_threads, threads
 
 MOST = 8
 """Items at work at once: as many as the widest batch has members."""
@@ -37,12 +37,20 @@ class _March:
     """Items that are at work, and what they wait for."""
 
     live: int
+    running: threading.Semaphore
     changed: threading.Condition = field(default_factory=threading.Condition)
     waiting: list[_Request] = field(default_factory=list)
     abandoned: bool = False
 
     def ask(self, request: _Request) -> list[Any]:
-        """Wait for the answers to a request."""
+        """Wait for the answers to a request, and meanwhile let another item run."""
+        self.running.release()
+        try:
+            return self._answers(request)
+        finally:
+            self.running.acquire()
+
+    def _answers(self, request: _Request) -> list[Any]:
         with self.changed:
             self.waiting.append(request)
             self.changed.notify_all()
@@ -97,13 +105,14 @@ def ask_together(function: Callable[[list[Question]], list[Answer]], questions: 
 def map_in_step(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
     """Results in the order of the items, some of which are at work side by side, in threads of their own.
 
-    They take turns, but wait for each other wherever one calls `ask_together`, so that all are answered at once.
+    As many run as there are threads to use; they wait for each other wherever one calls `ask_together`, so that all are
+    answered at once.
     Which questions meet depends on the items alone. No item may hold a lock that others want while it asks.
     """
     entries = list(items)
     if len(entries) < 2 or getattr(_HERE, "march", None) is not None:
         return [function(entry) for entry in entries]
-    march = _March(min(MOST, len(entries)))
+    march = _March(min(MOST, len(entries)), threading.Semaphore(threads()))
     queue, guard = iter(range(len(entries))), threading.Lock()
     results: dict[int, Result] = {}
     errors: dict[int, BaseException] = {}
@@ -119,7 +128,8 @@ def map_in_step(function: Callable[[Item], Result], items: Iterable[Item]) -> li
                     break
                 _HERE.rank = index
                 try:
-                    results[index] = function(entries[index])
+                    with march.running:
+                        results[index] = function(entries[index])
                 except _Abandoned:
                     break
                 except BaseException as error:

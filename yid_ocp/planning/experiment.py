@@ -25,7 +25,7 @@ from yid_ocp.analysis.layouts import TORQUE_STD
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import ConfigError, DataError, SolverError
 from yid_ocp.integrator.step import Step, compile_alike
-from yid_ocp.parallel import map_threads
+from yid_ocp.parallel import map_in_step
 from yid_ocp.planning.ends import first_rest, start_posture
 from yid_ocp.planning.mover import Mover
 from yid_ocp.planning.options import PlanOptions
@@ -335,7 +335,7 @@ class Experiment:
 
         still = residual(-1)
         blur = np.stack(
-            [(found - still) / WRONG for found in map_threads(residual, range(nc * waves.shape[1]))], axis=1
+            [(found - still) / WRONG for found in map_in_step(residual, range(nc * waves.shape[1]))], axis=1
         )
         known = blur.T @ blur
         if errors is not None and errors.encoders:
@@ -357,7 +357,7 @@ class Experiment:
             there = self.rows(moved.reshape(w.shape))
             return None if there is None else (there - rows) / DIFFERENCE
 
-        found = map_threads(one, range(w.size))
+        found = map_in_step(one, range(w.size))
         return None if any(part is None for part in found) else np.array(found)
 
 

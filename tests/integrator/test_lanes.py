@@ -1,0 +1,215 @@
+"""Members of a batch that march together give what they give one by one, whatever their companions do."""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+from dataclasses import replace
+from importlib import resources
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from yid_ocp.integrator import compiled, compiler
+from yid_ocp.integrator.lane_functions import lane_functions_source
+from yid_ocp.integrator.step_model import Directions, Feedback, Member
+
+pytestmark = pytest.mark.skipif(compiler.compiler() is None, reason="this machine has no C compiler")
+
+# Newton stops at 1e-14 in these cases; the rest is rounding of sums in another order
+TOLERANCE = 1e-9
+RESULTS = ("state", "multipliers", "effort", "torque", "by_state", "by_multipliers", "by_effort")
+
+
+@pytest.fixture(autouse=True)
+def at_once(monkeypatch):
+    """Batches from the first question on."""
+    monkeypatch.setattr(compiled, "WORTH", 0)
+
+
+def watched(monkeypatch, kernel):
+    """How many members every call of compiled code had."""
+    calls = []
+    original = kernel._rolled_out
+
+    def counted(library, members):
+        calls.append(len(members))
+        return original(library, members)
+
+    monkeypatch.setattr(kernel, "_rolled_out", counted)
+    return calls
+
+
+def members_of(case, count=8):
+    """Members with their own parameters, lengths, starts, gains and directions, the last without any of the latter."""
+    rng, sizes = np.random.default_rng(3), case.step.sizes
+    names = case.step.system.parameters.names
+    made = []
+    for i in range(count):
+        steps = len(case.torque) - i % 4
+        chosen = tuple(names[i % 3 : i % 3 + 1 + i % 2]) if i < count - 1 else ()
+        width = len(chosen) + i % 3
+        given = [None, None]
+        if i % 2:
+            given = [rng.normal(size=(steps, sizes["nu"], width)), rng.normal(size=(steps + 1, sizes["nc"], width))]
+        directions = Directions(chosen, 0.1 * rng.normal(size=(sizes["nx"], width)), *given)
+        theta = case.theta * np.exp(0.02 * rng.normal(size=len(case.theta)))
+        feedback = case.feedback
+        feedback = Feedback(feedback.index, feedback.gain[:steps] * (1 + 0.02 * i), feedback.reference[:steps])
+        torque = case.torque[:steps] * (1 + 0.02 * i)
+        made.append(Member(theta, case.start, torque, case.path[: steps + 1], feedback, directions))
+    return made
+
+
+def alone(case, member):
+    m = member
+    return case.step.kernel.rollout(m.theta, m.start, m.torque, m.path, m.feedback, m.wanted)
+
+
+def assert_same(one, other, tolerance=0.0):
+    assert (one.status.code, one.status.step) == (other.status.code, other.status.step)
+    for name in RESULTS:
+        first, second = getattr(one, name), getattr(other, name)
+        if second is None or not second.size:
+            assert first is None or not first.size
+            continue
+        scale = max(float(np.nanmax(np.abs(second), initial=0.0)), 1e-9)
+        np.testing.assert_allclose(first, second, rtol=0, atol=tolerance * scale, err_msg=name)
+
+
+@pytest.mark.parametrize("name", ["closed_loop", "relaxing_cable"])
+def test_a_batch_is_its_members_one_by_one(parts, urdf_folder, monkeypatch, name):
+    case = parts.builders[name](urdf_folder)
+    members = members_of(case)
+    single = [alone(case, member) for member in members]
+    assert all(rollout.status.ok for rollout in single)
+    calls = watched(monkeypatch, case.step.kernel)
+    for some in (members, [replace(member, wanted=None) for member in members]):
+        together = case.step.kernel.rollouts(some)
+        for one, member, other in zip(together, some, single, strict=True):
+            expected = other if member.wanted is not None else alone(case, member)
+            assert_same(one, expected, TOLERANCE)
+            # at a tolerance of 1e-14 rounding decides about the last iteration
+            assert abs(one.status.iterations - expected.status.iterations) <= 3
+    lanes = case.step.kernel._batched(None)[1]
+    assert calls[: 8 // lanes] == [lanes] * (8 // lanes)
+
+
+def test_companions_do_not_matter(parts, urdf_folder):
+    case = parts.builders["closed_loop"](urdf_folder)
+    members = [replace(member, wanted=None) for member in members_of(case)]
+    others = [members[0], *(replace(m, theta=m.theta * 1.01, start=m.start + 1e-3) for m in members[1:4]), members[7]]
+    first, second = case.step.kernel.rollouts(members), case.step.kernel.rollouts(others)
+    if case.step.kernel._batched(None)[1] == 8:
+        assert_same(first[0], second[0])
+        assert_same(first[7], second[4])
+
+
+def test_a_member_that_fails_fails_as_alone_and_leaves_the_others(parts, urdf_folder, monkeypatch):
+    case = parts.builders["closed_loop"](urdf_folder)
+    good = [replace(member, wanted=None) for member in members_of(case)]
+    expected = case.step.kernel.rollouts(good)
+    wild = good[2].torque.copy()
+    wild[4] = np.inf
+    lost = replace(good[5], theta=np.full_like(good[5].theta, np.nan))
+    members = [*good[:2], replace(good[2], torque=wild), *good[3:5], lost, *good[6:]]
+    calls = watched(monkeypatch, case.step.kernel)
+    found = case.step.kernel.rollouts(members)
+    assert calls.count(1) == 2  # the two that failed were asked again
+    for i in (2, 5):
+        assert not found[i].status.ok
+        assert_same(found[i], alone(case, members[i]))
+    assert found[2].status.step == 4
+    for i in set(range(8)) - {2, 5}:
+        assert_same(found[i], expected[i])
+
+
+def test_without_vectors_members_are_done_one_by_one(parts, urdf_folder, monkeypatch):
+    case = parts.builders["closed_loop"](urdf_folder)
+    members = members_of(case)
+    original = compiler.compile_library
+    monkeypatch.setattr(compiler, "compile_library", lambda text: None if "define BATCHED" in text else original(text))
+    for one, member in zip(case.step.kernel.rollouts(members), members, strict=True):
+        assert_same(one, alone(case, member))
+
+
+def test_few_members_do_not_ask_for_a_batch(parts, urdf_folder, monkeypatch):
+    case = parts.builders["closed_loop"](urdf_folder)
+    monkeypatch.setattr(compiled, "_batched_library", lambda model: pytest.fail("compiled for nothing"))
+    plain = [replace(member, wanted=None) for member in members_of(case)]
+    assert len(case.step.kernel.rollouts(plain[:3])) == 3
+    monkeypatch.setattr(compiled, "WORTH", 10**9)
+    assert len(case.step.kernel.rollouts(plain)) == 8
+
+
+# -- arithmetic --------------------------------------------------------------------------------------------------------
+
+DRIVER = """
+void yid_try(const double *in, double *out, int count) {
+    for (int first = 0; first < count; first += LANES) {
+        real x[2], y[OUTPUTS];
+        const real *arg[1] = {x};
+        real *res[1] = {y};
+        for (int lane = 0; lane < LANES; lane++)
+            for (int i = 0; i < 2; i++) x[i][lane] = in[2 * (first + lane) + i];
+        everything(arg, res, 0, 0, 0);
+        for (int lane = 0; lane < LANES; lane++)
+            for (int o = 0; o < OUTPUTS; o++) out[OUTPUTS * (first + lane) + o] = y[o][lane];
+    }
+}
+"""
+
+
+def everything():
+    """A function with every operation that has a form."""
+    x = ca.SX.sym("x", 2)
+    a, b = x[0], x[1]
+    one = [ca.sin, ca.cos, ca.tan, ca.exp, ca.tanh, ca.sinh, ca.cosh, ca.atan, ca.asinh, ca.erf, ca.expm1]
+    outputs = [f(a) for f in (*one, ca.floor, ca.ceil, ca.fabs, ca.sign)]
+    outputs += [ca.sqrt(a**2), ca.log(a**2 + 1), ca.log1p(a**2), ca.asin(ca.tanh(a)), ca.acos(ca.tanh(a))]
+    outputs += [ca.atanh(ca.tanh(a) / 2), ca.acosh(1 + a**2), (a**2) ** b, ca.atan2(a, b), ca.fmod(a, 3.0)]
+    outputs += [ca.copysign(a, b), ca.hypot(a, b), ca.remainder(a, 3.0), ca.fmin(a, b), ca.fmax(a, b), a - b, a / b]
+    outputs += [a < b, a <= b, ca.eq(a, b), ca.ne(a, b), ca.logic_and(a, b), ca.logic_or(a, b), ca.logic_not(a)]
+    outputs += [ca.if_else(a < 0.5, a**3, ca.inf), -a * 2, 1 / b, ca.sin(a + b) * ca.cos(a + b)]
+    return ca.Function("everything", [x], [ca.vertcat(*outputs)])
+
+
+MACHINES = {
+    "this": compiler.NATIVE,
+    "avx2": ("-mavx2", "-mfma"),
+    "any": (),
+}
+
+
+@pytest.mark.parametrize("machine", MACHINES)
+@pytest.mark.parametrize("program", ["cc", "clang"])
+def test_arithmetic_of_lanes_is_that_of_one(monkeypatch, machine, program):
+    path = compiler.compiler() if program == "cc" else shutil.which(program)
+    if path is None:
+        pytest.skip(f"there is no {program}")
+    if machine == "avx2" and "avx2" not in compiler._machine():
+        pytest.skip("this machine has no AVX2")
+    monkeypatch.setattr(compiler, "compiler", lambda: path)
+    monkeypatch.setattr(compiler, "NATIVE", MACHINES[machine])
+    function = everything()
+    body = lane_functions_source([function])
+    assert body is not None
+    arithmetic = resources.files("yid_ocp.integrator").joinpath("lanes.c").read_text(encoding="utf-8")
+    count = function.numel_out(0)
+    library = compiler.compile_library(f"#define BATCHED\n#define OUTPUTS {count}\n{arithmetic}\n{body}\n{DRIVER}")
+    assert library.yid_lanes() == (8 if machine == "this" and "avx512f" in compiler._machine() else 4)
+    rng = np.random.default_rng(0)
+    scale = 10.0 ** rng.uniform(-3, 2, size=(400, 2))
+    points = np.vstack([rng.normal(size=(400, 2)) * scale, [[0, 0], [1, 1], [0.5, -0.0], [np.pi, 0], [3e9, 2]] * 8])
+    found = np.zeros((len(points), count))
+    library.yid_try(ctypes.c_void_p(points.ctypes.data), ctypes.c_void_p(found.ctypes.data), len(points))
+    expected = np.array([np.array(function(point)).ravel() for point in points])
+    usable = np.isfinite(expected)
+    np.testing.assert_array_equal(np.isnan(found), np.isnan(expected))
+    np.testing.assert_allclose(found[usable], expected[usable], rtol=1e-13, atol=1e-16)
+
+
+def test_an_operation_without_a_form_is_refused():
+    x = ca.SX.sym("x")
+    assert lane_functions_source([ca.Function("odd", [x], [ca.erfinv(x)])]) is None
