@@ -50,14 +50,14 @@ class Interrupting:
     def __init__(self, after: int) -> None:
         self.left = after
 
-    def stage(self, text: str) -> None:
-        self.left -= text.startswith("refitted")
-        if self.left <= 0:
-            raise KeyboardInterrupt
+    def stage(self, text: str) -> None: ...
 
     def iterate(self, entry) -> None: ...
 
-    def advance(self, done, total, text) -> None: ...
+    def advance(self, done: int, total: int, text: str) -> None:
+        self.left -= text.startswith("refitted")
+        if self.left <= 0:
+            raise KeyboardInterrupt
 
 
 def test_an_interrupted_diagnosis_resumes_its_finished_refits(rubbing, tmp_path, counted, caplog):
