@@ -94,11 +94,8 @@ def test_a_moved_clamp_carries_the_object_and_stands_in_what_is_simulated(tmp_pa
     position = np.stack([base + rise, ahead + rise, tip + rise], axis=1)
     recording = Recording(None, (PointGroup("points", ("a", "b", "w_beam"), t, position, 1e-4),))
     clamp = "model.clamps={jaw: {origin: a, towards: b}}"
-    run = settings(
-        tmp_path,
-        recording,
-        (clamp, "model.frames={}", "model.object.mount={frame: jaw}", "problem.initial_state=equilibrium"),
-    )
+    mount = ("model.object.mount={}", "model.object.mount={frame: jaw}")
+    run = settings(tmp_path, recording, (clamp, "model.frames={}", *mount, "problem.initial_state=equilibrium"))
     problem = build_problem(run)
     assert problem.system.prescribed == tuple(f"jaw_{part}" for part in ("x", "y", "z", "rx", "ry", "rz"))
     made = run_simulate(run, tmp_path / "made").recording

@@ -94,11 +94,11 @@ def write_diagnosis_trajectories(path: Path, finding: Finding, predicted: Sequen
             for k, samples in enumerate(episode.samples):
                 both = {"before": before.predicted[k], "after": after.predicted[k]}
                 _store_sensor(file.require_group(episode.name), episode, samples, both)
-        starts = {episode.name: episode.grid.start for episode in finding.nominal.problem.episodes}
         for trace in () if finding.smoothed is None else finding.smoothed.traces:
             assert finding.smoothed is not None
+            episodes = finding.nominal.problem.episodes
             group = file.create_group(f"where/{trace.recording}")
-            group.attrs["start"] = starts[trace.recording]
+            group.attrs["start"] = next(e.grid.start for e in episodes if e.name == trace.recording)
             group.attrs["unknowns"] = _texts(trace.unknowns)
             group.attrs["locations"] = _texts([source.location for source in trace.sources])
             group.attrs["kinds"] = _texts([source.kind for source in trace.sources])
