@@ -138,7 +138,7 @@ def test_few_members_do_not_ask_for_a_batch(parts, urdf_folder, monkeypatch):
     case = parts.builders["closed_loop"](urdf_folder)
     monkeypatch.setattr(compiled, "_batched_library", lambda model: pytest.fail("compiled for nothing"))
     plain = [replace(member, wanted=None) for member in members_of(case)]
-    assert len(case.step.kernel.rollouts(plain[:3])) == 3
+    assert len(case.step.kernel.rollouts(plain[:2])) == 2
     monkeypatch.setattr(compiled, "WORTH", 10**9)
     assert len(case.step.kernel.rollouts(plain)) == 8
 

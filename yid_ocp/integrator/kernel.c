@@ -452,10 +452,15 @@ static int newton_damped(Work *k, const Point *a, double tolerance, int limit, d
                 const double size = coordinate_norm(trial);
                 if (isfinite(size) && size <= (1.0 - 0.25 * factor) * norm) break;
             }
-            if (factor < 1e-4) return NOT_CONVERGED;
             memcpy(a->q1, q_keep, sizeof(double) * N);
             memcpy(a->z1, z_keep, sizeof(double) * NZ);
             memcpy(a->lam, lam_keep, sizeof(double) * M);
+            if (factor < 1e-4) {
+                /* so near the end only rounding keeps a correction from getting smaller */
+                if (norm > 1e3 * tolerance || !evaluate(k, a)) return NOT_CONVERGED;
+                settle_multipliers(k, a, step, EVERY);
+                return OK;
+            }
             factor *= 0.5;
         }
     }

@@ -26,8 +26,8 @@ from yid_ocp.problem.outcome import EpisodeResult, Start
 from yid_ocp.problem.unknowns import Unknowns
 
 Array = NDArray[np.float64]
-MOST_MEMORY = 2.0**28
-"""Of the states and their derivatives of episodes that are rolled out at once [bytes]."""
+MOST_AT_ONCE, MOST_MEMORY = 16, 2.0**28
+"""Episodes that are rolled out at once, and memory of their states and derivatives [bytes]."""
 
 LEAST_GAIN = 0.1
 """Least factor between a recorded torque and the one that acts at which an error of the latter is one of the former."""
@@ -236,7 +236,7 @@ class Predictor:
         each = [8 * (episode.grid.steps + 1) * self.step.sizes["nx"] * (width + 1) for episode, *_ in asked]
         found: list[EpisodeResult | str] = []
         while len(found) < len(asked):
-            held = np.cumsum(each[len(found) :])
+            held = np.cumsum(each[len(found) :][:MOST_AT_ONCE])
             count = max(int(np.searchsorted(held, MOST_MEMORY, "right")), 1)
             found += part(asked[len(found) : len(found) + count])
         return found
