@@ -66,6 +66,7 @@ def settings_of(links: int, quick: bool, files: Sequence[Path] = (RECORDING,), s
     })  # fmt: skip
     given = [
         f"model.object.links={links}",
+        "parameters={}",  # those of the configuration are of other links
         f"parameters={stiffness}",
         f"recordings.estimate={json.dumps([str(file) for file in files])}",
         "recordings.held_out=[]",

@@ -267,7 +267,7 @@ def two_hands() -> None:
     way = "plan={point: w_T1, shift: [0.03, 0.03, 0.0], duration: 0.8}"
     print("| held by two arms | plan: error [mm], swing [mm/s] | same posture, smoothly |\n|---|---|---|")
     for name, config, more in (
-        ("junction of the Y", "dual_arm_vision", [f"parameters={{{truth}}}", way]),
+        ("junction of the Y", "dual_arm_vision", ["parameters={}", f"parameters={{{truth}}}", way]),
         ("middle of a cable", "plan_cable", []),
     ):
         run = load_config(CONFIG.with_name(f"{config}.yaml"), more)

@@ -63,6 +63,7 @@ def offsets(config: Path, recording: str, joints: Sequence[str]) -> Array:
         f"recordings.estimate=[{json.dumps(recording)}]",
         "recordings.held_out=[]",
         f"model.effects=[{', '.join(effects)}]",
+        "parameters={}",
         f"parameters={{{', '.join(f'{json.dumps(name)}: {{free: true}}' for name in free)}}}",
         "output.report=false",
     ]
