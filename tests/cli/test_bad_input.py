@@ -43,7 +43,7 @@ def edited(file, old, new):
         ("name: gauss_newton", "iterations: many", ("solver.iterations", "a whole number")),
         ("name: gauss_newton", "name: gaus_newton", ("there is no solver", "gauss_newton")),
         ("path_cutoff: .inf", "feedback: lqg", ("none, proportional, lqr",)),
-        ("mode: prescribed", "mode: perscribed", ("driven, prescribed, passive",)),
+        ("mode: prescribed", "mode: perscribed", ("driven, prescribed, servo, passive",)),
         ("compiler: false", "compiler: no", ("true or false",)),
         ("stiffness: 1.0", "stiffness: -1.0", ("from 0", "N m/rad")),
         ("bounds: [0.0, 100.0]", "bounds: [0.0]", ("a list of 2",)),

@@ -17,6 +17,7 @@ COARSE = (
     "solver.iterations=2",
     "problem.compiler=false",
     # one stiffness: the others are hardly seen in so short a time, and their profile likelihoods take many refits
+    "parameters={}",
     "parameters={T*.bend: {initial: 15}, T1.bend: {free: true, initial: 15}, T*.twist: {initial: 10}}",
 )
 # one of the paper's experiments is run with half the time step as well
@@ -42,6 +43,7 @@ QUICK = {
         "solver.iterations=2",
         "problem.compiler=false",
         "model.effects=[]",
+        "parameters={}",
         "parameters={beam.bend: {free: true, initial: 0.018}, beam.damping: {free: true, initial: 4.0e-5}}",
         *UNREFINED,
     ),

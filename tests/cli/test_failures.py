@@ -32,7 +32,8 @@ def test_a_solve_that_does_not_converge(cli, pendulum, tmp_path):
 
 
 def test_a_rollout_that_fails_leaves_reason_and_best_point(cli, pendulum, tmp_path, monkeypatch):
-    monkeypatch.setattr(Predictor, "run", lambda *a, **k: "estimate: step 3: Newton did not converge")
+    told = "estimate: step 3: Newton did not converge"
+    monkeypatch.setattr(Predictor, "run_all", lambda predictor, asked, derivatives: [told] * len(asked))
     done = cli("solve", pendulum, "--out", "failed")
     assert done.code == 1
     result = json.loads((tmp_path / "failed" / "result.json").read_text(), parse_constant=pytest.fail)
