@@ -362,7 +362,10 @@ HARMLESS = Screened((visible(FRICTION),), (score(FRICTION, p=0.6),), TABLE)
         ({"smoothed": LARGE, "disturbed": True}, ["nominal", "screen", "smooth", "compose"], "effect"),
         (SLIGHT, ["nominal", "screen", "elsewhere", "smooth", "compose"], "effect"),
         (
-            {"smoothed": smoothed({FORCE: 9.0}, chi2=(500.0, 100.0))},
+            {
+                "smoothed": smoothed({FORCE: 9.0}, chi2=(500.0, 100.0)),
+                "added": (added(FRICTION, fitted=fit([FRICTION], loss(1.7, 1.8), cost=50.0, values=VALUES)),),
+            },
             ["nominal", "screen", "smooth", "compose"],
             "unknown",
         ),
@@ -376,10 +379,10 @@ HARMLESS = Screened((visible(FRICTION),), (score(FRICTION, p=0.6),), TABLE)
         "three samples for each",
         "nothing could be seen",
         "nothing was added",
-        "most is left unexplained",
         "chance beside noise of torques, whatever its place",
         "the smoother is no measure beside noise of torques",
         "a slight gap may be a wrong valley",
+        "most is left unexplained",
     ],
 )
 def test_what_leads_to_which_step(monkeypatch, given, taken, verdict):
