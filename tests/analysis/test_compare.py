@@ -74,6 +74,7 @@ def test_command(repository, clean, tmp_path, capsys):
     settings = [
         "problem.duration=0.5",
         "compare.methods={gauss_newton: {}, single_shooting: {}}",
+        "parameters={}",
         "parameters={T1.bend: {free: true, initial: 15}, T1.twist: {initial: 13.6}, T2.bend: {initial: 10.7}, "
         "T2.twist: {initial: 8.2}, T3.bend: {initial: 11.5}, T3.twist: {initial: 9.7}}",
         *(f"recordings.{purpose}=[{clean}/single_arm_no_vision_{purpose}.h5]" for purpose in ("estimate", "held_out")),

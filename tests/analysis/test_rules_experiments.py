@@ -47,7 +47,7 @@ def mechanics(*, grasps=(), second=None, driven=(), prescribed=(), measured=Fals
     recording = SimpleNamespace(joints=object() if joints else None)
     episode = SimpleNamespace(samples=(SimpleNamespace(sensor=sensor),), recording=recording)
     system = SimpleNamespace(
-        grasps=[SimpleNamespace(kind=kind) for kind in grasps], driven=driven, prescribed=prescribed
+        grasps=[SimpleNamespace(kind=kind) for kind in grasps], driven=driven, prescribed=prescribed, servos=()
     )
     return LayoutBuilder(Setting(SimpleNamespace(system=system, episodes=(episode,)), np.zeros(1), second_arm=second))
 
@@ -92,7 +92,7 @@ def test_noise_of_torques_is_what_is_stated_or_typical(joints, std):
 
 def test_a_layout_is_built_once_and_says_what_takes_time(monkeypatch):
     told, built = [], []
-    builder = LayoutBuilder(Setting(None, np.zeros(1)), told.append)
+    builder = LayoutBuilder(Setting(None, np.zeros(1)), SimpleNamespace(stage=told.append))
 
     def build(mechanics):
         built.append(mechanics)

@@ -72,6 +72,7 @@ def short(repository, *settings):
         "problem.duration=1.0",
         "problem.compiler=false",
         "recordings.held_out=[]",
+        "parameters={}",
         "parameters={T1.bend: {free: true, initial: 20}, T2.bend: {free: true, initial: 10}, T2.twist: {initial: 10}}",
     )
     return load_problem(repository / "configs" / "single_arm_vision.yaml", (*coarse, *settings))

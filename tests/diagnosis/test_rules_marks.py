@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -360,9 +361,11 @@ def test_the_best_that_could_be_closed_is_that_of_the_true_effects(monkeypatch, 
 
 def test_reported_values_are_turned_back_into_parameters():
     quantities = [
-        SimpleNamespace(name="compliance", reported=("stiffness", "N/m"), reciprocal="stiffness N/m"),
-        SimpleNamespace(name="tau", reported=("tau", "s"), reciprocal=""),
-        SimpleNamespace(name="other", reported=("other", "s"), reciprocal=""),
+        replace(amplitude("compliance"), reciprocal="stiffness N/m"),
+        replace(amplitude("tightness"), reciprocal="limit N", power=2),
+        amplitude("tau"),
+        amplitude("other"),
     ]
-    found = answers._internal("a@b", {"stiffness": 4.0, "tau": 0.5}, quantities)
-    assert found == {"a@b.compliance": 0.25, "a@b.tau": 0.5}
+    found = answers._internal("a@b", {"stiffness": 4.0, "limit": 2.0, "tau": 0.5}, quantities)
+    assert found == {"a@b.compliance": 0.25, "a@b.tightness": 0.25, "a@b.tau": 0.5}
+    assert [quantity.turned(quantity.kept(3.0)) for quantity in quantities] == pytest.approx([3.0] * 4)

@@ -87,6 +87,10 @@ class Quantity:
             return value
         return 1 / value if self.power == 1 else value ** (-1 / self.power)
 
+    def kept(self, value: float) -> float:
+        """The value behind a reported one that is not zero; the same as it is without a reciprocal."""
+        return value**-self.power if self.reciprocal else value
+
 
 @dataclass(frozen=True)
 class Reported:
@@ -275,7 +279,7 @@ def build(kind: str, location: str, system: System, values: Mapping[str, float] 
             if not (value > 0 or (signed and value < 0)):
                 kind_of = "a number other than zero" if signed else "a positive number"
                 raise ConfigError(f"{name} = {value}", where=label, allowed=f"{kind_of} {quantity.reported[1]}")
-            value = value**-quantity.power
+            value = quantity.kept(value)
         given[quantity.name] = float(value)
     entries = (
         Parameter(f"{label}.{q.name}", given.get(q.name, q.neutral), q.unit, q.lower, q.upper, q.description)

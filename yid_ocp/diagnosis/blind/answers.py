@@ -57,6 +57,5 @@ def _internal(label: str, values: Mapping[str, float], quantities: Sequence[Quan
     for quantity in quantities:
         name, _ = quantity.reported
         if name in values:
-            value = values[name]
-            found[f"{label}.{quantity.name}"] = quantity.turned(value)
+            found[f"{label}.{quantity.name}"] = quantity.kept(values[name])
     return found
