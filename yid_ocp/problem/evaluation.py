@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from yid_ocp.problem.constant_errors import ConstantErrors, slopes_by_constants
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.measurements import Measurements, Rows, huber
 from yid_ocp.problem.noise import Innovations
@@ -106,14 +107,32 @@ def joined(measurements: Sequence[Measurements], result: EpisodeResult, threshol
 
 
 def residual_rows(episode: Episode, whitening: Innovations | None, result: EpisodeResult, threshold: float) -> Rows:
-    """One episode's part of the residual: in units of the sensors' noise, or innovations where they are frozen."""
-    if whitening is None:
+    """One episode's part of the residual: in units of the sensors' noise, or innovations where they are frozen.
+
+    Errors that are constant over the recording are part of the noise, see `ConstantErrors`.
+    """
+    by_constants = slopes_by_constants(episode.samples)
+    if whitening is None and not by_constants.shape[1]:
         return joined(episode.samples, result, threshold)
     plain = joined(episode.samples, result)
     columns = plain.residual[:, None]
     if plain.jacobian is not None:
         columns = np.hstack([columns, plain.jacobian])
-    columns = whitening.whitened(columns, result.push)[0]
+    if whitening is not None:
+        columns, by_constants = _innovations(whitening, columns, by_constants, result.push)
+    if by_constants.shape[1]:
+        columns = ConstantErrors.of(by_constants).whitened(columns)
     cost, factor = huber(columns[:, 0], threshold)
     columns = factor[:, None] * columns
     return Rows(cost, columns[:, 0], None if plain.jacobian is None else columns[:, 1:], factor)
+
+
+def _innovations(
+    whitening: Innovations, columns: Array, by_constants: Array, push: Array | None
+) -> tuple[Array, Array]:
+    """Columns and slopes by constant errors of sensors, which drive nothing, turned into innovations."""
+    kept, more = columns.shape[1], by_constants.shape[1]
+    if push is not None:
+        push = np.pad(push, ((0, 0), (0, 0), (0, more)))
+    made = whitening.whitened(np.hstack([columns, by_constants]), push)[0]
+    return made[:, :kept], made[:, kept:]

@@ -56,6 +56,8 @@ class Measurements:
         Standard deviation of the noise, in the sensor's unit; NaN where it is not known.
     span : (int, int)
         First and last node at which the sensor can be predicted.
+    bias_std : ndarray, shape (k,)
+        Standard deviation of a constant error of every output, in the sensor's unit; zero where there is none.
     """
 
     sensor: Sensor
@@ -65,6 +67,7 @@ class Measurements:
     weight: Array
     std: Array
     span: tuple[int, int]
+    bias_std: Array
 
     @property
     def channel_of_column(self) -> tuple[str, ...]:
@@ -191,7 +194,8 @@ def placed(data: SensorData, grid: Grid, where: str) -> Measurements:
     weight = np.where(seen, 1.0 / np.where(data.std > 0, data.std, 1.0), 0.0)
     node, fraction = grid.locate(data.t)
     std = np.where(seen, data.std, np.nan)
-    return Measurements(data.sensor, node, fraction, data.value, weight, std, data.span or (0, grid.steps))
+    bias = np.zeros(data.value.shape[1]) if data.bias_std is None else data.bias_std
+    return Measurements(data.sensor, node, fraction, data.value, weight, std, data.span or (0, grid.steps), bias)
 
 
 def paper_weighting(samples: Measurements, grid: Grid) -> Measurements:
@@ -203,7 +207,8 @@ def paper_weighting(samples: Measurements, grid: Grid) -> Measurements:
     weight = np.where(np.isfinite(samples.value), 1.0, 0.0)
     weight[nearest_node == 0] = 0.0
     weight[nearest_node == grid.steps] *= np.sqrt(2.0)
-    return replace(samples, node=nearest_node, fraction=np.zeros(len(nearest_node)), weight=weight)
+    none = np.zeros(len(samples.bias_std))
+    return replace(samples, node=nearest_node, fraction=np.zeros(len(nearest_node)), weight=weight, bias_std=none)
 
 
 def huber(residual: Array, scale: float) -> tuple[float, Array]:

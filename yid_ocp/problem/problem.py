@@ -323,7 +323,7 @@ class EstimationProblem(Shown):
     def gradient(
         self, x: ArrayLike, evaluation: Evaluation | None = None, warm: WarmStart | None = None
     ) -> tuple[float, Array, Evaluation]:
-        """Cost and its gradient by the adjoint sweep; of innovations by forward sensitivities.
+        """Cost and its gradient by the adjoint sweep; by forward sensitivities where noise is more than the sensors'.
 
         Parameters
         ----------
@@ -342,6 +342,7 @@ class EstimationProblem(Shown):
         """
         x = np.asarray(x, float)
         weighted = any(own is not None for own in self.innovations)
+        weighted |= any(np.any(s.bias_std > 0) for episode in self.episodes for s in episode.samples)
         if evaluation is None or (weighted and evaluation.jacobian is None):
             evaluation = self.evaluate(x, weighted, warm)
         gradient = np.zeros(len(x))

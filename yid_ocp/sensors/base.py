@@ -243,6 +243,8 @@ class SensorData:
         Outputs, NaN where there is none, and the standard deviations of their noise, in the sensor's unit.
     span : (int, int), optional
         First and last node at which the sensor can be predicted; all of them when absent.
+    bias_std : ndarray, optional, shape (k,)
+        Standard deviations of an error of every output that is constant in one recording; none when absent.
     """
 
     sensor: Sensor
@@ -250,6 +252,7 @@ class SensorData:
     value: Array
     std: Array
     span: tuple[int, int] | None = None
+    bias_std: Array | None = None
 
 
 SENSORS: Registry[Callable[[Surroundings], list[SensorData]]] = Registry("kind of sensor")

@@ -180,7 +180,8 @@ def measured_efforts(around: Surroundings) -> list[SensorData]:
             hint="use a longer recording, or raise problem.path_cutoff",
         )
     spread = np.broadcast_to(std, measured.shape)[kept]
-    return [SensorData(EffortSensor(names), times[kept], measured[kept], spread, (1, steps - 1))]
+    bias = torque_bias_std(joints, names, choice)
+    return [SensorData(EffortSensor(names), times[kept], measured[kept], spread, (1, steps - 1), bias)]
 
 
 # -- noise levels -----------------------------------------------------------------------------------------------------

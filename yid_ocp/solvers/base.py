@@ -187,7 +187,8 @@ Callback = Callable[[Iterate], None]
 class Outcome:
     """What a method's own loop returns: the best point, why it stopped, and how it got there.
 
-    `warm` is where the equilibria of the best point are looked for, as far as the method knows.
+    `warm` is where the equilibria of the best point are looked for, as far as the method knows. `worn_out` says that the
+    search ended because many steps were worth nothing beside the noise, whatever the linear model goes on promising.
     """
 
     status: Status
@@ -196,6 +197,7 @@ class Outcome:
     history: tuple[Iterate, ...]
     evaluations: int
     warm: WarmStart | None = None
+    worn_out: bool = False
 
 
 @runtime_checkable
@@ -358,7 +360,7 @@ def _solved(
     status, message = outcome.status, outcome.message
     if not finish.ok:
         status, message = Status.FAILED, finish.message
-    elif status == Status.CONVERGED and not settled(problem, outcome.x, finish):
+    elif status == Status.CONVERGED and not (outcome.worn_out or settled(problem, outcome.x, finish)):
         status = Status.STALLED
         message = f"the search stopped where a further step would lower the cost ({message}); {REMEDY}"
     elif tried > 1:

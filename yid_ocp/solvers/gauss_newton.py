@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -12,13 +13,17 @@ from numpy.typing import NDArray
 from yid_ocp.options import About, check
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.problem import EstimationProblem
-from yid_ocp.solvers.base import SOLVERS, Callback, Outcome, Recorder, Status, projected_gradient
+from yid_ocp.solvers.base import SOLVERS, Callback, Iterate, Outcome, Recorder, Status, projected_gradient
+from yid_ocp.solvers.judgement import uncertainty
 from yid_ocp.solvers.linear_model import bounded_step, promised, settled
 
 Array = NDArray[np.float64]
 
 # A positive unknown falls by no more than this factor in one step, until it is this part of its typical size.
 REACH, NEAR_ZERO = 10.0, 1e-3
+# So many accepted steps in a row are the end if together they save no more of the cost than this, a tenth of what one
+# standard deviation is worth, and move no unknown by more than this part of its standard deviation.
+PATIENCE, WORTHLESS, UNMOVED = 20, 0.05, 0.1
 
 
 @SOLVERS.register("gauss_newton")
@@ -28,7 +33,8 @@ class GaussNewton:
 
     Every iteration solves  min |J d + r|^2 + mu |d/s|^2  with  lower <= x + d <= upper, and accepts d when the cost
     falls by a fair part of what the linear model promised. A short step, or one that damping keeps from promising
-    anything, is no end: see `linear_model.settled`.
+    anything, is no end: see `linear_model.settled`. Many steps that are worth nothing beside the noise are one: where the
+    valley is rough (friction that turns, fast waves that many seconds add up) the linear model promises what no step keeps.
 
     References
     ----------
@@ -71,6 +77,14 @@ class GaussNewton:
             size = np.maximum(np.abs(x), scale)
             if rejected == 0:
                 recorder.accept(now.cost, x, projected_gradient(x, gradient, lower, upper, size))
+                saved = _saved(problem, recorder.history, now)
+                if saved is not None:
+                    message = (
+                        f"the last {PATIENCE} steps lowered the cost by {saved:.2g} together and moved nothing by a tenth of "
+                        "its standard deviation"
+                    )
+                    ended = self._end(Status.CONVERGED, message, x, recorder, now)
+                    return replace(ended, worn_out=True)
             if len(recorder.history) > self.iterations:
                 message = (
                     f"no convergence in {self.iterations} iterations; raise solver.iterations or free fewer parameters"
@@ -112,3 +126,15 @@ class GaussNewton:
 
     def _end(self, status: Status, message: str, x: Array, recorder: Recorder, now: Evaluation) -> Outcome:
         return Outcome(status, message, x, tuple(recorder.history), recorder.evaluations, now.warm)
+
+
+def _saved(problem: EstimationProblem, history: Sequence[Iterate], now: Evaluation) -> float | None:
+    """What the last steps saved of the cost together, if that is worth nothing; else None."""
+    if len(history) <= PATIENCE:
+        return None
+    before, last = history[-1 - PATIENCE], history[-1]
+    saved = before.cost - last.cost
+    if saved > WORTHLESS * problem.noise**2:
+        return None
+    std = np.sqrt(np.maximum(np.diag(uncertainty(problem, now)[0]), 0.0))
+    return saved if np.all(np.abs(last.x - before.x) <= UNMOVED * std) else None

@@ -27,8 +27,8 @@ AT_BOUND = 1e-4
 ONE_SIDED, TWO_SIDED = 2.705543454095404, 3.841458820694124
 # Blocks of time into which all recordings are cut where the misfit counts, and their shortest and longest length [s].
 BLOCKS, SHORTEST, LONGEST = 24, 0.25, 2.0
-# So many recordings tell by themselves how far what they say scatters.
-ENOUGH_RECORDINGS = 4
+# So many recordings, or channels of single recordings, tell by themselves how far what they say scatters.
+ENOUGH_RECORDINGS, ENOUGH_CHANNELS = 4, 8
 # A parabola whose end the cost reaches with a smaller part of the promised height is no likelihood's.
 PROMISED = 0.5
 # With more parameters two rollouts for each take longer than the search itself.
@@ -160,7 +160,8 @@ def counting_misfit(problem: EstimationProblem, evaluation: Evaluation, covarian
 
     What a model leaves out repeats itself from sample to sample and shows in all channels at once. The sandwich
     A^-1 S A^-1 therefore takes S from the scores J' r summed over blocks of time of one recording, all channels
-    together, and from those of whole recordings where there are enough; the larger variance of each unknown counts.
+    together, from those of single channels of whole recordings (a zero that moves, friction that holds), and from those of
+    whole recordings where there are enough; the largest variance of each unknown counts.
 
     Parameters
     ----------
@@ -198,12 +199,14 @@ def counting_misfit(problem: EstimationProblem, evaluation: Evaluation, covarian
 
 
 def _clusters(problem: EstimationProblem) -> list[list[NDArray[np.int64]]]:
-    """Rows of the data cut into blocks of time, and into recordings where there are enough of them."""
+    """Rows of the data cut into blocks of time, and where there are enough of them into recordings and their channels."""
     total = sum(episode.grid.steps for episode in problem.episodes) * problem.step.time_step
     length = float(np.clip(total / BLOCKS, SHORTEST, LONGEST))
     blocks: dict[tuple[str, int], list[NDArray[np.int64]]] = {}
     recordings: dict[str, list[NDArray[np.int64]]] = {}
+    channels: list[list[NDArray[np.int64]]] = []
     for series in residual_series(problem):
+        channels.append([series.rows])
         recordings.setdefault(series.recording, []).append(series.rows)
         at = (series.t / length).astype(int)
         for block in np.unique(at):
@@ -211,6 +214,8 @@ def _clusters(problem: EstimationProblem) -> list[list[NDArray[np.int64]]]:
     found: list[list[NDArray[np.int64]]] = []
     if len(blocks) > 1:
         found.append([np.concatenate(parts) for parts in blocks.values()])
+    if len(recordings) > 1 and len(channels) >= ENOUGH_CHANNELS:
+        found.append([np.concatenate(parts) for parts in channels])
     if len(recordings) >= ENOUGH_RECORDINGS:
         found.append([np.concatenate(parts) for parts in recordings.values()])
     return found
