@@ -34,7 +34,8 @@ def measured(sensor, node, fraction, value, weight=None, std=None, span=(0, 100)
     seen = np.isfinite(value)
     weight = np.where(seen, 1.0, 0.0) if weight is None else np.asarray(weight, float)
     std = np.where(seen, 1.0, np.nan) if std is None else np.asarray(std, float)
-    return Measurements(sensor, np.asarray(node), np.asarray(fraction, float), value, weight, std, span, np.zeros(value.shape[1]))
+    bias = np.zeros(value.shape[1])
+    return Measurements(sensor, np.asarray(node), np.asarray(fraction, float), value, weight, std, span, bias)
 
 
 def joints(names, t, position, **more) -> JointGroup:

@@ -338,4 +338,5 @@ def measurements(channels, node, fraction, value, weight, span=(0, 100), **senso
     """Samples of unit noise on nodes."""
     value, weight = np.asarray(value, float), np.asarray(weight, float)
     made = seeing(channels, **sensor)
-    return Measurements(made, np.asarray(node), np.asarray(fraction, float), value, weight, np.ones(value.shape), span, np.zeros(value.shape[1]))
+    rest = (weight, np.ones(value.shape), span, np.zeros(value.shape[1]))
+    return Measurements(made, np.asarray(node), np.asarray(fraction, float), value, *rest)

@@ -29,6 +29,7 @@ from yid_ocp.diagnosis.verdict import decide, explained_part, has_gap, shapeless
 from yid_ocp.diagnosis.words import cut_short, next_experiment, sentences, shortage
 from yid_ocp.errors import DataError, SolverError
 from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.constant_errors import without_constants
 from yid_ocp.problem.null_test import NullTest, noise_floor, null_test, residual_series
 from yid_ocp.progress import Logged, Progress
 from yid_ocp.solvers import GaussNewton, Solution, solve
@@ -291,7 +292,8 @@ def _followed(search: Search, nominal: Fit, before: tuple[Cut, ...] = ()) -> tup
 
 
 def _offsets_stated(problem: EstimationProblem) -> bool:
-    return problem.disturbed and any(e.errors is not None and np.any(e.errors.bias_std > 0) for e in problem.episodes)
+    driving = (e.errors is not None and bool(np.any(e.errors.bias_std > 0)) for e in problem.episodes)
+    return any(driving) or any(e.has_constant_errors for e in problem.episodes)
 
 
 def elsewhere(search: Search, nominal: Fit) -> Fit | None:
@@ -462,11 +464,19 @@ def held_out_test(fit: Fit, limits: Thresholds = DEFAULTS) -> NullTest:
 
 
 def smooth_fit(fit: Fit, limits: Thresholds = DEFAULTS) -> Smoothed:
-    """The weak-constraint smoother about a fitted model; noise that drives the motion is among its unknowns."""
+    """The weak-constraint smoother about a fitted model; noise that drives the motion is among its unknowns.
+
+    Constant errors of sensors are off what it sees.
+    """
     problem, evaluation, x = fit.problem, fit.evaluation, fit.problem.vector(fit.values)
     if problem.disturbed:
         problem = problem.weighted_by_sensors()
         evaluation = problem.evaluate(x, warm=fit.evaluation.warm)
+    if any(episode.has_constant_errors for episode in problem.episodes):
+        pairs = zip(problem.episodes, evaluation.episodes, strict=True)
+        less = [replace(e, samples=without_constants(e.samples, result.predicted)) for e, result in pairs]
+        problem = problem.on(less, ())
+        evaluation = problem.evaluate(x, warm=evaluation.warm)
     return smooth(problem, x, evaluation, limits)
 
 

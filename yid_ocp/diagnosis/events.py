@@ -28,6 +28,7 @@ from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
 from yid_ocp.diagnosis.torque_terms import torque_terms
 from yid_ocp.effects.base import robot_joints
 from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.constant_errors import without_constants
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.low_pass import LowPass
@@ -289,7 +290,7 @@ def _read_forces(problem: EstimationProblem, run: Run, limits: Thresholds) -> It
     """Histories of prescribed joints whose efforts are compared: needed less measured torque."""
     episode, result, _ = run
     tree = problem.system.mechanism
-    for samples, predicted in zip(episode.samples, result.predicted, strict=True):
+    for samples, predicted in zip(without_constants(episode.samples, result.predicted), result.predicted, strict=True):
         if not samples.sensor.efforts or samples.node.ndim > 1 or len(samples.node) < 10:
             continue
         error, held = _allowed(problem, run, samples.node, limits)

@@ -71,7 +71,7 @@ def slopes_by_constants(samples: Sequence[Measurements]) -> Array:
 
 
 def without_constants(samples: Sequence[Measurements], predicted: Sequence[Array]) -> tuple[Measurements, ...]:
-    """One recording's samples less what a prediction says of their constant errors.
+    """One recording's samples less what a prediction says of their constant errors, which then count no more.
 
     Parameters
     ----------
@@ -88,5 +88,5 @@ def without_constants(samples: Sequence[Measurements], predicted: Sequence[Array
         error, own = s.bias_std.copy(), s.bias_std > 0
         error[own] *= left[: np.count_nonzero(own)]
         left = left[np.count_nonzero(own) :]
-        made.append(replace(s, value=s.value - error))
+        made.append(replace(s, value=s.value - error, bias_std=np.zeros_like(error)))
     return tuple(made)

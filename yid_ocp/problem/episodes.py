@@ -82,6 +82,11 @@ class Episode:
         return replace(self.feedback, reference=self.errors.followed)
 
     @property
+    def has_constant_errors(self) -> bool:
+        """Whether a sensor may be wrong by a constant all along the recording, which its noise then counts."""
+        return any(np.any(samples.bias_std > 0) for samples in self.samples)
+
+    @property
     def name(self) -> str:
         """Name of the recording."""
         return self.recording.name

@@ -14,6 +14,7 @@ from yid_ocp.integrator.step import Directions, Rollout, Step
 from yid_ocp.integrator.step_model import Member
 from yid_ocp.model.system import System
 from yid_ocp.parallel import map_threads
+from yid_ocp.problem.constant_errors import without_constants
 from yid_ocp.problem.corrections import Inputs
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.functions import ModelFunctions
@@ -567,6 +568,7 @@ class _Pulls:
 
 
 def _plain(episode: Episode, result: EpisodeResult) -> Array:
-    """Residual of an episode in units of the sensors' noise."""
-    rows = [s.rows(y).residual for s, y in zip(episode.samples, result.predicted, strict=True)]
+    """Residual of an episode in units of the sensors' noise, their constant errors taken off."""
+    samples = without_constants(episode.samples, result.predicted)
+    rows = [s.rows(y).residual for s, y in zip(samples, result.predicted, strict=True)]
     return np.concatenate(rows)

@@ -342,7 +342,7 @@ class EstimationProblem(Shown):
         """
         x = np.asarray(x, float)
         weighted = any(own is not None for own in self.innovations)
-        weighted |= any(np.any(s.bias_std > 0) for episode in self.episodes for s in episode.samples)
+        weighted |= any(episode.has_constant_errors for episode in self.episodes)
         if evaluation is None or (weighted and evaluation.jacobian is None):
             evaluation = self.evaluate(x, weighted, warm)
         gradient = np.zeros(len(x))

@@ -96,7 +96,12 @@ def _unsure(free: Mapping[str, Mapping[str, Any]]) -> list[Block]:
     by = {v: [name for name, entry in free.items() if entry["verdict"] == v] for v in VERDICT_WORDS}
     found, weak, bound, lost = (by[v] for v in ("identifiable", "weak", "at_bound", "not_identifiable"))
     said = (
-        [f"{len(found)} of {len(free)} free parameters are found to within 10 %: {', '.join(found)}"] if found else []
+        [
+            f"{len(found)} of {len(free)} free parameters are found to within 10 % of their value or, near zero, of "
+            f"their usual size: {', '.join(found)}"
+        ]
+        if found
+        else []
     )
     if lost:
         said.append(f"{VERDICT_WORDS['not_identifiable']} from these recordings: {', '.join(lost)}")

@@ -187,8 +187,8 @@ Callback = Callable[[Iterate], None]
 class Outcome:
     """What a method's own loop returns: the best point, why it stopped, and how it got there.
 
-    `warm` is where the equilibria of the best point are looked for, as far as the method knows. `worn_out` says that the
-    search ended because many steps were worth nothing beside the noise, whatever the linear model goes on promising.
+    `warm` is where the equilibria of the best point are looked for, as far as the method knows. `worn_out` says that
+    the search ended because many steps were worth nothing beside the noise, whatever the linear model promises.
     """
 
     status: Status

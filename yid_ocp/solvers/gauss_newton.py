@@ -33,8 +33,9 @@ class GaussNewton:
 
     Every iteration solves  min |J d + r|^2 + mu |d/s|^2  with  lower <= x + d <= upper, and accepts d when the cost
     falls by a fair part of what the linear model promised. A short step, or one that damping keeps from promising
-    anything, is no end: see `linear_model.settled`. Many steps that are worth nothing beside the noise are one: where the
-    valley is rough (friction that turns, fast waves that many seconds add up) the linear model promises what no step keeps.
+    anything, is no end: see `linear_model.settled`. Many steps that are worth nothing beside the noise are one: where
+    the valley is rough (friction that turns, fast waves over many seconds) the linear model promises what no step
+    keeps.
 
     References
     ----------
@@ -80,8 +81,8 @@ class GaussNewton:
                 saved = _saved(problem, recorder.history, now)
                 if saved is not None:
                     message = (
-                        f"the last {PATIENCE} steps lowered the cost by {saved:.2g} together and moved nothing by a tenth of "
-                        "its standard deviation"
+                        f"the last {PATIENCE} steps lowered the cost by {saved:.2g} together and moved nothing by a "
+                        "tenth of its standard deviation"
                     )
                     ended = self._end(Status.CONVERGED, message, x, recorder, now)
                     return replace(ended, worn_out=True)

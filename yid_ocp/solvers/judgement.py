@@ -160,8 +160,8 @@ def counting_misfit(problem: EstimationProblem, evaluation: Evaluation, covarian
 
     What a model leaves out repeats itself from sample to sample and shows in all channels at once. The sandwich
     A^-1 S A^-1 therefore takes S from the scores J' r summed over blocks of time of one recording, all channels
-    together, from those of single channels of whole recordings (a zero that moves, friction that holds), and from those of
-    whole recordings where there are enough; the largest variance of each unknown counts.
+    together, and where there are enough from those of single channels of whole recordings (a zero that moves, friction
+    that holds) and of whole recordings; the largest variance of each unknown counts.
 
     Parameters
     ----------
@@ -199,7 +199,7 @@ def counting_misfit(problem: EstimationProblem, evaluation: Evaluation, covarian
 
 
 def _clusters(problem: EstimationProblem) -> list[list[NDArray[np.int64]]]:
-    """Rows of the data cut into blocks of time, and where there are enough of them into recordings and their channels."""
+    """Rows of the data cut into blocks of time, and where there are enough into recordings and channels of these."""
     total = sum(episode.grid.steps for episode in problem.episodes) * problem.step.time_step
     length = float(np.clip(total / BLOCKS, SHORTEST, LONGEST))
     blocks: dict[tuple[str, int], list[NDArray[np.int64]]] = {}
