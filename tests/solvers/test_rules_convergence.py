@@ -11,6 +11,7 @@ from made_problems import MadeUp, Steps, linear
 from yid_ocp.errors import DataError, SolverError
 from yid_ocp.problem.unknowns import soft_logarithm
 from yid_ocp.solvers import GaussNewton, Status, solve
+from yid_ocp.solvers.gauss_newton import PATIENCE
 from yid_ocp.solvers.linear_model import promised, settled
 
 
@@ -140,3 +141,30 @@ def test_another_start_that_cannot_even_begin_loses_nothing():
     problem = MadeUp(lambda x, duration: (9.0 * (-1.0) ** np.arange(10), np.ones((10, 1))))
     solution = solve(problem, Fragile())
     assert (solution.status, solution.x.tolist()) == (Status.CONVERGED, [1.0])
+
+
+def winding(steepness, pull, wound=40.0, size=0.2):
+    """A pull towards 1 along a valley that winds: steps are short, and the linear model promises all of the pull."""
+
+    def rows(x, duration):
+        bend = wound * x[0]
+        residual = np.array([steepness * (x[1] - np.sin(bend) / wound), pull * (x[0] - 1.0), 3.0])
+        return residual, np.array([[-steepness * np.cos(bend), steepness], [pull, 0.0], [0.0, 0.0]])
+
+    return MadeUp(rows, (size, size), lower=-np.inf)
+
+
+def test_steps_that_are_worth_nothing_beside_the_noise_are_an_end():
+    """The pull is worth 0.4 of a standard deviation; a hundredth of it is gained in twenty steps."""
+    problem = winding(1e4, 0.4, size=1.0)
+    found = solve(problem, GaussNewton(iterations=100), start=[0.0, 0.0], restarts=False)
+    assert found.status == Status.CONVERGED
+    assert found.iterations == PATIENCE
+    assert "moved nothing by a tenth of its standard deviation" in found.message
+
+
+@pytest.mark.parametrize(("steepness", "pull"), [(1e4, 2.5), (1e2, 1.5)], ids=["worth more", "quick enough"])
+def test_what_is_worth_a_standard_deviation_or_is_gained_is_none(steepness, pull):
+    problem = winding(steepness, pull, size=1.0)
+    found = GaussNewton(iterations=PATIENCE + 5).run(problem, np.zeros(2), None)
+    assert not found.worn_out

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from made_problems import MadeUp, linear
+from small_problems import PENDULUM, pendulum_step, taken
 
-from yid_ocp.problem.null_test import GapLimits
+from yid_ocp.problem import EstimationProblem, ProblemOptions
+from yid_ocp.problem.null_test import GapLimits, residual_series
 from yid_ocp.solvers.judgement import (
+    ENOUGH_CHANNELS,
     MOST_ASKED,
     NO_FIT,
     Estimate,
@@ -285,6 +289,28 @@ def test_a_misfit_of_one_block_or_of_none_widens_nothing():
 def test_noise_alone_is_counted_about_once():
     rng = np.random.default_rng(1)
     assert 1.0 <= widened(constant(rng.normal(size=4800))) < 1.5
+
+
+def test_a_constant_misfit_of_every_channel_of_a_recording_counts_as_one_each(urdf_folder):
+    """Zeros that move from recording to recording cancel in no block of time, and show in no other channel."""
+    step = pendulum_step(urdf_folder, prescribed=PENDULUM)
+    options = ProblemOptions(path_cutoff=np.inf, weak_prior_factor=0.0)
+    recordings = [taken(step, seed, camera=False, steps=200) for seed in range(3)]
+    problem = EstimationProblem(step, recordings, ("elbow.mass",), options)
+    found, series = problem.evaluate(problem.start), residual_series(problem)
+    offset = np.random.default_rng(2).choice([-3.0, 3.0], len(series))
+    moved = np.zeros(len(found.residual))
+    for own, size in zip(series, offset, strict=True):
+        moved[own.rows] = size
+    found = replace(found, residual=moved)
+    slope = found.jacobian[:, 0]
+    scores = np.array([size * slope[own.rows].sum() for own, size in zip(series, offset, strict=True)])
+    scores -= scores.mean()
+    expected = scores @ scores * len(series) / (len(series) - 1) / (slope @ slope) ** 2
+    plain, _ = uncertainty(problem, found)
+    assert len(series) >= ENOUGH_CHANNELS
+    assert expected > 3 * plain[0, 0]
+    assert counting_misfit(problem, found, plain)[0, 0] == pytest.approx(expected)
 
 
 # -- what the cost bears out ------------------------------------------------------------------------------------------

@@ -14,15 +14,16 @@ from yid_ocp.options import About, check
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.problem import EstimationProblem
 from yid_ocp.solvers.base import SOLVERS, Callback, Iterate, Outcome, Recorder, Status, projected_gradient
-from yid_ocp.solvers.judgement import uncertainty
-from yid_ocp.solvers.linear_model import bounded_step, promised, settled
+from yid_ocp.solvers.judgement import TWO_SIDED, uncertainty
+from yid_ocp.solvers.linear_model import bounded_step, promised, remaining, settled
 
 Array = NDArray[np.float64]
 
 # A positive unknown falls by no more than this factor in one step, until it is this part of its typical size.
 REACH, NEAR_ZERO = 10.0, 1e-3
 # So many accepted steps in a row are the end if together they save no more of the cost than this, a tenth of what one
-# standard deviation is worth, and move no unknown by more than this part of its standard deviation.
+# standard deviation is worth, and move no unknown by more than this part of its standard deviation, and if the linear
+# model promises no more than what a 95 % interval is worth.
 PATIENCE, WORTHLESS, UNMOVED = 20, 0.05, 0.1
 
 
@@ -134,8 +135,8 @@ def _saved(problem: EstimationProblem, history: Sequence[Iterate], now: Evaluati
     if len(history) <= PATIENCE:
         return None
     before, last = history[-1 - PATIENCE], history[-1]
-    saved = before.cost - last.cost
-    if saved > WORTHLESS * problem.noise**2:
+    saved, unit = before.cost - last.cost, problem.noise**2
+    if saved > WORTHLESS * unit or remaining(problem, last.x, now) > 0.5 * TWO_SIDED * unit:
         return None
     std = np.sqrt(np.maximum(np.diag(uncertainty(problem, now)[0]), 0.0))
     return saved if np.all(np.abs(last.x - before.x) <= UNMOVED * std) else None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import scipy.linalg
 import scipy.optimize
@@ -48,10 +50,6 @@ def promised(jacobian: Array, residual: Array, step: Array) -> float:
 def settled(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> bool:
     """Whether a point is an end of the search: no step of up to the unknowns' size promises a cost worth the name.
 
-    The step is that of the linear model, undamped and within the bounds, so that neither a short step nor a wall of
-    the cost beside a steep row can pass for an end. What holds the unknowns' size is measured by their value or their
-    typical size, whichever is larger.
-
     Parameters
     ----------
     problem : EstimationProblem
@@ -59,14 +57,24 @@ def settled(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> boo
     evaluation : Evaluation
         At `x`, with its Jacobian.
     """
+    worth = max(SETTLED * evaluation.cost, NEGLIGIBLE * problem.noise**2)
+    return remaining(problem, x, evaluation) <= worth
+
+
+def remaining(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> float:
+    """What the linear model promises of a step of up to the unknowns' size; infinite without a Jacobian.
+
+    The step is undamped and within the bounds, so that neither a short step nor a wall of the cost beside a steep row
+    can pass for an end. What holds the unknowns' size is measured by their value or their typical size, whichever is
+    larger. Parameters as of `settled`.
+    """
     if evaluation.jacobian is None:
-        return False
+        return math.inf
     if not len(x):
-        return True
+        return 0.0
     lower, upper = problem.bounds
     size = np.maximum(np.abs(x), problem.scales)
     scaled = evaluation.jacobian * size
     low, high = np.maximum((lower - x) / size, -1.0), np.minimum((upper - x) / size, 1.0)
     step = bounded_step(scaled, evaluation.residual, 1e-14, low, high)
-    worth = max(SETTLED * evaluation.cost, NEGLIGIBLE * problem.noise**2)
-    return promised(scaled, evaluation.residual, step) <= worth
+    return promised(scaled, evaluation.residual, step)

@@ -1,0 +1,120 @@
+"""Errors of measured efforts that are constant over a recording are noise of all its samples together."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_problems import pendulum_step, taken
+
+from yid_ocp.problem import EstimationProblem, ProblemOptions
+from yid_ocp.problem.constant_errors import ConstantErrors, slopes_by_constants, without_constants
+from yid_ocp.problem.options import SensorOptions
+from yid_ocp.solvers import GaussNewton, solve
+
+BIAS = {"shoulder": 0.4, "elbow": 0.2}  # [N m]
+OFFSETS = {f"effort_offset@{joint}.offset": std for joint, std in BIAS.items()}
+
+
+def options(bias=None, **more):
+    sensors = {"joints.effort": SensorOptions(bias_std=bias)}
+    return ProblemOptions(path_cutoff=math.inf, weak_prior_factor=0.0, sensors=sensors, **more)
+
+
+def arm(folder, bias, free, recordings=2, **how):
+    """A double pendulum of which recordings say no constant error, stated as noise or free beside its prior."""
+    step = pendulum_step(folder, [("effort_offset", joint, {}) for joint in BIAS], **how)
+    recorded = [taken(step, seed) for seed in range(recordings)]
+    if bias is not None:
+        return EstimationProblem(step, recorded, free, options(bias), held_out=[taken(step, 9)])
+    local = options(local=tuple(OFFSETS), priors=OFFSETS)
+    return EstimationProblem(step, recorded, (*free, *OFFSETS), local)
+
+
+def least(problem, x):
+    """The least cost over the offsets, in which it is square, and where."""
+    own = [i for i, name in enumerate(problem.names) if name.startswith("effort_offset")]
+    for _ in range(2):
+        found = problem.evaluate(x)
+        x = x.copy()
+        x[own] -= np.linalg.lstsq(found.jacobian[:, own], found.residual, rcond=None)[0]
+    return problem.evaluate(x, derivatives=False).cost, x
+
+
+def test_the_map_is_that_of_generalised_least_squares():
+    rng = np.random.default_rng(3)
+    slopes, columns = rng.standard_normal((40, 3)) * [0.1, 2.0, 30.0], rng.standard_normal((40, 5))
+    covariance = np.eye(40) + slopes @ slopes.T
+    made = ConstantErrors.of(slopes).whitened(columns)
+    np.testing.assert_allclose(made.T @ made, columns.T @ np.linalg.solve(covariance, columns), rtol=1e-9)
+    expected = -slopes.T @ np.linalg.solve(covariance, columns[:, 0])
+    np.testing.assert_allclose(ConstantErrors.of(slopes).estimated(columns[:, 0]), expected, rtol=1e-9, atol=1e-12)
+
+
+def test_a_stated_constant_is_what_an_offset_of_every_recording_beside_its_prior_would_be(urdf_folder):
+    free = ("shoulder.damping", "elbow.mass")
+    stated, spelt = (arm(urdf_folder, bias, free, prescribed=tuple(BIAS)) for bias in (BIAS, None))
+    found, other = (solve(problem, GaussNewton(), restarts=False) for problem in (stated, spelt))
+    assert found.cost == pytest.approx(other.cost, rel=1e-9)
+    for name in free:
+        assert found.parameters[name].value == pytest.approx(other.parameters[name].value, rel=1e-3)
+    plain = solve(arm(urdf_folder, 0.0, free, prescribed=tuple(BIAS)), GaussNewton(), restarts=False)
+    assert plain.cost > found.cost + 10.0
+
+
+def test_beside_noise_that_drives_other_joints_too(urdf_folder):
+    """One joint driven, the other prescribed: the filter's rows and the constants of the other's efforts together."""
+    how = {"driven": ("shoulder",), "prescribed": ("elbow",)}
+    step = pendulum_step(urdf_folder, [("effort_offset", "elbow", {})], **how)
+    name = "effort_offset@elbow.offset"
+    recorded = [taken(step, 4, camera=False)]
+    sensors = {"joints.effort": SensorOptions(std=0.05, bias_std={"shoulder": 0.1, "elbow": 0.5})}
+    given = ProblemOptions(path_cutoff=math.inf, weak_prior_factor=0.0, sensors=sensors)
+    stated = EstimationProblem(step, recorded, ("elbow.mass",), given)
+    bare = replace(given, sensors={"joints.effort": SensorOptions(std=0.05, bias_std={"shoulder": 0.1, "elbow": 0.0})})
+    spelt = EstimationProblem(step, recorded, ("elbow.mass", name), replace(bare, priors={name: 0.5}))
+    assert stated.episodes[0].has_constant_errors
+    assert not spelt.episodes[0].has_constant_errors
+    weighted, beside = stated.weighted_at(stated.start), spelt.weighted_at(spelt.start)
+    assert weighted.innovations[0] is not None
+    assert weighted.evaluate(stated.start).cost == pytest.approx(least(beside, spelt.start)[0], rel=1e-6)
+
+
+def test_the_gradient_is_that_of_the_cost(urdf_folder):
+    problem = arm(urdf_folder, BIAS, ("shoulder.damping", "elbow.mass"), prescribed=tuple(BIAS))
+    x = problem.start * 1.1
+    _, gradient, _ = problem.gradient(x)
+    for i, size in enumerate(1e-5 * np.abs(x)):
+        moved = size * np.eye(len(x))[i]
+        rise = problem.evaluate(x + moved, False).cost - problem.evaluate(x - moved, False).cost
+        assert gradient[i] == pytest.approx(rise / (2 * size), rel=1e-5)
+
+
+def test_what_is_known_of_constants_is_taken_off_the_samples(urdf_folder):
+    problem = arm(urdf_folder, BIAS, ("shoulder.damping",), prescribed=tuple(BIAS))
+    spelt = arm(urdf_folder, None, ("shoulder.damping",), prescribed=tuple(BIAS))
+    _, x = least(spelt, spelt.start)
+    found = problem.evaluate(problem.start, derivatives=False)
+    for i, (episode, result) in enumerate(zip(problem.episodes, found.episodes, strict=True)):
+        [(before, after)] = [
+            pair
+            for pair in zip(episode.samples, without_constants(episode.samples, result.predicted), strict=True)
+            if pair[0].sensor.efforts
+        ]
+        offsets = [x[spelt.names.index(f"effort_offset@{joint}.offset[{episode.name}]")] for joint in BIAS]
+        np.testing.assert_allclose(before.value - after.value, np.broadcast_to(offsets, before.value.shape), rtol=1e-6)
+        assert not np.any(after.bias_std), i
+
+
+def test_held_out_rows_count_it_and_rows_without_a_constant_stay(urdf_folder):
+    problem = arm(urdf_folder, BIAS, ("shoulder.damping",), prescribed=tuple(BIAS))
+    [(episode, result)] = problem.validate(problem.start)
+    counted = problem.held_out_rows(0, episode, result).residual
+    plain = np.concatenate([s.rows(y).residual for s, y in zip(episode.samples, result.predicted, strict=True)])
+    slopes = slopes_by_constants(episode.samples)
+    rows = np.any(slopes != 0, axis=1)
+    np.testing.assert_array_equal(counted[~rows], plain[~rows])
+    covariance = np.eye(len(plain)) + slopes @ slopes.T
+    assert counted @ counted == pytest.approx(plain @ np.linalg.solve(covariance, plain), rel=1e-9)
