@@ -167,6 +167,26 @@ def test_a_scheduler_file_will_do(scheduler, tmp_path):
     assert found[0].value == 5
 
 
+@pytest.mark.parametrize(("failures", "refused"), [(2, False), (3, True)])
+def test_an_event_loop_that_has_no_time_to_start_is_tried_again(scheduler, monkeypatch, failures, refused):
+    """Dask asserts that it runs after ten seconds."""
+    real, asked = distributed.Client, []
+
+    def busy(**where: Any) -> Any:
+        asked.append(where)
+        assert len(asked) > failures
+        return real(**where)
+
+    monkeypatch.setattr(distributed, "Client", busy)
+    if refused:
+        with pytest.raises(WorkerError, match="event loop did not start"), connected(scheduler.address):
+            pass
+    else:
+        with connected(scheduler.address) as (executor, _):
+            assert executor.submit(abs, -3).result(timeout=60) == 3
+    assert len(asked) == 3
+
+
 CASES = 12
 
 

@@ -226,13 +226,13 @@ def history(runs: Sequence[Estimates], level: float = 0.01) -> History:
     _, chi2, degrees = together(runs)
     drifts = tuple(_drift(name, runs, level / max(len(names), 1)) for name in names)
     against = tuple(_against(i, runs, level / len(runs)) for i in range(len(runs)))
-    return History(tuple(run.run for run in runs), drifts, against, chi2, degrees, _p_value(chi2, degrees), level)
+    return History(tuple(run.run for run in runs), drifts, against, chi2, degrees, p_value(chi2, degrees), level)
 
 
 def _drift(name: str, runs: Sequence[Estimates], level: float) -> Drift:
     own = [run.of((name,)) for run in runs if name in run.names]
     mean, chi2, degrees = together(own)
-    p = _p_value(chi2, degrees)
+    p = p_value(chi2, degrees)
     values, std = tuple(float(run.values[0]) for run in own), tuple(float(run.std[0]) for run in own)
     unit = mean.units.get(name, "")
     places = tuple(run.run for run in own)
@@ -242,13 +242,13 @@ def _drift(name: str, runs: Sequence[Estimates], level: float) -> Drift:
 def _against(i: int, runs: Sequence[Estimates], level: float) -> Against:
     """One run against the mean of all others; distrusted where they agree without it."""
     chi2, degrees, worst = _apart(runs[i], [run for k, run in enumerate(runs) if k != i])
-    p = _p_value(chi2, degrees)
+    p = p_value(chi2, degrees)
     without = []
     for k in range(len(runs)):
         _, rest, free = together([run for j, run in enumerate(runs) if j != k])
         without.append((rest, free))
     rest, free = without[i]
-    alone = len(runs) > 2 and p < level and _p_value(rest, free) >= level
+    alone = len(runs) > 2 and p < level and p_value(rest, free) >= level
     alone = alone or (len(runs) > 2 and p < level and rest < 0.5 * min(r for k, (r, _) in enumerate(without) if k != i))
     return Against(runs[i].run, chi2, degrees, p, worst, runs[i].explains, alone)
 
@@ -267,5 +267,6 @@ def _apart(run: Estimates, others: Sequence[Estimates]) -> tuple[float, int, str
     return chi2, len(shared), shared[int(np.argmax(np.abs(unit)))]
 
 
-def _p_value(chi2: float, degrees: int) -> float:
+def p_value(chi2: float, degrees: int) -> float:
+    """Of so large a chi2 by chance; 1 where nothing was compared."""
     return float(scipy.stats.chi2.sf(chi2, degrees)) if degrees else 1.0

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import scipy.stats
-
-from yid_ocp.analysis.history import Estimates, together
+from yid_ocp.analysis.history import Estimates, p_value, together
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.baseline import Shift, Since, since
 from yid_ocp.diagnosis.counterfactual import Counterfactual, counterfactual
@@ -43,8 +41,7 @@ class Earlier:
         if not runs:
             return Earlier(None, (), 0.0, 1.0, without)
         known, chi2, degrees = together(runs)
-        p = float(scipy.stats.chi2.sf(chi2, degrees)) if degrees else 1.0
-        return Earlier(known, tuple(run.run for run in runs), chi2, p, without)
+        return Earlier(known, tuple(run.run for run in runs), chi2, p_value(chi2, degrees), without)
 
     def since(self, fit: Fit, limits: Thresholds) -> Since | None:
         """How far a fit has moved from the earlier runs; None without any."""

@@ -16,6 +16,8 @@ from yid_ocp.version import differences, fingerprint
 
 CONNECTING = 15.0
 """Time in which a scheduler has to answer [s]."""
+STARTS = 3
+"""How often a client's event loop is started."""
 Function = Callable[..., Any]
 log = logging.getLogger(__name__)
 
@@ -42,7 +44,14 @@ def cluster(
     path = Path(scheduler).expanduser()
     where = {"scheduler_file": str(path)} if path.is_file() else {"address": scheduler}
     try:
-        client = distributed.Client(**where, timeout=CONNECTING, set_as_default=False)
+        client = _client(distributed, where)
+    except AssertionError as error:
+        raise WorkerError(
+            f"Dask's event loop did not start in {STARTS} times ten seconds",
+            where=scheduler,
+            allowed="a machine that has time for it",
+            hint="run it again once this machine is less busy",
+        ) from error
     except (OSError, ValueError, TypeError, LookupError) as error:  # TimeoutError is an OSError
         raise WorkerError(
             f"no scheduler answers: {str(error).splitlines()[0] if str(error) else type(error).__name__}",
@@ -60,6 +69,15 @@ def cluster(
         _refuse_unfit(client, function, folder)
         # Dask would take a task that failed before for done where the function counted as pure
         yield client.get_executor(pure=False), look
+
+
+def _client(distributed: Any, where: dict[str, str]) -> Any:
+    """A client; Dask asserts that its event loop starts within ten seconds, which a busy machine may not manage."""
+    for _ in range(STARTS - 1):
+        with contextlib.suppress(AssertionError):
+            return distributed.Client(**where, timeout=CONNECTING, set_as_default=False)
+        log.info("Dask's event loop did not start; it is tried again")
+    return distributed.Client(**where, timeout=CONNECTING, set_as_default=False)
 
 
 def _refuse_unfit(client: Any, function: Function | None, folder: Path | None) -> None:

@@ -44,7 +44,7 @@ class SensorOptions:
         NotNegative | Mapping[str, NotNegative] | None,
         About(
             "standard deviation of a constant error in each joint's torque, another in every recording, instead of the "
-            "recorded one (joints.effort of driven joints only)",
+            "recorded one (joints.effort only)",
             "N m",
         ),
     ] = None
