@@ -210,3 +210,27 @@ def test_the_preview_counts_bad_lines_and_guesses_units(tmp_path: Path) -> None:
     joints = joints_of(read_csv(path, **contents.options))
     assert joints.t[1] == pytest.approx(0.01)
     assert joints.position[0, 0] == pytest.approx(math.pi / 2)
+
+
+def test_telemetry_of_isaac_sims_identification(tmp_path: Path) -> None:
+    """`Time`, q1 ... dq1 ... cmd1 ... after comments; a table of two joints, here with their names in the URDF."""
+    path = tmp_path / "telemetry.csv"
+    path.write_text(
+        "# excited at 50 Hz\nTime, q1, q2, dq1, dq2, cmd1, cmd2\n0.0, 0.1, 0.2, 1, 2, 0.3, 0.4\n"
+        "# a pause\n0.02, 0.5, 0.6, 3, 4, 0.7, 0.8\n",
+        encoding="utf-8",
+    )
+    joints = read_csv(path, joints=["1=shoulder", "2=elbow"]).joints
+    assert joints is not None
+    assert joints.names == ("shoulder", "elbow")
+    np.testing.assert_array_equal(joints.t, [0.0, 0.02])
+    np.testing.assert_array_equal(joints.position, [[0.1, 0.2], [0.5, 0.6]])
+    np.testing.assert_array_equal(joints.velocity, [[1, 2], [3, 4]])
+    np.testing.assert_array_equal(joints.position_command, [[0.3, 0.4], [0.7, 0.8]])
+    contents = preview(path)
+    assert "columns" not in contents.options
+    assert [source.becomes for source in contents.sources][:4] == ["t", "position:1", "position:2", "velocity:1"]
+    # q0 is none of them, and q_1 is what it was
+    path.write_text("t,q0\n0,1\n1,2\n", encoding="utf-8")
+    with pytest.raises(DataError, match="meaning of column 'q0' is not known"):
+        read_csv(path)

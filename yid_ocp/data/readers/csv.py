@@ -27,6 +27,8 @@ from yid_ocp.errors import DataError, choices, nearest
 from yid_ocp.files import file_sha256
 
 _PREFIXES = {"q_": "position", **{f"{channel}_": channel for channel in JOINT_CHANNELS}}
+_NUMBERED = {"q": "position", "dq": "velocity", "cmd": "position_command"}
+"""What Isaac Sim's system identification calls the columns of joints 1, 2, ..., whatever the case."""
 _AXES = ("x", "y", "z")
 _MOST_BAD = 0.5
 """Part of a table's lines that may be bad; beyond it the table is not understood at all."""
@@ -55,8 +57,9 @@ def read_csv(
     """Read a table with one row per time.
 
     Columns are understood by their names: `t` or `time`; a channel and a joint, `q_<joint>`, `position_<joint>`,
-    `velocity_<joint>`, `effort_<joint>` and so on; else a point and an axis, `<point>_x`, `<point>_y`, `<point>_z`. An
-    empty cell is NaN. Where a table has joints and points, a row in which all cells of one of them are empty is a time
+    `velocity_<joint>`, `effort_<joint>` and so on; `q1`, `dq1` and `cmd1` as in telemetry of Isaac Sim's system
+    identification, position, velocity and commanded position of joint 1; else a point and an axis, `<point>_x`,
+    `<point>_y`, `<point>_z`. An empty cell is NaN; lines that begin with `#` are comments. Where a table has joints and points, a row in which all cells of one of them are empty is a time
     at which only the other was measured.
 
     Parameters
@@ -217,7 +220,7 @@ def _rows(path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
         with path.open(encoding="utf-8-sig", newline="") as file:
             lines = csv.reader(file, delimiter=delimiter, skipinitialspace=True)
             for cells in lines:
-                if cells:
+                if cells and not cells[0].lstrip().startswith("#"):
                     yield lines.line_num, cells
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         what = f"the file is not a table of text ({error})"
@@ -341,8 +344,11 @@ def _meanings(header: Sequence[str], columns: Mapping[str, str], where: str) -> 
 
 
 def _conventional_meaning(column: str) -> tuple[str, str] | None:
-    if column in ("t", "time"):
+    if column.lower() in ("t", "time"):
         return "t", ""
+    numbered = re.fullmatch(r"([a-z]+)([1-9]\d*)", column.lower())
+    if numbered and numbered[1] in _NUMBERED:
+        return _NUMBERED[numbered[1]], numbered[2]
     for prefix in sorted(_PREFIXES, key=len, reverse=True):
         if column.startswith(prefix) and column != prefix:
             return _PREFIXES[prefix], column.removeprefix(prefix)
