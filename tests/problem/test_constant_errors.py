@@ -12,7 +12,7 @@ from small_problems import pendulum_step, taken
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.constant_errors import ConstantErrors, slopes_by_constants, without_constants
 from yid_ocp.problem.options import SensorOptions
-from yid_ocp.solvers import GaussNewton, solve
+from yid_ocp.solvers import GaussNewton, MultipleShooting, solve
 
 BIAS = {"shoulder": 0.4, "elbow": 0.2}  # [N m]
 OFFSETS = {f"effort_offset@{joint}.offset": std for joint, std in BIAS.items()}
@@ -60,6 +60,8 @@ def test_a_stated_constant_is_what_an_offset_of_every_recording_beside_its_prior
     assert found.cost == pytest.approx(other.cost, rel=1e-9)
     for name in free:
         assert found.parameters[name].value == pytest.approx(other.parameters[name].value, rel=1e-3)
+    shot = solve(stated, MultipleShooting(transcription="symbolic", iterations=1), restarts=False)
+    assert "without the constant errors" in shot.message
     plain = solve(arm(urdf_folder, 0.0, free, prescribed=tuple(BIAS)), GaussNewton(), restarts=False)
     assert plain.cost > found.cost + 10.0
 

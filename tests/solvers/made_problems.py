@@ -83,7 +83,7 @@ class MadeUp:
             node=node, fraction=np.zeros(data), count=data,
         )  # fmt: skip
         grid = SimpleNamespace(steps=steps, time_step=0.1)
-        return SimpleNamespace(name=f"run {i}", grid=grid, samples=(group,))
+        return SimpleNamespace(name=f"run {i}", grid=grid, samples=(group,), has_constant_errors=False)
 
     @property
     def positive(self) -> np.ndarray:

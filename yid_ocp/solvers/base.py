@@ -354,6 +354,9 @@ def _solved(
     if problem.disturbed and not carries_noise(solver):
         remark = "; weighted by the sensors' noise alone, without the noise that drives the motion"
         outcome = replace(outcome, message=outcome.message + remark)
+    if not getattr(solver, "needs_rollout", True) and any(e.has_constant_errors for e in problem.episodes):
+        remark = "; weighted without the constant errors that measured efforts may have"
+        outcome = replace(outcome, message=outcome.message + remark)
     problem = weighted
     fit = judge_fit(problem, finish, limits)
     covariance = covariance_of_fit(problem, finish, fit)
