@@ -59,8 +59,8 @@ def read_csv(
     Columns are understood by their names: `t` or `time`; a channel and a joint, `q_<joint>`, `position_<joint>`,
     `velocity_<joint>`, `effort_<joint>` and so on; `q1`, `dq1` and `cmd1` as in telemetry of Isaac Sim's system
     identification, position, velocity and commanded position of joint 1; else a point and an axis, `<point>_x`,
-    `<point>_y`, `<point>_z`. An empty cell is NaN; lines that begin with `#` are comments. Where a table has joints and points, a row in which all cells of one of them are empty is a time
-    at which only the other was measured.
+    `<point>_y`, `<point>_z`. An empty cell is NaN; lines that begin with `#` are comments. Where a table has joints and
+    points, a row in which all cells of one of them are empty is a time at which only the other was measured.
 
     Parameters
     ----------
