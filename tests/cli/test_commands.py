@@ -9,7 +9,6 @@ import os
 import pathlib
 import subprocess
 import sys
-import time
 
 import h5py
 import pytest
@@ -30,18 +29,16 @@ PARAMETER_KEYS = {"value", "std", "unit", "initial", "lower", "upper", "free", "
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["solve", "--help"], ["--version"]])
-def test_help_is_quick_and_imports_nothing_heavy(arguments):
+def test_help_imports_nothing_but_the_standard_library(arguments):
+    """What makes it quick: time itself is measured nowhere in tests."""
     code = (
-        "import sys, time; begun = time.perf_counter(); from yid_ocp.cli import main; code = main(sys.argv[1:]);"
-        "heavy = {'casadi', 'numpy', 'scipy', 'pydantic', 'rich'} & set(sys.modules);"
-        "print('HEAVY', sorted(heavy), 'SECONDS', time.perf_counter() - begun); sys.exit(code)"
+        "import sys; before = set(sys.modules); from yid_ocp.cli import main; code = main(sys.argv[1:]);"
+        "found = {name.partition('.')[0] for name in set(sys.modules) - before} - set(sys.stdlib_module_names);"
+        "print('BEYOND', sorted(found)); sys.exit(code)"
     )
-    begun = time.perf_counter()
     done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert "HEAVY []" in done.stdout
-    assert float(done.stdout.rsplit("SECONDS", 1)[1]) < 0.5
-    assert time.perf_counter() - begun < 1.5
+    assert done.stdout.rstrip().endswith("BEYOND ['yid_ocp']")
 
 
 def test_as_a_module():
