@@ -302,7 +302,7 @@ def test_an_amplitude_may_leave_its_range_by_its_width(value, odd):
 
 def ranked(**decreases):
     return [
-        score(effect(f"{name}@x"), decrease=decrease, step={f"{name}@x.a": decrease})
+        score(effect(f"{name}@x"), p=1e-9, decrease=decrease, step={f"{name}@x.a": decrease})
         for name, decrease in sorted(decreases.items(), key=lambda entry: -entry[1])
     ]
 
@@ -345,7 +345,7 @@ def test_the_surest_are_refitted_wherever_they_stand():
 
 
 def test_the_best_of_every_place_of_the_gap_is_refitted():
-    scores = [score(effect(label), decrease=9.0 - i) for i, label in enumerate(("a@x", "b@y", "c@y", "d@z"))]
+    scores = [score(effect(label), p=1e-9, decrease=9.0 - i) for i, label in enumerate(("a@x", "b@y", "c@y", "d@z"))]
     table = alike([s.effect.label for s in scores], np.eye(4))
     assert shortlisted(scores, table, ("y",), refits=1) == ["a", "b"]
     assert shortlisted(scores, table, ("z", "y", "x", "nowhere"), refits=1) == ["a", "d", "b"]
@@ -628,3 +628,12 @@ def test_what_contradicts_a_baseline_counts_whatever_blocks_are_drawn():
     assert gain(before, after) == (pytest.approx(9.0), 0.0)
     found = closure(before, after)
     assert (found.value, found.low, found.high) == pytest.approx((9 / 11, 9 / 11, 9 / 11))
+
+
+def test_the_best_of_a_place_is_refitted_even_if_it_promises_nothing_where_anything_is_significant():
+    scores = ranked(a=9.0, b=0.1)
+    scores[1] = score(effect("b@y"), p=0.3, decrease=0.1, step={"b@y.a": 0.1})
+    table = alike([s.effect.label for s in scores], np.eye(2))
+    assert shortlisted(scores, table) == ["a"]
+    assert shortlisted(scores, table, ("y", "z")) == ["a", "b"]
+    assert shortlisted(scores[1:], table, ("y",)) == []

@@ -190,13 +190,18 @@ def relevant(before: Loss, after: Loss, limits: Thresholds = DEFAULTS) -> bool:
 
 
 def shortlist(
-    ranked: Sequence[Score], alike: Confusability, limits: Thresholds, places: Sequence[str] = ()
+    scores: Sequence[Score], alike: Confusability, limits: Thresholds, places: Sequence[str] = ()
 ) -> list[tuple[EffectBase, Mapping[str, float]]]:
     """Which candidates of the first pass are refitted: none is left out because worse ones stand before it.
 
-    The best by what they promise; those that can stand in for them; the best by their statistic, which a promise made
-    far from its end says little about; and the best of every place where the gap lies.
+    Of those that are significant, the best by what they promise; those that can stand in for them; the best by their
+    statistic, which a promise made far from its end says little about. Beside any of these the best of every place
+    where the gap lies is refitted whether significant or not: in a valley far from its end the linear model of a
+    candidate may say nothing.
     """
+    ranked = [score for score in scores if score.p_value < limits.level]
+    if not ranked:
+        return []
     best = list(ranked[: limits.refits])
     extra: list[Score] = []
     for score in best:
@@ -205,7 +210,7 @@ def shortlist(
     extra.sort(key=lambda s: -s.decrease)
     chosen = [*best, *extra[: limits.refits]]
     surest = sorted(ranked, key=lambda s: (s.p_value, -s.statistic))[: limits.surest]
-    there = [next((s for s in ranked if s.effect.location == place), None) for place in places]
+    there = [next((s for s in scores if s.effect.location == place), None) for place in places]
     for other in (*surest, *there):
         if other is not None and other not in chosen:
             chosen.append(other)
@@ -242,7 +247,9 @@ def compose(
         if added:
             search.progress.stage(f"scoring what is left beside {', '.join(e.label for e in base)}")
             screened = screen(search.problem, base, current.values, limits)
-        fits = refit_all(search, base, _significant(screened, limits, places), current.values)
+        # where the gap lay before anything was added asks for no more than the significant afterwards
+        scores = [score for score in screened.scores if not added or score.p_value < limits.level]
+        fits = refit_all(search, base, shortlist(scores, screened.alike, limits, places), current.values)
         if not fits:
             break
         near = within_reach(fits, limits)
@@ -260,12 +267,6 @@ def compose(
         if current.loss.mean < 1 + limits.smallest_gap:
             break
     return first, _reconsidered(search, nominal, added)
-
-
-def _significant(
-    screened: Screened, limits: Thresholds, places: Sequence[str] = ()
-) -> list[tuple[EffectBase, Mapping[str, float]]]:
-    return shortlist([s for s in screened.scores if s.p_value < limits.level], screened.alike, limits, places)
 
 
 def _worth_adding(current: Fit, chosen: Fit, limits: Thresholds) -> bool:
@@ -314,7 +315,8 @@ def _revised(search: Search, nominal: Fit, kept: tuple[Added, ...], position: in
         return _rebuilt(search, nominal, [other for other in kept if other is not entry], without)
     search.progress.stage(f"looking for others in the place of {entry.effect.label}")
     screened = screen(search.problem, rest, without.values, limits)
-    tried = [pair for pair in _significant(screened, limits)[: limits.refits] if pair[0].label != entry.effect.label]
+    tried = shortlist(screened.scores, screened.alike, limits)[: limits.refits]
+    tried = [pair for pair in tried if pair[0].label != entry.effect.label]
     own = replace(full, effects=(*rest, entry.effect))
     near = within_reach([own, *refit_all(search, rest, tried, without.values)], limits)
     chosen = next((fit for fit in near if _needed(without, fit, fit.effects[-1], limits)), own)
