@@ -26,6 +26,7 @@ from yid_ocp.diagnosis.select import (
     within_reach,
 )
 from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.errors import SolverError
 
 LIMITS = Thresholds()
 
@@ -359,9 +360,9 @@ A, B, C = (effect(f"{name}@x", amplitude()) for name in "abc")
 class Rounds:
     """Refits whose held-out losses are given by the effects' kinds, screened as wanted; remembers what was asked."""
 
-    def __init__(self, monkeypatch, losses, p_values=(1e-9, 1e-9, 1e-9), fails=(), absent=()):
+    def __init__(self, monkeypatch, losses, p_values=(1e-9, 1e-9, 1e-9), fails=(), absent=(), before=None):
         self.losses, self.fails, self.refits, self.screens, self.heard = losses, fails, [], [], Heard()
-        self.absent = absent
+        self.absent, self.before = absent, before
         kinds = [score(of, p=p, decrease=9.0 - i) for i, (of, p) in enumerate(zip((A, B, C), p_values, strict=True))]
         self.scores = tuple(kinds)
         monkeypatch.setattr(select, "refit_all", self.refit_all)
@@ -380,12 +381,19 @@ class Rounds:
         return Screened((), left, table)
 
     def screen(self, problem, base, values, limits):
-        self.screens.append(([of.kind for of in base], values["k"], problem, limits))
+        if not values and self.before is None:
+            raise SolverError("it snaps", where="diagnosis")
+        self.screens.append(([of.kind for of in base], values.get("k"), problem, limits))
         return self.screened(base)
 
-    def refit_all(self, search, base, tried, values):
-        self.refits.append(([of.kind for of in base], [of.kind for of, _ in tried], values["k"]))
+    def refit_all(self, search, base, tried, values, where=""):
+        self.refits.append(([of.kind for of in base], [of.kind for of, _ in tried], values.get("k")))
         known = [(*base, of) for of, _ in tried]
+        if where:
+            lost = {of.kind: self.before.get(of.kind, (9.0, 9.2)) for of, _ in tried}
+            pairs = [(of, loss(*lost[of.kind])) for of, _ in tried]
+            there = [(of, own, 0.5 if of.kind in self.before else 2.0) for of, own in pairs]
+            return [fit([of], own, cost, {"k": 7.0, f"{of.label}.a": 1.0}) for of, own, cost in there]
         return [self.fit(effects) for effects in known if "".join(sorted(e.kind for e in effects)) in self.losses]
 
     def refit(self, problem, effects, start, store, name, limits):
@@ -393,10 +401,10 @@ class Rounds:
         kinds = "".join(sorted(of.kind for of in effects))
         return None if kinds in self.fails else self.fit(effects)
 
-    def compose(self, **limits):
+    def compose(self, moved=False, **limits):
         search = Search(SimpleNamespace(), Thresholds(**limits), self.heard, None)
         nominal = fit((), loss(*self.losses[""]), values={"k": 0.0})
-        first, added = compose(search, nominal, self.screened())
+        first, added = compose(search, nominal, self.screened(), moved=moved)
         return [f.effects[0].kind for f in first], [entry.effect.kind for entry in added], added
 
 
@@ -409,6 +417,18 @@ def test_one_effect_that_leaves_no_gap_is_enough(monkeypatch):
     assert added[0].closure.value == pytest.approx(1 - 0.05 / 2.1)
     assert [of.kind for of in added[0].rivals] == ["a"]
     assert rounds.heard.stages == ["added a@x: 97.6 % of the held-out gap closed"]
+
+
+def test_where_a_fit_has_left_an_earlier_run_candidates_are_tried_from_there_too(monkeypatch):
+    """Each keeps the likelier of its two fits: b's from before, whatever its held-out loss, and a's from the fit."""
+    losses = {"": (3.0, 3.2), "a": (2.0, 2.2), "b": (2.5, 2.7), "c": (2.6, 2.8)}
+    rounds = Rounds(monkeypatch, losses, before={"b": (1.0, 1.1)})
+    first, chosen, added = rounds.compose(moved=True)
+    assert (first, chosen) == (["b", "a", "c"], ["b"])
+    assert rounds.refits == [([], ["a", "b", "c"], 0.0), ([], ["a", "b", "c"], None)]
+    assert added[0].fit.values["k"] == 7.0
+    # once an effect is in, and where the earlier run's model does not run, nothing is tried from there
+    assert Rounds(monkeypatch, losses).compose(moved=True)[1] == ["a"]
 
 
 def test_rivals_are_those_within_reach(monkeypatch):

@@ -7,9 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from yid_ocp.virtual.experiment import paper_system
-from yid_ocp.virtual.injected import InjectedEffect, InjectedTerms
+from yid_ocp.virtual.engine import Simulation
+from yid_ocp.virtual.experiment import VirtualExperiment, paper_system
+from yid_ocp.virtual.injected import InjectedEffect, InjectedTerms, injected_experiment
 from yid_ocp.virtual.mjcf import mujoco_xml
+from yid_ocp.virtual.motion import multisine
 from yid_ocp.virtual.outside import (
     CORD,
     CREASE_ANGLE,
@@ -157,6 +159,17 @@ def test_one_way_damping_brakes_one_way_only():
     found = bench.force(np.zeros(bench.model.nv), v)
     assert found[at] == pytest.approx(-0.6 * np.maximum(v[at], 0.0))
     assert np.setdiff1d(np.flatnonzero(found), at).size == 0
+
+
+def test_one_way_damping_of_a_light_branch_asks_nothing_of_the_arm():
+    """1 N m s/rad is some hundred times what an explicit step bears there: the arm would be told to hold 1000 N m."""
+    motion = multisine(SYSTEM, TRUTH, seed=1)
+    experiment = VirtualExperiment(motion, simulation=Simulation(0.3, time_step=2e-4), seed=2)
+    clean, braked = (
+        injected_experiment(SYSTEM, TRUTH, effects, experiment).joints.effort
+        for effects in ((), [InjectedEffect("one_way_damping", "T3", {"size": 1.0})])
+    )
+    assert 1e-4 < np.abs(braked - clean).max() < 5.0
 
 
 def test_a_cold_gear_brakes_until_it_is_warm():

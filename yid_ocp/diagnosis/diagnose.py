@@ -139,7 +139,7 @@ def _diagnosed(
     added: tuple[Added, ...] = ()
     if gap and enough and screened.scores:
         there = () if smoothed is None else main_places(localise(smoothed, limits.sure))
-        fits, added = compose(search, nominal, screened, [place.location for place in there])
+        fits, added = compose(search, nominal, screened, [place.location for place in there], bool(changed))
     clock.lap("refits")
     carried = carried_over(search, added[-1].fit) if added else ()
     if carried:

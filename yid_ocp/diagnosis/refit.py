@@ -293,6 +293,7 @@ def refit_all(
     base: Sequence[EffectBase],
     tried: Sequence[tuple[EffectBase, Mapping[str, float]]],
     values: Mapping[str, float],
+    where: str = "",
 ) -> list[Fit]:
     """Refit the model with each of several effects added to those of `base`; failures are left out.
 
@@ -304,6 +305,8 @@ def refit_all(
         With the values at which each begins.
     values : mapping of str to float
         Where all other unknowns begin.
+    where : str
+        What is said of `values` in the store, if the same effects are refitted from elsewhere too.
     """
 
     if not tried:
@@ -314,7 +317,8 @@ def refit_all(
 
     def one(entry: tuple[EffectBase, Mapping[str, float]]) -> Fit | None:
         effect, step = entry
-        fit = refit(search.problem, (*base, effect), {**values, **step}, search.store, limits=search.limits)
+        name = f"{describe((*base, effect))} {where}" if where else ""
+        fit = refit(search.problem, (*base, effect), {**values, **step}, search.store, name, search.limits)
         text = f"no fit with {effect.label}"
         if fit is not None:
             how = "resumed the refit" if fit.resumed else "refitted"

@@ -17,6 +17,7 @@ from yid_ocp.diagnosis.refit import Fit, Loss, Search, refit, refit_all
 from yid_ocp.diagnosis.screening import Confusability, Score, Screened, screen
 from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
 from yid_ocp.effects import EffectBase
+from yid_ocp.errors import SolverError
 
 RESAMPLES = 1000
 """Draws of held-out blocks for the interval of a closure."""
@@ -217,8 +218,29 @@ def shortlist(
     return [(s.effect, s.step) for s in chosen]
 
 
+def _from_before(search: Search) -> list[Fit]:
+    """Candidates refitted from the earlier run's parameters: the nominal fit's stand in for what is missing."""
+    try:
+        screened = screen(search.problem, (), {}, search.limits)
+    except SolverError:
+        return []
+    search.progress.stage("trying candidates from the earlier run's parameters")
+    chosen = shortlist(screened.scores, screened.alike, search.limits)
+    return refit_all(search, (), chosen, {}, "from the earlier run's parameters")
+
+
+def _likelier(fits: Sequence[Fit], others: Sequence[Fit]) -> list[Fit]:
+    """Of every effect the fit of least cost."""
+    best: dict[str, Fit] = {}
+    for fit in (*fits, *others):
+        label = fit.effects[-1].label
+        if label not in best or fit.cost < best[label].cost:
+            best[label] = fit
+    return list(best.values())
+
+
 def compose(
-    search: Search, nominal: Fit, screened: Screened, places: Sequence[str] = ()
+    search: Search, nominal: Fit, screened: Screened, places: Sequence[str] = (), moved: bool = False
 ) -> tuple[tuple[Fit, ...], tuple[Added, ...]]:
     """Add effects one after the other while the held-out gap closes, then try others in the place of each, and without.
 
@@ -231,6 +253,8 @@ def compose(
         All candidates at that fit.
     places : sequence of str
         Where the smoother says that the gap lies.
+    moved : bool
+        Whether the nominal fit has left what an earlier run found; candidates are then tried from there as well.
 
     Returns
     -------
@@ -250,6 +274,8 @@ def compose(
         # where the gap lay before anything was added asks for no more than the significant afterwards
         scores = [score for score in screened.scores if not added or score.p_value < limits.level]
         fits = refit_all(search, base, shortlist(scores, screened.alike, limits, places), current.values)
+        if moved and not added:
+            fits = _likelier(fits, _from_before(search))
         if not fits:
             break
         near = within_reach(fits, limits)

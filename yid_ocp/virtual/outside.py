@@ -203,11 +203,18 @@ def stiffness_drift(scene: Scene, model: Any, segment: str, size: float) -> Forc
 
 
 def one_way_damping(scene: Scene, model: Any, segment: str, size: float) -> Force:
-    """Bends that are damped one way only [N m s/rad]."""
+    """Bends that are damped one way only [N m s/rad].
+
+    The engine is told of it as its own damping, which it integrates implicitly: a light branch under so much explicit
+    damping bursts.
+    """
     both = np.concatenate(scene.bends(model, segment))
+    usual = model.dof_damping[both].copy()
 
     def push(_: Any, data: Any) -> None:
-        data.qfrc_passive[both] -= size * np.maximum(data.qvel[both], 0.0)
+        now = usual + size * (data.qvel[both] > 0)
+        data.qfrc_passive[both] -= (now - model.dof_damping[both]) * data.qvel[both]
+        model.dof_damping[both] = now
 
     return push
 
