@@ -471,6 +471,15 @@ def test_no_more_effects_than_allowed_nor_than_are_significant(monkeypatch):
     assert Rounds(monkeypatch, GROWING, p_values=(0.02, 0.03, 0.04)).compose() == ([], [], ())
 
 
+def test_what_is_added_to_others_is_of_a_size_to_be_expected(monkeypatch):
+    rounds = Rounds(monkeypatch, GROWING)
+    monkeypatch.setattr(select, "oversized", lambda of, values, limits: of.kind == "b")
+    assert rounds.compose()[1] == ["a", "c"]
+    # the first one may be larger, and what is in the place of one that is may be too
+    alone = Rounds(monkeypatch, {**GROWING, "b": (1.0, 1.1)})
+    assert alone.compose()[1] == ["b"]
+
+
 def test_a_rest_below_the_smallest_gap_is_left(monkeypatch):
     losses = {"": (3.0, 3.2), "a": (1.04, 1.14), "b": (2.0, 2.2), "c": (2.5, 2.7), "ab": (1.0, 1.0), "ac": (1.0, 1.0)}
     assert Rounds(monkeypatch, losses).compose()[1] == ["a"]

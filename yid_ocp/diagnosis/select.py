@@ -296,7 +296,12 @@ def compose(
 
 
 def _worth_adding(current: Fit, chosen: Fit, limits: Thresholds) -> bool:
-    """Whether the last effect of a fit closes a sure and relevant part of the gap, and is there at all."""
+    """Whether the last effect of a fit closes a sure and relevant part of the gap, and is there at all.
+
+    One that is added to others is of a size to be expected; beyond it, it mends what these do wrong.
+    """
+    if current.effects and oversized(chosen.effects[-1], chosen.values, limits):
+        return False
     gained, error = gain(current.loss, chosen.loss)
     closes = gained > error and gained >= limits.closure * current.loss.gap and current.loss.gap > 0
     if not closes and not far_likelier(current.loss, chosen.loss, limits):
@@ -344,7 +349,10 @@ def _revised(search: Search, nominal: Fit, kept: tuple[Added, ...], position: in
     tried = shortlist(screened.scores, screened.alike, limits)[: limits.refits]
     tried = [pair for pair in tried if pair[0].label != entry.effect.label]
     own = replace(full, effects=(*rest, entry.effect))
-    near = within_reach([own, *refit_all(search, rest, tried, without.values)], limits)
+    others = refit_all(search, rest, tried, without.values)
+    if not oversized(entry.effect, own.values, limits):
+        others = [fit for fit in others if not oversized(fit.effects[-1], fit.values, limits)]
+    near = within_reach([own, *others], limits)
     chosen = next((fit for fit in near if _needed(without, fit, fit.effects[-1], limits)), own)
     rivals = (chosen.effects[-1], *(fit.effects[-1] for fit in near if fit is not chosen))
     placed = [replace(e, effect=chosen.effects[-1], rivals=rivals) if e is entry else e for e in kept]
