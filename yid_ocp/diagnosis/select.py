@@ -276,6 +276,8 @@ def compose(
         fits = refit_all(search, base, shortlist(scores, screened.alike, limits, places), current.values)
         if moved and not added:
             fits = _likelier(fits, _from_before(search))
+        if added:
+            fits = _of_a_size(fits, limits)
         if not fits:
             break
         near = within_reach(fits, limits)
@@ -295,13 +297,13 @@ def compose(
     return first, _reconsidered(search, nominal, added)
 
 
-def _worth_adding(current: Fit, chosen: Fit, limits: Thresholds) -> bool:
-    """Whether the last effect of a fit closes a sure and relevant part of the gap, and is there at all.
+def _of_a_size(fits: Sequence[Fit], limits: Thresholds) -> list[Fit]:
+    """Fits whose last effect is of a size to be expected: beyond it, it mends what those before it do wrong."""
+    return [fit for fit in fits if not oversized(fit.effects[-1], fit.values, limits)]
 
-    One that is added to others is of a size to be expected; beyond it, it mends what these do wrong.
-    """
-    if current.effects and oversized(chosen.effects[-1], chosen.values, limits):
-        return False
+
+def _worth_adding(current: Fit, chosen: Fit, limits: Thresholds) -> bool:
+    """Whether the last effect of a fit closes a sure and relevant part of the gap, and is there at all."""
     gained, error = gain(current.loss, chosen.loss)
     closes = gained > error and gained >= limits.closure * current.loss.gap and current.loss.gap > 0
     if not closes and not far_likelier(current.loss, chosen.loss, limits):
@@ -351,7 +353,7 @@ def _revised(search: Search, nominal: Fit, kept: tuple[Added, ...], position: in
     own = replace(full, effects=(*rest, entry.effect))
     others = refit_all(search, rest, tried, without.values)
     if not oversized(entry.effect, own.values, limits):
-        others = [fit for fit in others if not oversized(fit.effects[-1], fit.values, limits)]
+        others = _of_a_size(others, limits)
     near = within_reach([own, *others], limits)
     chosen = next((fit for fit in near if _needed(without, fit, fit.effects[-1], limits)), own)
     rivals = (chosen.effects[-1], *(fit.effects[-1] for fit in near if fit is not chosen))
