@@ -16,7 +16,7 @@ from yid_ocp.workflow.solve import run_solve
 
 pytestmark = pytest.mark.slow
 SECOND_MOMENT = 0.03**4 / 12  # of the section [m^4]
-QUIET = ("output.report=false", "output.discretisation=none")
+QUIET = ("output.report=false",)
 
 
 @pytest.fixture(scope="module")
