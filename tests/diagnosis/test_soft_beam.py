@@ -54,6 +54,8 @@ def test_the_load_is_named_and_taking_it_away_predicts_the_bare_run(repository, 
         found = finding.last.values["point_mass@w_beam.mass"]
         assert found == pytest.approx(mass, rel=0.1)
         assert finding.counterfactual is not None
-        [(plain, without)] = finding.counterfactual.removed.means.values()
-        assert without < 0.2 * plain
+        # of a swing of 9 mm; without a diagnosis it is as little or 11 mm, by where the nominal fit ends
+        [(_, without)] = finding.counterfactual.removed.means.values()
+        assert without < 2e-3
+        assert finding.counterfactual.removed.better
         assert finding.counterfactual.added.better
