@@ -1,16 +1,16 @@
 """Planned motions that tell more, recorded in MuJoCo with the configuration's noise.
 
     python benchmarks/information.py parameter [--starts 20] [--recordings 5]
-    python benchmarks/information.py pair [--starts 3] [--case heavy_free_branch]
+    python benchmarks/information.py pair [--starts 3] [--case heavy_free_branch] [--share 1]
 
 `parameter`: one arm with a camera (`configs/single_arm_vision.yaml`), whose recording tells T3.bend to some 20 %. Its
 solution is where the motion is planned that tells T3.bend best; that motion is recorded in MuJoCo with the true
 stiffness and the noise of the shipped recordings, several draws of it, and each recording is solved by itself from
 3 N m/rad.
 
-`pair`: an effect of `diagnosis_cases.py` is withheld in MuJoCo, and the diagnosis finds another one as likely. Two
-motions that tell them apart are planned, recorded with the same effect at work, and diagnosed beside the first two
-recordings: one to estimate on, one held out.
+`pair`: an effect of `diagnosis_cases.py`, or a share of its size, is withheld in MuJoCo, and the diagnosis finds
+another one as likely. Two motions that tell them apart are planned, recorded with the same effect at work, and diagnosed
+beside the first two recordings: one to estimate on, one held out.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from make_recordings import ROUGH, TRUTH
 from yid_ocp.config.reader import DIAGNOSIS_DEFAULT, load_config
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis import Finding, Thresholds, diagnose
+from yid_ocp.effects import make_effect
 from yid_ocp.planning.information import InformationPlan, informative
 from yid_ocp.planning.options import PlanLimits, PlanOptions
 from yid_ocp.planning.plan import PlannedMovement
@@ -33,7 +34,7 @@ from yid_ocp.report.terminal import table
 from yid_ocp.solvers import GaussNewton, Solution, solve
 from yid_ocp.virtual.engine import Simulation
 from yid_ocp.virtual.experiment import PointCamera, VirtualExperiment, paper_system, virtual_experiment
-from yid_ocp.virtual.injected import injected_experiment
+from yid_ocp.virtual.injected import InjectedEffect, injected_experiment
 from yid_ocp.workflow.build import build_problem
 from yid_ocp.workflow.information import found_values
 from yid_ocp.workflow.progress import PlainProgress
@@ -93,8 +94,9 @@ def _row(words: str, solution: Solution) -> tuple[str, ...]:
     )
 
 
-def pair(name: str, starts: int) -> None:
+def pair(name: str, starts: int, share: float) -> None:
     case = CASES[name]
+    case = replace(case, withheld=tuple(_share(effect, share) for effect in case.withheld))
     run = load_config(None, (), DIAGNOSIS_DEFAULT)
     nominal = build_problem(run)
     made = [record(case, 1, 401), record(case, 7, 402)]
@@ -127,6 +129,18 @@ def pair(name: str, starts: int) -> None:
     )
 
 
+def _share(effect: InjectedEffect, share: float) -> InjectedEffect:
+    """The same effect, its amplitudes that part of the way from neutral."""
+    kind = make_effect(effect.kind, effect.location, paper_system(1))
+    names = {name.removeprefix(f"{kind.label}."): name for name in kind.amplitudes}
+    neutral = {short: kind.neutral[name] for short, name in names.items()}
+    values = {
+        name: neutral[name] + share * (value - neutral[name]) if name in neutral else value
+        for name, value in effect.values.items()
+    }
+    return replace(effect, values=values)
+
+
 def _diagnosed(nominal: EstimationProblem, estimate: list[Recording], held_out: list[Recording]) -> Finding:
     problem = EstimationProblem(nominal.step, estimate, nominal.free, nominal.options)
     return diagnose(problem, "all", held_out, thresholds=Thresholds(), progress=PlainProgress())
@@ -138,11 +152,12 @@ def main() -> None:
     parser.add_argument("--starts", type=int, default=5)
     parser.add_argument("--recordings", type=int, default=5)
     parser.add_argument("--case", default="heavy_free_branch", help="of diagnosis_cases.py")
+    parser.add_argument("--share", type=float, default=1.0, help="part of the case's size")
     arguments = parser.parse_args()
     if arguments.what == "parameter":
         parameter(arguments.starts, arguments.recordings)
     else:
-        pair(arguments.case, arguments.starts)
+        pair(arguments.case, arguments.starts, arguments.share)
 
 
 if __name__ == "__main__":

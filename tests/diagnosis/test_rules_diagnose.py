@@ -326,7 +326,7 @@ def test_a_gap_is_screened_located_and_closed(monkeypatch):
     assert [(e.label, e.angles) for e in screened.effects] == [(e.label, {"T1": 0.5}) for e in steps.effects]
     assert steps.taken[2][1] == (steps.nominal, Thresholds())
     assert steps.taken[3][1][0].problem is screened
-    assert steps.taken[3][1][1:] == (steps.nominal, steps.given["screened"], ["T1"])
+    assert steps.taken[3][1][1:] == (steps.nominal, steps.given["screened"], ["T1"], False)
     assert found.closure.value == pytest.approx(1 - 0.05 / 1.05)
     assert (found.added, found.fits[0]) == (steps.given["added"], steps.given["added"][0].fit)
     assert found.held_out == ("other",)

@@ -271,8 +271,8 @@ def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
     asked, heard = [], Heard()
     other, third = effect("offset@elbow"), effect("third@x")
 
-    def one(problem, effects, start, store, limits):
-        asked.append((problem, [e.kind for e in effects], start, store, limits))
+    def one(problem, effects, start, store, name, limits):
+        asked.append((problem, [e.kind for e in effects], start, store, name, limits))
         made = fit(effects, loss(1.2345, 1.2345))
         return None if effects[-1] is third else SimpleNamespace(**vars(made) | {"resumed": effects[-1] is other})
 
@@ -281,8 +281,8 @@ def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
     tried = [(FRICTION, {A: 0.7}), (other, {"k": 3.0}), (third, {})]
     found = refit_all(search, (effect("base@x"),), tried, {"k": 2.0})
     assert [f.effects[-1].kind for f in found] == ["friction", "offset"]
-    by_kind = {kinds[-1]: (problem, kinds, start, store, limits) for problem, kinds, start, store, limits in asked}
-    assert by_kind["friction"] == ("problem", ["base", "friction"], {"k": 2.0, A: 0.7}, "store", LIMITS)
+    by_kind = {kinds[-1]: (problem, kinds, *rest) for problem, kinds, *rest in asked}
+    assert by_kind["friction"] == ("problem", ["base", "friction"], {"k": 2.0, A: 0.7}, "store", "", LIMITS)
     assert by_kind["offset"][2] == {"k": 3.0}
     assert heard.stages == ["refitting with each of 3 effects beside base@x"]
     assert [part[:2] for part in heard.parts] == [(0, 3), (1, 3), (2, 3), (3, 3)]
@@ -290,6 +290,11 @@ def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
         "no fit with third@x",
         "refitted with friction@elbow: held-out chi2/n 1.234",
         "resumed the refit with offset@elbow: held-out chi2/n 1.234",
+    ]
+    # from elsewhere they have names of their own in the store
+    refit_all(search, (effect("base@x"),), tried, {}, "from there")
+    assert sorted(name for *_, name, _ in asked[3:]) == [
+        f"base@x and {label} from there" for label in ("friction@elbow", "offset@elbow", "third@x")
     ]
 
 
