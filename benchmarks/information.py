@@ -9,8 +9,8 @@ stiffness and the noise of the shipped recordings, several draws of it, and each
 3 N m/rad.
 
 `pair`: an effect of `diagnosis_cases.py`, or a share of its size, is withheld in MuJoCo, and the diagnosis finds
-another one as likely. Two motions that tell them apart are planned, recorded with the same effect at work, and diagnosed
-beside the first two recordings: one to estimate on, one held out.
+another one as likely. Two motions that tell them apart are planned, recorded with the same effect at work, and
+diagnosed beside the first two recordings: one to estimate on, one held out.
 """
 
 from __future__ import annotations
