@@ -196,3 +196,14 @@ def test_spans_are_shaded():
     figure = figures.over_time([Curve("a", t, t, {}, spans=[(1.0, 2.0)])], "#000000", {})
     (shape,) = figure.layout.shapes
     assert (shape.x0, shape.x1) == (1.0, 2.0)
+
+
+def test_long_names_of_rows_have_the_room_they_need():
+    name = "effort_offset@panda_joint1.offset"
+    made = [
+        charts.estimates({name: (1.0, 0.1, 0.0, True)}, "N m"),
+        charts.side_by_side({name: {"run": (1.0, 0.1)}}, "N m"),
+        charts.changes({name: Change(2.0, 1.0)}, "x", ("1", "2", "3")),
+        charts.matrix([name], np.eye(1), "row", "column"),
+    ]
+    assert all(figure.layout.yaxis.automargin for figure in made)

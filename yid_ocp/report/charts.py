@@ -47,7 +47,9 @@ def estimates(values: Mapping[str, tuple[float, float | None, float, bool]], uni
     figure = styled(figure, 110 + 34 * len(names), unit, "")
     lowest = min(0.0, *(value for value, *_ in values.values()))
     figure.update_xaxes(range=[lowest - 0.05 * largest, 1.6 * largest])
-    figure.update_yaxes(autorange="reversed", categoryorder="array", categoryarray=names)
+    figure.update_yaxes(
+        autorange="reversed", categoryorder="array", categoryarray=names, automargin=True, tickfont={"size": 11}
+    )
     return figure
 
 
