@@ -27,7 +27,8 @@ from yid_ocp.report.summaries import track_summary
 from yid_ocp.vision.calibration import Calibration
 from yid_ocp.vision.camera import DepthCamera, FrameTiming, VirtualCamera, VirtualFrames, virtual_frames
 from yid_ocp.vision.fit import ShapeFit
-from yid_ocp.vision.frames import look_at, write_frames
+from yid_ocp.vision.folders import write_frames
+from yid_ocp.vision.frames import look_at
 from yid_ocp.vision.meshes import Scene
 from yid_ocp.vision.pictures import draw_stages, draw_track
 from yid_ocp.vision.results import FrameReport, Track, dropped

@@ -20,9 +20,10 @@ from yid_ocp.files import content_hash, file_sha256, reason, write_text
 from yid_ocp.parallel import Task, ThisProcess, Workers, run_tasks, values_of
 from yid_ocp.progress import SILENT, Progress
 from yid_ocp.vision.calibration import Calibration
-from yid_ocp.vision.frames import FrameSequence, read_frames
+from yid_ocp.vision.frames import FrameSequence
 from yid_ocp.vision.meshes import Scene
 from yid_ocp.vision.plain import plain, remade
+from yid_ocp.vision.reading import read_frames
 from yid_ocp.vision.results import FrameReport
 from yid_ocp.vision.track import Tracker
 from yid_ocp.workflow.build import build_system, located, recording_file
@@ -127,7 +128,9 @@ def opened(run: Run) -> tuple[FrameSequence, Recording | None]:
             path = recording_file(run.recordings.estimate[0])
             recording = replace(read_recording(path, allow_nan_effort=True), name=path.stem)
     with located(run, "track", "frames"):
-        return read_frames(run.track.frames, pose=run.track.pose, unit=run.track.unit), recording
+        settings = run.track
+        seen = read_frames(run.track.frames, pose=settings.pose, unit=settings.unit, topic=settings.topic)
+    return seen, recording
 
 
 def common(config: Path, inputs: Mapping[str, str]) -> dict[str, Any]:
