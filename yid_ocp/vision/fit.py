@@ -24,9 +24,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.least_squares import Quadratic, damped_newton
-from yid_ocp.model.kinematics import forward_kinematics
+from yid_ocp.model.kinematics import Kinematics, forward_kinematics
+from yid_ocp.model.mechanism import Mechanism
 from yid_ocp.model.system import System
 from yid_ocp.options import About, check
+from yid_ocp.vision.evidence import Evidence, Sight, Thing, Tubes, away_from, gather, nearest
 from yid_ocp.vision.meshes import numeric_mechanism
 
 Array = NDArray[np.float64]
@@ -35,9 +37,7 @@ Integers = NDArray[np.int64]
 NODE_FACTOR = math.pi / 4
 """Where the mean of a tube's visible half lies, as a share of its radius."""
 
-_AWAY = -0.5  # cosine of normal and sight beyond which a point cannot be on the side that the camera sees
-_STATIONS = 6  # per link, where it is asked whether points are near
-_OWN_SHARE = 0.3
+_NEAR = 3.0  # times the last scale, beyond which a point says nothing of the shape
 _TOUCHING = 1e-3  # [m]
 _LEAST_STIFFNESS = 1e-2  # of the mean; softer bends are still held this much
 _TOLERANCE = 1e-4  # of a bend [rad] and, relative, of the cost, at which a pass ends
@@ -92,6 +92,26 @@ class FitOptions:
 
 
 @dataclass(frozen=True, eq=False)
+class SizeRows:
+    """What one frame says of the tubes' sizes, the bends following as they like best.
+
+    The sizes are the logarithms of all lengths and then of all radii, segment by segment, relative to the values of the
+    fit. About these the least cost is  g'x + x'Sx/2.
+
+    Attributes
+    ----------
+    gradient : ndarray, shape (2 s,)
+    curvature : ndarray, shape (2 s, 2 s)
+    points : ndarray, shape (np, 3, 2 s)
+        How the system's points move with them [m].
+    """
+
+    gradient: Array
+    curvature: Array
+    points: Array
+
+
+@dataclass(frozen=True, eq=False)
 class Fit:
     """A shape and how good it is.
 
@@ -104,16 +124,23 @@ class Fit:
     std : ndarray, shape (np, 3)
         Standard deviation of each coordinate by the curvature of the cost [m].
     distance : float
-        Mean of |e_i| over the points of the cloud, each counted for 0.1 m at most: the value of equation (3) [m].
-        Parts of the cloud that are not connected with the largest one and lie off the shape are left out.
-    inliers : float
-        Share of these points that are nearer than three times the last scale.
-    coverage : ndarray, shape (K,)
-        Share of each link's length along which there are points.
+        Mean of |e_i| over the points near the shape that belong to no other thing [m].
+    noise : float
+        Standard deviation of e_i of the points on the shape [m].
+    filled, empty : ndarray, shape (K,)
+        Share of each link's length on which there are points, and on which the camera sees that there are none.
     seen : ndarray of bool, shape (np,)
         Whether there are points enough about each of the system's points, or a gripper that holds it.
     gap : ndarray, shape (grasps, 3)
         From what each gripper holds to the gripper [m].
+    ends : ndarray, shape (E,)
+        By how much each free tube's end lies further along than the shape has it, NaN where that is not seen [m].
+    contested : float
+        Share of the points on the shape that may belong to a thing which touches it; they are left out.
+    things : tuple of Thing
+        What else there is.
+    sizes : SizeRows
+        What the frame says of lengths and radii.
     iterations : int
     centre_line : ndarray, shape (K, 2, 3)
         Start and end of every link [m].
@@ -123,36 +150,17 @@ class Fit:
     points: Array
     std: Array
     distance: float
-    inliers: float
-    coverage: Array
+    noise: float
+    filled: Array
+    empty: Array
     seen: NDArray[np.bool_]
     gap: Array
+    ends: Array
+    contested: float
+    things: tuple[Thing, ...]
+    sizes: SizeRows
     iterations: int
     centre_line: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Sight:
-    """What one frame knows: processed points and where they were seen from.
-
-    Attributes
-    ----------
-    points : ndarray, shape (N, 3)
-        Surface points in the world [m].
-    weight : ndarray, shape (N,)
-    part : ndarray of int, shape (N,)
-        Connected part of the skeleton's graph to which each point belongs, 0 for the largest.
-    nodes : ndarray, shape (K, 3)
-        Of their skeleton [m].
-    camera : ndarray, shape (3,)
-        The camera's position [m].
-    """
-
-    points: Array
-    weight: Array
-    part: Integers
-    nodes: Array
-    camera: Array
 
 
 class ShapeFit:
@@ -195,32 +203,41 @@ class ShapeFit:
         elastic = {entry.joint for entry in system.elastic}
         self.known = tuple(name for name in tree.joint_names if name not in elastic)
 
-        q = ca.SX.sym("q", system.size)
-        kinematics = forward_kinematics(tree, q)
-        columns = list(self.free)
-        starts, ends, radii, owners = [], [], [], []
+        radii, owners = [], []
         for segment in system.segments:
-            for i, names in enumerate(segment.links):
-                starts.append(kinematics.origins[tree.joint_index(names[0])])
-                ends.append(kinematics.position(f"{segment.name}_{i}_tip"))
-                radii.append(number(segment.radius)[0])
-                owners.append(segment.name)
+            radii += [number(segment.radius)[0]] * len(segment.links)
+            owners += [segment.name] * len(segment.links)
         self.radius, self.owner = np.array(radii), tuple(owners)
-        corners = ca.vertcat(*(ca.vertcat(a, b) for a, b in zip(starts, ends, strict=True)))
+        q, columns = ca.SX.sym("q", system.size), list(self.free)
+        corners, seen, held, gap = _expressions(system, forward_kinematics(tree, q), self.options)
+        held, gap = (ca.substitute(entry, symbols, ca.SX(ca.DM(theta))) for entry in (held, gap))
         self._corners = ca.Function("corners", [q], ca.cse([corners, ca.densify(ca.jacobian(corners, q)[:, columns])]))
-        seen = ca.vertcat(*(kinematics.position(name) for name in system.points))
         self._seen = ca.Function("seen", [q], ca.cse([seen, ca.densify(ca.jacobian(seen, q)[:, columns])]))
-        rows = [ca.SX(0, 1)]
-        for grasp in system.grasps:
-            residual, alignment = grasp.residual(kinematics), grasp.alignment(kinematics)
-            rows.append(residual[:3] / self.options.grasp_std)
-            if grasp.kind != "point":  # the first column of a weld is a roll, which stays unknown
-                rows.append(alignment[-3:] / self.options.direction_std)
-        held = ca.substitute(ca.vertcat(*rows), symbols, ca.SX(ca.DM(theta)))
-        gaps = [grasp.residual(kinematics)[:3] for grasp in system.grasps]
-        gap = ca.substitute(ca.vertcat(ca.SX(0, 1), *gaps), symbols, ca.SX(ca.DM(theta)))
         self._gap = ca.Function("gap", [q], [ca.densify(gap)])
         self._held = ca.Function("held", [q], ca.cse([held, ca.densify(ca.jacobian(held, q)[:, columns])]))
+        # how all this moves as the tubes grow
+        full = _expressions(system, forward_kinematics(system.mechanism, q), self.options)[:3]
+        growth = np.zeros((len(theta), len(system.segments)))
+        for k, segment in enumerate(system.segments):
+            for name in ca.symvar(ca.vertcat(*segment.lengths)):
+                index = system.parameters.names.index(name.name())
+                growth[index, k] = theta[index]
+        grown = [ca.densify(ca.mtimes(ca.jacobian(entry, symbols), ca.DM(growth))) for entry in full]
+        self._grown = ca.Function("grown", [q], ca.cse(ca.substitute(grown, [symbols], [ca.SX(ca.DM(theta))])))
+        at_rest = self._corners(self.rest)[0]
+        self.reach, self.free_ends = self._ends(np.array(at_rest).reshape(-1, 2, 3), tree)
+
+    def _ends(self, corners: Array, tree: Mechanism) -> tuple[Array, tuple[int, ...]]:
+        """Length of the tube that each link belongs to, and the links after which nothing comes."""
+        lengths = np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)
+        reach = np.array([lengths[[name == other for other in self.owner]].sum() for name in self.owner])
+        q = ca.SX.sym("q", self.system.size)
+        kinematics = forward_kinematics(tree, q)
+        held = [kinematics.position(grasp.held) for grasp in self.system.grasps]
+        places = np.array(ca.Function("held", [q], [ca.horzcat(ca.SX(3, 0), *held)])(self.rest)).T
+        taken = np.concatenate([corners[:, 0], places])
+        apart = np.linalg.norm(corners[:, 1][:, None] - taken, axis=2).min(axis=1)
+        return reach, tuple(int(k) for k in np.flatnonzero(apart > _TOUCHING))
 
     def solve(
         self,
@@ -267,7 +284,7 @@ class ShapeFit:
         best = min(tried, key=lambda minimum: minimum.cost)
         last = self._minimise(best, on_points)
         iterations = sum(minimum.iterations for minimum in tried) + last.iterations - best.iterations
-        return self._judged(replace(last, iterations=iterations), sight, weight)
+        return self._judged(replace(last, iterations=iterations), sight, on_points)
 
     def _tasks(
         self, sight: Sight, weight: Array, previous: tuple[Array, float] | None
@@ -305,69 +322,53 @@ class ShapeFit:
             end = _Minimum(q, found.model.hessian, found.model.cost, end.iterations + found.iterations)
         return end
 
-    def _judged(self, minimum: _Minimum, sight: Sight, weight: Array) -> Fit:
-        """The shape with its standard deviations, and how much of the cloud lies on it."""
+    def _judged(self, first: _Minimum, sight: Sight, tasks: Sequence[_Task]) -> Fit:
+        """The shape by the points that are surely its own, with its standard deviations, and what speaks against it."""
+        near = (self.options.surface_scales or self.options.scales)[-1] * _NEAR
+        evidence = gather(self.tubes(first.q), sight, near)
+        minimum, left = first, tasks
+        doubtful = evidence.contested | evidence.foreign
+        if evidence.contested.any() and tasks and not doubtful.all():
+            left = [replace(task, points=task.points[~doubtful], weight=task.weight[~doubtful]) for task in tasks]
+            minimum = self._minimise(first, left)
+            contested = evidence.contested
+            evidence = replace(gather(self.tubes(minimum.q), sight, near), contested=contested)
         q = minimum.q
-        near = (self.options.surface_scales or self.options.scales)[-1] * 3
-        error, link, along = self._errors(q, sight.points, 1.0, sight.camera)
-        size = np.abs(error)
-        on_shape = size < near
-        own = _own_parts(sight.part, on_shape, weight)
-        points, jacobian = self._seen(q)
-        spread = np.array(jacobian) @ np.linalg.solve(minimum.hessian, np.array(jacobian).T)
-        corners = np.array(self._corners(q)[0]).reshape(-1, 2, 3)
-        coverage = self._coverage(link[on_shape], along[on_shape])
-        places = np.array(points).reshape(-1, 3)
+        points, jacobian = (np.array(x) for x in self._seen(q))
+        spread = jacobian @ np.linalg.solve(minimum.hessian, jacobian.T)
+        places = points.reshape(-1, 3)
+        # what the contested points would have made of it, had they counted
+        moved = places - self.place(first.q)
+        corners = self.tubes(q).corners
+        on_shape = evidence.own | evidence.contested
+        swath = self._swath_std(corners, places, evidence, sight.camera)
         return Fit(
             q,
             places,
-            np.sqrt(np.maximum(np.diag(spread), 0.0)).reshape(-1, 3),
-            float(np.average(np.minimum(size, 0.1)[own], weights=weight[own])),
-            float(np.average(on_shape[own], weights=weight[own])),
-            coverage,
-            self._seen_points(corners, places, coverage),
+            np.sqrt(np.maximum(np.diag(spread), 0.0).reshape(-1, 3) + moved**2 + swath**2),
+            evidence.distance,
+            evidence.noise,
+            evidence.filled,
+            evidence.empty,
+            self._seen_points(corners, places, evidence),
             np.array(self._gap(q)).reshape(-1, 3),
+            evidence.ends,
+            float(evidence.contested.sum() / max(on_shape.sum(), 1)),
+            evidence.things,
+            self._size_rows(q, left[-1] if left else None, evidence),
             minimum.iterations,
             corners,
         )
-
-    def _errors(self, q: Array, points: Array, share: float, camera: Array) -> tuple[Array, Integers, Array]:
-        """e_i, the link that each point belongs to, and where along it (0 to 1)."""
-        corners = np.array(self._corners(q)[0]).reshape(-1, 2, 3)
-        link, along, normal, distance = self._nearest(corners, points, share)
-        away = np.einsum("ij,ij->i", normal, points - camera) > -_AWAY * np.linalg.norm(points - camera, axis=1)
-        return np.where(away, -distance, distance) - share * self.radius[link], link, along
-
-    def _nearest(self, corners: Array, points: Array, share: float) -> tuple[Integers, Array, Array, Array]:
-        start, edge = corners[:, 0], corners[:, 1] - corners[:, 0]
-        square = np.einsum("ij,ij->i", edge, edge)
-        # (p - a).d for all points and links at once, by one product of matrices
-        t = np.clip((points @ edge.T - np.einsum("ij,ij->i", start, edge)) / square, 0.0, 1.0)
-        apart = np.zeros(t.shape)
-        for axis in range(3):
-            apart += (points[:, axis, None] - start[:, axis] - t * edge[:, axis]) ** 2
-        link = np.argmin(np.sqrt(apart) - share * self.radius, axis=1)
-        rows = np.arange(len(points))
-        along = t[rows, link]
-        normal = points - start[link] - along[:, None] * edge[link]
-        distance = np.sqrt(apart[rows, link])
-        return link, along, normal / np.maximum(distance, 1e-9)[:, None], distance
 
     def _quadratic(self, q: Array, task: _Task) -> Quadratic:
         """Cost, gradient and Gauss-Newton Hessian by the free bends."""
         out, jacobian = self._corners(q)
         corners, by_q = np.array(out).reshape(-1, 2, 3), np.array(jacobian)
-        link, along, normal, distance = self._nearest(corners, task.points, task.share)
-        sight = task.points - task.camera
-        away = np.einsum("ij,ij->i", normal, sight) > -_AWAY * np.linalg.norm(sight, axis=1)
-        sign = np.where(away, -1.0, 1.0)
-        error = sign * distance - task.share * self.radius[link]
+        surface = _surface(corners, self.radius, task)
+        link, error, rows = surface.link, surface.error, surface.rows
         square = (error / task.scale) ** 2
         cost = 0.5 * task.scale**2 * float(np.sum(task.weight * square / (1 + square)))
         weight = task.weight / (1 + square) ** 2
-        # e falls as the centre line moves along the normal: de = -n'((1 - t) da + t db)
-        direction = -sign[:, None] * normal
-        rows = np.concatenate([direction * (1 - along)[:, None], direction * along[:, None]], axis=1)
         count = len(self.radius)
         gradient, hessian = np.zeros(by_q.shape[1]), np.zeros((by_q.shape[1],) * 2)
         for k in range(count):
@@ -392,29 +393,76 @@ class ShapeFit:
             hessian += slow**2 * np.eye(len(change))
         return Quadratic(cost, gradient, hessian)
 
-    def _coverage(self, link: Integers, along: Array) -> Array:
-        stations = link * _STATIONS + np.minimum((along * _STATIONS).astype(np.int64), _STATIONS - 1)
-        filled = np.bincount(stations, minlength=len(self.radius) * _STATIONS).reshape(-1, _STATIONS) > 0
-        return np.asarray(filled.mean(axis=1))
-
-    def _seen_points(self, corners: Array, places: Array, coverage: Array) -> NDArray[np.bool_]:
-        """A point is seen where a link that begins or ends there is."""
+    def _seen_points(self, corners: Array, places: Array, evidence: Evidence) -> NDArray[np.bool_]:
+        """A point is seen where a link that begins or ends there is, and has points wherever it could have some."""
         apart = np.linalg.norm(corners[:, :, None] - places, axis=3).min(axis=1)
-        covered = (apart < _TOUCHING) & (coverage[:, None] >= self.options.least_coverage)
+        least = self.options.least_coverage
+        sure = (evidence.filled >= least) & (evidence.spoken_for >= least)
+        covered = (apart < _TOUCHING) & sure[:, None]
         held = {grasp.held for grasp in self.system.grasps}
         return np.asarray(covered.any(axis=0) | np.array([name in held for name in self.system.points]))
+
+    def _swath_std(self, corners: Array, places: Array, evidence: Evidence, camera: Array) -> Array:
+        """Standard deviation of each point, shape (np, 3), that the spread across the links about it leaves [m]."""
+        apart = np.linalg.norm(corners[:, :, None] - places, axis=3).min(axis=1)
+        across = np.cross(corners[:, 1] - corners[:, 0], corners.mean(axis=1) - camera)
+        across /= np.maximum(np.linalg.norm(across, axis=1), 1e-12)[:, None]
+        spread = np.sqrt(evidence.swath)[:, None] * np.abs(across)
+        return np.asarray(np.max(np.where((apart < _TOUCHING)[..., None], spread[:, None], 0.0), axis=0))
+
+    def _size_rows(self, q: Array, task: _Task | None, evidence: Evidence) -> SizeRows:
+        """What a frame's points say of lengths and radii at its shape."""
+        names = [segment.name for segment in self.system.segments]
+        free, many = len(self.free), len(names)
+        out, jacobian = self._corners(q)
+        by_length, seen_by_length, held_by_length = (np.array(x) for x in self._grown(q))
+        chain = np.hstack([np.array(jacobian), by_length])
+        total = free + 2 * many
+        gradient, hessian = np.zeros(total), np.zeros((total, total))
+
+        def add(rows: Array, error: Array, weight: Array) -> None:
+            nonlocal gradient, hessian
+            weighted = rows * weight[:, None]
+            gradient = gradient + weighted.T @ error
+            hessian = hessian + weighted.T @ rows
+
+        if task is not None:
+            surface = _surface(np.array(out).reshape(-1, 2, 3), self.radius, task)
+            weight = task.weight / (1 + (surface.error / task.scale) ** 2) ** 2
+            segment = np.array([names.index(owner) for owner in self.owner])
+            for k in range(len(self.radius)):
+                mine = surface.link == k
+                rows = np.zeros((int(mine.sum()), total))
+                rows[:, : free + many] = surface.rows[mine] @ chain[6 * k : 6 * k + 6]
+                rows[:, free + many + segment[k]] = -task.share * self.radius[k]
+                add(rows, surface.error[mine], weight[mine])
+        for k, offset in zip(self.free_ends, evidence.ends, strict=True):
+            if np.isfinite(offset):
+                start, tip = np.array(out).reshape(-1, 2, 3)[k]
+                axis = (tip - start) / np.linalg.norm(tip - start)
+                rows = np.zeros((1, total))
+                rows[0, : free + many] = -axis @ chain[6 * k + 3 : 6 * k + 6]
+                add(rows, np.array([offset]), np.array([1.0 / max(self.options.noise, evidence.noise) ** 2]))
+        held, by_held = (np.array(x) for x in self._held(q))
+        add(np.hstack([by_held, held_by_length, np.zeros((len(held), many))]), held.ravel(), np.ones(len(held)))
+        gradient[:free] += (q - self.rest)[list(self.free)] * self._prior**2
+        hessian[:free, :free] += np.diag(self._prior**2)
+        # the bends follow: dq = -H_qq^-1 (g_q + H_qx x)
+        follow = np.linalg.solve(hessian[:free, :free], np.column_stack([gradient[:free], hessian[:free, free:]]))
+        pull = gradient[free:] - hessian[free:, :free] @ follow[:, 0]
+        curvature = hessian[free:, free:] - hessian[free:, :free] @ follow[:, 1:]
+        moved = np.hstack([seen_by_length, np.zeros((len(seen_by_length), many))])
+        moved = moved - np.array(self._seen(q)[1]) @ follow[:, 1:]
+        return SizeRows(pull, curvature, moved.reshape(-1, 3, 2 * many))
+
+    def tubes(self, q: Array) -> Tubes:
+        """The tubes at a configuration."""
+        corners = np.array(self._corners(q)[0]).reshape(-1, 2, 3)
+        return Tubes(corners, self.radius, self.free_ends, self.reach)
 
     def place(self, q: ArrayLike) -> Array:
         """The system's points at a configuration, shape (np, 3) [m]."""
         return np.array(self._seen(np.asarray(q, float))[0]).reshape(-1, 3)
-
-
-def _own_parts(part: Integers, near: NDArray[np.bool_], weight: Array) -> NDArray[np.bool_]:
-    """Points of the largest part, and of others that mostly lie on the shape."""
-    total = np.bincount(part, weight)
-    share = np.bincount(part, weight * near) / np.maximum(total, 1e-12)
-    share[0] = 1.0
-    return np.asarray(share[part] >= _OWN_SHARE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -437,3 +485,42 @@ class _Task:
     scale: float
     camera: Array
     previous: tuple[Array, float] | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Surface:
+    """Points against the tubes: errors, the link of each, and how the error moves with that link's two corners."""
+
+    link: Integers
+    error: Array
+    rows: Array
+
+
+def _surface(corners: Array, radius: Array, task: _Task) -> _Surface:
+    link, along, normal, distance = nearest(corners, radius, task.points, task.share)
+    sign = np.where(away_from(normal, task.points - task.camera), -1.0, 1.0)
+    error = sign * distance - task.share * radius[link]
+    # e falls as the centre line moves along the normal: de = -n'((1 - t) da + t db)
+    direction = -sign[:, None] * normal
+    rows = np.concatenate([direction * (1 - along)[:, None], direction * along[:, None]], axis=1)
+    return _Surface(link, error, rows)
+
+
+def _expressions(
+    system: System, kinematics: Kinematics, options: FitOptions
+) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
+    """Corners of the links, the system's points, what grasps hold in standard deviations, and their gaps."""
+    tree = kinematics.mechanism
+    corners = []
+    for segment in system.segments:
+        for i, names in enumerate(segment.links):
+            corners += [kinematics.origins[tree.joint_index(names[0])], kinematics.position(f"{segment.name}_{i}_tip")]
+    rows, gaps = [ca.SX(0, 1)], [ca.SX(0, 1)]
+    for grasp in system.grasps:
+        residual, alignment = grasp.residual(kinematics), grasp.alignment(kinematics)
+        gaps.append(residual[:3])
+        rows.append(residual[:3] / options.grasp_std)
+        if grasp.kind != "point":  # the first column of a weld is a roll, which stays unknown
+            rows.append(alignment[-3:] / options.direction_std)
+    seen = ca.vertcat(*(kinematics.position(name) for name in system.points))
+    return ca.vertcat(*corners), seen, ca.vertcat(*rows), ca.vertcat(*gaps)

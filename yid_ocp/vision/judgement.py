@@ -19,19 +19,26 @@ from yid_ocp.vision.results import FrameReport
 
 Array = NDArray[np.float64]
 
+_MEAN_ABS = math.sqrt(2.0 / math.pi)  # of a normal variable, in standard deviations
+
 
 def unfit(fit: Fit, shape: ShapeFit, options: TrackOptions) -> str:
     """Why a frame's fit cannot be used, by itself; empty for a good one."""
     if not np.isfinite(fit.q).all():
         return "the fit failed"
-    if fit.distance > options.d_max:
-        limit = 1e3 * options.d_max
-        return f"the shape does not fit: {1e3 * fit.distance:.1f} mm off on average, d_max is {limit:g} mm"
+    # a mean distance of normal noise is 0.8 of its standard deviation
+    limit = math.hypot(options.d_max * float(shape.radius.mean()), _MEAN_ABS * shape.options.noise)
+    if fit.distance > limit:
+        off = f"{1e3 * fit.distance:.1f} mm off on average, d_max allows {1e3 * limit:.1f} mm"
+        return f"the shape does not fit: {off}"
     bend = float(np.abs((fit.q - shape.rest)[list(shape.free)]).max())
     if bend > options.largest_bend:
         return f"the shape is folded: a joint is bent by {math.degrees(bend):.0f} degrees"
-    if fit.inliers < options.least_inliers:
-        return f"the shape does not fit: only {100 * fit.inliers:.0f} % of the points lie on it"
+    lengths = np.linalg.norm(fit.centre_line[:, 1] - fit.centre_line[:, 0], axis=1)
+    there, bare = float(lengths @ fit.filled), float(lengths @ fit.empty)
+    if there < options.least_covered * (there + bare):
+        share = 100 * there / (there + bare)
+        return f"the shape does not fit: only {share:.0f} % of its visible length has points of its own"
     return ""
 
 

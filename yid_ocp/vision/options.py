@@ -26,8 +26,13 @@ class TrackOptions:
         default_factory=ClockOptions
     )
     d_max: Annotated[
-        float, Gt(0), About("a frame whose points are further from the fitted shape on average is dropped", "m")
-    ] = 0.012
+        float,
+        Gt(0),
+        About(
+            "a frame whose points are further from the fitted shape on average, beyond their noise, is dropped; in radii of "
+            "the tubes"
+        ),
+    ] = 0.5
     largest_bend: Annotated[
         float, Gt(0), About("a frame whose shape has a joint that is bent further is dropped", "rad")
     ] = 1.2
@@ -43,8 +48,11 @@ class TrackOptions:
             "m",
         ),
     ] = 0.008
-    least_inliers: Annotated[
-        float, Ge(0), Le(1), About("a frame of which a smaller fraction of the points lies on the shape is dropped")
+    least_covered: Annotated[
+        float,
+        Ge(0),
+        Le(1),
+        About("a frame with points on a smaller share of the object's visible length is dropped"),
     ] = 0.6
     point_std_max: Annotated[
         float, Gt(0), About("a point that is known less well in a frame counts as not seen there", "m")

@@ -21,15 +21,18 @@ from yid_ocp.model.system import System
 from yid_ocp.vision.calibration import Calibration, as_given, calibrate
 from yid_ocp.vision.clock import own_delay
 from yid_ocp.vision.filters import Cloud, ObjectRegion, voxel_grid, without_outliers, without_robot
-from yid_ocp.vision.fit import ShapeFit, Sight
+from yid_ocp.vision.evidence import Sight
+from yid_ocp.vision.fit import ShapeFit
 from yid_ocp.vision.frames import FrameSequence
 from yid_ocp.vision.judgement import judged, measured, unfit
 from yid_ocp.vision.meshes import Scene, Surfaces, numeric_mechanism, robot_meshes
 from yid_ocp.vision.options import TrackOptions
 from yid_ocp.vision.results import FrameReport, Stages, Track
 from yid_ocp.vision.skeleton import skeleton
+from yid_ocp.vision.view import View
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 Progress = Callable[[int, int, str], None]
 
 _LARGEST = 50.0  # [m]; a depth camera sees no further, a cloud in millimetres always does
@@ -167,10 +170,22 @@ class _Tracker:
                 " both started together",
             )
 
-    def _read(self, index: int, calibration: Calibration) -> tuple[Cloud, int]:
-        """A frame's cloud in the world where the object can be, the robot's points among them, and how many it had."""
+    def _removed(self, q: Array, calibration: Calibration) -> Callable[[Array], Mask]:
+        """Which places the filters leave no points of, the robot at a configuration."""
+        region, padding = self.region.at(q, calibration.camera), self.options.filters.padding
+        within = padding + float(self.shape.radius.max())
+
+        def removed(places: Array) -> Mask:
+            gone = ~region.contains(places)
+            if self.robot is not None:
+                gone |= np.isfinite(self.robot.distance(places, q, within))
+            return gone
+
+        return removed
+
+    def _read(self, index: int, calibration: Calibration) -> tuple[Cloud, Array]:
+        """A frame's cloud in the world where the object can be, the robot's points among them, and all its points."""
         points = calibration.world(self.sequence.load(index))
-        count = len(points)
         points = points[np.isfinite(points).all(axis=1)]
         if not len(points):
             raise DataError("the cloud is empty")
@@ -184,7 +199,7 @@ class _Tracker:
             raise DataError("no point lies where the object can be: check the camera's pose")
         cloud = voxel_grid(points[inside], filters.voxel)
         # before the robot is taken out: among all surfaces, wrong points are few
-        return cloud.keep(without_outliers(cloud, filters.neighbours, filters.outlier_ratio)), count
+        return cloud.keep(without_outliers(cloud, filters.neighbours, filters.outlier_ratio)), points
 
     def _frame(
         self, index: int, reason: str, calibration: Calibration, last: tuple[Array, float] | None
@@ -203,7 +218,7 @@ class _Tracker:
             cloud, raw = self._read(index, calibration)
         except DataError as error:
             return replace(report, reason=error.what), None
-        report = replace(report, raw=raw)
+        report = replace(report, raw=len(raw))
         if self.span is not None and not self.span[0] <= t <= self.span[1]:
             return replace(report, reason="there are no joint angles at its time"), None
         rng = np.random.default_rng([options.seed, index])
@@ -225,8 +240,8 @@ class _Tracker:
         if not len(found.nodes):
             return replace(report, reason="no part of the cloud is dense enough for a skeleton"), None
         rest = cloud.keep(found.connected)
-        part = found.part[found.label[found.connected]]
-        sight = Sight(rest.points, rest.weight, part, found.nodes, calibration.camera)
+        view = View(raw, calibration.pose, self.sequence.intrinsics)
+        sight = Sight(rest.points, rest.weight, found.nodes, calibration.camera, view, self._removed(q, calibration))
         before = () if last is None else (last[0],)
         fit = self.shape.solve(sight, q, before, None if last is None else (last[0], t - last[1]))
         spent = time.process_time() - begun
