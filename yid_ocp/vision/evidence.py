@@ -34,6 +34,7 @@ _FEWEST = 12  # points of a thing
 _MATCH = 0.5  # of a piece of surface about a point that must be foreign for it to go on there
 _MOST_THINGS = 8  # of a frame, that are remembered
 _FILLED = 0.3  # of the usual number of points, with which a slice of a tube counts as filled
+_SURROUNDINGS = 3.0  # radii about a node, in which it is asked how wide the surface is there
 _AHEAD = 0.5  # of its length, by which a tube may be too short and its end still be found
 
 
@@ -268,6 +269,35 @@ def gather(tubes: Tubes, seen: Sight, near: float) -> Evidence:
         _swath(tubes, seen, counted & ~contested, link, normal * distance[:, None]),
         _things(part, seen),
     )
+
+
+def slender(sight: Sight, radius: float) -> tuple[Mask, Mask]:
+    """Which nodes and points lie where the surface is no wider than tubes are.
+
+    About a tube points spread by its length in one direction and by r/sqrt(3) across; on a table, a wall or a body they
+    spread as far in two.
+
+    Parameters
+    ----------
+    sight : Sight
+    radius : float
+        Of the thickest tube [m].
+
+    Returns
+    -------
+    nodes : ndarray of bool, shape (K,)
+    points : ndarray of bool, shape (N,)
+        Those whose nearest node is among them.
+    """
+    tree, within = cKDTree(sight.points), _SURROUNDINGS * radius
+    thin = np.zeros(len(sight.nodes), bool)
+    for i, around in enumerate(tree.query_ball_point(sight.nodes, within)):
+        if len(around) > 3:
+            away = sight.points[around] - sight.points[around].mean(axis=0)
+            second = float(np.linalg.eigvalsh(away.T @ away / len(around))[1])
+            # halfway between a tube, r/sqrt(3), and a disc, within/2
+            thin[i] = math.sqrt(max(second, 0.0)) < 0.5 * (radius / math.sqrt(3.0) + 0.5 * within)
+    return thin, thin[cKDTree(sight.nodes).query(sight.points)[1]]
 
 
 def _median(values: Array, weight: Array) -> float:

@@ -28,7 +28,7 @@ from yid_ocp.model.kinematics import Kinematics, forward_kinematics
 from yid_ocp.model.mechanism import Mechanism
 from yid_ocp.model.system import System
 from yid_ocp.options import About, check
-from yid_ocp.vision.evidence import Evidence, Sight, Thing, Tubes, away_from, gather, nearest
+from yid_ocp.vision.evidence import Evidence, Sight, Thing, Tubes, away_from, gather, nearest, slender
 from yid_ocp.vision.meshes import numeric_mechanism
 
 Array = NDArray[np.float64]
@@ -84,6 +84,12 @@ class FitOptions:
         Le(1),
         About("a link with points along a smaller fraction of its length is hidden, or not where the fit has it"),
     ] = 0.5
+    least_filled: Annotated[
+        float,
+        Ge(0),
+        Le(1),
+        About("a tube with points on a smaller share of its visible length is not where the fit has it"),
+    ] = 0.75
 
     def __post_init__(self) -> None:
         check(self, "fit options")
@@ -194,6 +200,7 @@ class ShapeFit:
 
         bends = [entry for entry in system.elastic if entry.kind == "bend" and entry.axis]
         self.free = tuple(tree.joint_index(entry.joint) for entry in bends)
+        self.free_owner = tuple(_owner(system, entry.joint) for entry in bends)
         self.rest = np.zeros(system.size)
         for entry in system.elastic:
             self.rest[tree.joint_index(entry.joint)] = number(entry.rest)[0]
@@ -225,12 +232,12 @@ class ShapeFit:
         grown = [ca.densify(ca.mtimes(ca.jacobian(entry, symbols), ca.DM(growth))) for entry in full]
         self._grown = ca.Function("grown", [q], ca.cse(ca.substitute(grown, [symbols], [ca.SX(ca.DM(theta))])))
         at_rest = self._corners(self.rest)[0]
+        self._lengths = np.linalg.norm(np.diff(np.array(at_rest).reshape(-1, 2, 3), axis=1)[:, 0], axis=1)
         self.reach, self.free_ends = self._ends(np.array(at_rest).reshape(-1, 2, 3), tree)
 
     def _ends(self, corners: Array, tree: Mechanism) -> tuple[Array, tuple[int, ...]]:
         """Length of the tube that each link belongs to, and the links after which nothing comes."""
-        lengths = np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)
-        reach = np.array([lengths[[name == other for other in self.owner]].sum() for name in self.owner])
+        reach = np.array([self._lengths[[name == other for other in self.owner]].sum() for name in self.owner])
         q = ca.SX.sym("q", self.system.size)
         kinematics = forward_kinematics(tree, q)
         held = [kinematics.position(grasp.held) for grasp in self.system.grasps]
@@ -274,30 +281,85 @@ class ShapeFit:
         q = self.rest.copy()
         known = [self.system.mechanism.joint_index(name) for name in self.known]
         q[known] = q_known[known]
-        weight = np.minimum(sight.weight, self.options.weight_cap)
-        on_nodes, on_points = self._tasks(sight, weight, previous)
-        tried = []
+        begun = []
         for start in (*starts, self.rest):
             trial = q.copy()
             trial[free] = start[free]
-            tried.append(self._minimise(_Minimum(trial, np.eye(len(free)), math.inf, 0), on_nodes))
+            begun.append(trial)
+        everything = _Left(np.ones(len(sight.nodes), bool), np.ones(len(sight.points), bool))
+        thin = _Left(*slender(sight, float(self.radius.max())))
+        best = self._attempt(sight, begun, thin if thin.nodes.any() else everything, previous)
+        for left in (self._without_failed(best, sight), everything):
+            failed = self._failed(best.evidence)
+            if not failed:
+                break
+            # a part of the object is not where this has it: something like it stood nearer to where the search began
+            trial = best.minimum.q.copy()
+            again = [index for index, owner in zip(self.free, self.free_owner, strict=True) if owner in failed]
+            trial[again] = self.rest[again]
+            if left.nodes.any() and left.points.any():
+                other = self._attempt(sight, [trial, *begun], left, previous)
+                best = max(best, other, key=lambda attempt: self._covered(attempt.evidence))
+        return self._judged(best, sight, previous)
+
+    def _covered(self, evidence: Evidence) -> float:
+        """Share of the visible length that has points of its own."""
+        filled, empty = float(self._lengths @ evidence.filled), float(self._lengths @ evidence.empty)
+        return filled / max(filled + empty, 1e-12)
+
+    def _failed(self, evidence: Evidence) -> set[str]:
+        """Tubes of which too much is seen to be empty."""
+        failed = set()
+        for name in dict.fromkeys(self.owner):
+            mine = self._lengths * np.array([name == owner for owner in self.owner])
+            filled, empty = float(mine @ evidence.filled), float(mine @ evidence.empty)
+            if empty > 0 and filled < self.options.least_filled * (filled + empty):
+                failed.add(name)
+        return failed
+
+    def _without_failed(self, attempt: _Attempt, sight: Sight) -> _Left:
+        """All nodes and points but those on which failed tubes lie."""
+        tubes, failed = self.tubes(attempt.minimum.q), self._failed(attempt.evidence)
+        lies = np.array([owner in failed for owner in self.owner])
+        link = nearest(tubes.corners, tubes.radius, sight.points)[0]
+        wrong = lies[link] & (attempt.evidence.own | attempt.evidence.contested)
+        node_link, _, _, distance = nearest(tubes.corners, tubes.radius, sight.nodes, NODE_FACTOR)
+        return _Left(~(lies[node_link] & (distance < 2 * tubes.radius[node_link])), ~wrong)
+
+    def _attempt(
+        self, sight: Sight, starts: Sequence[Array], left: _Left, previous: tuple[Array, float] | None
+    ) -> _Attempt:
+        """The best shape through some of the nodes and points, then through those that are surely its own."""
+        on_nodes, on_points = self._tasks(sight, left, previous)
+        tried = [self._minimise(_Minimum(start, np.eye(len(self.free)), math.inf, 0), on_nodes) for start in starts]
         best = min(tried, key=lambda minimum: minimum.cost)
         last = self._minimise(best, on_points)
         iterations = sum(minimum.iterations for minimum in tried) + last.iterations - best.iterations
-        return self._judged(replace(last, iterations=iterations), sight, on_points)
+        evidence = gather(self.tubes(last.q), sight, self._near)
+        if on_points:
+            keep = ~(evidence.contested | evidence.foreign)
+            if keep.any():
+                last = self._minimise(last, self._tasks(sight, _Left(left.nodes, keep), previous)[1])
+                evidence = gather(self.tubes(last.q), sight, self._near)
+        return _Attempt(replace(last, iterations=iterations + last.iterations), evidence)
+
+    @property
+    def _near(self) -> float:
+        return (self.options.surface_scales or self.options.scales)[-1] * _NEAR
 
     def _tasks(
-        self, sight: Sight, weight: Array, previous: tuple[Array, float] | None
+        self, sight: Sight, left: _Left, previous: tuple[Array, float] | None
     ) -> tuple[list[_Task], list[_Task]]:
         """The passes on the nodes and those on the points."""
-        options = self.options
+        options, camera = self.options, sight.camera
         factor = 1.0 / (options.noise_correlation * options.noise**2)
+        weight = np.minimum(sight.weight, options.weight_cap)[left.points]
+        nodes, points = sight.nodes[left.nodes], sight.points[left.points]
         # nodes weigh together as much as the points, which share their errors
-        node_weight = np.full(len(sight.nodes), weight.sum() / len(sight.nodes)) * factor
-        camera = sight.camera
+        node_weight = np.full(len(nodes), weight.sum() / max(len(nodes), 1)) * factor
         return (
-            [_Task(sight.nodes, node_weight, NODE_FACTOR, scale, camera, previous) for scale in options.scales],
-            [_Task(sight.points, weight * factor, 1.0, scale, camera, previous) for scale in options.surface_scales],
+            [_Task(nodes, node_weight, NODE_FACTOR, scale, camera, previous) for scale in options.scales],
+            [_Task(points, weight * factor, 1.0, scale, camera, previous) for scale in options.surface_scales],
         )
 
     def _minimise(self, start: _Minimum, tasks: Sequence[_Task]) -> _Minimum:
@@ -322,25 +384,22 @@ class ShapeFit:
             end = _Minimum(q, found.model.hessian, found.model.cost, end.iterations + found.iterations)
         return end
 
-    def _judged(self, first: _Minimum, sight: Sight, tasks: Sequence[_Task]) -> Fit:
-        """The shape by the points that are surely its own, with its standard deviations, and what speaks against it."""
-        near = (self.options.surface_scales or self.options.scales)[-1] * _NEAR
-        evidence = gather(self.tubes(first.q), sight, near)
-        minimum, left = first, tasks
-        doubtful = evidence.contested | evidence.foreign
-        if evidence.contested.any() and tasks and not doubtful.all():
-            left = [replace(task, points=task.points[~doubtful], weight=task.weight[~doubtful]) for task in tasks]
-            minimum = self._minimise(first, left)
-            contested = evidence.contested
-            evidence = replace(gather(self.tubes(minimum.q), sight, near), contested=contested)
-        q = minimum.q
+    def _judged(self, attempt: _Attempt, sight: Sight, previous: tuple[Array, float] | None) -> Fit:
+        """The shape with its standard deviations, and what speaks for and against it."""
+        minimum, evidence = attempt.minimum, attempt.evidence
+        q, on_shape = minimum.q, evidence.own | evidence.contested
         points, jacobian = (np.array(x) for x in self._seen(q))
         spread = jacobian @ np.linalg.solve(minimum.hessian, jacobian.T)
         places = points.reshape(-1, 3)
-        # what the contested points would have made of it, had they counted
-        moved = places - self.place(first.q)
+        own, every = (
+            self._tasks(sight, _Left(np.zeros(len(sight.nodes), bool), mask), previous)[1][-1:]
+            for mask in (~(evidence.contested | evidence.foreign), ~evidence.foreign)
+        )
+        moved = np.zeros(places.shape)
+        if every and evidence.contested.any():
+            # how far the contested points would take the shape, if they counted
+            moved = (jacobian @ self._quadratic(q, every[0]).change(0.0)).reshape(-1, 3)
         corners = self.tubes(q).corners
-        on_shape = evidence.own | evidence.contested
         swath = self._swath_std(corners, places, evidence, sight.camera)
         return Fit(
             q,
@@ -355,7 +414,7 @@ class ShapeFit:
             evidence.ends,
             float(evidence.contested.sum() / max(on_shape.sum(), 1)),
             evidence.things,
-            self._size_rows(q, left[-1] if left else None, evidence),
+            self._size_rows(q, own[0] if own else None, evidence),
             minimum.iterations,
             corners,
         )
@@ -394,10 +453,11 @@ class ShapeFit:
         return Quadratic(cost, gradient, hessian)
 
     def _seen_points(self, corners: Array, places: Array, evidence: Evidence) -> NDArray[np.bool_]:
-        """A point is seen where a link that begins or ends there is, and has points wherever it could have some."""
+        """A point is seen where a link that begins or ends there is, of a tube that is where it should be."""
         apart = np.linalg.norm(corners[:, :, None] - places, axis=3).min(axis=1)
-        least = self.options.least_coverage
-        sure = (evidence.filled >= least) & (evidence.spoken_for >= least)
+        failed = self._failed(evidence)
+        sure = evidence.filled >= self.options.least_coverage
+        sure &= np.array([owner not in failed for owner in self.owner])
         covered = (apart < _TOUCHING) & sure[:, None]
         held = {grasp.held for grasp in self.system.grasps}
         return np.asarray(covered.any(axis=0) | np.array([name in held for name in self.system.points]))
@@ -476,6 +536,22 @@ class _Minimum:
 
 
 @dataclass(frozen=True, eq=False)
+class _Left:
+    """Which of a frame's nodes and points count."""
+
+    nodes: NDArray[np.bool_]
+    points: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class _Attempt:
+    """A shape and what the whole cloud says of it."""
+
+    minimum: _Minimum
+    evidence: Evidence
+
+
+@dataclass(frozen=True, eq=False)
 class _Task:
     """One pass: points, their weights, where they lie on the tubes, the scale of the loss, the camera, the prior."""
 
@@ -504,6 +580,11 @@ def _surface(corners: Array, radius: Array, task: _Task) -> _Surface:
     direction = -sign[:, None] * normal
     rows = np.concatenate([direction * (1 - along)[:, None], direction * along[:, None]], axis=1)
     return _Surface(link, error, rows)
+
+
+def _owner(system: System, joint: str) -> str:
+    """Segment to which an elastic joint belongs."""
+    return next((s.name for s in system.segments if any(joint in names for names in s.links)), "")
 
 
 def _expressions(
