@@ -9,6 +9,7 @@ the camera itself.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ Mask = NDArray[np.bool_]
 
 _BASELINE = 0.1  # [m]; between the camera's two eyes, of which no usual depth camera has a wider one
 _HALF = 0.5  # of the points in a direction decide
+_STRIP, _PIECES = 0.02, 20  # of a picture: width of the strip along a side and the pieces of it, half of them filled
 _LEAST_DEPTH = 0.05  # [m]; nearer to the camera's plane there is no picture
 
 
@@ -35,7 +37,7 @@ class View:
     pose : ndarray, shape (4, 4)
         Camera (x right, y down, z ahead) in the world.
     pinhole : Pinhole, optional
-        Where it is known what lies outside of the picture is known as well.
+        Without it the picture ends where points stand along most of a side.
     """
 
     points: Array
@@ -65,6 +67,10 @@ class View:
             camera = self.pinhole
             u, v = camera.fx * asked[:, 0] + camera.cx, camera.fy * asked[:, 1] + camera.cy
             hidden |= (u < 0) | (u > camera.width - 1) | (v < 0) | (v > camera.height - 1)
+        else:
+            low, high = self._borders
+            reach = (radius / np.maximum(depth, _LEAST_DEPTH))[:, None]
+            hidden |= ((asked < low + reach) | (asked > high - reach)).any(axis=1)
         seen, distance = self._about(asked, hidden)
         if not len(seen):
             return hidden
@@ -75,14 +81,36 @@ class View:
             hidden[i] = np.mean(there < limit) > _HALF if len(there) else self._shadowed(tree, distance, asked[i], limit)
         return hidden
 
+    @cached_property
+    def _all(self) -> tuple[Array, Array]:
+        seen, depth = _picture(self.points, self.pose)
+        return seen[depth > _LEAST_DEPTH], depth[depth > _LEAST_DEPTH]
+
+    @cached_property
+    def _borders(self) -> tuple[Array, Array]:
+        """Where the picture ends, as far as points along all of a side show it; infinite at other sides."""
+        borders = np.array([[-np.inf, -np.inf], [np.inf, np.inf]])
+        seen, _ = self._all
+        if len(seen):
+            low, high = seen.min(0), seen.max(0)
+            for axis in range(2):
+                for end, value in enumerate((low[axis], high[axis])):
+                    strip = np.abs(seen[:, axis] - value) <= _STRIP * (high[axis] - low[axis])
+                    other = 1 - axis
+                    along = (seen[strip, other] - low[other]) / max(high[other] - low[other], 1e-12)
+                    filled = np.bincount(np.minimum((along * _PIECES).astype(np.int64), _PIECES - 1), minlength=_PIECES)
+                    if np.mean(filled > 0) > _HALF:
+                        borders[end, axis] = value
+        return borders[0], borders[1]
+
     def _about(self, asked: Array, hidden: Mask) -> tuple[Array, Array]:
         """Points of the picture round about the places: where in the picture, and how deep."""
         if hidden.all():
             return np.empty((0, 2)), np.empty(0)
         low, high = asked[~hidden].min(0), asked[~hidden].max(0)
         middle, half = 0.5 * (low + high), 0.5 * (high - low) + _BASELINE
-        seen, depth = _picture(self.points, self.pose)
-        near = (depth > _LEAST_DEPTH) & (np.abs(seen - middle) <= half).all(axis=1)
+        seen, depth = self._all
+        near = (np.abs(seen - middle) <= half).all(axis=1)
         return seen[near], depth[near]
 
     @staticmethod
