@@ -283,7 +283,7 @@ def _person(t: float) -> list[Mesh]:
     sway = 0.04 * math.sin(1.7 * t)
     x, y = 1.0 + sway, -1.1
     legs = [_limb([x, y + s, -0.93], [x, y + s, -0.1], 0.08) for s in (-0.1, 0.1)]
-    arm = _limb([x, y + 0.15, 0.45], [x + 0.05, y + 0.65 + sway, 0.25], 0.05)
+    arm = _limb([x, y + 0.15, 0.35], [x + 0.05, y + 0.6 + sway, 0.0], 0.05)
     return [*legs, _limb([x, y, -0.15], [x, y, 0.5], 0.17), _limb([x, y, 0.55], [x, y, 0.75], 0.1), arm]
 
 
