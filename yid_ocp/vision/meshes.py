@@ -230,8 +230,10 @@ class Surfaces:
             normal[chosen] = unit[better] @ pose[:3, :3].T
         return distance, normal, owner
 
-    def cast(self, pinhole: Pinhole, pose: ArrayLike, q: ArrayLike) -> tuple[Array, Array]:
-        """Depth image without noise, and how squarely each pixel's ray meets the surface.
+    def cast(
+        self, pinhole: Pinhole, pose: ArrayLike, q: ArrayLike
+    ) -> tuple[Array, Array, NDArray[np.int64]]:
+        """Depth image without noise, how squarely each pixel's ray meets the surface, and whose surface it is.
 
         Parameters
         ----------
@@ -246,12 +248,15 @@ class Surfaces:
             Along the optical axis [m]; infinite where there is nothing.
         cosine : ndarray, shape (height, width)
             Of the angle between ray and surface normal.
+        part : ndarray of int, shape (height, width)
+            Index into `joints`, -1 where there is nothing.
         """
         o3d = open3d_module()
         rays = pinhole.rays
         camera = np.asarray(pose, float)
         depth = np.full(rays.shape[:2], np.inf)
         cosine = np.zeros(rays.shape[:2])
+        owner = np.full(rays.shape[:2], -1)
         for part, placed in enumerate(self.poses(q)):
             rotation = placed[:3, :3].T @ camera[:3, :3]
             origin = placed[:3, :3].T @ (camera[:3, 3] - placed[:3, 3])
@@ -270,7 +275,8 @@ class Surfaces:
             nearer = hit < depth[rows, columns]
             depth[rows, columns] = np.where(nearer, hit, depth[rows, columns])
             cosine[rows, columns] = np.where(nearer, square, cosine[rows, columns])
-        return depth, cosine
+            owner[rows, columns] = np.where(nearer, part, owner[rows, columns])
+        return depth, cosine, owner
 
     def _window(self, pinhole: Pinhole, rotation: Array, origin: Array, part: int) -> tuple[slice, slice] | None:
         low, high = self._low[part], self._high[part]
