@@ -28,7 +28,7 @@ from yid_ocp.problem.null_test import GapLimits
 from yid_ocp.problem.options import ProblemOptions, SensorOptions
 from yid_ocp.solvers import SOLVERS, GaussNewton, Lifted, MultipleShooting, SingleShooting, SteepestDescent
 from yid_ocp.solvers.base import Solver
-from yid_ocp.vision.track import TrackOptions
+from yid_ocp.vision.options import TrackOptions
 
 Triple = tuple[float, float, float]
 Quadruple = tuple[float, float, float, float]

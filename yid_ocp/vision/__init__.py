@@ -18,8 +18,8 @@ from yid_ocp.vision.frames import look_at as look_at
 from yid_ocp.vision.frames import read_frames as read_frames
 from yid_ocp.vision.frames import write_frames as write_frames
 from yid_ocp.vision.meshes import Scene as Scene
+from yid_ocp.vision.options import TrackOptions as TrackOptions
+from yid_ocp.vision.results import FrameReport as FrameReport
+from yid_ocp.vision.results import Track as Track
 from yid_ocp.vision.skeleton import WalkOptions as WalkOptions
-from yid_ocp.vision.track import FrameReport as FrameReport
-from yid_ocp.vision.track import Track as Track
-from yid_ocp.vision.track import TrackOptions as TrackOptions
 from yid_ocp.vision.track import track as track

@@ -77,13 +77,11 @@ class Clock:
     std : float
         Its standard deviation; infinite where it was not estimated [s].
     estimated : bool
-    delay : ndarray, shape (M,)
-        Each frame's own offset minus the common one [s]; NaN where it cannot be told.
-    delay_std : ndarray, shape (M,)
-        [s]
     shift : ndarray, shape (3,)
         What would have to be added to the camera's points to bring them onto the arm [m]: an error of its pose, of its
         depth or of the joints' zeros. It is only reported.
+    variance : float
+        Of a frame's own offset times what the frame says of it: see `own_delay` [m^2].
     message : str
         In words.
     """
@@ -91,15 +89,18 @@ class Clock:
     offset: float
     std: float
     estimated: bool
-    delay: Array
-    delay_std: Array
     shift: Array
+    variance: float
     message: str
+
+    def joint_time(self, stamp: float) -> float:
+        """Time on the joints' clock of a time stamp [s]."""
+        return stamp - self.offset
 
 
 def estimate_clock(
     robot: Surfaces,
-    clouds: Sequence[Cloud | None],
+    clouds: Sequence[Cloud],
     stamps: Array,
     posture: Callable[[float], Array],
     rng: np.random.Generator,
@@ -110,8 +111,8 @@ def estimate_clock(
     Parameters
     ----------
     robot : Surfaces
-    clouds : sequence of Cloud or None
-        Of every frame, the robot's points among them; None for frames that are of no use.
+    clouds : sequence of Cloud
+        Of every frame, the robot's points among them.
     stamps : ndarray, shape (M,)
         [s]
     posture : callable
@@ -137,9 +138,51 @@ def estimate_clock(
             raise _UndeterminedError("the arm is not in view")
         return _estimated(arm, samples, stamps, rng, chosen)
     except _UndeterminedError as reason:
-        nothing = np.full(len(stamps), np.nan)
         text = f"clock offset {1e3 * chosen.offset:.0f} ms as given: {reason}"
-        return Clock(chosen.offset, math.inf, False, nothing, nothing, np.zeros(3), text)
+        return Clock(chosen.offset, math.inf, False, np.zeros(3), 0.0, text)
+
+
+def own_delay(
+    robot: Surfaces,
+    cloud: Cloud,
+    stamp: float,
+    posture: Callable[[float], Array],
+    clock: Clock,
+    rng: np.random.Generator,
+    options: ClockOptions,
+) -> tuple[float, float]:
+    """How late one frame was stamped, beyond the common offset, and the standard deviation of that [s].
+
+    Parameters
+    ----------
+    robot : Surfaces
+    cloud : Cloud
+        The robot's points among them.
+    stamp : float
+        [s]
+    posture : callable
+        See `estimate_clock`.
+    clock : Clock
+        Of the sequence.
+    rng : Generator
+    options : ClockOptions
+
+    Returns
+    -------
+    (float, float)
+        NaN where it cannot be told: the clock was not estimated, or the arm is not in view.
+    """
+    nothing = (math.nan, math.nan)
+    if not clock.estimated:
+        return nothing
+    arm = _Arm(robot, posture)
+    points = arm.points_near(cloud, stamp, rng, options)
+    if points is None:
+        return nothing
+    grid = _grid(options)
+    curve = _coarse_curve(arm, points, stamp, rng, grid, options.reach)
+    own = _own(arm, points + clock.shift, stamp, clock.offset, float(grid[int(np.argmin(curve))]), options)
+    return own.offset - clock.offset, math.sqrt(clock.variance / max(own.information, 1e-12))
 
 
 class _UndeterminedError(Exception):
@@ -171,11 +214,9 @@ class _Arm:
         ahead, behind = self.poses(t + _STEP), self.poses(t - _STEP)
         return float(np.abs((ahead[:, :3, 3] - behind[:, :3, 3]) / (2 * _STEP)).max())
 
-    def points_near(
-        self, cloud: Cloud | None, stamp: float, rng: np.random.Generator, options: ClockOptions
-    ) -> Array | None:
+    def points_near(self, cloud: Cloud, stamp: float, rng: np.random.Generator, options: ClockOptions) -> Array | None:
         """Points of a frame near the moving links, the fastest of them; None for too few."""
-        if cloud is None or len(cloud) < _FEWEST:
+        if len(cloud) < _FEWEST:
             return None
         t = stamp - options.offset
         speed = max(self.speed(t + d) for d in (-options.search, 0.0, options.search))
@@ -225,9 +266,10 @@ def _estimated(
     arm: _Arm, samples: Mapping[int, Array], stamps: Array, rng: np.random.Generator, options: ClockOptions
 ) -> Clock:
     """The offset that most frames agree on; `_UndeterminedError` where there is none."""
-    steps = math.ceil(options.search / _COARSE)
-    coarse: Array = options.offset + _COARSE * np.arange(-steps, steps + 1, dtype=float)
-    curves = _coarse_curves(arm, samples, stamps, rng, coarse, options.reach)
+    coarse = _grid(options)
+    curves = {
+        i: _coarse_curve(arm, points, float(stamps[i]), rng, coarse, options.reach) for i, points in samples.items()
+    }
     offset, shift = _lowest(curves, coarse, options), np.zeros(3)
     usual = sorted(samples)
     own, information = np.full(len(stamps), np.nan), np.zeros(len(stamps))
@@ -235,12 +277,8 @@ def _estimated(
         chosen = {i: samples[i] for i in usual}
         offset, shift = _aligned(arm, chosen, stamps, (offset, shift), [share * options.reach for share in narrowing])
         for i, points in samples.items():
-            moved, stamp = points + shift, float(stamps[i])
-            trial = arm.own_offset(moved, stamp, offset, options.reach, _NARROWING[-3:])
             lowest = float(coarse[int(np.argmin(curves[i]))])
-            if abs(lowest - offset) > _LEAST_LATE:
-                other = arm.own_offset(moved, stamp, lowest, options.reach, _NARROWING[1:])
-                trial = other if other.misfit < _CLEARLY * trial.misfit else trial
+            trial = _own(arm, points + shift, float(stamps[i]), offset, lowest, options)
             own[i], information[i] = trial.offset, trial.information
         if np.linalg.norm(shift) > options.reach:
             raise _UndeterminedError("what the camera sees does not lie on the arm")
@@ -248,19 +286,31 @@ def _estimated(
     return _summary(own, information, usual, offset, shift, options)
 
 
-def _coarse_curves(
-    arm: _Arm, samples: Mapping[int, Array], stamps: Array, rng: np.random.Generator, coarse: Array, reach: float
-) -> dict[int, Array]:
-    """Mean square distance of some points of every frame at the offsets of a coarse grid [m^2]."""
-    curves = {}
-    for i, points in samples.items():
-        few = points[rng.choice(len(points), min(_FEW, len(points)), replace=False)]
-        sums = np.empty(len(coarse))
-        for k, offset in enumerate(coarse):
-            away = arm.robot.distance(few, arm.posture(stamps[i] - offset), reach, moving_only=True)
-            sums[k] = np.mean(np.minimum(away, reach) ** 2)
-        curves[i] = sums
-    return curves
+def _grid(options: ClockOptions) -> Array:
+    """Offsets of the coarse search [s]."""
+    steps = math.ceil(options.search / _COARSE)
+    return np.asarray(options.offset + _COARSE * np.arange(-steps, steps + 1, dtype=float))
+
+
+def _own(arm: _Arm, points: Array, stamp: float, offset: float, lowest: float, options: ClockOptions) -> _OwnOffset:
+    """One frame's own offset, near the common one unless another fits clearly better [s]."""
+    trial = arm.own_offset(points, stamp, offset, options.reach, _NARROWING[-3:])
+    if abs(lowest - offset) > _LEAST_LATE:
+        other = arm.own_offset(points, stamp, lowest, options.reach, _NARROWING[1:])
+        trial = other if other.misfit < _CLEARLY * trial.misfit else trial
+    return trial
+
+
+def _coarse_curve(
+    arm: _Arm, points: Array, stamp: float, rng: np.random.Generator, coarse: Array, reach: float
+) -> Array:
+    """Mean square distance of some points of a frame at the offsets of a coarse grid [m^2]."""
+    few = points[rng.choice(len(points), min(_FEW, len(points)), replace=False)]
+    sums = np.empty(len(coarse))
+    for k, offset in enumerate(coarse):
+        away = arm.robot.distance(few, arm.posture(stamp - offset), reach, moving_only=True)
+        sums[k] = np.mean(np.minimum(away, reach) ** 2)
+    return sums
 
 
 def _lowest(curves: Mapping[int, Array], coarse: Array, options: ClockOptions) -> float:
@@ -315,14 +365,12 @@ def _summary(
     weight = information[usual]
     # the errors of one frame's points are alike to an unknown degree: only the scatter says how much a frame knows
     variance = max(float(np.mean(weight * apart**2)), 1e-12)
-    own_std = np.sqrt(variance / np.maximum(information, 1e-12))
     count = len(usual)
     offset += float(weight @ apart / weight.sum())
     std = math.sqrt(float(weight**2 @ (own[usual] - offset) ** 2) * count / (count - 1)) / float(weight.sum())
     if not std < options.determined:
         raise _UndeterminedError("the arm moves too little to tell")
-    own_std = np.where(np.isfinite(own), own_std, np.nan)
     text = f"clock offset {1e3 * offset:.1f} ms ± {1e3 * std:.1f} ms (stamp minus joint time, from {count} frames)"
     if np.linalg.norm(shift) > _NOTED_SHIFT:
         text += f"; the camera sees the arm {1e3 * np.linalg.norm(shift):.0f} mm from where the joints have it"
-    return Clock(offset, std, True, own - offset, own_std, shift, text)
+    return Clock(offset, std, True, shift, variance, text)

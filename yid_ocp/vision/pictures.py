@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from yid_ocp.errors import OutputError
 from yid_ocp.files import new_file
-from yid_ocp.vision.track import Stages, Track
+from yid_ocp.vision.results import Stages, Track
 
 Array = NDArray[np.float64]
 

@@ -1,225 +1,40 @@
 """From a frame sequence and the joints' recording to measured points: filter, thin, fit, judge, and write them down.
 
-Every frame ends as a fitted shape or with the reason why it was dropped; nothing in one frame stops the sequence.
+A first pass over some frames finds what is common to the sequence (`calibration`). A second one takes frame by frame
+and keeps no cloud; every frame ends as a fitted shape or with the reason why it was dropped, and nothing in one frame stops
+the sequence. What is left is small and judged in the end (`judgement`).
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Annotated
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-from annotated_types import Ge, Gt, Le
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
-from yid_ocp.data.recording import PointGroup, Recording, validate
+from yid_ocp.data.recording import Recording
 from yid_ocp.errors import ConfigError, DataError, ModelError, nearest
 from yid_ocp.model.system import System
-from yid_ocp.options import About, check
-from yid_ocp.vision.clock import Clock, ClockOptions, estimate_clock
-from yid_ocp.vision.filters import Cloud, FilterOptions, ObjectRegion, voxel_grid, without_outliers, without_robot
-from yid_ocp.vision.fit import Fit, FitOptions, ShapeFit, Sight
+from yid_ocp.vision.calibration import Calibration, as_given, calibrate
+from yid_ocp.vision.clock import own_delay
+from yid_ocp.vision.filters import Cloud, ObjectRegion, voxel_grid, without_outliers, without_robot
+from yid_ocp.vision.fit import ShapeFit, Sight
 from yid_ocp.vision.frames import FrameSequence
-from yid_ocp.vision.meshes import MeshKind, Scene, Surfaces, numeric_mechanism, robot_meshes
-from yid_ocp.vision.skeleton import Skeleton, WalkOptions, skeleton
+from yid_ocp.vision.judgement import judged, measured, unfit
+from yid_ocp.vision.meshes import Scene, Surfaces, numeric_mechanism, robot_meshes
+from yid_ocp.vision.options import TrackOptions
+from yid_ocp.vision.results import FrameReport, Stages, Track
+from yid_ocp.vision.skeleton import skeleton
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
 
-GROUP = "points_camera"
 _LARGEST = 50.0  # [m]; a depth camera sees no further, a cloud in millimetres always does
 _SAME_TIME = 1e-6  # [s]
-
-
-@dataclass(frozen=True)
-class TrackOptions:
-    """How a frame sequence is turned into measured points, and which of its frames are good."""
-
-    filters: Annotated[FilterOptions, About("what counts as the object")] = field(default_factory=FilterOptions)
-    walk: Annotated[WalkOptions, About("how a cloud is thinned")] = field(default_factory=WalkOptions)
-    fit: Annotated[FitOptions, About("how a shape is fitted")] = field(default_factory=FitOptions)
-    clock: Annotated[ClockOptions, About("how the camera's clock is compared with the joints'")] = field(
-        default_factory=ClockOptions
-    )
-    d_max: Annotated[
-        float, Gt(0), About("a frame whose points are further from the fitted shape on average is dropped", "m")
-    ] = 0.012
-    largest_bend: Annotated[
-        float, Gt(0), About("a frame whose shape has a joint that is bent further is dropped", "rad")
-    ] = 1.2
-    worse: Annotated[
-        float, Gt(0), About("a frame whose distance is so many times the median of all good frames is dropped")
-    ] = 1.7
-    gap_max: Annotated[
-        float,
-        Gt(0),
-        About(
-            "a frame in which an end is further from the gripper that holds it than usual by more is dropped: its time "
-            "is not what its stamp says",
-            "m",
-        ),
-    ] = 0.008
-    least_inliers: Annotated[
-        float, Ge(0), Le(1), About("a frame of which a smaller fraction of the points lies on the shape is dropped")
-    ] = 0.6
-    point_std_max: Annotated[
-        float, Gt(0), About("a point that is known less well in a frame counts as not seen there", "m")
-    ] = 0.02
-    std_floor: Annotated[
-        float,
-        Gt(0),
-        About("standard deviation that no fit is better than: of the camera's pose and of straight links", "m"),
-    ] = 0.003
-    stamp_std: Annotated[
-        float, Ge(0), About("standard deviation of a frame's time stamp, beyond the common offset", "s")
-    ] = 0.003
-    points: Annotated[
-        tuple[str, ...] | None,
-        About("points to write down; those that no arm holds when absent, as arms know theirs better"),
-    ] = None
-    mesh: Annotated[MeshKind, About("meshes of the robot's self-filter")] = "visual"
-    seed: Annotated[int, Ge(0), About("of the walk's random points and of all subsampling")] = 0
-
-    def __post_init__(self) -> None:
-        check(self, "track options")
-
-
-@dataclass(frozen=True, eq=False)
-class FrameReport:
-    """What became of one frame.
-
-    Attributes
-    ----------
-    index : int
-        Of the sequence.
-    name : str
-    stamp : float
-        As the camera gave it [s].
-    t : float
-        On the joints' clock [s].
-    reason : str
-        Why it was dropped; empty for a good one.
-    raw, filtered, nodes : int
-        Points of the cloud, points left by the filters, nodes of the skeleton.
-    delay : float
-        Of its stamp beyond the common offset, NaN where it cannot be told [s].
-    seconds : float
-        Processor time from the filtered cloud to the fitted points [s].
-    fit : Fit or None
-    """
-
-    index: int
-    name: str
-    stamp: float
-    t: float
-    reason: str
-    raw: int
-    filtered: int
-    nodes: int
-    delay: float
-    seconds: float
-    fit: Fit | None
-
-    @property
-    def good(self) -> bool:
-        """Whether it was used."""
-        return not self.reason
-
-
-@dataclass(frozen=True, eq=False)
-class Stages:
-    """One frame on its way, for pictures.
-
-    Attributes
-    ----------
-    name : str
-    cloud, filtered : ndarray, shape (N, 3)
-        In the world [m].
-    skeleton : Skeleton
-    fit : Fit
-    camera : ndarray, shape (3,)
-        [m]
-    """
-
-    name: str
-    cloud: Array
-    filtered: Array
-    skeleton: Skeleton
-    fit: Fit
-    camera: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Track:
-    """Shapes and points of the good frames.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Points written down.
-    t : ndarray, shape (M,)
-        Times of the good frames on the joints' clock [s].
-    q : ndarray, shape (M, n)
-        Configurations, twists at rest.
-    position, std : ndarray, shape (M, np, 3)
-        [m]; NaN where a point was not seen well enough.
-    frames : tuple of FrameReport
-        All of them, by time stamp.
-    clock : Clock
-    stages : tuple of Stages
-        Of the frames that were asked for and turned out well.
-    """
-
-    names: tuple[str, ...]
-    t: Array
-    q: Array
-    position: Array
-    std: Array
-    frames: tuple[FrameReport, ...]
-    clock: Clock
-    stages: tuple[Stages, ...]
-    _system_points: tuple[str, ...]
-    _place: Callable[[Array], Array]
-    _pose: Array
-
-    def shape(self, t: float) -> Array:
-        """Configuration at any time between the good frames, by a cubic spline through theirs, shape (n,).
-
-        Beyond the first and the last frame it stays as it was there.
-        """
-        at = float(np.clip(t, self.t[0], self.t[-1]))
-        return self.q[0].copy() if len(self.t) < 2 else np.asarray(CubicSpline(self.t, self.q, axis=0)(at))
-
-    def points(self, t: float) -> Array:
-        """The written points at any time, by the kinematics of `shape`, shape (np, 3) [m]."""
-        return self._place(self.shape(t))[[self._system_points.index(name) for name in self.names]]
-
-    @property
-    def dropped(self) -> dict[str, int]:
-        """How often each reason dropped a frame; numbers in the reasons are left out."""
-        reasons = (frame.reason.partition(":")[0] for frame in self.frames if not frame.good)
-        return dict(Counter(reasons).most_common())
-
-    def group(self) -> PointGroup:
-        """The points as a group of a recording, called `points_camera`."""
-        return PointGroup(
-            GROUP, self.names, self.t, self.position, self.std, "depth camera, fitted shape", pose=self._pose
-        )
-
-    def recording(self, recording: Recording) -> Recording:
-        """A recording with these points in place of any `points_camera` that it had; `DataError` as `validate`."""
-        others = tuple(group for group in recording.points if group.name != GROUP)
-        text = f"{recording.description} Points of {len(self.t)} of {len(self.frames)} frames; {self.clock.message}."
-        made = replace(recording, points=(*others, self.group()), description=text.strip(), sha256=None)
-        # the positions of a straight object belong to the group that a file lists first
-        if not others or others[0] is not recording.points[0] or others[0].name > GROUP:
-            made = replace(made, straight=None)
-        return validate(made)
+_SAMPLE = 60  # frames, at most, from which what is common to all of them is found
 
 
 def track(
@@ -265,17 +80,19 @@ def track(
 
 
 @dataclass(frozen=True, eq=False)
-class _Reading:
-    """A frame that was read: its cloud where the object can be, None with a reason; how many points it had."""
+class _Order:
+    """Frames by their stamps, and why some of them cannot be used at all, by their indices."""
 
-    index: int
-    cloud: Cloud | None
-    raw: int = 0
-    reason: str = ""
+    indices: tuple[int, ...]
+    reasons: Mapping[int, str]
+
+    @property
+    def usable(self) -> list[int]:
+        return [i for i in self.indices if i not in self.reasons]
 
 
 class _Tracker:
-    """The state of one call of `track`."""
+    """What one call of `track` needs for any of its frames."""
 
     def __init__(self, scene: Scene, recording: Recording, sequence: FrameSequence, options: TrackOptions) -> None:
         system, values = scene.system, scene.values
@@ -283,7 +100,6 @@ class _Tracker:
         self.shape = ShapeFit(system, options.fit, values)
         self.names = _chosen_points(system, options.points)
         self.region = ObjectRegion(system, options.filters, values)
-        self.camera = sequence.pose[:3, 3]
         self.span, self.angles = _joint_angles(system, recording, self.shape.known)
         tree = numeric_mechanism(system, values)
         self.robot: Surfaces | None = None
@@ -292,7 +108,6 @@ class _Tracker:
             if all(joint < 0 for joint in meshes):
                 raise ModelError("no link of the robot moves with the model's joints", where=str(scene.urdf))
             self.robot = Surfaces(tree, meshes)
-        self.rng = np.random.default_rng(options.seed)
 
     def posture(self, t: float) -> Array:
         """Configuration at a time on the joints' clock, the object at rest; it stays at the recording's ends beyond."""
@@ -302,49 +117,41 @@ class _Tracker:
         return q
 
     def run(self, wanted: frozenset[int], progress: Progress) -> Track:
-        """Both passes over the sequence."""
-        total = 2 * len(self.sequence)
-        readings = self._readings(progress)
-        stamps = self.sequence.t[[reading.index for reading in readings]]
-        progress(len(self.sequence), total, "comparing the clocks")
-        clock = self._clock([reading.cloud for reading in readings], stamps)
+        """Both passes over the sequence, and the judgement."""
+        order = _by_stamp(self.sequence.t)
+        self._check_clock(order.usable)
+        sample = _spread(order.usable, _SAMPLE)
+        total = len(sample) + len(order.indices)
+        calibration = self._calibration(sample, lambda done, text: progress(done, total, text))
         frames: list[FrameReport] = []
         kept: list[Stages] = []
         last: tuple[Array, float] | None = None
-        for k in range(len(readings)):
-            reading = readings[k]
-            readings[k] = replace(reading, cloud=None)  # a long sequence would fill the memory
-            progress(len(self.sequence) + k, total, f"fitting {self.sequence.names[reading.index]}")
-            report, stage = self._frame(reading, clock, k, last)
+        for done, i in enumerate(order.indices):
+            progress(len(sample) + done, total, f"fitting {self.sequence.names[i]}")
+            report, stage = self._frame(i, order.reasons.get(i, ""), calibration, last)
             frames.append(report)
             if report.good and report.fit is not None:
                 last = report.fit.q, report.t
-            if stage is not None and report.good and reading.index in wanted:
+            if stage is not None and report.good and i in wanted:
                 kept.append(stage())
         progress(total, total, "done")
-        fits = [frame.fit for frame in frames if frame.good and frame.fit is not None]
-        if fits:
-            usual = float(np.median([fit.distance for fit in fits]))
-            gap = np.median([fit.gap for fit in fits], axis=0)
-            frames = [self._compared(frame, usual, gap) for frame in frames]
-        return self._track(frames, clock, kept)
+        return self._track(judged(frames, self.options), calibration, kept)
 
-    def _readings(self, progress: Progress) -> list[_Reading]:
-        """All frames by their stamps, filtered as far as that needs no clock."""
-        order, reasons = _sorted_frames(self.sequence.t)
-        self._check_clock([i for i in order if i not in reasons])
-        readings = []
-        for done, i in enumerate(order):
-            progress(done, 2 * len(order), f"reading {self.sequence.names[i]}")
-            reading = _Reading(i, None, reason=reasons.get(i, ""))
-            if i not in reasons:
-                try:
-                    cloud, raw = self._read(i)
-                    reading = _Reading(i, cloud, raw)
-                except DataError as error:
-                    reading = _Reading(i, None, reason=error.what)
-            readings.append(reading)
-        return readings
+    def _calibration(self, sample: Sequence[int], progress: Callable[[int, str], None]) -> Calibration:
+        """What is common to the sequence, from some of its frames."""
+        given = as_given(self.sequence.pose, self.options.clock)
+        clouds, stamps = [], []
+        for done, i in enumerate(sample):
+            progress(done, f"reading {self.sequence.names[i]}")
+            try:
+                clouds.append(self._read(i, given)[0])
+            except DataError:
+                continue  # the second pass says why
+            stamps.append(float(self.sequence.t[i]))
+        progress(len(sample), "comparing the clocks")
+        robot = None if self.span is None else self.robot
+        rng = np.random.default_rng(self.options.seed)
+        return calibrate(robot, clouds, np.array(stamps), self.sequence.pose, self.posture, rng, self.options.clock)
 
     def _check_clock(self, usable: Sequence[int]) -> None:
         if self.span is None or not usable:
@@ -360,8 +167,9 @@ class _Tracker:
                 " both started together",
             )
 
-    def _read(self, index: int) -> tuple[Cloud, int]:
-        points = self.sequence.world(index)
+    def _read(self, index: int, calibration: Calibration) -> tuple[Cloud, int]:
+        """A frame's cloud in the world where the object can be, the robot's points among them, and how many it had."""
+        points = calibration.world(self.sequence.load(index))
         count = len(points)
         points = points[np.isfinite(points).all(axis=1)]
         if not len(points):
@@ -370,128 +178,81 @@ class _Tracker:
         if far > _LARGEST:
             raise DataError(f"the cloud is not in metres: half of its points are {far:.0f} m away (millimetres?)")
         filters = self.options.filters
-        q = self.posture(float(self.sequence.t[index]) - self.options.clock.offset)
-        inside = self.region.at(q, self.camera).contains(points)
+        q = self.posture(calibration.clock.joint_time(float(self.sequence.t[index])))
+        inside = self.region.at(q, calibration.camera).contains(points)
         if not inside.any():
             raise DataError("no point lies where the object can be: check the camera's pose")
         cloud = voxel_grid(points[inside], filters.voxel)
         # before the robot is taken out: among all surfaces, wrong points are few
         return cloud.keep(without_outliers(cloud, filters.neighbours, filters.outlier_ratio)), count
 
-    def _clock(self, clouds: Sequence[Cloud | None], stamps: Array) -> Clock:
-        options = self.options.clock
-        if self.robot is None or self.span is None:
-            nothing = np.full(len(stamps), np.nan)
-            text = f"clock offset {1e3 * options.offset:.0f} ms as given: no robot to compare"
-            return Clock(options.offset, math.inf, False, nothing, nothing, np.zeros(3), text)
-        return estimate_clock(self.robot, clouds, stamps, self.posture, self.rng, options)
-
     def _frame(
-        self, reading: _Reading, clock: Clock, row: int, last: tuple[Array, float] | None
+        self, index: int, reason: str, calibration: Calibration, last: tuple[Array, float] | None
     ) -> tuple[FrameReport, Callable[[], Stages] | None]:
-        """What became of a frame, and its stages if it has a shape; `last`: shape and time of the good frame before."""
-        options, index, cloud = self.options, reading.index, reading.cloud
+        """What became of a frame, and its stages if it has a shape.
+
+        `reason`: why it is of no use, if that is known; `last`: shape and time of the good frame before.
+        """
+        options, clock, name = self.options, calibration.clock, self.sequence.names[index]
         stamp = float(self.sequence.t[index])
-        t, delay = stamp - clock.offset, float(clock.delay[row])
-        name = self.sequence.names[index]
-        report = FrameReport(index, name, stamp, t, reading.reason, reading.raw, 0, 0, delay, 0.0, None)
-        if reading.reason or cloud is None:
+        t = clock.joint_time(stamp)
+        report = FrameReport(index, name, stamp, t, reason, 0, 0, 0, math.nan, 0.0, None)
+        if reason:
             return report, None
+        try:
+            cloud, raw = self._read(index, calibration)
+        except DataError as error:
+            return replace(report, reason=error.what), None
+        report = replace(report, raw=raw)
         if self.span is not None and not self.span[0] <= t <= self.span[1]:
             return replace(report, reason="there are no joint angles at its time"), None
-        if abs(delay) > max(options.clock.late, 4 * float(clock.delay_std[row])):
-            return replace(report, reason=f"its stamp is late: by {1e3 * delay:.0f} ms"), None
+        rng = np.random.default_rng([options.seed, index])
+        if self.robot is not None and self.span is not None:
+            delay, std = own_delay(self.robot, cloud, stamp, self.posture, clock, rng, options.clock)
+            report = replace(report, delay=delay)
+            if abs(delay) > max(options.clock.late, 4 * std):
+                return replace(report, reason=f"its stamp is late: by {1e3 * delay:.0f} ms"), None
         q = self.posture(t)
         if self.robot is not None:
             cloud = cloud.keep(without_robot(cloud, self.robot, q, options.filters.padding))
         if len(cloud) < options.filters.least:
             return replace(report, filtered=len(cloud), reason=f"too few points of the object: {len(cloud)} left"), None
         if len(cloud) > options.filters.most:
-            cloud = cloud.keep(np.sort(self.rng.choice(len(cloud), options.filters.most, replace=False)))
+            cloud = cloud.keep(np.sort(rng.choice(len(cloud), options.filters.most, replace=False)))
         begun = time.process_time()
-        found = skeleton(cloud, self.rng, options.walk)
+        found = skeleton(cloud, rng, options.walk)
         report = replace(report, filtered=len(cloud), nodes=len(found.nodes))
         if not len(found.nodes):
             return replace(report, reason="no part of the cloud is dense enough for a skeleton"), None
         rest = cloud.keep(found.connected)
         part = found.part[found.label[found.connected]]
-        sight = Sight(rest.points, rest.weight, part, found.nodes, self.camera)
+        sight = Sight(rest.points, rest.weight, part, found.nodes, calibration.camera)
         before = () if last is None else (last[0],)
         fit = self.shape.solve(sight, q, before, None if last is None else (last[0], t - last[1]))
         spent = time.process_time() - begun
-        report = replace(report, fit=fit, reason=self._judge(fit), seconds=spent)
-        return report, lambda: Stages(name, self.sequence.world(index), rest.points, found, fit, self.camera)
+        report = replace(report, fit=fit, reason=unfit(fit, self.shape, options), seconds=spent)
 
-    def _judge(self, fit: Fit) -> str:
-        options = self.options
-        if not np.isfinite(fit.q).all():
-            return "the fit failed"
-        if fit.distance > options.d_max:
-            limit = 1e3 * options.d_max
-            return f"the shape does not fit: {1e3 * fit.distance:.1f} mm off on average, d_max is {limit:g} mm"
-        bend = float(np.abs((fit.q - self.shape.rest)[list(self.shape.free)]).max())
-        if bend > options.largest_bend:
-            return f"the shape is folded: a joint is bent by {math.degrees(bend):.0f} degrees"
-        if fit.inliers < options.least_inliers:
-            return f"the shape does not fit: only {100 * fit.inliers:.0f} % of the points lie on it"
-        return ""
+        def stages() -> Stages:
+            seen = calibration.world(self.sequence.load(index))
+            return Stages(name, seen, rest.points, found, fit, calibration.camera)
 
-    def _compared(self, frame: FrameReport, usual: float, gap: Array) -> FrameReport:
-        if not frame.good or frame.fit is None:
-            return frame
-        if frame.fit.distance > self.options.worse * usual:
-            off = f"{1e3 * frame.fit.distance:.1f} mm off on average, {1e3 * usual:.1f} mm are usual"
-            return replace(frame, reason=f"the shape fits worse than in other frames: {off}")
-        apart = float(np.linalg.norm(frame.fit.gap - gap, axis=1).max(initial=0.0))
-        if apart > self.options.gap_max:
-            off = f"{1e3 * apart:.0f} mm more than usual (a late stamp?)"
-            return replace(frame, reason=f"an end is not where its gripper is: {off}")
-        return frame
+        return report, stages
 
-    def _track(self, frames: Sequence[FrameReport], clock: Clock, kept: Sequence[Stages]) -> Track:
-        good = [frame for frame in frames if frame.good]
-        if not good:
-            count = Counter(frame.reason for frame in frames).most_common(3)
-            listed = "; ".join(f"{reason} ({number} of {len(frames)})" for reason, number in count)
-            hint = (
-                "check the camera's pose, the unit of the clouds and the filters, and look at the pictures of a frame"
-            )
-            if "metres" in listed:
-                hint = "say in camera.json that the unit is mm"
-            raise DataError(f"not one frame could be used: {listed}", where=self.sequence.source, hint=hint)
-        fits = [frame.fit for frame in good if frame.fit is not None]
-        t = np.array([frame.t for frame in good])
+    def _track(self, frames: Sequence[FrameReport], calibration: Calibration, kept: Sequence[Stages]) -> Track:
         columns = [self.system.points.index(name) for name in self.names]
-        position = np.array([fit.points[columns] for fit in fits])
-        std = np.hypot(np.array([fit.std[columns] for fit in fits]), self.options.std_floor)
-        # where the arm seems displaced, so may the object be
-        std = np.hypot(std, np.abs(clock.shift))
-        uncertain = math.hypot(self.options.stamp_std, clock.std if clock.estimated else 0.0)
-        if len(t) > 1:
-            velocity = np.asarray(CubicSpline(t, position, axis=0)(t, 1))
-            std = np.hypot(std, np.abs(velocity) * uncertain)
-        unseen = np.linalg.norm(std, axis=2) > math.sqrt(3.0) * self.options.point_std_max
-        unseen |= ~np.array([fit.seen[columns] for fit in fits])
-        if unseen.all():
-            best = 1e3 * float(np.sqrt((std**2).mean(axis=2)).min())
-            raise DataError(
-                f"no point is known well enough in any frame: the best within {best:.0f} mm,"
-                f" point_std_max is {1e3 * self.options.point_std_max:g} mm",
-                where=self.sequence.source,
-                hint=f"check the camera's pose and clock ({clock.message}), or look at the pictures of a frame",
-            )
+        points = measured(frames, columns, calibration.clock, self.options, self.sequence.source)
         return Track(
             self.names,
-            t,
-            np.array([fit.q for fit in fits]),
-            np.where(unseen[..., None], np.nan, position),
-            np.where(unseen[..., None], np.nan, std),
+            points.t,
+            points.q,
+            points.position,
+            points.std,
             tuple(frames),
-            clock,
+            calibration.clock,
             tuple(kept),
             self.system.points,
             self.shape.place,
-            self.sequence.pose,
+            calibration.pose,
         )
 
 
@@ -537,8 +298,8 @@ def _joint_angles(
     return (float(t[0]), float(t[-1])), angles
 
 
-def _sorted_frames(stamps: Array) -> tuple[list[int], dict[int, str]]:
-    """Frames by time stamp, and why some of them cannot be used: no time, or the time of the one before."""
+def _by_stamp(stamps: Array) -> _Order:
+    """Frames by time stamp; of no use are those that have none, or that of the one before."""
     reasons = {int(i): "its time stamp is not a number" for i in np.flatnonzero(~np.isfinite(stamps))}
     order = sorted(range(len(stamps)), key=lambda i: (math.inf if i in reasons else float(stamps[i]), i))
     before = -math.inf
@@ -548,4 +309,11 @@ def _sorted_frames(stamps: Array) -> tuple[list[int], dict[int, str]]:
                 reasons[i] = "its time stamp is that of the frame before: a duplicate"
             else:
                 before = float(stamps[i])
-    return order, reasons
+    return _Order(tuple(order), reasons)
+
+
+def _spread(indices: Sequence[int], most: int) -> list[int]:
+    """So many of the indices at most, evenly spread."""
+    if len(indices) <= most:
+        return list(indices)
+    return [indices[int(k)] for k in np.linspace(0, len(indices) - 1, most).round()]

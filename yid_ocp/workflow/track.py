@@ -27,7 +27,8 @@ from yid_ocp.vision.fit import ShapeFit
 from yid_ocp.vision.frames import FrameSequence, look_at, read_frames, write_frames
 from yid_ocp.vision.meshes import Scene
 from yid_ocp.vision.pictures import draw_stages, draw_track
-from yid_ocp.vision.track import Track, track
+from yid_ocp.vision.results import Track
+from yid_ocp.vision.track import track
 from yid_ocp.workflow.build import build_system, located, recording_file
 from yid_ocp.workflow.command import DONE, carry_out
 from yid_ocp.workflow.doubts import doubts_result, of_one
