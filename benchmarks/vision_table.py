@@ -430,7 +430,7 @@ def tracked(made: Film, options: TrackOptions) -> tuple[Track | None, Outcome]:
     size = np.linalg.norm(found.std, axis=2) / math.sqrt(3)
     spent = time.process_time() - drawn
     return found, Outcome(
-        error, apart / found.std, size, len(found.t), count, "", spent, found.clock.message, found.dropped
+        error, apart / found.std, size, len(found.t), count, "", spent, found.calibration.message, found.dropped
     )
 
 

@@ -218,6 +218,8 @@ class ShapeFit:
                 rows.append(alignment[-3:] / self.options.direction_std)
         held = ca.substitute(ca.vertcat(*rows), symbols, ca.SX(ca.DM(theta)))
         gaps = [grasp.residual(kinematics)[:3] for grasp in system.grasps]
+        holders = [kinematics.position(grasp.holder) for grasp in system.grasps]
+        self._holders = ca.Function("holders", [q], [ca.densify(ca.vertcat(ca.SX(0, 1), *holders))])
         gap = ca.substitute(ca.vertcat(ca.SX(0, 1), *gaps), symbols, ca.SX(ca.DM(theta)))
         self._gap = ca.Function("gap", [q], [ca.densify(gap)])
         self._held = ca.Function("held", [q], ca.cse([held, ca.densify(ca.jacobian(held, q)[:, columns])]))
@@ -403,6 +405,10 @@ class ShapeFit:
         covered = (apart < _TOUCHING) & (coverage[:, None] >= self.options.least_coverage)
         held = {grasp.held for grasp in self.system.grasps}
         return np.asarray(covered.any(axis=0) | np.array([name in held for name in self.system.points]))
+
+    def grips(self, q: ArrayLike) -> Array:
+        """Where the grippers are at a configuration, shape (grasps, 3) [m]."""
+        return np.array(self._holders(np.asarray(q, float))).reshape(-1, 3)
 
     def place(self, q: ArrayLike) -> Array:
         """The system's points at a configuration, shape (np, 3) [m]."""

@@ -19,13 +19,14 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.errors import ConfigError, DataError, ModelError, nearest
 from yid_ocp.model.system import System
 from yid_ocp.vision.calibration import Calibration, as_given, calibrate
-from yid_ocp.vision.clock import own_delay
+from yid_ocp.vision.clock import own_offset
 from yid_ocp.vision.filters import Cloud, ObjectRegion, voxel_grid, without_outliers, without_robot
 from yid_ocp.vision.fit import ShapeFit, Sight
 from yid_ocp.vision.frames import FrameSequence
 from yid_ocp.vision.judgement import judged, measured, unfit
 from yid_ocp.vision.meshes import Scene, Surfaces, numeric_mechanism, robot_meshes
 from yid_ocp.vision.options import TrackOptions
+from yid_ocp.vision.registration import Arm, Glimpse
 from yid_ocp.vision.results import FrameReport, Stages, Track
 from yid_ocp.vision.skeleton import skeleton
 
@@ -34,7 +35,7 @@ Progress = Callable[[int, int, str], None]
 
 _LARGEST = 50.0  # [m]; a depth camera sees no further, a cloud in millimetres always does
 _SAME_TIME = 1e-6  # [s]
-_SAMPLE = 60  # frames, at most, from which what is common to all of them is found
+_GRIP = 0.06  # about a grasp, beyond the tube's radius, a point may be the object's [m]
 
 
 def track(
@@ -108,6 +109,9 @@ class _Tracker:
             if all(joint < 0 for joint in meshes):
                 raise ModelError("no link of the robot moves with the model's joints", where=str(scene.urdf))
             self.robot = Surfaces(tree, meshes)
+        self.arm: Arm | None = None
+        if self.robot is not None and self.span is not None:
+            self.arm = Arm(self.robot, self.posture, self.shape.grips, float(self.shape.radius.max()) + _GRIP)
 
     def posture(self, t: float) -> Array:
         """Configuration at a time on the joints' clock, the object at rest; it stays at the recording's ends beyond."""
@@ -120,7 +124,7 @@ class _Tracker:
         """Both passes over the sequence, and the judgement."""
         order = _by_stamp(self.sequence.t)
         self._check_clock(order.usable)
-        sample = _spread(order.usable, _SAMPLE)
+        sample = _spread(order.usable, self.options.calibration.frames) if self.arm is not None else []
         total = len(sample) + len(order.indices)
         calibration = self._calibration(sample, lambda done, text: progress(done, total, text))
         frames: list[FrameReport] = []
@@ -139,19 +143,20 @@ class _Tracker:
 
     def _calibration(self, sample: Sequence[int], progress: Callable[[int, str], None]) -> Calibration:
         """What is common to the sequence, from some of its frames."""
-        given = as_given(self.sequence.pose, self.options.clock)
-        clouds, stamps = [], []
+        if self.arm is None:
+            return as_given(self.sequence.pose, self.options.clock, "no robot to compare")
+        glimpses = []
         for done, i in enumerate(sample):
             progress(done, f"reading {self.sequence.names[i]}")
             try:
-                clouds.append(self._read(i, given)[0])
+                points = self._points(i)
             except DataError:
                 continue  # the second pass says why
-            stamps.append(float(self.sequence.t[i]))
-        progress(len(sample), "comparing the clocks")
-        robot = None if self.span is None else self.robot
+            glimpses.append(Glimpse(float(self.sequence.t[i]), voxel_grid(points, self.options.filters.voxel).points))
+        progress(len(sample), "calibrating the camera by the arm")
         rng = np.random.default_rng(self.options.seed)
-        return calibrate(robot, clouds, np.array(stamps), self.sequence.pose, self.posture, rng, self.options.clock)
+        options, source = self.options, self.sequence.source
+        return calibrate(self.arm, glimpses, self.sequence.pose, rng, options.calibration, options.clock, source)
 
     def _check_clock(self, usable: Sequence[int]) -> None:
         if self.span is None or not usable:
@@ -167,24 +172,29 @@ class _Tracker:
                 " both started together",
             )
 
-    def _read(self, index: int, calibration: Calibration) -> tuple[Cloud, int]:
-        """A frame's cloud in the world where the object can be, the robot's points among them, and how many it had."""
-        points = calibration.world(self.sequence.load(index))
-        count = len(points)
+    def _points(self, index: int) -> Array:
+        """A frame's finite points in the camera's frame."""
+        points = self.sequence.load(index)
         points = points[np.isfinite(points).all(axis=1)]
         if not len(points):
             raise DataError("the cloud is empty")
         far = float(np.median(np.abs(points).max(axis=1)))
         if far > _LARGEST:
             raise DataError(f"the cloud is not in metres: half of its points are {far:.0f} m away (millimetres?)")
+        return points
+
+    def _read(self, index: int, calibration: Calibration) -> tuple[Cloud, int]:
+        """A frame's cloud in the world where the object can be, the robot's points among them, and how many it had."""
+        seen = self._points(index)
+        points = calibration.state.world(seen)
         filters = self.options.filters
-        q = self.posture(calibration.clock.joint_time(float(self.sequence.t[index])))
+        q = self.posture(float(calibration.state.time(self.sequence.t[index])))
         inside = self.region.at(q, calibration.camera).contains(points)
         if not inside.any():
             raise DataError("no point lies where the object can be: check the camera's pose")
         cloud = voxel_grid(points[inside], filters.voxel)
         # before the robot is taken out: among all surfaces, wrong points are few
-        return cloud.keep(without_outliers(cloud, filters.neighbours, filters.outlier_ratio)), count
+        return cloud.keep(without_outliers(cloud, filters.neighbours, filters.outlier_ratio)), len(seen)
 
     def _frame(
         self, index: int, reason: str, calibration: Calibration, last: tuple[Array, float] | None
@@ -193,9 +203,9 @@ class _Tracker:
 
         `reason`: why it is of no use, if that is known; `last`: shape and time of the good frame before.
         """
-        options, clock, name = self.options, calibration.clock, self.sequence.names[index]
+        options, name = self.options, self.sequence.names[index]
         stamp = float(self.sequence.t[index])
-        t = clock.joint_time(stamp)
+        t = float(calibration.state.time(stamp))
         report = FrameReport(index, name, stamp, t, reason, 0, 0, 0, math.nan, 0.0, None)
         if reason:
             return report, None
@@ -207,11 +217,13 @@ class _Tracker:
         if self.span is not None and not self.span[0] <= t <= self.span[1]:
             return replace(report, reason="there are no joint angles at its time"), None
         rng = np.random.default_rng([options.seed, index])
-        if self.robot is not None and self.span is not None:
-            delay, std = own_delay(self.robot, cloud, stamp, self.posture, clock, rng, options.clock)
-            report = replace(report, delay=delay)
-            if abs(delay) > max(options.clock.late, 4 * std):
-                return replace(report, reason=f"its stamp is late: by {1e3 * delay:.0f} ms"), None
+        usual = calibration.usual
+        if self.arm is not None and usual is not None:
+            own = own_offset(self.arm, calibration.state, stamp, cloud.points, rng, usual.misfit)
+            if own is not None and own.information > 0:
+                report = replace(report, delay=own.delay)
+                if abs(own.delay) > max(options.clock.late, 4 * own.std(usual.variance)):
+                    return replace(report, reason=f"its stamp is late: by {1e3 * own.delay:.0f} ms"), None
         q = self.posture(t)
         if self.robot is not None:
             cloud = cloud.keep(without_robot(cloud, self.robot, q, options.filters.padding))
@@ -233,14 +245,14 @@ class _Tracker:
         report = replace(report, fit=fit, reason=unfit(fit, self.shape, options), seconds=spent)
 
         def stages() -> Stages:
-            seen = calibration.world(self.sequence.load(index))
+            seen = calibration.state.world(self.sequence.load(index))
             return Stages(name, seen, rest.points, found, fit, calibration.camera)
 
         return report, stages
 
     def _track(self, frames: Sequence[FrameReport], calibration: Calibration, kept: Sequence[Stages]) -> Track:
         columns = [self.system.points.index(name) for name in self.names]
-        points = measured(frames, columns, calibration.clock, self.options, self.sequence.source)
+        points = measured(frames, columns, calibration, self.options, self.sequence.source)
         return Track(
             self.names,
             points.t,
@@ -248,11 +260,10 @@ class _Tracker:
             points.position,
             points.std,
             tuple(frames),
-            calibration.clock,
+            calibration,
             tuple(kept),
             self.system.points,
             self.shape.place,
-            calibration.pose,
         )
 
 
