@@ -236,7 +236,10 @@ class _Calibrator:
 
     def run(self) -> Calibration:
         if len(self.glimpses) < _LEAST_FRAMES:
-            raise _UntoldError("it is hardly in view", "turn the camera so that it sees the arm")
+            raise _UntoldError(
+                f"it is in view in {len(self.glimpses)} frames, {_LEAST_FRAMES} are needed",
+                "turn the camera so that it sees the arm, or record for longer",
+            )
         state, chosen = self._start(), self.glimpses
         for _ in range(2):  # once more without the frames that were stamped late
             state, found, used = self._settled(state, chosen)
@@ -276,7 +279,7 @@ class _Calibrator:
         few = _some(self.glimpses, _START_FRAMES)
         tried = starts(self.arm, few, self.told, self.clock.search, _STARTS)
         if not tried:
-            raise _UntoldError("it is hardly in view", "turn the camera so that it sees the arm")
+            raise _UntoldError("it is hardly in view", "turn the camera so that it sees more of the arm")
         clouds, best, most = Clouds(few), tried[0], -1.0
         for trial in tried:
             for reach in _WIDE:

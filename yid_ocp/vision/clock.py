@@ -31,7 +31,10 @@ _SHARE = 0.3  # of the points must lie on the arm, or they are something else
 _UNUSUAL = 1.5  # times the usual misfit, from which on other starts are tried
 _CLEARLY = 0.8  # of the misfit at the common offset, below which another is believed
 _LEAST_LATE = 0.02  # [s]; a stamp that is off by less is like the others
-_MEDIAN_SQUARE = 0.4549  # of a normal variable
+_LATE = 4.0  # standard deviations
+_SHIFT_STD = 1e-3  # of the arm in one frame from where it should be by the calibration [m]
+_ALIKE = 3.0  # points drawn at random have errors that are alike in groups of so many
+_TO_SIGMA, _LEAST_SIGMA = 1.4826, 1e-3  # from the median of sizes; [m]
 _LARGEST_CHANGE = 0.05  # of an offset in one iteration [s]
 
 
@@ -69,19 +72,15 @@ class OwnOffset:
     ----------
     delay : float
         Its offset beyond the common one [s].
+    std : float
+        Of that; infinite where too few points lie on the arm [s].
     misfit : float
         Mean square of its points' distances from the arm there [m^2].
-    information : float
-        How much it says of the offset, zero where the arm is not in view [m^2/s^2].
     """
 
     delay: float
+    std: float
     misfit: float
-    information: float
-
-    def std(self, variance: float) -> float:
-        """Standard deviation of the delay [s], from the variance of all frames' delays times their information."""
-        return math.sqrt(variance / self.information) if self.information > 0 else math.nan
 
 
 def own_offset(
@@ -130,17 +129,29 @@ def own_offset(
 
 
 def _nearby(arm: Arm, origin: Array, t: float, points: Array, start: float) -> OwnOffset:
-    """The offset not far from a start, by Gauss and Newton's method within one reach after the other."""
-    delay, information = start, 0.0
+    """The offset not far from a start, by Gauss and Newton's method within one reach after the other.
+
+    A shift of the frame is a further unknown, since the calibration is not exact: an arm that moves slowly tells a
+    shift from a delay as little as it should.
+    """
+    x = np.array([start, 0.0, 0.0, 0.0])
+    hessian, sigma = np.zeros((4, 4)), _REACH
     for share in _NARROWING:
-        met = arm.met(points, origin, t - delay, share * _REACH, along=True)
-        information = float(met.rate @ met.rate)
-        if information > 0:
-            delay -= float(np.clip(met.rate @ met.error / information, -_LARGEST_CHANGE, _LARGEST_CHANGE))
-    met = arm.met(points, origin, t - delay, _REACH, along=True)
-    on_arm = np.count_nonzero(np.abs(met.error) < _NARROWING[-1] * _REACH)
-    enough = on_arm >= _SHARE * len(points)
-    return OwnOffset(delay, _mean_square(met.error, len(points)), information if enough else 0.0)
+        met = arm.met(points + x[1:], origin, t - x[0], share * _REACH, along=True)
+        if len(met.error) < FEWEST:
+            break
+        sigma = max(_TO_SIGMA * float(np.median(np.abs(met.error))), _LEAST_SIGMA)
+        slope = np.column_stack([met.rate, met.normal])
+        prior = np.array([0.0, *[_ALIKE * (sigma / _SHIFT_STD) ** 2] * 3])
+        hessian = slope.T @ slope + np.diag(prior) + 1e-9 * np.eye(4)
+        step = -np.linalg.solve(hessian, slope.T @ met.error + prior * x)
+        x += np.clip(step, -_LARGEST_CHANGE, _LARGEST_CHANGE)
+    error = arm.met(points + x[1:], origin, t - x[0], _REACH, along=True).error
+    on_arm = np.count_nonzero(np.abs(error) < _NARROWING[-1] * _REACH)
+    std = math.inf
+    if on_arm >= max(_SHARE * len(points), FEWEST):
+        std = sigma * math.sqrt(_ALIKE * float(np.linalg.inv(hessian)[0, 0]))
+    return OwnOffset(float(x[0]), std, _mean_square(error, len(points)))
 
 
 def _misfit(arm: Arm, origin: Array, t: float, points: Array) -> float:
@@ -160,28 +171,26 @@ class Usual:
     ----------
     on_time : list of int
         Those that agree on one offset.
-    variance : float
-        Of their delays times what each says of it [m^2].
     misfit : float
         Median of theirs [m^2].
     """
 
     on_time: list[int]
-    variance: float
     misfit: float
 
 
 def agreed(own: Sequence[OwnOffset | None]) -> Usual:
     """Frames whose own offsets agree: those stamped late must not pull the others."""
-    known = [(i, entry) for i, entry in enumerate(own) if entry is not None and entry.information > 0]
+    known = [(i, entry) for i, entry in enumerate(own) if entry is not None and math.isfinite(entry.std)]
     if not known:
-        return Usual([], 0.0, 0.0)
-    delay = np.array([entry.delay for _, entry in known])
-    information = np.array([entry.information for _, entry in known])
-    apart = delay - weighted_median(delay, information)
-    # the errors of one frame's points are alike to an unknown degree: only the scatter says how much a frame knows
-    variance = max(float(np.median(information * apart**2)) / _MEDIAN_SQUARE, 1e-12)
-    near = np.abs(apart) < np.maximum(_LEAST_LATE, 4 * np.sqrt(variance / information))
+        return Usual([], 0.0)
+    delay, std = (np.array([getattr(entry, name) for _, entry in known]) for name in ("delay", "std"))
+    apart = np.abs(delay - weighted_median(delay, std**-2))
+    near = apart < np.maximum(_LEAST_LATE, _LATE * std)
     on_time = [i for (i, _), good in zip(known, near, strict=True) if good]
-    misfit = float(np.median([entry.misfit for _, entry in known]))
-    return Usual(on_time, variance, misfit)
+    return Usual(on_time, float(np.median([entry.misfit for _, entry in known])))
+
+
+def is_late(own: OwnOffset, options: ClockOptions) -> bool:
+    """Whether a frame was stamped late, beyond doubt."""
+    return abs(own.delay) > max(options.late, _LATE * own.std)

@@ -19,7 +19,7 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.errors import ConfigError, DataError, ModelError, nearest
 from yid_ocp.model.system import System
 from yid_ocp.vision.calibration import Calibration, as_given, calibrate
-from yid_ocp.vision.clock import own_offset
+from yid_ocp.vision.clock import is_late, own_offset
 from yid_ocp.vision.filters import Cloud, ObjectRegion, voxel_grid, without_outliers, without_robot
 from yid_ocp.vision.fit import ShapeFit, Sight
 from yid_ocp.vision.frames import FrameSequence
@@ -220,9 +220,9 @@ class _Tracker:
         usual = calibration.usual
         if self.arm is not None and usual is not None:
             own = own_offset(self.arm, calibration.state, stamp, cloud.points, rng, usual.misfit)
-            if own is not None and own.information > 0:
+            if own is not None and math.isfinite(own.std):
                 report = replace(report, delay=own.delay)
-                if abs(own.delay) > max(options.clock.late, 4 * own.std(usual.variance)):
+                if is_late(own, options.clock):
                     return replace(report, reason=f"its stamp is late: by {1e3 * own.delay:.0f} ms"), None
         q = self.posture(t)
         if self.robot is not None:
