@@ -389,8 +389,10 @@ class TrackSettings:
     """How points are measured in a depth camera's frames."""
 
     frames: Annotated[
-        FilePath | None, About("folder of clouds or depth images; a virtual frame sequence when absent")
+        FilePath | None,
+        About("folder of clouds or depth images, bag, MCAP or RealSense file; a virtual frame sequence when absent"),
     ] = None
+    topic: Annotated[str | None, About("of the clouds or depth images in a bag, where it has several")] = None
     pose: Annotated[
         tuple[Quadruple, Quadruple, Quadruple, Quadruple] | None,
         About("camera (x right, y down, z ahead) in the world, row by row, instead of the folder's", "m"),

@@ -2,8 +2,8 @@
 
 The robot is the calibration target: all ten numbers are estimated together from the arm in a sample of the frames
 (`registration`), from starts that are looked for about what is told. Priors about that are wide; they decide where the
-arm's motion informs of nothing. What stays uncertain is an error common to all frames, and enters the standard deviation
-of every point.
+arm's motion informs of nothing. What stays uncertain is an error common to all frames, and enters the standard
+deviation of every point.
 """
 
 from __future__ import annotations

@@ -169,13 +169,13 @@ class Usual:
 
     Attributes
     ----------
-    on_time : list of int
+    on_time : tuple of int
         Those that agree on one offset.
     misfit : float
         Median of theirs [m^2].
     """
 
-    on_time: list[int]
+    on_time: tuple[int, ...]
     misfit: float
 
 
@@ -183,11 +183,11 @@ def agreed(own: Sequence[OwnOffset | None]) -> Usual:
     """Frames whose own offsets agree: those stamped late must not pull the others."""
     known = [(i, entry) for i, entry in enumerate(own) if entry is not None and math.isfinite(entry.std)]
     if not known:
-        return Usual([], 0.0)
+        return Usual((), 0.0)
     delay, std = (np.array([getattr(entry, name) for _, entry in known]) for name in ("delay", "std"))
     apart = np.abs(delay - weighted_median(delay, std**-2))
     near = apart < np.maximum(_LEAST_LATE, _LATE * std)
-    on_time = [i for (i, _), good in zip(known, near, strict=True) if good]
+    on_time = tuple(i for (i, _), good in zip(known, near, strict=True) if good)
     return Usual(on_time, float(np.median([entry.misfit for _, entry in known])))
 
 

@@ -67,7 +67,7 @@ class Measured:
     t : ndarray, shape (M,)
         [s]
     q : ndarray, shape (M, n)
-    position, std : ndarray, shape (M, np, 3)
+    position, std, common : ndarray, shape (M, np, 3)
         [m]; NaN where a point was not seen well enough.
     """
 
@@ -75,6 +75,7 @@ class Measured:
     q: Array
     position: Array
     std: Array
+    common: Array
 
 
 def measured(
@@ -111,8 +112,8 @@ def measured(
     # a point is where it was at some time of the exposure, which is uniform over that
     std = np.hypot(std, np.abs(velocity) * math.hypot(options.stamp_std, options.exposure / math.sqrt(12.0)))
     stamps = np.repeat([frame.stamp for frame in good], len(columns))
-    common = calibration.common_std(position.reshape(-1, 3), velocity.reshape(-1, 3), stamps)
-    std = np.hypot(std, common.reshape(std.shape))
+    common = calibration.common_std(position.reshape(-1, 3), velocity.reshape(-1, 3), stamps).reshape(std.shape)
+    std = np.hypot(std, common)
     unseen = np.linalg.norm(std, axis=2) > math.sqrt(3.0) * options.point_std_max
     unseen |= ~np.array([fit.seen[list(columns)] for fit in fits])
     if unseen.all():
@@ -125,7 +126,7 @@ def measured(
         )
     hidden = unseen[..., None]
     q = np.array([fit.q for fit in fits])
-    return Measured(t, q, np.where(hidden, np.nan, position), np.where(hidden, np.nan, std))
+    return Measured(t, q, *(np.where(hidden, np.nan, entry) for entry in (position, std, common)))
 
 
 def _none_good(frames: Sequence[FrameReport], source: str) -> DataError:

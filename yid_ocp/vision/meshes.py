@@ -23,7 +23,8 @@ from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Mechanism
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import robot_file
-from yid_ocp.vision.frames import Pinhole, open3d_module
+from yid_ocp.vision.frames import open3d_module
+from yid_ocp.vision.lens import Pinhole
 
 Array = NDArray[np.float64]
 MeshKind = Literal["visual", "collision"]
@@ -316,7 +317,7 @@ class Surfaces:
         seen = (corners - origin) @ rotation
         if (seen[:, 2] < _NEAR).all():
             return None
-        if (seen[:, 2] < _NEAR).any():
+        if (seen[:, 2] < _NEAR).any() or pinhole.distorted:
             return slice(0, pinhole.height), slice(0, pinhole.width)
         u = pinhole.fx * seen[:, 0] / seen[:, 2] + pinhole.cx
         v = pinhole.fy * seen[:, 1] / seen[:, 2] + pinhole.cy

@@ -244,7 +244,7 @@ class Arm:
 
 @dataclass(frozen=True, eq=False)
 class Met:
-    """Points beside the arm: which ones, e [m], the surface's normal, its velocity along that [m/s], part, place there."""
+    """Points beside the arm: which ones, e [m], the surface's normal, velocity along that [m/s], part, place there."""
 
     chosen: Integers
     error: Array
@@ -284,7 +284,7 @@ class RobustSum:
     count: int
 
     def tempered(self, precision: Array) -> tuple[Array, Array, float]:
-        """Hessian and gradient of the data, weighed by how much they know, and that weight; `precision`: the prior's."""
+        """Hessian and gradient of the data by a weight for how much they know, and that; `precision`: the prior's."""
         scale = 1.0 / np.sqrt(np.diag(self.hessian) + np.diag(precision))
         whole = (self.hessian + 1e-6 * precision) * np.outer(scale, scale)
         excess = np.linalg.solve(whole, self.blocks * np.outer(scale, scale))

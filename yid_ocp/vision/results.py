@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -62,27 +62,37 @@ class FrameReport:
         return not self.reason
 
 
+def dropped(frames: Iterable[FrameReport]) -> dict[str, int]:
+    """How often each reason dropped a frame; numbers in the reasons are left out."""
+    return dict(Counter(frame.reason.partition(":")[0] for frame in frames if not frame.good).most_common())
+
+
 @dataclass(frozen=True, eq=False)
 class Stages:
-    """One frame on its way, for pictures.
+    """One frame on its way, for pictures; what a dropped frame did not come to is None.
 
     Attributes
     ----------
     name : str
-    cloud, filtered : ndarray, shape (N, 3)
-        In the world [m].
-    skeleton : Skeleton
-    fit : Fit
+    reason : str
+        Why the frame was dropped; empty for a good one.
     camera : ndarray, shape (3,)
         [m]
+    cloud : ndarray, shape (N, 3)
+        In the world [m].
+    filtered : ndarray, shape (N, 3), optional
+        What the filters left [m].
+    skeleton : Skeleton, optional
+    fit : Fit, optional
     """
 
     name: str
-    cloud: Array
-    filtered: Array
-    skeleton: Skeleton
-    fit: Fit
+    reason: str
     camera: Array
+    cloud: Array
+    filtered: Array | None = None
+    skeleton: Skeleton | None = None
+    fit: Fit | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,8 +107,9 @@ class Track:
         Times of the good frames on the joints' clock [s].
     q : ndarray, shape (M, n)
         Configurations, twists at rest.
-    position, std : ndarray, shape (M, np, 3)
-        [m]; NaN where a point was not seen well enough.
+    position, std, common : ndarray, shape (M, np, 3)
+        [m]; NaN where a point was not seen well enough. `common`: of `std`, what all frames have in common, from the
+        camera's pose, depth and clock.
     frames : tuple of FrameReport
         All of them, by time stamp.
     calibration : Calibration
@@ -111,6 +122,7 @@ class Track:
     q: Array
     position: Array
     std: Array
+    common: Array
     frames: tuple[FrameReport, ...]
     calibration: Calibration
     stages: tuple[Stages, ...]
@@ -131,24 +143,22 @@ class Track:
 
     @property
     def dropped(self) -> dict[str, int]:
-        """How often each reason dropped a frame; numbers in the reasons are left out."""
-        reasons = (frame.reason.partition(":")[0] for frame in self.frames if not frame.good)
-        return dict(Counter(reasons).most_common())
+        """How often each reason dropped a frame."""
+        return dropped(self.frames)
 
     def group(self) -> PointGroup:
         """The points as a group of a recording, called `points_camera`."""
-        return PointGroup(
-            GROUP,
-            self.names,
-            self.t,
-            self.position,
-            self.std,
-            "depth camera, fitted shape",
-            pose=self.calibration.state.pose,
-        )
+        pose, words = self.calibration.state.pose, "depth camera, fitted shape"
+        if np.nanmax(self.common) > 0:
+            words += f"; of std, {1e3 * np.nanmedian(self.common):.1f} mm (median) are one error of all frames"
+        return PointGroup(GROUP, self.names, self.t, self.position, self.std, words, pose=pose)
 
-    def recording(self, recording: Recording) -> Recording:
-        """A recording with these points in place of any `points_camera` that it had; `DataError` as `validate`."""
+    def recording(self, recording: Recording | None) -> Recording:
+        """A recording with these points in place of any `points_camera` that it had; `DataError` as `validate`.
+
+        Without a recording, as of an object that no robot holds, one of these points alone.
+        """
+        recording = Recording(source="depth camera", name="camera") if recording is None else recording
         others = tuple(group for group in recording.points if group.name != GROUP)
         text = (
             f"{recording.description} Points of {len(self.t)} of {len(self.frames)} frames; {self.calibration.message}."

@@ -1,15 +1,15 @@
 """From a frame sequence and the joints' recording to measured points: filter, thin, fit, judge, and write them down.
 
 A first pass over some frames finds what is common to the sequence (`calibration`). A second one takes frame by frame
-and keeps no cloud; every frame ends as a fitted shape or with the reason why it was dropped, and nothing in one frame stops
-the sequence. What is left is small and judged in the end (`judgement`).
+and keeps no cloud; every frame ends as a fitted shape or with the reason why it was dropped, and nothing in one frame
+stops the sequence. What is left is small and judged in the end (`judgement`).
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,7 +28,7 @@ from yid_ocp.vision.meshes import Scene, Surfaces, numeric_mechanism, robot_mesh
 from yid_ocp.vision.options import TrackOptions
 from yid_ocp.vision.registration import Arm, Glimpse
 from yid_ocp.vision.results import FrameReport, Stages, Track
-from yid_ocp.vision.skeleton import skeleton
+from yid_ocp.vision.skeleton import Skeleton, skeleton
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
@@ -40,7 +40,7 @@ _GRIP = 0.06  # about a grasp, beyond the tube's radius, a point may be the obje
 
 def track(
     scene: Scene,
-    recording: Recording,
+    recording: Recording | None,
     sequence: FrameSequence,
     options: TrackOptions | None = None,
     *,
@@ -54,12 +54,12 @@ def track(
     scene : Scene
         Robot and object; joints that are not elastic must be in the recording. Without a URDF file there is no
         self-filter and no clock offset.
-    recording : Recording
-        Joint angles, for the self-filter, the grasps and the clock.
+    recording : Recording or None
+        Joint angles, for the self-filter, the grasps and the clock; None where the model has no robot.
     sequence : FrameSequence
     options : TrackOptions, optional
     stages : sequence of int
-        Frames of the frame sequence of which all stages are kept for pictures.
+        Frames of the frame sequence of which all stages are kept for pictures, as far as they can be read.
     progress : callable, optional
         Called with frames done, frames in all and what is being done.
 
@@ -76,26 +76,52 @@ def track(
     ModelError
         Meshes that cannot be read.
     """
-    tracker = _Tracker(scene, recording, sequence, options or TrackOptions())
-    return tracker.run(frozenset(stages), progress or (lambda done, total, text: None))
+    tracker = Tracker(scene, recording, sequence, options or TrackOptions())
+    told = progress or (lambda done, total, text: None)
+    total = len(tracker.sample) + len(tracker.order)
+    calibration = tracker.calibration(lambda done, text: told(done, total, text))
+    frames = []
+    for done, i in enumerate(tracker.order, start=len(tracker.sample)):
+        told(done, total, f"fitting {sequence.names[i]}")
+        frames.append(tracker.frame(i, calibration))
+    told(total, total, "done")
+    found = tracker.finished(tracker.judged(frames), calibration)
+    drawn = (tracker.stages(frame, calibration) for frame in found.frames if frame.index in stages)
+    return replace(found, stages=tuple(entry for entry in drawn if entry is not None))
 
 
-@dataclass(frozen=True, eq=False)
-class _Order:
-    """Frames by their stamps, and why some of them cannot be used at all, by their indices."""
+@dataclass(eq=False)
+class _Work:
+    """A frame while it is worked on: its report so far and what is left of its cloud."""
 
-    indices: tuple[int, ...]
-    reasons: Mapping[int, str]
+    report: FrameReport
+    filtered: Cloud | None = None
+    skeleton: Skeleton | None = None
 
-    @property
-    def usable(self) -> list[int]:
-        return [i for i in self.indices if i not in self.reasons]
+    def dropped(self, reason: str) -> _Work:
+        self.report = replace(self.report, reason=reason)
+        return self
 
 
-class _Tracker:
-    """What one call of `track` needs for any of its frames."""
+class Tracker:
+    """What is needed for any frame of a sequence, whichever process works on it.
 
-    def __init__(self, scene: Scene, recording: Recording, sequence: FrameSequence, options: TrackOptions) -> None:
+    Parameters
+    ----------
+    scene, recording, sequence, options
+        As `track`.
+
+    Attributes
+    ----------
+    order : tuple of int
+        All frames by their stamps.
+    sample : tuple of int
+        Frames from which what is common to all of them is found.
+    """
+
+    def __init__(
+        self, scene: Scene, recording: Recording | None, sequence: FrameSequence, options: TrackOptions
+    ) -> None:
         system, values = scene.system, scene.values
         self.system, self.sequence, self.options = system, sequence, options
         self.shape = ShapeFit(system, options.fit, values)
@@ -112,6 +138,10 @@ class _Tracker:
         self.arm: Arm | None = None
         if self.robot is not None and self.span is not None:
             self.arm = Arm(self.robot, self.posture, self.shape.grips, float(self.shape.radius.max()) + _GRIP)
+        self.order, self._reasons = _by_stamp(sequence.t)
+        usable = [i for i in self.order if i not in self._reasons]
+        self._check_clock(usable)
+        self.sample = _spread(usable, options.calibration.frames) if self.arm is not None else []
 
     def posture(self, t: float) -> Array:
         """Configuration at a time on the joints' clock, the object at rest; it stays at the recording's ends beyond."""
@@ -120,43 +150,23 @@ class _Tracker:
             q[[self.system.mechanism.joint_index(name) for name in self.shape.known]] = self.angles(t)
         return q
 
-    def run(self, wanted: frozenset[int], progress: Progress) -> Track:
-        """Both passes over the sequence, and the judgement."""
-        order = _by_stamp(self.sequence.t)
-        self._check_clock(order.usable)
-        sample = _spread(order.usable, self.options.calibration.frames) if self.arm is not None else []
-        total = len(sample) + len(order.indices)
-        calibration = self._calibration(sample, lambda done, text: progress(done, total, text))
-        frames: list[FrameReport] = []
-        kept: list[Stages] = []
-        last: tuple[Array, float] | None = None
-        for done, i in enumerate(order.indices):
-            progress(len(sample) + done, total, f"fitting {self.sequence.names[i]}")
-            report, stage = self._frame(i, order.reasons.get(i, ""), calibration, last)
-            frames.append(report)
-            if report.good and report.fit is not None:
-                last = report.fit.q, report.t
-            if stage is not None and report.good and i in wanted:
-                kept.append(stage())
-        progress(total, total, "done")
-        return self._track(judged(frames, self.options), calibration, kept)
-
-    def _calibration(self, sample: Sequence[int], progress: Callable[[int, str], None]) -> Calibration:
+    def calibration(self, progress: Callable[[int, str], None] = lambda done, text: None) -> Calibration:
         """What is common to the sequence, from some of its frames."""
+        options = self.options
         if self.arm is None:
-            return as_given(self.sequence.pose, self.options.clock, "no robot to compare")
+            return as_given(self.sequence.pose, options.clock, "no robot to compare")
         glimpses = []
-        for done, i in enumerate(sample):
+        for done, i in enumerate(self.sample):
             progress(done, f"reading {self.sequence.names[i]}")
             try:
                 points = self._points(i)
             except DataError:
                 continue  # the second pass says why
-            glimpses.append(Glimpse(float(self.sequence.t[i]), voxel_grid(points, self.options.filters.voxel).points))
-        progress(len(sample), "calibrating the camera by the arm")
-        rng = np.random.default_rng(self.options.seed)
-        options, source = self.options, self.sequence.source
-        return calibrate(self.arm, glimpses, self.sequence.pose, rng, options.calibration, options.clock, source)
+            glimpses.append(Glimpse(float(self.sequence.t[i]), voxel_grid(points, options.filters.voxel).points))
+        progress(len(self.sample), "calibrating the camera by the arm")
+        rng = np.random.default_rng(options.seed)
+        pose, source = self.sequence.pose, self.sequence.source
+        return calibrate(self.arm, glimpses, pose, rng, options.calibration, options.clock, source)
 
     def _check_clock(self, usable: Sequence[int]) -> None:
         if self.span is None or not usable:
@@ -196,61 +206,32 @@ class _Tracker:
         # before the robot is taken out: among all surfaces, wrong points are few
         return cloud.keep(without_outliers(cloud, filters.neighbours, filters.outlier_ratio)), len(seen)
 
-    def _frame(
-        self, index: int, reason: str, calibration: Calibration, last: tuple[Array, float] | None
-    ) -> tuple[FrameReport, Callable[[], Stages] | None]:
-        """What became of a frame, and its stages if it has a shape.
+    def frame(self, index: int, calibration: Calibration) -> FrameReport:
+        """What became of a frame by itself: nothing of any other frame enters."""
+        return self._work(index, calibration).report
 
-        `reason`: why it is of no use, if that is known; `last`: shape and time of the good frame before.
-        """
-        options, name = self.options, self.sequence.names[index]
+    def stages(self, frame: FrameReport, calibration: Calibration) -> Stages | None:
+        """A frame once more, for pictures; None where its cloud cannot be read."""
+        try:
+            cloud = calibration.state.world(self.sequence.load(frame.index))
+        except DataError:
+            return None
+        work = self._work(frame.index, calibration)
+        filtered = None if work.filtered is None else work.filtered.points
+        return Stages(frame.name, frame.reason, calibration.camera, cloud, filtered, work.skeleton, work.report.fit)
+
+    def unread(self, index: int, calibration: Calibration, reason: str) -> FrameReport:
+        """A frame of which nothing is known but why it is dropped, empty if it is not."""
         stamp = float(self.sequence.t[index])
         t = float(calibration.state.time(stamp))
-        report = FrameReport(index, name, stamp, t, reason, 0, 0, 0, math.nan, 0.0, None)
-        if reason:
-            return report, None
-        try:
-            cloud, raw = self._read(index, calibration)
-        except DataError as error:
-            return replace(report, reason=error.what), None
-        report = replace(report, raw=raw)
-        if self.span is not None and not self.span[0] <= t <= self.span[1]:
-            return replace(report, reason="there are no joint angles at its time"), None
-        rng = np.random.default_rng([options.seed, index])
-        usual = calibration.usual
-        if self.arm is not None and usual is not None:
-            own = own_offset(self.arm, calibration.state, stamp, cloud.points, rng, usual.misfit)
-            if own is not None and math.isfinite(own.std):
-                report = replace(report, delay=own.delay)
-                if is_late(own, options.clock):
-                    return replace(report, reason=f"its stamp is late: by {1e3 * own.delay:.0f} ms"), None
-        q = self.posture(t)
-        if self.robot is not None:
-            cloud = cloud.keep(without_robot(cloud, self.robot, q, options.filters.padding))
-        if len(cloud) < options.filters.least:
-            return replace(report, filtered=len(cloud), reason=f"too few points of the object: {len(cloud)} left"), None
-        if len(cloud) > options.filters.most:
-            cloud = cloud.keep(np.sort(rng.choice(len(cloud), options.filters.most, replace=False)))
-        begun = time.process_time()
-        found = skeleton(cloud, rng, options.walk)
-        report = replace(report, filtered=len(cloud), nodes=len(found.nodes))
-        if not len(found.nodes):
-            return replace(report, reason="no part of the cloud is dense enough for a skeleton"), None
-        rest = cloud.keep(found.connected)
-        part = found.part[found.label[found.connected]]
-        sight = Sight(rest.points, rest.weight, part, found.nodes, calibration.camera)
-        before = () if last is None else (last[0],)
-        fit = self.shape.solve(sight, q, before, None if last is None else (last[0], t - last[1]))
-        spent = time.process_time() - begun
-        report = replace(report, fit=fit, reason=unfit(fit, self.shape, options), seconds=spent)
+        return FrameReport(index, self.sequence.names[index], stamp, t, reason, 0, 0, 0, math.nan, 0.0, None)
 
-        def stages() -> Stages:
-            seen = calibration.state.world(self.sequence.load(index))
-            return Stages(name, seen, rest.points, found, fit, calibration.camera)
+    def judged(self, frames: Sequence[FrameReport]) -> list[FrameReport]:
+        """The frames with those dropped that are unlike the others."""
+        return judged(frames, self.options)
 
-        return report, stages
-
-    def _track(self, frames: Sequence[FrameReport], calibration: Calibration, kept: Sequence[Stages]) -> Track:
+    def finished(self, frames: Sequence[FrameReport], calibration: Calibration) -> Track:
+        """The track of judged frames; `DataError` where none is good."""
         columns = [self.system.points.index(name) for name in self.names]
         points = measured(frames, columns, calibration, self.options, self.sequence.source)
         return Track(
@@ -259,12 +240,60 @@ class _Tracker:
             points.q,
             points.position,
             points.std,
+            points.common,
             tuple(frames),
             calibration,
-            tuple(kept),
+            (),
             self.system.points,
             self.shape.place,
         )
+
+    def _work(self, index: int, calibration: Calibration) -> _Work:
+        options = self.options
+        work = _Work(self.unread(index, calibration, self._reasons.get(index, "")))
+        if work.report.reason:
+            return work
+        stamp, t = work.report.stamp, work.report.t
+        try:
+            cloud, raw = self._read(index, calibration)
+        except DataError as error:
+            return work.dropped(error.what)
+        work.report = replace(work.report, raw=raw)
+        if self.span is not None and not self.span[0] <= t <= self.span[1]:
+            return work.dropped("there are no joint angles at its time")
+        rng = np.random.default_rng([options.seed, index])
+        usual = calibration.usual
+        if self.arm is not None and usual is not None:
+            own = own_offset(self.arm, calibration.state, stamp, cloud.points, rng, usual.misfit)
+            if own is not None and math.isfinite(own.std):
+                work.report = replace(work.report, delay=own.delay)
+                if is_late(own, options.clock):
+                    return work.dropped(f"its stamp is late: by {1e3 * own.delay:.0f} ms")
+        q = self.posture(t)
+        if self.robot is not None:
+            cloud = cloud.keep(without_robot(cloud, self.robot, q, options.filters.padding))
+        work.filtered, work.report = cloud, replace(work.report, filtered=len(cloud))
+        if len(cloud) < options.filters.least:
+            return work.dropped(f"too few points of the object: {len(cloud)} left")
+        if len(cloud) > options.filters.most:
+            cloud = cloud.keep(np.sort(rng.choice(len(cloud), options.filters.most, replace=False)))
+        self._fit(work, cloud, q, rng, calibration.camera)
+        return work
+
+    def _fit(self, work: _Work, cloud: Cloud, q: Array, rng: np.random.Generator, camera: Array) -> None:
+        begun = time.process_time()
+        found = skeleton(cloud, rng, self.options.walk)
+        work.skeleton = found
+        work.report = replace(work.report, filtered=len(cloud), nodes=len(found.nodes))
+        if not len(found.nodes):
+            work.dropped("no part of the cloud is dense enough for a skeleton")
+            return
+        rest = cloud.keep(found.connected)
+        part = found.part[found.label[found.connected]]
+        work.filtered = rest
+        fit = self.shape.solve(Sight(rest.points, rest.weight, part, found.nodes, camera), q)
+        spent = time.process_time() - begun
+        work.report = replace(work.report, fit=fit, reason=unfit(fit, self.shape, self.options), seconds=spent)
 
 
 def _chosen_points(system: System, wanted: tuple[str, ...] | None) -> tuple[str, ...]:
@@ -279,16 +308,18 @@ def _chosen_points(system: System, wanted: tuple[str, ...] | None) -> tuple[str,
 
 
 def _joint_angles(
-    system: System, recording: Recording, known: Sequence[str]
+    system: System, recording: Recording | None, known: Sequence[str]
 ) -> tuple[tuple[float, float] | None, Callable[[float], Array] | None]:
     """Time span of the joints and their angles in the order of `known`, None without a robot."""
     if not known:
         return None, None
+    need = "which the self-filter and the grasps need"
+    if recording is None:
+        hint = "list the recording that was made with the frames under recordings.estimate, or set model.robot to null"
+        raise DataError(f"there is no recording with the joint angles, {need}", where="track", hint=hint)
     joints = recording.joints
     if joints is None:
-        raise DataError(
-            "the recording has no joint angles, which the self-filter and the grasps need", where=recording.name
-        )
+        raise DataError(f"the recording has no joint angles, {need}", where=recording.name)
     for name in known:
         if name not in joints.names:
             raise DataError(
@@ -309,8 +340,8 @@ def _joint_angles(
     return (float(t[0]), float(t[-1])), angles
 
 
-def _by_stamp(stamps: Array) -> _Order:
-    """Frames by time stamp; of no use are those that have none, or that of the one before."""
+def _by_stamp(stamps: Array) -> tuple[tuple[int, ...], dict[int, str]]:
+    """Frames by time stamp, and why some are of no use: they have none, or that of the one before."""
     reasons = {int(i): "its time stamp is not a number" for i in np.flatnonzero(~np.isfinite(stamps))}
     order = sorted(range(len(stamps)), key=lambda i: (math.inf if i in reasons else float(stamps[i]), i))
     before = -math.inf
@@ -320,11 +351,11 @@ def _by_stamp(stamps: Array) -> _Order:
                 reasons[i] = "its time stamp is that of the frame before: a duplicate"
             else:
                 before = float(stamps[i])
-    return _Order(tuple(order), reasons)
+    return tuple(order), reasons
 
 
-def _spread(indices: Sequence[int], most: int) -> list[int]:
+def _spread(indices: Sequence[int], most: int) -> tuple[int, ...]:
     """So many of the indices at most, evenly spread."""
     if len(indices) <= most:
-        return list(indices)
-    return [indices[int(k)] for k in np.linspace(0, len(indices) - 1, most).round()]
+        return tuple(indices)
+    return tuple(indices[int(k)] for k in np.linspace(0, len(indices) - 1, most).round())
