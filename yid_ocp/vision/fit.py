@@ -221,6 +221,8 @@ class ShapeFit:
         held, gap = (ca.substitute(entry, symbols, ca.SX(ca.DM(theta))) for entry in (held, gap))
         self._corners = ca.Function("corners", [q], ca.cse([corners, ca.densify(ca.jacobian(corners, q)[:, columns])]))
         self._seen = ca.Function("seen", [q], ca.cse([seen, ca.densify(ca.jacobian(seen, q)[:, columns])]))
+        holders = [forward_kinematics(tree, q).position(grasp.holder) for grasp in system.grasps]
+        self._holders = ca.Function("holders", [q], [ca.densify(ca.vertcat(ca.SX(0, 1), *holders))])
         self._gap = ca.Function("gap", [q], [ca.densify(gap)])
         self._held = ca.Function("held", [q], ca.cse([held, ca.densify(ca.jacobian(held, q)[:, columns])]))
         # how all this moves as the tubes grow
@@ -520,6 +522,10 @@ class ShapeFit:
         """The tubes at a configuration."""
         corners = np.array(self._corners(q)[0]).reshape(-1, 2, 3)
         return Tubes(corners, self.radius, self.free_ends, self.reach)
+
+    def grips(self, q: ArrayLike) -> Array:
+        """Where the grippers are at a configuration, shape (grasps, 3) [m]."""
+        return np.array(self._holders(np.asarray(q, float))).reshape(-1, 3)
 
     def place(self, q: ArrayLike) -> Array:
         """The system's points at a configuration, shape (np, 3) [m]."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from yid_ocp.errors import DataError
-from yid_ocp.vision.clock import Clock
+from yid_ocp.vision.calibration import Calibration
 from yid_ocp.vision.fit import Fit, ShapeFit
 from yid_ocp.vision.options import TrackOptions
 from yid_ocp.vision.results import FrameReport
@@ -74,7 +74,7 @@ class Measured:
     t : ndarray, shape (M,)
         [s]
     q : ndarray, shape (M, n)
-    position, std : ndarray, shape (M, np, 3)
+    position, std, common : ndarray, shape (M, np, 3)
         [m]; NaN where a point was not seen well enough.
     """
 
@@ -82,10 +82,11 @@ class Measured:
     q: Array
     position: Array
     std: Array
+    common: Array
 
 
 def measured(
-    frames: Sequence[FrameReport], columns: Sequence[int], clock: Clock, options: TrackOptions, source: str
+    frames: Sequence[FrameReport], columns: Sequence[int], calibration: Calibration, options: TrackOptions, source: str
 ) -> Measured:
     """Points of the good frames with standard deviations.
 
@@ -95,7 +96,7 @@ def measured(
         All of them, judged.
     columns : sequence of int
         Of the system's points, those that are wanted.
-    clock : Clock
+    calibration : Calibration
     options : TrackOptions
     source : str
         Where the frames come from.
@@ -112,12 +113,14 @@ def measured(
     t = np.array([frame.t for frame in good])
     position = np.array([fit.points[list(columns)] for fit in fits])
     std = np.hypot(np.array([fit.std[list(columns)] for fit in fits]), options.std_floor)
-    # where the arm seems displaced, so may the object be
-    std = np.hypot(std, np.abs(clock.shift))
-    uncertain = math.hypot(options.stamp_std, clock.std if clock.estimated else 0.0)
+    velocity = np.zeros_like(position)
     if len(t) > 1:
         velocity = np.asarray(CubicSpline(t, position, axis=0)(t, 1))
-        std = np.hypot(std, np.abs(velocity) * uncertain)
+    # a point is where it was at some time of the exposure, which is uniform over that
+    std = np.hypot(std, np.abs(velocity) * math.hypot(options.stamp_std, options.exposure / math.sqrt(12.0)))
+    stamps = np.repeat([frame.stamp for frame in good], len(columns))
+    common = calibration.common_std(position.reshape(-1, 3), velocity.reshape(-1, 3), stamps).reshape(std.shape)
+    std = np.hypot(std, common)
     unseen = np.linalg.norm(std, axis=2) > math.sqrt(3.0) * options.point_std_max
     unseen |= ~np.array([fit.seen[list(columns)] for fit in fits])
     if unseen.all():
@@ -126,11 +129,11 @@ def measured(
             f"no point is known well enough in any frame: the best within {best:.0f} mm,"
             f" point_std_max is {1e3 * options.point_std_max:g} mm",
             where=source,
-            hint=f"check the camera's pose and clock ({clock.message}), or look at the pictures of a frame",
+            hint=f"check the camera's pose and clock ({calibration.message}), or look at the pictures of a frame",
         )
     hidden = unseen[..., None]
     q = np.array([fit.q for fit in fits])
-    return Measured(t, q, np.where(hidden, np.nan, position), np.where(hidden, np.nan, std))
+    return Measured(t, q, *(np.where(hidden, np.nan, entry) for entry in (position, std, common)))
 
 
 def _none_good(frames: Sequence[FrameReport], source: str) -> DataError:

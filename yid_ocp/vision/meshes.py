@@ -231,8 +231,8 @@ class Surfaces:
             normal[chosen] = unit[better] @ pose[:3, :3].T
         return distance, normal, owner
 
-    def cast(self, pinhole: Pinhole, pose: ArrayLike, q: ArrayLike) -> tuple[Array, Array]:
-        """Depth image without noise, and how squarely each pixel's ray meets the surface.
+    def cast(self, pinhole: Pinhole, pose: ArrayLike, q: ArrayLike) -> tuple[Array, Array, NDArray[np.int64]]:
+        """Depth image without noise, how squarely each pixel's ray meets the surface, and whose surface it is.
 
         Parameters
         ----------
@@ -247,12 +247,15 @@ class Surfaces:
             Along the optical axis [m]; infinite where there is nothing.
         cosine : ndarray, shape (height, width)
             Of the angle between ray and surface normal.
+        part : ndarray of int, shape (height, width)
+            Index into `joints`, -1 where there is nothing.
         """
         o3d = open3d_module()
         rays = pinhole.rays
         camera = np.asarray(pose, float)
         depth = np.full(rays.shape[:2], np.inf)
         cosine = np.zeros(rays.shape[:2])
+        owner = np.full(rays.shape[:2], -1)
         for part, placed in enumerate(self.poses(q)):
             rotation = placed[:3, :3].T @ camera[:3, :3]
             origin = placed[:3, :3].T @ (camera[:3, 3] - placed[:3, 3])
@@ -271,7 +274,42 @@ class Surfaces:
             nearer = hit < depth[rows, columns]
             depth[rows, columns] = np.where(nearer, hit, depth[rows, columns])
             cosine[rows, columns] = np.where(nearer, square, cosine[rows, columns])
-        return depth, cosine
+            owner[rows, columns] = np.where(nearer, part, owner[rows, columns])
+        return depth, cosine, owner
+
+    def meet(self, origin: Array, directions: Array, q: ArrayLike) -> tuple[Array, Array, NDArray[np.int64]]:
+        """Where rays first meet a surface, the fixed ones among them.
+
+        Parameters
+        ----------
+        origin : ndarray, shape (3,)
+            Of all rays, in the world [m].
+        directions : ndarray, shape (N, 3)
+        q : array_like, shape (n,)
+
+        Returns
+        -------
+        distance : ndarray, shape (N,)
+            In lengths of the directions; infinite for rays that meet nothing.
+        normal : ndarray, shape (N, 3)
+            Unit vector of the surface, towards the origin.
+        part : ndarray of int, shape (N,)
+            Index into `joints`, -1 for nothing.
+        """
+        o3d = open3d_module()
+        distance, normal = np.full(len(directions), np.inf), np.zeros((len(directions), 3))
+        owner = np.full(len(directions), -1)
+        for part, pose in enumerate(self.poses(q)):
+            local = directions @ pose[:3, :3]
+            start = np.broadcast_to((origin - pose[:3, 3]) @ pose[:3, :3], local.shape)
+            rays = np.ascontiguousarray(np.concatenate([start, local], axis=1), dtype=np.float32)
+            answer = self._scenes[part].cast_rays(o3d.core.Tensor(rays), nthreads=1)
+            hit = answer["t_hit"].numpy().astype(np.float64)
+            nearer = hit < distance
+            distance[nearer], owner[nearer] = hit[nearer], part
+            normal[nearer] = answer["primitive_normals"].numpy()[nearer] @ pose[:3, :3].T
+        away = np.einsum("ij,ij->i", normal, directions) > 0
+        return distance, np.where(away[:, None], -normal, normal), owner
 
     def _window(self, pinhole: Pinhole, rotation: Array, origin: Array, part: int) -> tuple[slice, slice] | None:
         low, high = self._low[part], self._high[part]

@@ -8,6 +8,7 @@ from typing import Annotated
 from annotated_types import Ge, Gt, Le
 
 from yid_ocp.options import About, check
+from yid_ocp.vision.calibration import CalibrationOptions
 from yid_ocp.vision.clock import ClockOptions
 from yid_ocp.vision.filters import FilterOptions
 from yid_ocp.vision.fit import FitOptions
@@ -25,6 +26,9 @@ class TrackOptions:
     clock: Annotated[ClockOptions, About("how the camera's clock is compared with the joints'")] = field(
         default_factory=ClockOptions
     )
+    calibration: Annotated[
+        CalibrationOptions, About("how pose, depth and clock of the camera are estimated from the arm that it sees")
+    ] = field(default_factory=CalibrationOptions)
     d_max: Annotated[
         float,
         Gt(0),
@@ -58,13 +62,14 @@ class TrackOptions:
         float, Gt(0), About("a point that is known less well in a frame counts as not seen there", "m")
     ] = 0.02
     std_floor: Annotated[
-        float,
-        Gt(0),
-        About("standard deviation that no fit is better than: of the camera's pose and of straight links", "m"),
+        float, Gt(0), About("standard deviation that no fit is better than, of straight links in place of a curve", "m")
     ] = 0.003
     stamp_std: Annotated[
         float, Ge(0), About("standard deviation of a frame's time stamp, beyond the common offset", "s")
     ] = 0.003
+    exposure: Annotated[
+        float, Ge(0), About("how long the camera looks for one frame, half of it before its stamp and half behind", "s")
+    ] = 0.0
     points: Annotated[
         tuple[str, ...] | None,
         About("points to write down; those that no arm holds when absent, as arms know theirs better"),

@@ -19,7 +19,7 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.errors import ConfigError, DataError, ModelError, nearest
 from yid_ocp.model.system import System
 from yid_ocp.vision.calibration import Calibration, as_given, calibrate
-from yid_ocp.vision.clock import own_delay
+from yid_ocp.vision.clock import is_late, own_offset
 from yid_ocp.vision.filters import Cloud, ObjectRegion, voxel_grid, without_outliers, without_robot
 from yid_ocp.vision.evidence import Sight
 from yid_ocp.vision.fit import ShapeFit
@@ -27,6 +27,7 @@ from yid_ocp.vision.frames import FrameSequence
 from yid_ocp.vision.judgement import judged, measured, unfit
 from yid_ocp.vision.meshes import Scene, Surfaces, numeric_mechanism, robot_meshes
 from yid_ocp.vision.options import TrackOptions
+from yid_ocp.vision.registration import Arm, Glimpse
 from yid_ocp.vision.results import FrameReport, Stages, Track
 from yid_ocp.vision.skeleton import Skeleton, skeleton
 from yid_ocp.vision.view import View
@@ -37,7 +38,7 @@ Progress = Callable[[int, int, str], None]
 
 _LARGEST = 50.0  # [m]; a depth camera sees no further, a cloud in millimetres always does
 _SAME_TIME = 1e-6  # [s]
-_SAMPLE = 60  # frames, at most, from which what is common to all of them is found
+_GRIP = 0.06  # about a grasp, beyond the tube's radius, a point may be the object's [m]
 
 
 def track(
@@ -137,10 +138,13 @@ class Tracker:
             if all(joint < 0 for joint in meshes):
                 raise ModelError("no link of the robot moves with the model's joints", where=str(scene.urdf))
             self.robot = Surfaces(tree, meshes)
+        self.arm: Arm | None = None
+        if self.robot is not None and self.span is not None:
+            self.arm = Arm(self.robot, self.posture, self.shape.grips, float(self.shape.radius.max()) + _GRIP)
         self.order, self._reasons = _by_stamp(sequence.t)
         usable = [i for i in self.order if i not in self._reasons]
         self._check_clock(usable)
-        self.sample = _spread(usable, _SAMPLE)
+        self.sample = _spread(usable, options.calibration.frames) if self.arm is not None else []
 
     def posture(self, t: float) -> Array:
         """Configuration at a time on the joints' clock, the object at rest; it stays at the recording's ends beyond."""
@@ -151,19 +155,21 @@ class Tracker:
 
     def calibration(self, progress: Callable[[int, str], None] = lambda done, text: None) -> Calibration:
         """What is common to the sequence, from some of its frames."""
-        given = as_given(self.sequence.pose, self.options.clock)
-        clouds, stamps = [], []
+        options = self.options
+        if self.arm is None:
+            return as_given(self.sequence.pose, options.clock, "no robot to compare")
+        glimpses = []
         for done, i in enumerate(self.sample):
             progress(done, f"reading {self.sequence.names[i]}")
             try:
-                clouds.append(self._read(i, given)[0])
+                points = self._points(i)
             except DataError:
                 continue  # the second pass says why
-            stamps.append(float(self.sequence.t[i]))
-        progress(len(self.sample), "comparing the clocks")
-        robot = None if self.span is None else self.robot
-        rng = np.random.default_rng(self.options.seed)
-        return calibrate(robot, clouds, np.array(stamps), self.sequence.pose, self.posture, rng, self.options.clock)
+            glimpses.append(Glimpse(float(self.sequence.t[i]), voxel_grid(points, options.filters.voxel).points))
+        progress(len(self.sample), "calibrating the camera by the arm")
+        rng = np.random.default_rng(options.seed)
+        pose, source = self.sequence.pose, self.sequence.source
+        return calibrate(self.arm, glimpses, pose, rng, options.calibration, options.clock, source)
 
     def _check_clock(self, usable: Sequence[int]) -> None:
         if self.span is None or not usable:
@@ -192,17 +198,22 @@ class Tracker:
 
         return removed
 
-    def _read(self, index: int, calibration: Calibration) -> tuple[Cloud, Array]:
-        """A frame's cloud in the world where the object can be, the robot's points among them, and all its points."""
-        points = calibration.world(self.sequence.load(index))
+    def _points(self, index: int) -> Array:
+        """A frame's finite points in the camera's frame."""
+        points = self.sequence.load(index)
         points = points[np.isfinite(points).all(axis=1)]
         if not len(points):
             raise DataError("the cloud is empty")
         far = float(np.median(np.abs(points).max(axis=1)))
         if far > _LARGEST:
             raise DataError(f"the cloud is not in metres: half of its points are {far:.0f} m away (millimetres?)")
+        return points
+
+    def _read(self, index: int, calibration: Calibration) -> tuple[Cloud, Array]:
+        """A frame's cloud in the world where the object can be, the robot's points among them, and all its points."""
+        points = calibration.state.world(self._points(index))
         filters = self.options.filters
-        q = self.posture(calibration.clock.joint_time(float(self.sequence.t[index])))
+        q = self.posture(float(calibration.state.time(self.sequence.t[index])))
         inside = self.region.at(q, calibration.camera).contains(points)
         if not inside.any():
             raise DataError("no point lies where the object can be: check the camera's pose")
@@ -217,7 +228,7 @@ class Tracker:
     def stages(self, frame: FrameReport, calibration: Calibration) -> Stages | None:
         """A frame once more, for pictures; None where its cloud cannot be read."""
         try:
-            cloud = calibration.world(self.sequence.load(frame.index))
+            cloud = calibration.state.world(self.sequence.load(frame.index))
         except DataError:
             return None
         work = self._work(frame.index, calibration)
@@ -227,7 +238,7 @@ class Tracker:
     def unread(self, index: int, calibration: Calibration, reason: str) -> FrameReport:
         """A frame of which nothing is known but why it is dropped, empty if it is not."""
         stamp = float(self.sequence.t[index])
-        t = calibration.clock.joint_time(stamp)
+        t = float(calibration.state.time(stamp))
         return FrameReport(index, self.sequence.names[index], stamp, t, reason, 0, 0, 0, math.nan, 0.0, None)
 
     def judged(self, frames: Sequence[FrameReport]) -> list[FrameReport]:
@@ -237,19 +248,19 @@ class Tracker:
     def finished(self, frames: Sequence[FrameReport], calibration: Calibration) -> Track:
         """The track of judged frames; `DataError` where none is good."""
         columns = [self.system.points.index(name) for name in self.names]
-        points = measured(frames, columns, calibration.clock, self.options, self.sequence.source)
+        points = measured(frames, columns, calibration, self.options, self.sequence.source)
         return Track(
             self.names,
             points.t,
             points.q,
             points.position,
             points.std,
+            points.common,
             tuple(frames),
-            calibration.clock,
+            calibration,
             (),
             self.system.points,
             self.shape.place,
-            calibration.pose,
         )
 
     def _work(self, index: int, calibration: Calibration) -> _Work:
@@ -266,11 +277,13 @@ class Tracker:
         if self.span is not None and not self.span[0] <= t <= self.span[1]:
             return work.dropped("there are no joint angles at its time")
         rng = np.random.default_rng([options.seed, index])
-        if self.robot is not None and self.span is not None:
-            delay, std = own_delay(self.robot, cloud, stamp, self.posture, calibration.clock, rng, options.clock)
-            work.report = replace(work.report, delay=delay)
-            if abs(delay) > max(options.clock.late, 4 * std):
-                return work.dropped(f"its stamp is late: by {1e3 * delay:.0f} ms")
+        usual = calibration.usual
+        if self.arm is not None and usual is not None:
+            own = own_offset(self.arm, calibration.state, stamp, cloud.points, rng, usual.misfit)
+            if own is not None and math.isfinite(own.std):
+                work.report = replace(work.report, delay=own.delay)
+                if is_late(own, options.clock):
+                    return work.dropped(f"its stamp is late: by {1e3 * own.delay:.0f} ms")
         q = self.posture(t)
         if self.robot is not None:
             cloud = cloud.keep(without_robot(cloud, self.robot, q, options.filters.padding))
@@ -294,7 +307,7 @@ class Tracker:
             return
         rest = cloud.keep(found.connected)
         work.filtered = rest
-        view = View(raw, calibration.pose, self.sequence.intrinsics)
+        view = View(raw, calibration.state.pose, self.sequence.intrinsics)
         sight = Sight(rest.points, rest.weight, found.nodes, calibration.camera, view, self._removed(q, calibration))
         fit = self.shape.solve(sight, q)
         spent = time.process_time() - begun
