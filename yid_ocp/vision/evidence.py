@@ -9,7 +9,7 @@ A station of a tube that no own point lies on is hidden, or it is empty although
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -353,9 +353,7 @@ def _contacts(tree: cKDTree, seen: Sight, shape: Mask, foreign: Mask, within: fl
     return contact
 
 
-def _coverage(
-    tubes: Tubes, seen: Sight, own: Mask, link: Integers, along: Array, gate: float
-) -> tuple[Array, Array]:
+def _coverage(tubes: Tubes, seen: Sight, own: Mask, link: Integers, along: Array, gate: float) -> tuple[Array, Array]:
     """Shares of each link that have own points, and that visibly have none."""
     lengths = tubes.lengths
     count = np.maximum(_STATIONS, np.ceil(lengths / (2 * tubes.radius))).astype(np.int64)
@@ -410,9 +408,7 @@ class _Slices:
         length = float(np.linalg.norm(tip - start))
         thick = max(float(tubes.radius[link]), 2 * spacing)
         behind, ahead = max(3, int(length / thick)), max(3, int(_AHEAD * tubes.reach[link] / thick))
-        return _Slices(
-            tip, (tip - start) / length, float(tubes.radius[link]), thick * np.arange(-behind, ahead + 1.0)
-        )
+        return _Slices(tip, (tip - start) / length, float(tubes.radius[link]), thick * np.arange(-behind, ahead + 1.0))
 
     def place(self, along: float) -> Array:
         return np.asarray(self.tip + along * self.axis)

@@ -37,6 +37,7 @@ Integers = NDArray[np.int64]
 NODE_FACTOR = math.pi / 4
 """Where the mean of a tube's visible half lies, as a share of its radius."""
 
+_SIGMAS = 3.0  # of a point, beyond which an end stands elsewhere than the shape has it
 _RIM = 0.85  # of the radius to either side, within which a tube's depth is compared
 _NEAR = 3.0  # times the last scale, beyond which a point says nothing of the shape
 _TOUCHING = 1e-3  # [m]
@@ -338,16 +339,17 @@ class ShapeFit:
         best = min(tried, key=lambda minimum: minimum.cost)
         last = self._minimise(best, on_points)
         iterations = sum(minimum.iterations for minimum in tried) + last.iterations - best.iterations
-        evidence = gather(self.tubes(last.q), sight, self._near)
+        evidence = gather(self.tubes(last.q), sight, self.near)
         if on_points:
             keep = ~(evidence.contested | evidence.foreign)
             if keep.any():
                 last = self._minimise(last, self._tasks(sight, _Left(left.nodes, keep), previous)[1])
-                evidence = gather(self.tubes(last.q), sight, self._near)
+                evidence = gather(self.tubes(last.q), sight, self.near)
         return _Attempt(replace(last, iterations=iterations + last.iterations), evidence)
 
     @property
-    def _near(self) -> float:
+    def near(self) -> float:
+        """Distance from the surface beyond which a point says nothing of the shape [m]."""
         return (self.options.surface_scales or self.options.scales)[-1] * _NEAR
 
     def _tasks(
@@ -404,10 +406,16 @@ class ShapeFit:
             moved = (jacobian @ self._quadratic(q, every[0]).change(0.0)).reshape(-1, 3)
         corners = self.tubes(q).corners
         swath = self._swath_std(corners, places, evidence, sight.camera)
+        off_end = np.zeros(places.shape)
+        for k, offset in zip(self.free_ends, evidence.ends, strict=True):
+            if abs(offset) > _SIGMAS * max(self.options.noise, evidence.noise):
+                at_end = np.linalg.norm(places - corners[k, 1], axis=1) < _TOUCHING
+                axis = (corners[k, 1] - corners[k, 0]) / np.linalg.norm(corners[k, 1] - corners[k, 0])
+                off_end[at_end] = offset * axis
         return Fit(
             q,
             places,
-            np.sqrt(np.maximum(np.diag(spread), 0.0).reshape(-1, 3) + moved**2 + swath**2),
+            np.sqrt(np.maximum(np.diag(spread), 0.0).reshape(-1, 3) + moved**2 + swath**2 + off_end**2),
             evidence.distance,
             evidence.noise,
             evidence.filled,
@@ -629,9 +637,7 @@ def _owner(system: System, joint: str) -> str:
     return next((s.name for s in system.segments if any(joint in names for names in s.links)), "")
 
 
-def _expressions(
-    system: System, kinematics: Kinematics, options: FitOptions
-) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
+def _expressions(system: System, kinematics: Kinematics, options: FitOptions) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
     """Corners of the links, the system's points, what grasps hold in standard deviations, and their gaps."""
     tree = kinematics.mechanism
     corners = []

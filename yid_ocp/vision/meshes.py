@@ -11,10 +11,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import casadi as ca
 import numpy as np
+from annotated_types import Gt
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import DataError, ModelError
@@ -23,15 +24,38 @@ from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Mechanism
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import robot_file
+from yid_ocp.options import About
 from yid_ocp.vision.frames import open3d_module
 from yid_ocp.vision.lens import Pinhole
 
 Array = NDArray[np.float64]
 MeshKind = Literal["visual", "collision"]
+Size = Annotated[float, Gt(0)]
 
 _FACETS = 48  # of a tube: the surface is then within 0.2 % of the radius
 _TOUCHING = 5e-4  # [m]
 _NEAR = 0.05  # [m]; closer than this a box is not projected but taken to fill the image
+
+
+@dataclass(frozen=True)
+class ExtraMesh:
+    """Something that the robot's URDF does not have: a gripper's body, a table, a camera's stand."""
+
+    link: Annotated[str | None, About("of the robot that carries it; null for the world")] = None
+    mesh: Annotated[str | None, About("file that trimesh reads, in metres: STL, OBJ, DAE", path=True)] = None
+    box: Annotated[tuple[Size, Size, Size] | None, About("in place of a file: edges along x, y, z", "m")] = None
+    cylinder: Annotated[tuple[Size, Size] | None, About("the same: radius and length along z", "m")] = None
+    sphere: Annotated[float | None, Gt(0), About("the same: radius", "m")] = None
+    position: Annotated[tuple[float, float, float], About("of its middle in the frame of the link", "m")] = (
+        0.0,
+        0.0,
+        0.0,
+    )
+    rpy: Annotated[tuple[float, float, float], About("roll, pitch and yaw in the frame of the link", "rad")] = (
+        0.0,
+        0.0,
+        0.0,
+    )
 
 
 @dataclass(frozen=True)
@@ -45,11 +69,14 @@ class Scene:
         File of the robot, for its meshes (`package:baxter`); None for the object alone.
     values : mapping of str to float, optional
         Parameter values (lengths, radii, relative stiffnesses); nominal where absent.
+    extra : sequence of ExtraMesh
+        What stands about that is neither.
     """
 
     system: System
     urdf: str | Path | None = None
     values: Mapping[str, float] | None = None
+    extra: Sequence[ExtraMesh] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -383,12 +410,13 @@ def _shape_mesh(geometry: Any, urdf: Path) -> Mesh | None:
     if geometry.mesh is None:
         return None
     scale = np.ones(3) if geometry.mesh.scale is None else np.asarray(geometry.mesh.scale, float)
-    loaded = _loaded(mesh_file(geometry.mesh.filename, urdf))
+    loaded = file_mesh(mesh_file(geometry.mesh.filename, urdf))
     return replace(loaded, vertices=loaded.vertices * scale)
 
 
 @lru_cache(maxsize=64)
-def _loaded(file: Path) -> Mesh:
+def file_mesh(file: Path) -> Mesh:
+    """Triangles of a file; `ModelError` where it cannot be read."""
     import trimesh
 
     try:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Literal
 
 from annotated_types import Ge, Gt, Le
 
 from yid_ocp.options import About, check
 from yid_ocp.vision.calibration import CalibrationOptions
 from yid_ocp.vision.clock import ClockOptions
+from yid_ocp.vision.doubt import SizeKind
 from yid_ocp.vision.filters import FilterOptions
 from yid_ocp.vision.fit import FitOptions
 from yid_ocp.vision.meshes import MeshKind
@@ -29,12 +30,23 @@ class TrackOptions:
     calibration: Annotated[
         CalibrationOptions, About("how pose, depth and clock of the camera are estimated from the arm that it sees")
     ] = field(default_factory=CalibrationOptions)
+    background: Annotated[
+        Literal["none", "frames"],
+        About(
+            "frames: what stands still in most frames, away from every shape that was fitted, is left out; beside it "
+            "track.background"
+        ),
+    ] = "none"
+    estimate: Annotated[
+        tuple[SizeKind, ...],
+        About("sizes of the tubes that are estimated from the clouds, where these tell them; all are checked anyway"),
+    ] = ()
     d_max: Annotated[
         float,
         Gt(0),
         About(
-            "a frame whose points are further from the fitted shape on average, beyond their noise, is dropped; in radii of "
-            "the tubes"
+            "a frame whose points are further from the fitted shape on average, beyond their noise, is dropped; in "
+            "radii of the tubes"
         ),
     ] = 0.5
     largest_bend: Annotated[

@@ -12,6 +12,8 @@ from scipy.interpolate import CubicSpline
 
 from yid_ocp.data.recording import PointGroup, Recording, validate
 from yid_ocp.vision.calibration import Calibration
+from yid_ocp.vision.clutter import Foreign
+from yid_ocp.vision.doubt import Sizes
 from yid_ocp.vision.fit import Fit
 from yid_ocp.vision.skeleton import Skeleton
 
@@ -113,6 +115,10 @@ class Track:
     frames : tuple of FrameReport
         All of them, by time stamp.
     calibration : Calibration
+    sizes : Sizes
+        What the frames say of the object's lengths and radii.
+    things : tuple of Foreign
+        What stood about the object.
     stages : tuple of Stages
         Of the frames that were asked for and turned out well.
     """
@@ -125,6 +131,8 @@ class Track:
     common: Array
     frames: tuple[FrameReport, ...]
     calibration: Calibration
+    sizes: Sizes
+    things: tuple[Foreign, ...]
     stages: tuple[Stages, ...]
     _system_points: tuple[str, ...]
     _place: Callable[[Array], Array]
@@ -145,6 +153,11 @@ class Track:
     def dropped(self) -> dict[str, int]:
         """How often each reason dropped a frame."""
         return dropped(self.frames)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the frames say of the object's sizes and of things about it, in words."""
+        return (*self.sizes.messages, *(thing.text for thing in self.things))
 
     def group(self) -> PointGroup:
         """The points as a group of a recording, called `points_camera`."""

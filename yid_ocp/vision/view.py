@@ -78,7 +78,9 @@ class View:
         for i in np.flatnonzero(~hidden):
             there = distance[tree.query_ball_point(asked[i], wide[i])]
             limit = depth[i] - radius[i] - margin
-            hidden[i] = np.mean(there < limit) > _HALF if len(there) else self._shadowed(tree, distance, asked[i], limit)
+            hidden[i] = (
+                np.mean(there < limit) > _HALF if len(there) else self._shadowed(tree, distance, asked[i], limit)
+            )
         return hidden
 
     @cached_property
