@@ -1,12 +1,13 @@
 """From a depth camera's clouds to measured points of the object; and a virtual camera that makes such clouds."""
 
+from yid_ocp.vision.calibration import Calibration as Calibration
+from yid_ocp.vision.calibration import CalibrationOptions as CalibrationOptions
 from yid_ocp.vision.camera import Background as Background
 from yid_ocp.vision.camera import DepthCamera as DepthCamera
 from yid_ocp.vision.camera import FrameTiming as FrameTiming
 from yid_ocp.vision.camera import VirtualCamera as VirtualCamera
 from yid_ocp.vision.camera import VirtualFrames as VirtualFrames
 from yid_ocp.vision.camera import virtual_frames as virtual_frames
-from yid_ocp.vision.clock import Clock as Clock
 from yid_ocp.vision.clock import ClockOptions as ClockOptions
 from yid_ocp.vision.filters import FilterOptions as FilterOptions
 from yid_ocp.vision.fit import FitOptions as FitOptions

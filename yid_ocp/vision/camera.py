@@ -238,7 +238,7 @@ class _Images(Sequence[Array]):
         number = int(index)
         if number not in self._kept:
             self._kept.clear()
-            depth, cosine = self.surfaces.cast(self.camera.pinhole, self.pose, self.q[number])
+            depth, cosine, _ = self.surfaces.cast(self.camera.pinhole, self.pose, self.q[number])
             rng = np.random.default_rng([self.seed, number])
             self._kept[number] = self.camera.measure(depth, cosine, rng)
         return self._kept[number]

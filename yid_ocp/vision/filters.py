@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
 import casadi as ca
 import numpy as np
-from annotated_types import Ge, Gt
+from annotated_types import Ge, Gt, Le
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
@@ -20,6 +21,8 @@ from yid_ocp.vision.meshes import Surfaces, numeric_mechanism
 Array = NDArray[np.float64]
 Triple = tuple[float, float, float]
 Mask = NDArray[np.bool_]
+Part = Annotated[float, Ge(0), Le(255)]
+Colour = tuple[Part, Part, Part]
 
 _TO_SIGMA = 1.4826  # from the median absolute deviation of a normal distribution to its standard deviation
 
@@ -83,6 +86,21 @@ class FilterOptions:
             "m",
         ),
     ] = 0.0
+    colours: Annotated[
+        tuple[Colour, ...],
+        About(
+            "of the object: red, green and blue, 0 to 255; points of other colours are left out, where the clouds have "
+            "colours; all are kept when empty"
+        ),
+    ] = ()
+    colour_angle: Annotated[
+        float,
+        Gt(0),
+        Le(math.pi / 2),
+        About(
+            "between a point's and the object's colour as directions, by which light and shade change nothing", "rad"
+        ),
+    ] = 0.2
     neighbours: Annotated[int, Ge(1), About("of every point, whose mean distance tells whether it is alone")] = 12
     outlier_ratio: Annotated[
         float,
@@ -258,6 +276,33 @@ def without_outliers(cloud: Cloud, neighbours: int, ratio: float) -> Mask:
     middle = weighted_median(distance, cloud.weight)
     spread = _TO_SIGMA * weighted_median(np.abs(distance - middle), cloud.weight)
     return np.asarray(distance <= middle + ratio * spread)
+
+
+def of_colours(colours: ArrayLike, wanted: ArrayLike, angle: float) -> Mask:
+    """Which points have one of some colours.
+
+    Parameters
+    ----------
+    colours : array_like, shape (N, 3)
+        Red, green and blue, 0 to 255 (sRGB).
+    wanted : array_like, shape (C, 3)
+    angle : float
+        Largest angle between two colours as directions of linear light, which brightness does not change [rad].
+
+    Returns
+    -------
+    ndarray, shape (N,)
+    """
+    seen, asked = (_light(np.asarray(entry, float)) for entry in (colours, wanted))
+    return np.asarray((seen @ asked.T).max(axis=1) >= math.cos(angle))
+
+
+def _light(colours: Array) -> Array:
+    """Unit directions of linear light; black, which has none, is grey."""
+    share = colours / 255.0
+    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
+    linear = np.maximum(linear, 1e-6)
+    return np.asarray(linear / np.linalg.norm(linear, axis=1)[:, None])
 
 
 def weighted_median(values: Array, weight: Array) -> float:

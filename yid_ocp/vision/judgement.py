@@ -12,26 +12,35 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from yid_ocp.errors import DataError
-from yid_ocp.vision.clock import Clock
+from yid_ocp.vision.clutter import Foreign
+from yid_ocp.vision.common import Common
 from yid_ocp.vision.fit import Fit, ShapeFit
 from yid_ocp.vision.options import TrackOptions
 from yid_ocp.vision.results import FrameReport
 
 Array = NDArray[np.float64]
 
+_MOST_NOTES = 4  # in a hint
+_MEAN_ABS = math.sqrt(2.0 / math.pi)  # of a normal variable, in standard deviations
+
 
 def unfit(fit: Fit, shape: ShapeFit, options: TrackOptions) -> str:
     """Why a frame's fit cannot be used, by itself; empty for a good one."""
     if not np.isfinite(fit.q).all():
         return "the fit failed"
-    if fit.distance > options.d_max:
-        limit = 1e3 * options.d_max
-        return f"the shape does not fit: {1e3 * fit.distance:.1f} mm off on average, d_max is {limit:g} mm"
+    # a mean distance of normal noise is 0.8 of its standard deviation
+    limit = math.hypot(options.d_max * float(shape.radius.mean()), _MEAN_ABS * shape.options.noise)
+    if fit.distance > limit:
+        off = f"{1e3 * fit.distance:.1f} mm off on average, d_max allows {1e3 * limit:.1f} mm"
+        return f"the shape does not fit: {off}"
     bend = float(np.abs((fit.q - shape.rest)[list(shape.bends)]).max())
     if bend > options.largest_bend:
         return f"the shape is folded: a joint is bent by {math.degrees(bend):.0f} degrees"
-    if fit.inliers < options.least_inliers:
-        return f"the shape does not fit: only {100 * fit.inliers:.0f} % of the points lie on it"
+    lengths = np.linalg.norm(fit.centre_line[:, 1] - fit.centre_line[:, 0], axis=1)
+    there, bare = float(lengths @ fit.filled), float(lengths @ fit.empty)
+    if there < options.least_covered * (there + bare):
+        share = 100 * there / (there + bare)
+        return f"the shape does not fit: only {share:.0f} % of its visible length has points of its own"
     return ""
 
 
@@ -67,7 +76,7 @@ class Measured:
     t : ndarray, shape (M,)
         [s]
     q : ndarray, shape (M, n)
-    position, std : ndarray, shape (M, np, 3)
+    position, std, common : ndarray, shape (M, np, 3)
         [m]; NaN where a point was not seen well enough.
     """
 
@@ -75,10 +84,16 @@ class Measured:
     q: Array
     position: Array
     std: Array
+    common: Array
 
 
 def measured(
-    frames: Sequence[FrameReport], columns: Sequence[int], clock: Clock, options: TrackOptions, source: str
+    frames: Sequence[FrameReport],
+    columns: Sequence[int],
+    common: Common,
+    things: Sequence[Foreign],
+    options: TrackOptions,
+    source: str,
 ) -> Measured:
     """Points of the good frames with standard deviations.
 
@@ -88,7 +103,9 @@ def measured(
         All of them, judged.
     columns : sequence of int
         Of the system's points, those that are wanted.
-    clock : Clock
+    common : Common
+    things : sequence of Foreign
+        That stood about the object.
     options : TrackOptions
     source : str
         Where the frames come from.
@@ -100,17 +117,22 @@ def measured(
     """
     good = [frame for frame in frames if frame.good]
     if not good:
-        raise _none_good(frames, source)
+        raise _none_good(frames, [*common.sizes.messages, *(thing.text for thing in things)], source)
     fits = [frame.fit for frame in good if frame.fit is not None]
     t = np.array([frame.t for frame in good])
     position = np.array([fit.points[list(columns)] for fit in fits])
     std = np.hypot(np.array([fit.std[list(columns)] for fit in fits]), options.std_floor)
-    # where the arm seems displaced, so may the object be
-    std = np.hypot(std, np.abs(clock.shift))
-    uncertain = math.hypot(options.stamp_std, clock.std if clock.estimated else 0.0)
+    sizes = common.sizes
+    std = np.hypot(std, np.array([sizes.std_of(fit.sizes.points[list(columns)]) for fit in fits]))
+    velocity = np.zeros_like(position)
     if len(t) > 1:
         velocity = np.asarray(CubicSpline(t, position, axis=0)(t, 1))
-        std = np.hypot(std, np.abs(velocity) * uncertain)
+    # a point is where it was at some time of the exposure, which is uniform over that
+    std = np.hypot(std, np.abs(velocity) * math.hypot(options.stamp_std, options.exposure / math.sqrt(12.0)))
+    stamps = np.repeat([frame.stamp for frame in good], len(columns))
+    calibration = common.calibration
+    shared = calibration.common_std(position.reshape(-1, 3), velocity.reshape(-1, 3), stamps).reshape(std.shape)
+    std = np.hypot(std, shared)
     unseen = np.linalg.norm(std, axis=2) > math.sqrt(3.0) * options.point_std_max
     unseen |= ~np.array([fit.seen[list(columns)] for fit in fits])
     if unseen.all():
@@ -119,17 +141,24 @@ def measured(
             f"no point is known well enough in any frame: the best within {best:.0f} mm,"
             f" point_std_max is {1e3 * options.point_std_max:g} mm",
             where=source,
-            hint=f"check the camera's pose and clock ({clock.message}), or look at the pictures of a frame",
+            hint=_hint(
+                [*sizes.messages, *(thing.text for thing in things)],
+                f"check the camera's pose and clock ({calibration.message}), or look at the pictures of a frame",
+            ),
         )
     hidden = unseen[..., None]
     q = np.array([fit.q for fit in fits])
-    return Measured(t, q, np.where(hidden, np.nan, position), np.where(hidden, np.nan, std))
+    return Measured(t, q, *(np.where(hidden, np.nan, entry) for entry in (position, std, shared)))
 
 
-def _none_good(frames: Sequence[FrameReport], source: str) -> DataError:
+def _none_good(frames: Sequence[FrameReport], notes: Sequence[str], source: str) -> DataError:
     count = Counter(frame.reason for frame in frames).most_common(3)
     listed = "; ".join(f"{reason} ({number} of {len(frames)})" for reason, number in count)
     hint = "check the camera's pose, the unit of the clouds and the filters, and look at the pictures of a frame"
-    if "metres" in listed:
-        hint = "say in camera.json that the unit is mm"
+    hint = "say in camera.json that the unit is mm" if "metres" in listed else _hint(notes, hint)
     return DataError(f"not one frame could be used: {listed}", where=source, hint=hint)
+
+
+def _hint(notes: Sequence[str], otherwise: str) -> str:
+    """What is known to be wrong with the object or stands about it comes before general advice."""
+    return "; ".join([*notes[:_MOST_NOTES], otherwise])

@@ -11,10 +11,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import casadi as ca
 import numpy as np
+from annotated_types import Gt
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import DataError, ModelError
@@ -23,15 +24,38 @@ from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Mechanism
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import robot_file
+from yid_ocp.options import About
 from yid_ocp.vision.frames import open3d_module
 from yid_ocp.vision.lens import Pinhole
 
 Array = NDArray[np.float64]
 MeshKind = Literal["visual", "collision"]
+Size = Annotated[float, Gt(0)]
 
 _FACETS = 48  # of a tube: the surface is then within 0.2 % of the radius
 _TOUCHING = 5e-4  # [m]
 _NEAR = 0.05  # [m]; closer than this a box is not projected but taken to fill the image
+
+
+@dataclass(frozen=True)
+class ExtraMesh:
+    """Something that the robot's URDF does not have: a gripper's body, a table, a camera's stand."""
+
+    link: Annotated[str | None, About("of the robot that carries it; null for the world")] = None
+    mesh: Annotated[str | None, About("file that trimesh reads, in metres: STL, OBJ, DAE", path=True)] = None
+    box: Annotated[tuple[Size, Size, Size] | None, About("in place of a file: edges along x, y, z", "m")] = None
+    cylinder: Annotated[tuple[Size, Size] | None, About("the same: radius and length along z", "m")] = None
+    sphere: Annotated[float | None, Gt(0), About("the same: radius", "m")] = None
+    position: Annotated[tuple[float, float, float], About("of its middle in the frame of the link", "m")] = (
+        0.0,
+        0.0,
+        0.0,
+    )
+    rpy: Annotated[tuple[float, float, float], About("roll, pitch and yaw in the frame of the link", "rad")] = (
+        0.0,
+        0.0,
+        0.0,
+    )
 
 
 @dataclass(frozen=True)
@@ -45,11 +69,14 @@ class Scene:
         File of the robot, for its meshes (`package:baxter`); None for the object alone.
     values : mapping of str to float, optional
         Parameter values (lengths, radii, relative stiffnesses); nominal where absent.
+    extra : sequence of ExtraMesh
+        What stands about that is neither.
     """
 
     system: System
     urdf: str | Path | None = None
     values: Mapping[str, float] | None = None
+    extra: Sequence[ExtraMesh] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,8 +258,8 @@ class Surfaces:
             normal[chosen] = unit[better] @ pose[:3, :3].T
         return distance, normal, owner
 
-    def cast(self, pinhole: Pinhole, pose: ArrayLike, q: ArrayLike) -> tuple[Array, Array]:
-        """Depth image without noise, and how squarely each pixel's ray meets the surface.
+    def cast(self, pinhole: Pinhole, pose: ArrayLike, q: ArrayLike) -> tuple[Array, Array, NDArray[np.int64]]:
+        """Depth image without noise, how squarely each pixel's ray meets the surface, and whose surface it is.
 
         Parameters
         ----------
@@ -247,12 +274,15 @@ class Surfaces:
             Along the optical axis [m]; infinite where there is nothing.
         cosine : ndarray, shape (height, width)
             Of the angle between ray and surface normal.
+        part : ndarray of int, shape (height, width)
+            Index into `joints`, -1 where there is nothing.
         """
         o3d = open3d_module()
         rays = pinhole.rays
         camera = np.asarray(pose, float)
         depth = np.full(rays.shape[:2], np.inf)
         cosine = np.zeros(rays.shape[:2])
+        owner = np.full(rays.shape[:2], -1)
         for part, placed in enumerate(self.poses(q)):
             rotation = placed[:3, :3].T @ camera[:3, :3]
             origin = placed[:3, :3].T @ (camera[:3, 3] - placed[:3, 3])
@@ -271,7 +301,42 @@ class Surfaces:
             nearer = hit < depth[rows, columns]
             depth[rows, columns] = np.where(nearer, hit, depth[rows, columns])
             cosine[rows, columns] = np.where(nearer, square, cosine[rows, columns])
-        return depth, cosine
+            owner[rows, columns] = np.where(nearer, part, owner[rows, columns])
+        return depth, cosine, owner
+
+    def meet(self, origin: Array, directions: Array, q: ArrayLike) -> tuple[Array, Array, NDArray[np.int64]]:
+        """Where rays first meet a surface, the fixed ones among them.
+
+        Parameters
+        ----------
+        origin : ndarray, shape (3,)
+            Of all rays, in the world [m].
+        directions : ndarray, shape (N, 3)
+        q : array_like, shape (n,)
+
+        Returns
+        -------
+        distance : ndarray, shape (N,)
+            In lengths of the directions; infinite for rays that meet nothing.
+        normal : ndarray, shape (N, 3)
+            Unit vector of the surface, towards the origin.
+        part : ndarray of int, shape (N,)
+            Index into `joints`, -1 for nothing.
+        """
+        o3d = open3d_module()
+        distance, normal = np.full(len(directions), np.inf), np.zeros((len(directions), 3))
+        owner = np.full(len(directions), -1)
+        for part, pose in enumerate(self.poses(q)):
+            local = directions @ pose[:3, :3]
+            start = np.broadcast_to((origin - pose[:3, 3]) @ pose[:3, :3], local.shape)
+            rays = np.ascontiguousarray(np.concatenate([start, local], axis=1), dtype=np.float32)
+            answer = self._scenes[part].cast_rays(o3d.core.Tensor(rays), nthreads=1)
+            hit = answer["t_hit"].numpy().astype(np.float64)
+            nearer = hit < distance
+            distance[nearer], owner[nearer] = hit[nearer], part
+            normal[nearer] = answer["primitive_normals"].numpy()[nearer] @ pose[:3, :3].T
+        away = np.einsum("ij,ij->i", normal, directions) > 0
+        return distance, np.where(away[:, None], -normal, normal), owner
 
     def _window(self, pinhole: Pinhole, rotation: Array, origin: Array, part: int) -> tuple[slice, slice] | None:
         low, high = self._low[part], self._high[part]
@@ -345,12 +410,13 @@ def _shape_mesh(geometry: Any, urdf: Path) -> Mesh | None:
     if geometry.mesh is None:
         return None
     scale = np.ones(3) if geometry.mesh.scale is None else np.asarray(geometry.mesh.scale, float)
-    loaded = _loaded(mesh_file(geometry.mesh.filename, urdf))
+    loaded = file_mesh(mesh_file(geometry.mesh.filename, urdf))
     return replace(loaded, vertices=loaded.vertices * scale)
 
 
 @lru_cache(maxsize=64)
-def _loaded(file: Path) -> Mesh:
+def file_mesh(file: Path) -> Mesh:
+    """Triangles of a file; `ModelError` where it cannot be read."""
     import trimesh
 
     try:

@@ -133,7 +133,7 @@ def draw_track(track: Track, file: str | os.PathLike[str]) -> None:
         panel.set_ylabel(f"{name} [mm]")
     axes[0].legend(loc="upper right", ncols=3, frameon=False)
     axes[0].set_title(
-        f"about the mean, two standard deviations; dotted: dropped frames\n{track.clock.message}", fontsize=9
+        f"about the mean, two standard deviations; dotted: dropped frames\n{track.calibration.message}", fontsize=9
     )
     axes[-1].set_xlabel("t [s]")
     with new_file(Path(file)) as temporary:

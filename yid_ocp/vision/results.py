@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from yid_ocp.data.recording import PointGroup, Recording, validate
-from yid_ocp.vision.clock import Clock
+from yid_ocp.vision.calibration import Calibration
+from yid_ocp.vision.clutter import Foreign
+from yid_ocp.vision.doubt import Sizes
 from yid_ocp.vision.fit import Fit
 from yid_ocp.vision.skeleton import Skeleton
 
@@ -110,11 +112,16 @@ class Track:
         Times of the good frames on the joints' clock [s].
     q : ndarray, shape (M, n)
         Configurations, twists at rest.
-    position, std : ndarray, shape (M, np, 3)
-        [m]; NaN where a point was not seen well enough.
+    position, std, common : ndarray, shape (M, np, 3)
+        [m]; NaN where a point was not seen well enough. `common`: of `std`, what all frames have in common, from the
+        camera's pose, depth and clock.
     frames : tuple of FrameReport
         All of them, by time stamp.
-    clock : Clock
+    calibration : Calibration
+    sizes : Sizes
+        What the frames say of the object's lengths and radii.
+    things : tuple of Foreign
+        What stood about the object.
     note : str
         How the root was told from other ends; empty where the model says where it is.
     stages : tuple of Stages
@@ -126,13 +133,15 @@ class Track:
     q: Array
     position: Array
     std: Array
+    common: Array
     frames: tuple[FrameReport, ...]
-    clock: Clock
+    calibration: Calibration
+    sizes: Sizes
+    things: tuple[Foreign, ...]
     note: str
     stages: tuple[Stages, ...]
     _system_points: tuple[str, ...]
     _place: Callable[[Array], Array]
-    _pose: Array
 
     def shape(self, t: float) -> Array:
         """Configuration at any time between the good frames, by a cubic spline through theirs, shape (n,).
@@ -151,11 +160,17 @@ class Track:
         """How often each reason dropped a frame."""
         return dropped(self.frames)
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the frames say of the object's sizes and of things about it, in words."""
+        return (*self.sizes.messages, *(thing.text for thing in self.things))
+
     def group(self) -> PointGroup:
         """The points as a group of a recording, called `points_camera`."""
-        return PointGroup(
-            GROUP, self.names, self.t, self.position, self.std, "depth camera, fitted shape", pose=self._pose
-        )
+        pose, words = self.calibration.state.pose, "depth camera, fitted shape"
+        if np.nanmax(self.common) > 0:
+            words += f"; of std, {1e3 * np.nanmedian(self.common):.1f} mm (median) are one error of all frames"
+        return PointGroup(GROUP, self.names, self.t, self.position, self.std, words, pose=pose)
 
     def recording(self, recording: Recording | None) -> Recording:
         """A recording with these points in place of any `points_camera` that it had; `DataError` as `validate`.
@@ -164,7 +179,9 @@ class Track:
         """
         recording = Recording(source="depth camera", name="camera") if recording is None else recording
         others = tuple(group for group in recording.points if group.name != GROUP)
-        text = f"{recording.description} Points of {len(self.t)} of {len(self.frames)} frames; {self.clock.message}."
+        text = (
+            f"{recording.description} Points of {len(self.t)} of {len(self.frames)} frames; {self.calibration.message}."
+        )
         made = replace(recording, points=(*others, self.group()), description=text.strip(), sha256=None)
         # the positions of a straight object belong to the group that a file lists first
         if not others or others[0] is not recording.points[0] or others[0].name > GROUP:

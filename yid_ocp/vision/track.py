@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,26 +20,35 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.errors import ConfigError, DataError, ModelError, nearest
 from yid_ocp.model.system import System
 from yid_ocp.vision.calibration import Calibration, as_given, calibrate
-from yid_ocp.vision.clock import own_delay
+from yid_ocp.vision.clock import is_late, own_offset
+from yid_ocp.vision.clutter import Background, Foreign, extra_meshes, foreign
+from yid_ocp.vision.common import Common
+from yid_ocp.vision.doubt import Sizes, ask_sizes
 from yid_ocp.vision.ends import told, touching
-from yid_ocp.vision.filters import Cloud, ObjectRegion, voxel_grid, without_outliers, without_robot
-from yid_ocp.vision.fit import Fit, ShapeFit, Sight
+from yid_ocp.vision.evidence import Sight
+from yid_ocp.vision.filters import Cloud, ObjectRegion, of_colours, voxel_grid, without_outliers, without_robot
+from yid_ocp.vision.fit import Fit, ShapeFit
 from yid_ocp.vision.frames import FrameSequence
 from yid_ocp.vision.judgement import judged, measured, unfit
-from yid_ocp.vision.meshes import Scene, Surfaces, numeric_mechanism, robot_meshes
+from yid_ocp.vision.meshes import Mesh, Scene, Surfaces, numeric_mechanism, robot_meshes
 from yid_ocp.vision.options import TrackOptions
+from yid_ocp.vision.registration import Arm, Glimpse
 from yid_ocp.vision.results import FrameReport, Stages, Track
 from yid_ocp.vision.skeleton import Skeleton, skeleton
 from yid_ocp.vision.starts import Starts, loosened
 from yid_ocp.vision.trace import traced
+from yid_ocp.vision.view import View
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 Progress = Callable[[int, int, str], None]
+_Given = tuple[Array, View, Callable[[Array], Mask]]
 
+_ASKED = 12  # frames, at most, that are asked about the object's sizes
 _LARGEST = 50.0  # [m]; a depth camera sees no further, a cloud in millimetres always does
 _SAME_TIME = 1e-6  # [s]
 _AS_GOOD = 1.2  # times the distance of the best shape, up to which another one may be the right one
-_SAMPLE = 60  # frames, at most, from which what is common to all of them is found
+_GRIP = 0.06  # about a grasp, beyond the tube's radius, a point may be the object's [m]
 
 
 def track(
@@ -49,6 +58,7 @@ def track(
     options: TrackOptions | None = None,
     *,
     stages: Sequence[int] = (),
+    empty: FrameSequence | None = None,
     progress: Progress | None = None,
 ) -> Track:
     """Measure the object's points in a sequence.
@@ -64,6 +74,8 @@ def track(
     options : TrackOptions, optional
     stages : sequence of int
         Frames of the frame sequence of which all stages are kept for pictures, as far as they can be read.
+    empty : FrameSequence, optional
+        Frames of the scene without robot and object, by the same camera: a background.
     progress : callable, optional
         Called with frames done, frames in all and what is being done.
 
@@ -80,17 +92,17 @@ def track(
     ModelError
         Meshes that cannot be read.
     """
-    tracker = Tracker(scene, recording, sequence, options or TrackOptions())
+    tracker = Tracker(scene, recording, sequence, options or TrackOptions(), empty)
     told = progress or (lambda done, total, text: None)
     total = len(tracker.sample) + len(tracker.order)
-    calibration = tracker.calibration(lambda done, text: told(done, total, text))
+    common = tracker.common(lambda done, text: told(done, total, text))
     frames = []
     for done, i in enumerate(tracker.order, start=len(tracker.sample)):
         told(done, total, f"fitting {sequence.names[i]}")
-        frames.append(tracker.frame(i, calibration))
+        frames.append(tracker.frame(i, common))
     told(total, total, "done")
-    found = tracker.finished(*tracker.judged(frames), calibration)
-    drawn = (tracker.stages(frame, calibration) for frame in found.frames if frame.index in stages)
+    found = tracker.finished(*tracker.judged(frames), common)
+    drawn = (tracker.stages(frame, common) for frame in found.frames if frame.index in stages)
     return replace(found, stages=tuple(entry for entry in drawn if entry is not None))
 
 
@@ -107,12 +119,21 @@ class _Work:
         return self
 
 
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """What a frame shows, once for every way in which it may, the robot's configuration, and where searches begin."""
+
+    sights: tuple[Sight, ...]
+    q: Array
+    starts: tuple[tuple[Array, ...], ...]
+
+
 class Tracker:
     """What is needed for any frame of a sequence, whichever process works on it.
 
     Parameters
     ----------
-    scene, recording, sequence, options
+    scene, recording, sequence, options, empty
         As `track`.
 
     Attributes
@@ -124,10 +145,15 @@ class Tracker:
     """
 
     def __init__(
-        self, scene: Scene, recording: Recording | None, sequence: FrameSequence, options: TrackOptions
+        self,
+        scene: Scene,
+        recording: Recording | None,
+        sequence: FrameSequence,
+        options: TrackOptions,
+        empty: FrameSequence | None = None,
     ) -> None:
         system, values = scene.system, scene.values
-        loose: tuple[str, ...] = ()
+        self._loose: tuple[str, ...] = ()
         anywhere = options.root != "model"
         if anywhere:
             if scene.urdf is not None:
@@ -135,25 +161,35 @@ class Tracker:
                 raise ConfigError(
                     "a robot holds the object: its root is where the model has it", where="root", hint=hint
                 )
-            system, loose = loosened(system, values)
-        self.system, self.sequence, self.options = system, sequence, options
-        self.shape = ShapeFit(system, options.fit, values, loose)
+            system, self._loose = loosened(system, values)
+        self.system, self.values, self.sequence, self.options, self.empty = system, values, sequence, options, empty
+        self.shape = self._shape_of(values)
         self.starts = self.shape.starts() if anywhere else None
         self.names = _chosen_points(system, options.points)
         self.region = ObjectRegion(system, options.filters, values, anywhere=anywhere)
         # of a root that is sought nothing that was recorded is needed
         self.span, self.angles = _joint_angles(system, recording, () if anywhere else self.shape.known)
         tree = numeric_mechanism(system, values)
-        self.robot: Surfaces | None = None
+        meshes: dict[int, Mesh] = {}
         if scene.urdf is not None:
             meshes = robot_meshes(scene.urdf, tree, options.mesh)
             if all(joint < 0 for joint in meshes):
                 raise ModelError("no link of the robot moves with the model's joints", where=str(scene.urdf))
-            self.robot = Surfaces(tree, meshes)
+        for joint, extra in extra_meshes(scene.extra, tree).items():
+            meshes[joint] = Mesh.joined([*([meshes[joint]] if joint in meshes else []), *extra])
+        self.robot = Surfaces(tree, meshes) if meshes else None
+        self.arm: Arm | None = None
+        if self.robot is not None and self.span is not None and scene.urdf is not None:
+            self.arm = Arm(self.robot, self.posture, self.shape.grips, float(self.shape.radius.max()) + _GRIP)
         self.order, self._reasons = _by_stamp(sequence.t)
         usable = [i for i in self.order if i not in self._reasons]
         self._check_clock(usable)
-        self.sample = _spread(usable, _SAMPLE)
+        if options.filters.colours and sequence.colours is None:
+            hint = "leave track.options.filters.colours out, or record clouds with colours"
+            raise DataError("the clouds have no colours", where=sequence.source, hint=hint)
+        self._asked = _spread(usable, _ASKED)
+        self._shapes: dict[tuple[float, ...], ShapeFit] = {(): self.shape}
+        self.sample = _spread(usable, options.calibration.frames) if self.arm is not None else []
 
     def posture(self, t: float) -> Array:
         """Configuration at a time on the joints' clock, the object at rest; it stays at the recording's ends beyond."""
@@ -162,21 +198,55 @@ class Tracker:
             q[[self.system.mechanism.joint_index(name) for name in self.shape.known]] = self.angles(t)
         return q
 
-    def calibration(self, progress: Callable[[int, str], None] = lambda done, text: None) -> Calibration:
+    def common(self, progress: Callable[[int, str], None] = lambda done, text: None) -> Common:
         """What is common to the sequence, from some of its frames."""
-        given = as_given(self.sequence.pose, self.options.clock)
-        clouds, stamps = [], []
+        calibration = self._calibration(progress)
+        progress(len(self.sample), "comparing the object's sizes")
+        background = Background()
+        filters, noise = self.options.filters, self.options.fit.noise
+        if self.empty is not None:
+            clouds = [calibration.state.world(self._finite(self.empty, i)[0]) for i in range(len(self.empty))]
+            background = Background.empty_scene(clouds, filters.voxel, noise)
+        looks = [look for i in self._asked if (look := self._look(i, calibration, background)) is not None]
+        last: list[tuple[ShapeFit, Fit]] = []
+
+        def fitted(values: Mapping[str, float], starts: Sequence[Array]) -> list[Fit]:
+            shape = self._shape_of(values)
+            before: list[Array | None] = list(starts) if len(starts) == len(looks) else [None] * len(looks)
+            last[:] = [
+                (shape, shape.solve(look.sights[0], look.q, look.starts[0] if start is None else (start,)))
+                for look, start in zip(looks, before, strict=True)
+            ]
+            return [fit for _, fit in last]
+
+        sizes = ask_sizes(self.system, self.values, self.options.estimate, noise, fitted)
+        if self.options.background == "frames":
+            shapes = [shape.tubes(fit.q) for shape, fit in last if not unfit(fit, shape, self.options)]
+            clouds = [look.sights[0].points for look in looks]
+            still = Background.still(clouds, shapes, 2 * filters.voxel, noise, self.shape.near)
+            if len(background.points):
+                still = Background(
+                    np.concatenate([still.points, background.points]), max(still.within, background.within)
+                )
+            background = still
+        return Common(calibration, sizes, background)
+
+    def _calibration(self, progress: Callable[[int, str], None]) -> Calibration:
+        options = self.options
+        if self.arm is None:
+            return as_given(self.sequence.pose, options.clock, "no robot to compare")
+        glimpses = []
         for done, i in enumerate(self.sample):
             progress(done, f"reading {self.sequence.names[i]}")
             try:
-                clouds.append(self._read(i, given)[0])
+                points = self._points(i)
             except DataError:
                 continue  # the second pass says why
-            stamps.append(float(self.sequence.t[i]))
-        progress(len(self.sample), "comparing the clocks")
-        robot = None if self.span is None else self.robot
-        rng = np.random.default_rng(self.options.seed)
-        return calibrate(robot, clouds, np.array(stamps), self.sequence.pose, self.posture, rng, self.options.clock)
+            glimpses.append(Glimpse(float(self.sequence.t[i]), voxel_grid(points, options.filters.voxel).points))
+        progress(len(self.sample), "calibrating the camera by the arm")
+        rng = np.random.default_rng(options.seed)
+        pose, source = self.sequence.pose, self.sequence.source
+        return calibrate(self.arm, glimpses, pose, rng, options.calibration, options.clock, source)
 
     def _check_clock(self, usable: Sequence[int]) -> None:
         if self.span is None or not usable:
@@ -192,43 +262,86 @@ class Tracker:
                 " both started together",
             )
 
-    def _read(self, index: int, calibration: Calibration) -> tuple[Cloud, int]:
-        """A frame's cloud in the world where the object can be, the robot's points among them, and how many it had."""
-        points = calibration.world(self.sequence.load(index))
-        count = len(points)
-        points = points[np.isfinite(points).all(axis=1)]
+    def _shape(self, sizes: Sizes) -> ShapeFit:
+        """The object with the sizes that were estimated."""
+        key = tuple(np.where(sizes.used, sizes.change, 0.0).tolist()) if any(sizes.used) else ()
+        if key not in self._shapes:
+            self._shapes[key] = self._shape_of(sizes.values(self.system, self.values))
+        return self._shapes[key]
+
+    def _shape_of(self, values: Mapping[str, float] | None) -> ShapeFit:
+        return ShapeFit(self.system, self.options.fit, values, self._loose)
+
+    def _removed(self, q: Array, calibration: Calibration, background: Background) -> Callable[[Array], Mask]:
+        """Which places the filters leave no points of, the robot at a configuration."""
+        region, padding = self.region.at(q, calibration.camera), self.options.filters.padding
+        within = padding + float(self.shape.radius.max())
+
+        def removed(places: Array) -> Mask:
+            gone = ~region.contains(places)
+            if self.robot is not None:
+                gone |= np.isfinite(self.robot.distance(places, q, within))
+            return gone | background.contains(places, float(self.shape.radius.max()))
+
+        return removed
+
+    def _points(self, index: int) -> Array:
+        """A frame's finite points in the camera's frame."""
+        return self._finite(self.sequence, index)[0]
+
+    @staticmethod
+    def _finite(sequence: FrameSequence, index: int) -> tuple[Array, Mask]:
+        """A frame's finite points in the camera's frame, and which of all its points they are."""
+        points = sequence.load(index)
+        finite: Mask = np.asarray(np.isfinite(points).all(axis=1))
+        points = points[finite]
         if not len(points):
             raise DataError("the cloud is empty")
         far = float(np.median(np.abs(points).max(axis=1)))
         if far > _LARGEST:
             raise DataError(f"the cloud is not in metres: half of its points are {far:.0f} m away (millimetres?)")
+        return points, finite
+
+    def _read(self, index: int, calibration: Calibration) -> tuple[Cloud, Array]:
+        """A frame's cloud in the world where the object can be, the robot's points among them, and all its points."""
+        found, finite = self._finite(self.sequence, index)
+        points = calibration.state.world(found)
         filters = self.options.filters
-        q = self.posture(calibration.clock.joint_time(float(self.sequence.t[index])))
+        q = self.posture(float(calibration.state.time(self.sequence.t[index])))
         inside = self.region.at(q, calibration.camera).contains(points)
         if not inside.any():
             raise DataError("no point lies where the object can be: check the camera's pose")
+        if filters.colours and self.sequence.colours is not None:
+            colours = self.sequence.colours(index)
+            if colours is None:
+                raise DataError("the cloud has no colours")
+            inside[inside] = of_colours(colours[finite][inside], filters.colours, filters.colour_angle)
+            if not inside.any():
+                raise DataError("no point has one of the object's colours: check filters.colours")
         cloud = voxel_grid(points[inside], filters.voxel)
         # before the robot is taken out: among all surfaces, wrong points are few
-        return cloud.keep(without_outliers(cloud, filters.neighbours, filters.outlier_ratio)), count
+        return cloud.keep(without_outliers(cloud, filters.neighbours, filters.outlier_ratio)), points
 
-    def frame(self, index: int, calibration: Calibration) -> FrameReport:
+    def frame(self, index: int, common: Common) -> FrameReport:
         """What became of a frame by itself: nothing of any other frame enters."""
-        return self._work(index, calibration).report
+        return self._work(index, common).report
 
-    def stages(self, frame: FrameReport, calibration: Calibration) -> Stages | None:
+    def stages(self, frame: FrameReport, common: Common) -> Stages | None:
         """A frame once more, for pictures; None where its cloud cannot be read."""
         try:
-            cloud = calibration.world(self.sequence.load(frame.index))
+            cloud = common.calibration.state.world(self.sequence.load(frame.index))
         except DataError:
             return None
-        work = self._work(frame.index, calibration)
+        work = self._work(frame.index, common)
         filtered = None if work.filtered is None else work.filtered.points
-        return Stages(frame.name, frame.reason, calibration.camera, cloud, filtered, work.skeleton, work.report.fit)
+        return Stages(
+            frame.name, frame.reason, common.calibration.camera, cloud, filtered, work.skeleton, work.report.fit
+        )
 
     def unread(self, index: int, calibration: Calibration, reason: str) -> FrameReport:
         """A frame of which nothing is known but why it is dropped, empty if it is not."""
         stamp = float(self.sequence.t[index])
-        t = calibration.clock.joint_time(stamp)
+        t = float(calibration.state.time(stamp))
         return FrameReport(index, self.sequence.names[index], stamp, t, reason, 0, 0, 0, math.nan, 0.0, None)
 
     def judged(self, frames: Sequence[FrameReport]) -> tuple[list[FrameReport], str]:
@@ -236,89 +349,133 @@ class Tracker:
         rooted, note = told(frames, self.options)
         return judged(rooted, self.options), note
 
-    def finished(self, frames: Sequence[FrameReport], note: str, calibration: Calibration) -> Track:
+    def finished(self, frames: Sequence[FrameReport], note: str, common: Common) -> Track:
         """The track of judged frames; `DataError` where none is good."""
         columns = [self.system.points.index(name) for name in self.names]
-        points = measured(frames, columns, calibration.clock, self.options, self.sequence.source)
+        things = self.things(frames)
+        points = measured(frames, columns, common, things, self.options, self.sequence.source)
         return Track(
             self.names,
             points.t,
             points.q,
             points.position,
             points.std,
+            points.common,
             tuple(frames),
-            calibration.clock,
+            common.calibration,
+            common.sizes,
+            things,
             note,
             (),
             self.system.points,
-            self.shape.place,
-            calibration.pose,
+            self._shape(common.sizes).place,
         )
 
-    def _work(self, index: int, calibration: Calibration) -> _Work:
-        options = self.options
-        work = _Work(self.unread(index, calibration, self._reasons.get(index, "")))
-        if work.report.reason:
+    def things(self, frames: Sequence[FrameReport]) -> tuple[Foreign, ...]:
+        """What stood about the object in the frames that were fitted."""
+        fitted = [(frame.t, frame.fit) for frame in frames if frame.fit is not None]
+        if not fitted:
+            return ()
+        corners = np.concatenate([fit.centre_line.reshape(-1, 3) for _, fit in fitted])
+        radius = float(self.shape.radius.max())
+        box = corners.min(axis=0) - radius, corners.max(axis=0) + radius
+        seen, noise = [(t, fit.things) for t, fit in fitted], self.options.fit.noise
+        return foreign(seen, len(fitted), noise, box, self._links, self.sequence.colours is not None)
+
+    def _links(self, t: float) -> dict[str, Array]:
+        """Poses of what moves with the robot at a time, by the names of the joints."""
+        if self.robot is None:
+            return {}
+        poses = self.robot.poses(self.posture(t))
+        names = self.system.mechanism.joint_names
+        return {
+            _link_of(self.system, names[j]): pose for j, pose in zip(self.robot.joints, poses, strict=True) if j >= 0
+        }
+
+    def _work(self, index: int, common: Common) -> _Work:
+        work = _Work(self.unread(index, common.calibration, self._reasons.get(index, "")))
+        look = self._prepared(work, common.calibration, common.background)
+        if look is None:
             return work
-        stamp, t = work.report.stamp, work.report.t
+        begun = time.process_time()
+        shape = self._shape(common.sizes)
+        fits = [shape.solve(sight, look.q, starts) for sight, starts in zip(look.sights, look.starts, strict=True)]
+        fits.sort(key=lambda fit: fit.distance)
+        reason = unfit(fits[0], shape, self.options)
+        if self.starts is not None and not reason and touching(fits[0].centre_line, shape.radius):
+            reason = "the object crosses or touches itself"
+        other = fits[1] if len(fits) > 1 and fits[1].distance < _AS_GOOD * fits[0].distance else None
+        spent = work.report.seconds + time.process_time() - begun
+        work.report = replace(work.report, fit=fits[0], other=other, reason=reason, seconds=spent)
+        return work
+
+    def _look(self, index: int, calibration: Calibration, background: Background) -> _Look | None:
+        """A frame that can be fitted; None for others."""
+        return self._prepared(
+            _Work(self.unread(index, calibration, self._reasons.get(index, ""))), calibration, background
+        )
+
+    def _prepared(self, work: _Work, calibration: Calibration, background: Background) -> _Look | None:
+        """What a frame shows of the object, None with the reason in its report."""
+        options, index, stamp, t = self.options, work.report.index, work.report.stamp, work.report.t
+        if work.report.reason:
+            return None
         try:
             cloud, raw = self._read(index, calibration)
         except DataError as error:
-            return work.dropped(error.what)
-        work.report = replace(work.report, raw=raw)
+            work.dropped(error.what)
+            return None
+        work.report = replace(work.report, raw=len(raw))
         if self.span is not None and not self.span[0] <= t <= self.span[1]:
-            return work.dropped("there are no joint angles at its time")
+            work.dropped("there are no joint angles at its time")
+            return None
         rng = np.random.default_rng([options.seed, index])
-        if self.robot is not None and self.span is not None:
-            delay, std = own_delay(self.robot, cloud, stamp, self.posture, calibration.clock, rng, options.clock)
-            work.report = replace(work.report, delay=delay)
-            if abs(delay) > max(options.clock.late, 4 * std):
-                return work.dropped(f"its stamp is late: by {1e3 * delay:.0f} ms")
+        usual = calibration.usual
+        if self.arm is not None and usual is not None:
+            own = own_offset(self.arm, calibration.state, stamp, cloud.points, rng, usual.misfit)
+            if own is not None and math.isfinite(own.std):
+                work.report = replace(work.report, delay=own.delay)
+                if is_late(own, options.clock):
+                    work.dropped(f"its stamp is late: by {1e3 * own.delay:.0f} ms")
+                    return None
         q = self.posture(t)
         if self.robot is not None:
             cloud = cloud.keep(without_robot(cloud, self.robot, q, options.filters.padding))
+        cloud = cloud.keep(~background.contains(cloud.points))
         work.filtered, work.report = cloud, replace(work.report, filtered=len(cloud))
         if len(cloud) < options.filters.least:
-            return work.dropped(f"too few points of the object: {len(cloud)} left")
+            work.dropped(f"too few points of the object: {len(cloud)} left")
+            return None
         if len(cloud) > options.filters.most:
             cloud = cloud.keep(np.sort(rng.choice(len(cloud), options.filters.most, replace=False)))
             work.report = replace(work.report, filtered=len(cloud))
-        self._fit(work, cloud, q, rng, calibration.camera)
-        return work
-
-    def _fit(self, work: _Work, cloud: Cloud, q: Array, rng: np.random.Generator, camera: Array) -> None:
         begun = time.process_time()
+        view = View(raw, calibration.state.pose, self.sequence.intrinsics)
+        given = calibration.camera, view, self._removed(q, calibration, background)
         try:
-            fits = (
-                self._held(work, cloud, q, rng, camera)
+            look = (
+                self._held(work, cloud, q, rng, given)
                 if self.starts is None
-                else self._anywhere(self.starts, work, cloud, rng, camera)
+                else self._anywhere(self.starts, work, cloud, rng, given)
             )
         except DataError as error:
             work.dropped(error.what)
-            return
-        reason = unfit(fits[0], self.shape, self.options)
-        if self.starts is not None and not reason and touching(fits[0].centre_line, self.shape.radius):
-            reason = "the object crosses or touches itself"
-        other = fits[1] if len(fits) > 1 else None
-        spent = time.process_time() - begun
-        work.report = replace(work.report, fit=fits[0], other=other, reason=reason, seconds=spent)
+            return None
+        work.report = replace(work.report, seconds=time.process_time() - begun)
+        return look
 
-    def _held(self, work: _Work, cloud: Cloud, q: Array, rng: np.random.Generator, camera: Array) -> list[Fit]:
-        """The shape of an object whose root is where the model has it."""
+    def _held(self, work: _Work, cloud: Cloud, q: Array, rng: np.random.Generator, given: _Given) -> _Look:
+        """What is seen of an object whose root is where the model has it."""
         found = skeleton(cloud, rng, self.options.walk)
         work.skeleton, work.report = found, replace(work.report, nodes=len(found.nodes))
         if not len(found.nodes):
             raise DataError("no part of the cloud is dense enough for a skeleton")
         rest = cloud.keep(found.connected)
-        part = found.part[found.label[found.connected]]
         work.filtered = rest
-        return [self.shape.solve(Sight(rest.points, rest.weight, part, found.nodes, camera), q)]
+        return _Look((Sight(rest.points, rest.weight, found.nodes, *given),), q, ((),))
 
-    def _anywhere(
-        self, starts: Starts, work: _Work, cloud: Cloud, rng: np.random.Generator, camera: Array
-    ) -> list[Fit]:
-        """The best shape with its root anywhere, and one with another root that is as good, if there is one."""
+    def _anywhere(self, starts: Starts, work: _Work, cloud: Cloud, rng: np.random.Generator, given: _Given) -> _Look:
+        """What is seen of an object whose root is sought, with the ends that it may have where."""
         diameter, options = 2.0 * float(self.shape.radius.max()), self.options
         course = traced(cloud, diameter, options.walk.link_length, rng)
         work.skeleton, work.report = course.skeleton, replace(work.report, nodes=len(course.nodes))
@@ -332,13 +489,14 @@ class Tracker:
         own = cKDTree(course.nodes).query(cloud.points)[0] < 2.0 * diameter
         rest = cloud.keep(own)
         work.filtered = rest
-        part = np.zeros(len(rest), dtype=np.int64)
-        fits = []
-        for start in found:
-            sight = Sight(rest.points, rest.weight, part, course.nodes, camera, start.anchors)
-            fits.append(self.shape.solve(sight, self.shape.rest, [start.q]))
-        fits.sort(key=lambda fit: fit.distance)
-        return [fit for fit in fits[:2] if fit.distance < _AS_GOOD * fits[0].distance]
+        sights = tuple(Sight(rest.points, rest.weight, course.nodes, *given, anchors=start.anchors) for start in found)
+        return _Look(sights, self.shape.rest, tuple((start.q,) for start in found))
+
+
+def _link_of(system: System, joint: str) -> str:
+    """Name of a frame that stands still beside a joint's moving side: its link, as far as the model has it."""
+    index = system.mechanism.joint_index(joint)
+    return next((name for name, frame in system.mechanism.frames.items() if frame.joint == index), joint)
 
 
 def _chosen_points(system: System, wanted: tuple[str, ...] | None) -> tuple[str, ...]:

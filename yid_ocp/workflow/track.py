@@ -6,7 +6,7 @@ import argparse
 import shutil
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ from yid_ocp.vision.folders import write_frames
 from yid_ocp.vision.frames import look_at
 from yid_ocp.vision.meshes import Scene
 from yid_ocp.vision.pictures import draw_stages, draw_track
+from yid_ocp.vision.registration import CLOCK, DEPTH, DRIFT, SCALE, SHIFT, TURN
 from yid_ocp.vision.results import FrameReport, Track, dropped
 from yid_ocp.vision.track import Tracker
 from yid_ocp.workflow.build import build_system, located, recording_file
@@ -114,12 +115,12 @@ def run_track(
                 tracker = Tracker(Scene(system, run.model.robot), recording, seen, settings.options)
                 doubts = [] if recording is None else of_one(run, system, recording)
                 progress.stage("finding what is common to the frames")
-                calibration = filmed.tasks.calibration()
+                common = filmed.tasks.common()
                 progress.stage("tracking")
-                frames, note = tracker.judged(filmed.tasks.frames(tracker, calibration, workers, progress))
+                frames, note = tracker.judged(filmed.tasks.frames(tracker, common, workers, progress))
                 found: Track | None = None
                 try:
-                    found = tracker.finished(frames, note, calibration)
+                    found = tracker.finished(frames, note, common)
                 except DataError as error:
                     refused = error
         except YidError:
@@ -127,10 +128,10 @@ def run_track(
             raise
         progress.stage("drawing")
         for frame in _drawn(frames, settings.pictures):
-            stages = tracker.stages(frame, calibration)
+            stages = tracker.stages(frame, common)
             if stages is not None:
                 draw_stages(stages, folder.path / "pictures")
-        result = track_result(frames, calibration, found) | {"root": note}
+        result = track_result(frames, common.calibration, found) | {"root": note}
         told, tracked = [], None
         if found is not None:
             draw_track(found, folder.path / "track.png")
@@ -211,16 +212,9 @@ def _with_folder(refused: DataError | None, folder: Path) -> DataError:
 def track_result(frames: Sequence[FrameReport], calibration: Calibration, found: Track | None) -> dict[str, Any]:
     """`yid-track/1` without doubts, inputs and versions; `found` is None where no frame is good."""
     spent = [frame.seconds for frame in frames if frame.fit is not None]
-    clock = calibration.clock
     return {
         "format": FORMAT,
-        "clock": {
-            "offset": clock.offset,
-            "std": clock.std if clock.estimated else None,
-            "estimated": clock.estimated,
-            "shift": clock.shift,
-            "message": clock.message,
-        },
+        "camera": camera_result(calibration),
         "points": {} if found is None else _points(found),
         "truth_errors": {},
         "dropped": dropped(frames),
@@ -244,12 +238,40 @@ def track_result(frames: Sequence[FrameReport], calibration: Calibration, found:
     }
 
 
+def camera_result(calibration: Calibration) -> dict[str, Any]:
+    """The camera of a sequence: what is used, what was told, how well it is known."""
+    state, told, change = calibration.state, calibration.told, calibration.state.minus(calibration.told)
+    std = np.sqrt(np.diag(calibration.covariance))
+    return {
+        "message": calibration.message,
+        "estimated": calibration.frames > 0,
+        "frames": calibration.frames,
+        "pose": state.pose,
+        "told_pose": told.pose,
+        "turned": float(np.linalg.norm(change[TURN])),
+        "turn_std": std[TURN],
+        "shifted": float(np.linalg.norm(change[SHIFT])),
+        "shift_std": std[SHIFT],
+        "depth_factor": state.factor,
+        "depth_factor_std": std[SCALE],
+        "depth_offset": state.depth,
+        "depth_offset_std": std[DEPTH],
+        "clock_offset": state.offset,
+        "clock_offset_std": std[CLOCK],
+        "clock_about": state.about,
+        "clock_drift": state.drift,
+        "clock_drift_std": std[DRIFT],
+        "presence": None if calibration.presence is None else asdict(calibration.presence),
+    }
+
+
 def _points(found: Track) -> dict[str, Any]:
     seen = np.asarray(np.isfinite(found.position).all(axis=2))
     return {
         name: {
             "frames": int(seen[:, i].sum()),
             "std": float(np.median(found.std[seen[:, i], i])) if seen[:, i].any() else None,
+            "common_std": float(np.median(found.common[seen[:, i], i])) if seen[:, i].any() else None,
         }
         for i, name in enumerate(found.names)
     }

@@ -19,7 +19,7 @@ from yid_ocp.errors import OutputError
 from yid_ocp.files import content_hash, file_sha256, reason, write_text
 from yid_ocp.parallel import Task, ThisProcess, Workers, run_tasks, values_of
 from yid_ocp.progress import SILENT, Progress
-from yid_ocp.vision.calibration import Calibration
+from yid_ocp.vision.common import Common
 from yid_ocp.vision.frames import FrameSequence
 from yid_ocp.vision.meshes import Scene
 from yid_ocp.vision.plain import plain, remade
@@ -73,16 +73,16 @@ class FrameTasks:
         write_text(folder / CONFIG, text)
         return FrameTasks(own, folder, inputs)
 
-    def calibration(self) -> Calibration:
+    def common(self) -> Common:
         """What is common to the frames; worked out in this process."""
         task = Task("what is common", {"config": self.folder / CONFIG, "inputs": self.inputs})
         [found] = values_of(run_tasks(common, [task], self.folder / DONE, ThisProcess()))
-        return remade(Calibration, found)
+        return remade(Common, found)
 
     def frames(
         self,
         tracker: Tracker,
-        calibration: Calibration,
+        common: Common,
         workers: Workers | Executor | None = None,
         progress: Progress = SILENT,
     ) -> list[FrameReport]:
@@ -90,7 +90,7 @@ class FrameTasks:
 
         One that ended the process that worked on it is dropped.
         """
-        common_to_all = {"config": self.folder / CONFIG, "inputs": self.inputs, "calibration": plain(calibration)}
+        common_to_all = {"config": self.folder / CONFIG, "inputs": self.inputs, "common": plain(common)}
         names = tracker.sequence.names
         tasks = [Task(names[i], {**common_to_all, "index": i}) for i in tracker.order]
         executor = ThisProcess() if workers is None else workers
@@ -100,7 +100,7 @@ class FrameTasks:
         found = {i: remade(FrameReport, value) for i, value in zip(_but(tracker.order, ended), others, strict=True)}
         for k in ended:
             i = tracker.order[k]
-            found[i] = tracker.unread(i, calibration, f"work on it failed: {results[k].error}")
+            found[i] = tracker.unread(i, common.calibration, f"work on it failed: {results[k].error}")
         return [found[i] for i in tracker.order]
 
     def clear(self) -> None:
@@ -136,15 +136,15 @@ def opened(run: Run) -> tuple[FrameSequence, Recording | None]:
 def common(config: Path, inputs: Mapping[str, str]) -> dict[str, Any]:
     """Task: what is common to the frames of a run, as `plain` gives it."""
     del inputs  # they belong to what the result depends on
-    made: dict[str, Any] = plain(_tracker(config.read_text(encoding="utf-8"), config).calibration())
+    made: dict[str, Any] = plain(_tracker(config.read_text(encoding="utf-8"), config).common())
     return made
 
 
-def one_frame(config: Path, inputs: Mapping[str, str], calibration: Mapping[str, Any], index: int) -> dict[str, Any]:
+def one_frame(config: Path, inputs: Mapping[str, str], common: Mapping[str, Any], index: int) -> dict[str, Any]:
     """Task: what became of one frame, as `plain` gives it."""
     del inputs
     tracker = _tracker(config.read_text(encoding="utf-8"), config)
-    made: dict[str, Any] = plain(tracker.frame(index, remade(Calibration, calibration)))
+    made: dict[str, Any] = plain(tracker.frame(index, remade(Common, common)))
     return made
 
 
