@@ -17,6 +17,7 @@ from yid_ocp.vision.frames import FrameSequence as FrameSequence
 from yid_ocp.vision.frames import look_at as look_at
 from yid_ocp.vision.lens import XTION as XTION
 from yid_ocp.vision.lens import Pinhole as Pinhole
+from yid_ocp.vision.meshes import ExtraMesh as ExtraMesh
 from yid_ocp.vision.meshes import Scene as Scene
 from yid_ocp.vision.options import TrackOptions as TrackOptions
 from yid_ocp.vision.reading import read_frames as read_frames

@@ -31,7 +31,7 @@ Mask = NDArray[np.bool_]
 _SIGMAS = 3.0  # of a point, within which it is the background's
 _MOST = 0.5  # of the frames, in which what stands still must be seen: arm and object hide it from time to time
 _ALIKE = 0.5  # of a thing's size, within which it is the same thing in another frame
-_STILL = 0.1  # of its size, by which a still thing's middle wanders as others hide parts of it
+_STILL = 0.3  # of its size, by which a still thing's middle wanders at most
 _FOLLOWS = 0.5  # of how far it wanders in the world, below which it moves with a link
 _FEWEST = 2  # frames in which a thing is worth a word
 _TO_SIGMA = 1.4826
@@ -114,13 +114,13 @@ def extra_meshes(extra: Sequence[ExtraMesh], mechanism: Mechanism) -> dict[int, 
     for number, entry in enumerate(extra):
         where = f"model: extra_meshes: {number}"
         mesh = _shape(entry, where)
-        pose = transform(roll_pitch_yaw(*entry.rpy), entry.position)
+        pose = transform(roll_pitch_yaw(*entry.rpy), entry.xyz)
         joint = -1
-        if entry.link is not None:
-            if entry.link not in mechanism.frames:
-                hint = nearest(entry.link, list(mechanism.frames))
-                raise ConfigError(f"there is no link '{entry.link}'", where=where, hint=hint)
-            frame = mechanism.frames[entry.link]
+        if entry.frame is not None:
+            if entry.frame not in mechanism.frames:
+                hint = nearest(entry.frame, list(mechanism.frames))
+                raise ConfigError(f"there is no link '{entry.frame}'", where=where, hint=hint)
+            frame = mechanism.frames[entry.frame]
             joint, pose = frame.joint, np.array(ca.DM(frame.placement.matrix())) @ pose
         made.setdefault(joint, []).append(mesh.moved(pose))
     return made
@@ -233,7 +233,9 @@ def _named(
     centre = np.median(places, axis=0)
     size = np.median([thing.size for _, thing in group], axis=0)
     far = _wandering(places)
-    moving = far > max(_SIGMAS * noise, _STILL * float(np.linalg.norm(size)))
+    # as arm and object hide parts of a still thing, the middle of the rest wanders within it
+    span = np.ptp(places, axis=0)
+    moving = bool((span > np.maximum(2 * _SIGMAS * noise, _STILL * np.max([x.size for _, x in group], axis=0))).any())
     link = ""
     if moving:
         poses = [links(t) for t, _ in group]
@@ -253,7 +255,7 @@ def _named(
     how = f"moving with {link}" if link else "moving" if moving else "still"
     text = f"something of {big} m at ({where}) m is not the object, {how}, in {len(group)} of {total} frames: "
     if link:
-        text += f"give its shape under model.extra_meshes with link: {link}"
+        text += f"give its shape under model.extra_meshes with frame: {link}"
     elif moving:
         text += "take it out of view" if not beside else "leave it out with track.options.filters.lower and upper"
         text += ", or give the object's colour under track.options.filters.colours" if coloured else ""

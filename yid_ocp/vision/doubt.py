@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.model.system import System
-from yid_ocp.vision.fit import Fit
+from yid_ocp.vision.fitted import Fit
 
 Array = NDArray[np.float64]
 SizeKind = Literal["length", "radius"]

@@ -13,7 +13,7 @@ line (the two bends at the next joint reach every direction) and stay at rest.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -28,8 +28,10 @@ from yid_ocp.model.kinematics import Kinematics, forward_kinematics
 from yid_ocp.model.mechanism import Mechanism
 from yid_ocp.model.system import System
 from yid_ocp.options import About, check
-from yid_ocp.vision.evidence import Evidence, Sight, Thing, Tubes, away_from, gather, nearest, slender
+from yid_ocp.vision.evidence import Evidence, Sight, Tubes, gather, nearest, slender
+from yid_ocp.vision.fitted import Fit, SizeRows
 from yid_ocp.vision.meshes import numeric_mechanism
+from yid_ocp.vision.residuals import along_sight, nearest_way
 from yid_ocp.vision.starts import Anchor, Starts
 
 Array = NDArray[np.float64]
@@ -39,7 +41,6 @@ NODE_FACTOR = math.pi / 4
 """Where the mean of a tube's visible half lies, as a share of its radius."""
 
 _SIGMAS = 3.0  # of a point, beyond which an end stands elsewhere than the shape has it
-_RIM = 0.85  # of the radius to either side, within which a tube's depth is compared
 _NEAR = 3.0  # times the last scale, beyond which a point says nothing of the shape
 _TOUCHING = 1e-3  # [m]
 _LEAST_STIFFNESS = 1e-2  # of the mean; softer bends are still held this much
@@ -96,78 +97,6 @@ class FitOptions:
         check(self, "fit options")
         if not self.scales and not self.surface_scales:
             raise ConfigError("there is no pass to fit in", where="fit options: scales", allowed="one scale or more")
-
-
-@dataclass(frozen=True, eq=False)
-class SizeRows:
-    """What one frame says of the tubes' sizes, the bends following as they like best.
-
-    The sizes are the logarithms of all lengths and then of all radii, segment by segment, relative to the values of the
-    fit. About these the least cost is  g'x + x'Sx/2.
-
-    Attributes
-    ----------
-    gradient : ndarray, shape (2 s,)
-    curvature : ndarray, shape (2 s, 2 s)
-    points : ndarray, shape (np, 3, 2 s)
-        How the system's points move with them [m].
-    """
-
-    gradient: Array
-    curvature: Array
-    points: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """A shape and how good it is.
-
-    Attributes
-    ----------
-    q : ndarray, shape (n,)
-        Configuration, twists at rest.
-    points : ndarray, shape (np, 3)
-        The system's points there [m].
-    std : ndarray, shape (np, 3)
-        Standard deviation of each coordinate by the curvature of the cost [m].
-    distance : float
-        Mean of |e_i| over the points near the shape that belong to no other thing [m].
-    noise : float
-        Standard deviation of e_i of the points on the shape [m].
-    filled, empty : ndarray, shape (K,)
-        Share of each link's length on which there are points, and on which the camera sees that there are none.
-    seen : ndarray of bool, shape (np,)
-        Whether there are points enough about each of the system's points, or a gripper that holds it.
-    gap : ndarray, shape (grasps, 3)
-        From what each gripper holds to the gripper [m].
-    ends : ndarray, shape (E,)
-        By how much each free tube's end lies further along than the shape has it, NaN where that is not seen [m].
-    contested : float
-        Share of the points on the shape that may belong to a thing which touches it; they are left out.
-    things : tuple of Thing
-        What else there is.
-    sizes : SizeRows
-        What the frame says of lengths and radii.
-    iterations : int
-    centre_line : ndarray, shape (K, 2, 3)
-        Start and end of every link [m].
-    """
-
-    q: Array
-    points: Array
-    std: Array
-    distance: float
-    noise: float
-    filled: Array
-    empty: Array
-    seen: NDArray[np.bool_]
-    gap: Array
-    ends: Array
-    contested: float
-    things: tuple[Thing, ...]
-    sizes: SizeRows
-    iterations: int
-    centre_line: Array
 
 
 class ShapeFit:
@@ -298,18 +227,45 @@ class ShapeFit:
         everything = _Left(np.ones(len(sight.nodes), bool), np.ones(len(sight.points), bool))
         thin = _Left(*slender(sight, float(self.radius.max())))
         best = self._attempt(sight, begun, thin if thin.nodes.any() else everything)
-        for left in (self._without_failed(best, sight), everything):
+        for left in (self._without(best, sight, self._links_of(self._failed(best.evidence))), everything):
             failed = self._failed(best.evidence)
             if not failed:
                 break
             # a part of the object is not where this has it: something like it stood nearer to where the search began
-            trial = best.minimum.q.copy()
-            again = [index for index, owner in zip(self.free, self.free_owner, strict=True) if owner in failed]
-            trial[again] = self.rest[again]
             if left.nodes.any() and left.points.any():
-                other = self._attempt(sight, [trial, *begun], left)
+                other = self._attempt(sight, [self._rested(best.minimum.q, failed), *begun], left)
                 best = max(best, other, key=lambda attempt: self._covered(attempt.evidence))
-        return self._judged(best, sight)
+        return self._judged(best, self._rivals(best, sight), sight)
+
+    def _rested(self, q: Array, tubes: Collection[str]) -> Array:
+        """A configuration with some tubes as at rest."""
+        trial = q.copy()
+        again = [index for index, owner in zip(self.free, self.free_owner, strict=True) if owner in tubes]
+        trial[again] = self.rest[again]
+        return trial
+
+    def _links_of(self, tubes: Collection[str]) -> NDArray[np.bool_]:
+        return np.array([owner in tubes for owner in self.owner])
+
+    def _rivals(self, best: _Attempt, sight: Sight) -> list[Array]:
+        """Other shapes that the cloud speaks for as much: where a thing touches a tube, that may go on along the thing.
+
+        Everything is tried that is left without the points on which the tube lies from the contact on.
+        """
+        if not best.evidence.contested.any() or not self.options.surface_scales:
+            return []
+        tubes = self.tubes(best.minimum.q)
+        touched = nearest(tubes.corners, tubes.radius, sight.points[best.evidence.contested])[0]
+        found = []
+        for name in dict.fromkeys(self.owner[k] for k in sorted(set(touched.tolist()))):
+            mine = self._links_of({name})
+            onward = mine & (np.arange(len(mine)) >= min(k for k in touched if mine[k]))
+            left = self._without(best, sight, onward)
+            if left.nodes.any() and left.points.any():
+                rival = self._attempt(sight, [self._rested(best.minimum.q, {name}), best.minimum.q], left)
+                if not self._failed(rival.evidence):
+                    found.append(rival.minimum.q)
+        return found
 
     def _covered(self, evidence: Evidence) -> float:
         """Share of the visible length that has points of its own."""
@@ -326,14 +282,13 @@ class ShapeFit:
                 failed.add(name)
         return failed
 
-    def _without_failed(self, attempt: _Attempt, sight: Sight) -> _Left:
-        """All nodes and points but those on which failed tubes lie."""
-        tubes, failed = self.tubes(attempt.minimum.q), self._failed(attempt.evidence)
-        lies = np.array([owner in failed for owner in self.owner])
+    def _without(self, attempt: _Attempt, sight: Sight, links: NDArray[np.bool_]) -> _Left:
+        """All nodes and points but those on which some links lie."""
+        tubes = self.tubes(attempt.minimum.q)
         link = nearest(tubes.corners, tubes.radius, sight.points)[0]
-        wrong = lies[link] & (attempt.evidence.own | attempt.evidence.contested)
+        wrong = links[link] & (attempt.evidence.own | attempt.evidence.contested)
         node_link, _, _, distance = nearest(tubes.corners, tubes.radius, sight.nodes, NODE_FACTOR)
-        return _Left(~(lies[node_link] & (distance < 2 * tubes.radius[node_link])), ~wrong)
+        return _Left(~(links[node_link] & (distance < 2 * tubes.radius[node_link])), ~wrong)
 
     def _attempt(self, sight: Sight, starts: Sequence[Array], left: _Left) -> _Attempt:
         """The best shape through some of the nodes and points, then through those that are surely its own."""
@@ -391,7 +346,7 @@ class ShapeFit:
             end = _Minimum(q, found.model.hessian, found.model.cost, end.iterations + found.iterations)
         return end
 
-    def _judged(self, attempt: _Attempt, sight: Sight) -> Fit:
+    def _judged(self, attempt: _Attempt, rivals: Sequence[Array], sight: Sight) -> Fit:
         """The shape with its standard deviations, and what speaks for and against it."""
         minimum, evidence = attempt.minimum, attempt.evidence
         q, on_shape = minimum.q, evidence.own | evidence.contested
@@ -406,6 +361,8 @@ class ShapeFit:
         if every and evidence.contested.any():
             # how far the contested points would take the shape, if they counted
             moved = (jacobian @ self._quadratic(q, every[0]).change(0.0)).reshape(-1, 3)
+        for rival in rivals:
+            moved = np.maximum(np.abs(moved), np.abs(self.place(rival) - places))
         corners = self.tubes(q).corners
         swath = self._swath_std(corners, places, evidence, sight.camera)
         off_end = np.zeros(places.shape)
@@ -436,7 +393,7 @@ class ShapeFit:
         """Cost, gradient and Gauss-Newton Hessian by the free bends."""
         out, jacobian = self._corners(q)
         corners, by_q = np.array(out).reshape(-1, 2, 3), np.array(jacobian)
-        surface = _surface(corners, self.radius, task)
+        surface = nearest_way(corners, self.radius, task.points, task.camera, task.share)
         link, error, rows = surface.link, surface.error, surface.rows
         square = (error / task.scale) ** 2
         cost = 0.5 * task.scale**2 * float(np.sum(task.weight * square / (1 + square)))
@@ -505,8 +462,8 @@ class ShapeFit:
             hessian = hessian + weighted.T @ rows
 
         if task is not None:
-            depths = _depths(np.array(out).reshape(-1, 2, 3), self.radius, task)
-            weight = depths.weight / (1 + (depths.error / task.scale) ** 2) ** 2
+            depths = along_sight(np.array(out).reshape(-1, 2, 3), self.radius, task.points, task.camera)
+            weight = task.weight[depths.index] / (1 + (depths.error / task.scale) ** 2) ** 2
             segment = np.array([names.index(owner) for owner in self.owner])
             for k in range(len(self.radius)):
                 mine = depths.link == k
@@ -583,60 +540,6 @@ class _Task:
     scale: float
     camera: Array
     anchors: Sequence[Anchor]
-
-
-@dataclass(frozen=True, eq=False)
-class _Surface:
-    """Points against the tubes: errors, the link of each, and how the error moves with that link's two corners."""
-
-    link: Integers
-    error: Array
-    rows: Array
-
-
-def _surface(corners: Array, radius: Array, task: _Task) -> _Surface:
-    link, along, normal, distance = nearest(corners, radius, task.points, task.share)
-    sign = np.where(away_from(normal, task.points - task.camera), -1.0, 1.0)
-    error = sign * distance - task.share * radius[link]
-    # e falls as the centre line moves along the normal: de = -n'((1 - t) da + t db)
-    direction = -sign[:, None] * normal
-    rows = np.concatenate([direction * (1 - along)[:, None], direction * along[:, None]], axis=1)
-    return _Surface(link, error, rows)
-
-
-@dataclass(frozen=True, eq=False)
-class _Depths:
-    """Points against the tubes along the lines of sight, where the camera's noise is.
-
-    Across them a point stands where its pixel does. That of a fit which goes the nearest way to the surface turns with
-    the noise, which does little to where a tube is, but makes it a tenth too thin.
-    """
-
-    link: Integers
-    error: Array
-    weight: Array
-    rows: Array
-    by_radius: Array
-
-
-def _depths(corners: Array, radius: Array, task: _Task) -> _Depths:
-    link, along, normal, distance = nearest(corners, radius, task.points)
-    edge = corners[:, 1] - corners[:, 0]
-    axis = (edge / np.linalg.norm(edge, axis=1)[:, None])[link]
-    sight = task.camera - task.points
-    front = sight - np.einsum("ij,ij->i", sight, axis)[:, None] * axis
-    front /= np.maximum(np.linalg.norm(front, axis=1), 1e-12)[:, None]
-    side = np.cross(axis, front)
-    offset = normal * distance[:, None]
-    across = np.einsum("ij,ij->i", offset, side)
-    # towards its rim a tube's depth changes by more than its radius says
-    mine = np.flatnonzero((np.abs(across) < _RIM * radius[link]) & (along > 0) & (along < 1))
-    link, along, front, side, across = link[mine], along[mine], front[mine], side[mine], across[mine]
-    deep = np.sqrt(radius[link] ** 2 - across**2)
-    error = np.einsum("ij,ij->i", offset[mine], front) - deep
-    direction = -front - (across / deep)[:, None] * side
-    rows = np.concatenate([direction * (1 - along)[:, None], direction * along[:, None]], axis=1)
-    return _Depths(link, error, task.weight[mine], rows, -radius[link] / deep)
 
 
 def _owner(system: System, joint: str) -> str:

@@ -14,7 +14,8 @@ from scipy.interpolate import CubicSpline
 from yid_ocp.errors import DataError
 from yid_ocp.vision.clutter import Foreign
 from yid_ocp.vision.common import Common
-from yid_ocp.vision.fit import Fit, ShapeFit
+from yid_ocp.vision.fit import ShapeFit
+from yid_ocp.vision.fitted import Fit
 from yid_ocp.vision.options import TrackOptions
 from yid_ocp.vision.results import FrameReport
 
@@ -36,10 +37,8 @@ def unfit(fit: Fit, shape: ShapeFit, options: TrackOptions) -> str:
     bend = float(np.abs((fit.q - shape.rest)[list(shape.bends)]).max())
     if bend > options.largest_bend:
         return f"the shape is folded: a joint is bent by {math.degrees(bend):.0f} degrees"
-    lengths = np.linalg.norm(fit.centre_line[:, 1] - fit.centre_line[:, 0], axis=1)
-    there, bare = float(lengths @ fit.filled), float(lengths @ fit.empty)
-    if there < options.least_covered * (there + bare):
-        share = 100 * there / (there + bare)
+    if fit.covered < options.least_covered:
+        share = 100 * fit.covered
         return f"the shape does not fit: only {share:.0f} % of its visible length has points of its own"
     return ""
 

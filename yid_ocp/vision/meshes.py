@@ -41,17 +41,17 @@ _NEAR = 0.05  # [m]; closer than this a box is not projected but taken to fill t
 class ExtraMesh:
     """Something that the robot's URDF does not have: a gripper's body, a table, a camera's stand."""
 
-    link: Annotated[str | None, About("of the robot that carries it; null for the world")] = None
+    frame: Annotated[str | None, About("link of the robot that carries it; null for the world")] = None
     mesh: Annotated[str | None, About("file that trimesh reads, in metres: STL, OBJ, DAE", path=True)] = None
     box: Annotated[tuple[Size, Size, Size] | None, About("in place of a file: edges along x, y, z", "m")] = None
     cylinder: Annotated[tuple[Size, Size] | None, About("the same: radius and length along z", "m")] = None
     sphere: Annotated[float | None, Gt(0), About("the same: radius", "m")] = None
-    position: Annotated[tuple[float, float, float], About("of its middle in the frame of the link", "m")] = (
+    xyz: Annotated[tuple[float, float, float], About("of its middle in the link", "m")] = (
         0.0,
         0.0,
         0.0,
     )
-    rpy: Annotated[tuple[float, float, float], About("roll, pitch and yaw in the frame of the link", "rad")] = (
+    rpy: Annotated[tuple[float, float, float], About("roll, pitch and yaw in the link", "rad")] = (
         0.0,
         0.0,
         0.0,

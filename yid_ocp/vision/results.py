@@ -14,7 +14,7 @@ from yid_ocp.data.recording import PointGroup, Recording, validate
 from yid_ocp.vision.calibration import Calibration
 from yid_ocp.vision.clutter import Foreign
 from yid_ocp.vision.doubt import Sizes
-from yid_ocp.vision.fit import Fit
+from yid_ocp.vision.fitted import Fit
 from yid_ocp.vision.skeleton import Skeleton
 
 Array = NDArray[np.float64]

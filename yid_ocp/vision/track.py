@@ -27,7 +27,8 @@ from yid_ocp.vision.doubt import Sizes, ask_sizes
 from yid_ocp.vision.ends import told, touching
 from yid_ocp.vision.evidence import Sight
 from yid_ocp.vision.filters import Cloud, ObjectRegion, of_colours, voxel_grid, without_outliers, without_robot
-from yid_ocp.vision.fit import Fit, ShapeFit
+from yid_ocp.vision.fit import ShapeFit
+from yid_ocp.vision.fitted import Fit
 from yid_ocp.vision.frames import FrameSequence
 from yid_ocp.vision.judgement import judged, measured, unfit
 from yid_ocp.vision.meshes import Mesh, Scene, Surfaces, numeric_mechanism, robot_meshes

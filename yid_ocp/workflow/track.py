@@ -26,10 +26,12 @@ from yid_ocp.report.scene import scene as moving
 from yid_ocp.report.summaries import track_summary
 from yid_ocp.vision.calibration import Calibration
 from yid_ocp.vision.camera import DepthCamera, FrameTiming, VirtualCamera, VirtualFrames, virtual_frames
+from yid_ocp.vision.clutter import Foreign
+from yid_ocp.vision.common import Common
+from yid_ocp.vision.doubt import Sizes
 from yid_ocp.vision.fit import ShapeFit
 from yid_ocp.vision.folders import write_frames
 from yid_ocp.vision.frames import look_at
-from yid_ocp.vision.meshes import Scene
 from yid_ocp.vision.pictures import draw_stages, draw_track
 from yid_ocp.vision.registration import CLOCK, DEPTH, DRIFT, SCALE, SHIFT, TURN
 from yid_ocp.vision.results import FrameReport, Track, dropped
@@ -38,7 +40,7 @@ from yid_ocp.workflow.build import build_system, located, recording_file
 from yid_ocp.workflow.command import DONE, carry_out, given_workers
 from yid_ocp.workflow.doubts import doubts_result, of_one
 from yid_ocp.workflow.folder import RunFolder, new_run_folder
-from yid_ocp.workflow.tracked_frames import FrameTasks, opened
+from yid_ocp.workflow.tracked_frames import FrameTasks, empty_scene, opened, scene_of
 
 FORMAT = "yid-track/1"
 Array = NDArray[np.float64]
@@ -112,7 +114,7 @@ def run_track(
         try:
             with located(run, "track"):
                 seen, recording = opened(filmed.tasks.run)
-                tracker = Tracker(Scene(system, run.model.robot), recording, seen, settings.options)
+                tracker = Tracker(scene_of(run, system), recording, seen, settings.options, empty_scene(run))
                 doubts = [] if recording is None else of_one(run, system, recording)
                 progress.stage("finding what is common to the frames")
                 common = filmed.tasks.common()
@@ -131,7 +133,7 @@ def run_track(
             stages = tracker.stages(frame, common)
             if stages is not None:
                 draw_stages(stages, folder.path / "pictures")
-        result = track_result(frames, common.calibration, found) | {"root": note}
+        result = track_result(frames, common, tracker.things(frames), found) | {"root": note}
         told, tracked = [], None
         if found is not None:
             draw_track(found, folder.path / "track.png")
@@ -209,12 +211,16 @@ def _with_folder(refused: DataError | None, folder: Path) -> DataError:
     return DataError(refused.what, where=refused.where, allowed=refused.allowed, hint=hint)
 
 
-def track_result(frames: Sequence[FrameReport], calibration: Calibration, found: Track | None) -> dict[str, Any]:
+def track_result(
+    frames: Sequence[FrameReport], common: Common, things: Sequence[Foreign], found: Track | None
+) -> dict[str, Any]:
     """`yid-track/1` without doubts, inputs and versions; `found` is None where no frame is good."""
     spent = [frame.seconds for frame in frames if frame.fit is not None]
     return {
         "format": FORMAT,
-        "camera": camera_result(calibration),
+        "camera": camera_result(common.calibration),
+        "sizes": sizes_result(common.sizes),
+        "things": [asdict(thing) for thing in things],
         "points": {} if found is None else _points(found),
         "truth_errors": {},
         "dropped": dropped(frames),
@@ -230,11 +236,31 @@ def track_result(frames: Sequence[FrameReport], calibration: Calibration, found:
                 "nodes": frame.nodes,
                 "delay": None if np.isnan(frame.delay) else frame.delay,
                 "distance": None if frame.fit is None else frame.fit.distance,
-                "inliers": None if frame.fit is None else frame.fit.inliers,
+                "covered": None if frame.fit is None else frame.fit.covered,
+                "contested": None if frame.fit is None else frame.fit.contested,
                 "seconds": frame.seconds,
             }
             for frame in frames
         ],
+    }
+
+
+def sizes_result(sizes: Sizes) -> dict[str, Any]:
+    """Lengths and radii: the model's, the values that fit the frames with their standard deviations, and what of it."""
+    fits = sizes.told * np.exp(sizes.change)
+    return {
+        "frames": sizes.frames,
+        "messages": list(sizes.messages),
+        "of": {
+            name: {
+                "model": sizes.told[i],
+                "fits": fits[i] if sizes.known[i] else None,
+                "std": fits[i] * sizes.std[i] if sizes.known[i] else None,
+                "doubted": bool(sizes.doubted[i]),
+                "used": sizes.used[i],
+            }
+            for i, name in enumerate(sizes.names)
+        },
     }
 
 
@@ -331,5 +357,5 @@ def simulated_frames(run: Run, system: System, settings: VirtualFramesSettings) 
         )
         pose = look_at(settings.eye, settings.target)
         camera = VirtualCamera(pose, DepthCamera(outliers=settings.outliers), timing, seed=settings.seed)
-        made = virtual_frames(Scene(system, run.model.robot), truth.t, truth.q, camera)
+        made = virtual_frames(scene_of(run, system), truth.t, truth.q, camera)
     return recording, made

@@ -17,6 +17,7 @@ from yid_ocp.data.hdf5 import read_recording
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import OutputError
 from yid_ocp.files import content_hash, file_sha256, reason, write_text
+from yid_ocp.model.system import System
 from yid_ocp.parallel import Task, ThisProcess, Workers, run_tasks, values_of
 from yid_ocp.progress import SILENT, Progress
 from yid_ocp.vision.common import Common
@@ -64,6 +65,8 @@ class FrameTasks:
         inputs = {"frames": file_sha256(frames)}
         if joints is not None:
             inputs["joints"] = file_sha256(joints)
+        if run.track.background is not None:
+            inputs["background"] = file_sha256(Path(run.track.background))
         text = dump_config(own)
         folder = partial / content_hash([text, inputs])[:16]
         try:
@@ -76,7 +79,7 @@ class FrameTasks:
     def common(self) -> Common:
         """What is common to the frames; worked out in this process."""
         task = Task("what is common", {"config": self.folder / CONFIG, "inputs": self.inputs})
-        [found] = values_of(run_tasks(common, [task], self.folder / DONE, ThisProcess()))
+        [found] = values_of(run_tasks(found_common, [task], self.folder / DONE, ThisProcess()))
         return remade(Common, found)
 
     def frames(
@@ -133,7 +136,20 @@ def opened(run: Run) -> tuple[FrameSequence, Recording | None]:
     return seen, recording
 
 
-def common(config: Path, inputs: Mapping[str, str]) -> dict[str, Any]:
+def scene_of(run: Run, system: System) -> Scene:
+    """What the camera looks at."""
+    return Scene(system, run.model.robot, extra=run.model.extra_meshes)
+
+
+def empty_scene(run: Run) -> FrameSequence | None:
+    """Frames of the scene without robot and object, None where the settings have none."""
+    if run.track.background is None:
+        return None
+    with located(run, "track", "background"):
+        return read_frames(run.track.background, pose=run.track.pose, unit=run.track.unit, topic=run.track.topic)
+
+
+def found_common(config: Path, inputs: Mapping[str, str]) -> dict[str, Any]:
     """Task: what is common to the frames of a run, as `plain` gives it."""
     del inputs  # they belong to what the result depends on
     made: dict[str, Any] = plain(_tracker(config.read_text(encoding="utf-8"), config).common())
@@ -154,4 +170,4 @@ def _tracker(text: str, config: Path) -> Tracker:
     del text
     run = load_config(config)
     sequence, recording = opened(run)
-    return Tracker(Scene(build_system(run), run.model.robot), recording, sequence, run.track.options)
+    return Tracker(scene_of(run, build_system(run)), recording, sequence, run.track.options, empty_scene(run))
