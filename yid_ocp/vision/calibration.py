@@ -47,7 +47,8 @@ _STARTS = 4
 _WIDE = (0.08, 0.06, 0.045)  # reach of nearest surfaces, from stage to stage [m]
 _REACH = 0.035  # along the camera's rays [m]
 _ROUNDS, _LAST_ROUNDS = 3, 15
-_FEW, _MANY = 250, 700  # points of a frame
+_THIN = 5000  # points of a frame among which starts are tried
+_FEW, _MANY = 250, 700  # of them, near the arm
 _SETTLED = 1e-5  # of a step: [rad], [m], [s]
 _AROUND = 0.3  # of the directions to the arm that are looked at, to every side, as x/z and y/z
 _NOTED = 0.006  # displacement of the arm that is worth a word [m]
@@ -274,9 +275,13 @@ class _Calibrator:
         kept = ((at > towards.min(axis=0) - _AROUND) & (at < towards.max(axis=0) + _AROUND)).all(axis=1)
         return Glimpse(glimpse.stamp, points[kept]) if np.count_nonzero(kept) >= FEWEST else None
 
+    def _thinned(self, glimpse: Glimpse) -> Glimpse:
+        count = len(glimpse.points)
+        return replace(glimpse, points=glimpse.points[self.rng.choice(count, min(count, _THIN), replace=False)])
+
     def _start(self) -> CameraState:
         """The state near which most of the arm is where the camera sees something."""
-        few = _some(self.glimpses, _START_FRAMES)
+        few = [self._thinned(glimpse) for glimpse in _some(self.glimpses, _START_FRAMES)]
         tried = starts(self.arm, few, self.told, self.clock.search, _STARTS)
         if not tried:
             raise _UntoldError("it is hardly in view", "turn the camera so that it sees more of the arm")

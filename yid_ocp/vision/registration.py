@@ -125,9 +125,14 @@ class CameraState:
         pose = self.pose.copy()
         pose[:3, :3] = Rotation.from_rotvec(change[TURN]).as_matrix() @ pose[:3, :3]
         pose[:3, 3] += change[SHIFT]
-        factor = self.factor * math.exp(float(change[SCALE]))
-        rest = (getattr(self, name) + float(change[i]) for name, i in (("depth", 7), ("offset", 8), ("drift", 9)))
-        return CameraState(pose, factor, *rest, self.about)
+        return CameraState(
+            pose,
+            self.factor * math.exp(float(change[SCALE])),
+            self.depth + float(change[DEPTH]),
+            self.offset + float(change[CLOCK]),
+            self.drift + float(change[DRIFT]),
+            self.about,
+        )
 
     def minus(self, other: CameraState) -> Array:
         """The change from another state, shape (10,)."""
@@ -330,7 +335,7 @@ def robust_sum(rows: Sequence[Rows], reach: float) -> RobustSum:
 def improved(state: CameraState, found: RobustSum, told: CameraState, precision: Array) -> tuple[CameraState, Array]:
     """The state after one step, and the step; `precision`: of what is told, shape (10, 10)."""
     hessian, gradient, _ = found.tempered(precision)
-    step = -np.linalg.solve(hessian + precision, gradient + precision @ state.minus(told))
+    step = np.asarray(-np.linalg.solve(hessian + precision, gradient + precision @ state.minus(told)), float)
     return state.moved(step), step
 
 
@@ -493,4 +498,5 @@ class Clouds:
             covered = known & ~near & (depth < own[:, 2] - within)
             counts += [np.count_nonzero(x) for x in (near, covered, through, known | near)]
         samples = max(int(counts[3]), 1)
-        return Presence(*(counts[:3] / samples), int(counts[3]))
+        there, covered, through = (float(share) for share in counts[:3] / samples)
+        return Presence(there, covered, through, int(counts[3]))
