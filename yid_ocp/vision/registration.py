@@ -389,12 +389,10 @@ class _Field:
     Attributes
     ----------
     cost : ndarray, shape (cells,)
-        min(distance to the cloud, capture)^2, of capture^2.
+        min(distance to the cloud, capture)^2, of capture^2; `_HIDDEN` out of the cloud's view.
     low : ndarray, shape (3,)
         Corner of the grid [m].
     shape : tuple of int
-    view : ndarray, shape (2, 2)
-        Smallest and largest x/z and y/z of the cloud.
     points : ndarray, shape (N, 3)
         In the world at the told state [m].
     part : ndarray of int, shape (N,)
@@ -403,7 +401,6 @@ class _Field:
     cost: NDArray[np.float32]
     low: Array
     shape: tuple[int, ...]
-    view: Array
     points: Array
     part: Integers
 
@@ -414,7 +411,8 @@ class _Field:
         own = told.measured(points)
         at = glimpse.points[:, :2] / glimpse.points[:, 2:]
         view = np.array([at.min(axis=0), at.max(axis=0)])
-        seen = _inside(own, view)
+        towards = own[:, :2] / own[:, 2:]
+        seen = ((towards >= view[0]) & (towards <= view[1])).all(axis=1)
         if np.count_nonzero(seen) < FEWEST:
             return None
         chosen = np.flatnonzero(seen)
@@ -431,8 +429,14 @@ class _Field:
         if empty.all():
             return None
         distance = distance_transform_edt(empty, sampling=_CELL)
-        cost = (np.minimum(distance, _CAPTURE) / _CAPTURE) ** 2
-        return _Field(cost.astype(np.float32).ravel(), low, tuple(int(n) for n in shape), view, points, part)
+        centre = [low[axis] + _CELL * (np.arange(shape[axis]) + 0.5) for axis in range(3)]
+        outside = np.zeros(shape, bool)
+        for axis in (0, 1):
+            at = centre[axis][:, None] / np.maximum(centre[2], _CELL)
+            beyond = (at < view[0, axis]) | (at > view[1, axis])
+            outside |= beyond[:, None] if axis == 0 else beyond
+        cost = np.where(outside, _HIDDEN, (np.minimum(distance, _CAPTURE) / _CAPTURE) ** 2)
+        return _Field(cost.astype(np.float32).ravel(), low, tuple(int(n) for n in shape), points, part)
 
     def costs(self, arm: Arm, told: CameraState, stamp: float, delay: float, cells: Integers) -> Array:
         """Mean cost of the arm as it was `delay` [s] earlier, shifted by cells of the camera's frame."""
@@ -445,14 +449,7 @@ class _Field:
         index = np.clip(index, [_SIDEWAYS, _SIDEWAYS, _AHEAD], limit - 1 - [_SIDEWAYS, _SIDEWAYS, _AHEAD])
         strides = np.array([self.shape[1] * self.shape[2], self.shape[2], 1])
         cost = self.cost[(index @ strides)[None, :] + (cells @ strides)[:, None]]
-        there = own[None] + _CELL * cells[:, None]
-        return np.asarray(np.where(_inside(there, self.view), cost, _HIDDEN).mean(axis=1))
-
-
-def _inside(points: Array, view: Array) -> Mask:
-    """Which points of the camera's frame, shape (..., 3), lie in its view."""
-    at = points[..., :2] / points[..., 2:]
-    return np.asarray(((at >= view[0]) & (at <= view[1])).all(axis=-1))
+        return np.asarray(cost.mean(axis=1), float)
 
 
 # -- how much of the arm is there -------------------------------------------------------------------------------------
