@@ -141,7 +141,7 @@ def track_summary(result: Mapping[str, Any]) -> list[Block]:
         *doubt_blocks(result),
         *([Table(rows, "Points", key=True)] if result["points"] else []),
         Statement(said, "verdict"),
-        *statements([*dropped, result["camera"]["message"]]),
+        *statements([*dropped, result["camera"]["message"], *([result["root"]] if result["root"] else [])]),
     ]
 
 

@@ -145,9 +145,18 @@ class ObjectRegion:
     options : FilterOptions
     values : mapping of str to float, optional
         Parameter values; nominal where absent.
+    anywhere : bool
+        Whether its root may be anywhere; only the box and the floor of the options bound it then.
     """
 
-    def __init__(self, system: System, options: FilterOptions, values: Mapping[str, float] | None = None) -> None:
+    def __init__(
+        self,
+        system: System,
+        options: FilterOptions,
+        values: Mapping[str, float] | None = None,
+        *,
+        anywhere: bool = False,
+    ) -> None:
         tree = numeric_mechanism(system, values)
         symbols, theta = system.parameters.symbols, system.parameters.vector(values)
         lengths = {
@@ -159,14 +168,14 @@ class ObjectRegion:
         for segment in system.segments:
             reach[segment.name] = lengths[segment.name] + (reach[segment.parent] if segment.parent else 0.0)
         first = next(s for s in system.segments if s.parent is None)
-        self._radius = max(reach.values()) + radius + options.reach_margin
+        self._radius = np.inf if anywhere else max(reach.values()) + radius + options.reach_margin
         base = tree.joint_index(first.links[0][0])
         q = ca.SX.sym("q", system.size)
         kinematics = forward_kinematics(tree, q)
         self._root = ca.Function("root", [q], [kinematics.origins[base]])
         tips = [kinematics.position(f"w_{name}") for name in lengths if f"w_{name}" in tree.frames]
         low = -np.inf if options.floor is None else options.floor
-        if options.floor is None and tree.joints[base].parent < 0 and tips:
+        if options.floor is None and tree.joints[base].parent < 0 and tips and not anywhere:
             rest = np.zeros(system.size)
             root = float(np.array(self._root(rest))[2, 0])
             heights = np.array(ca.Function("tips", [q], [ca.horzcat(*tips)])(rest))[2]
@@ -178,7 +187,7 @@ class ObjectRegion:
         self._lower[2] = max(self._lower[2], low)
         self._behind = options.behind
         elastic = {entry.joint for entry in system.elastic}
-        roots = [j for j in tree.joints if j.parent < 0 and j.name not in elastic]
+        roots = [j for j in tree.joints if j.parent < 0 and j.name not in elastic and not anywhere]
         bases = [np.array(ca.DM(joint.placement.translation)).ravel() for joint in roots]
         self._base = np.mean(bases, axis=0) if bases else None
 

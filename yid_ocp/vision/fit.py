@@ -28,6 +28,7 @@ from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.options import About, check
 from yid_ocp.vision.meshes import numeric_mechanism
+from yid_ocp.vision.starts import Anchor, Starts
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -40,6 +41,7 @@ _STATIONS = 6  # per link, where it is asked whether points are near
 _OWN_SHARE = 0.3
 _TOUCHING = 1e-3  # [m]
 _LEAST_STIFFNESS = 1e-2  # of the mean; softer bends are still held this much
+_LOOSE = 1e-2  # [1/m, 1/rad]; holds what no point tells, such as a straight rope's turn about itself
 _TOLERANCE = 1e-4  # of a bend [rad] and, relative, of the cost, at which a pass ends
 
 
@@ -73,9 +75,6 @@ class FitOptions:
     bend_std: Annotated[
         float, Gt(0), About("bend of a joint of mean stiffness that costs as much as one standard deviation", "rad")
     ] = 0.3
-    rate_std: Annotated[
-        float, Gt(0), About("change of a bend since the previous frame that costs as much, per time between", "rad/s")
-    ] = 3.0
     iterations: Annotated[int, Ge(1), About("at most so many in a pass")] = 25
     weight_cap: Annotated[float, Gt(0), About("a point counts at most for so many of the camera's")] = 6.0
     least_coverage: Annotated[
@@ -146,6 +145,8 @@ class Sight:
         Of their skeleton [m].
     camera : ndarray, shape (3,)
         The camera's position [m].
+    anchors : sequence of Anchor
+        Ends of the object that were seen.
     """
 
     points: Array
@@ -153,6 +154,7 @@ class Sight:
     part: Integers
     nodes: Array
     camera: Array
+    anchors: Sequence[Anchor] = ()
 
 
 class ShapeFit:
@@ -164,6 +166,8 @@ class ShapeFit:
     options : FitOptions, optional
     values : mapping of str to float, optional
         Parameter values (lengths, radii, stiffnesses for the prior); nominal where absent.
+    loose : sequence of str
+        Joints beside the bends that are sought as well, with next to no prior: see `starts.loosened`.
 
     Raises
     ------
@@ -172,28 +176,35 @@ class ShapeFit:
     """
 
     def __init__(
-        self, system: System, options: FitOptions | None = None, values: Mapping[str, float] | None = None
+        self,
+        system: System,
+        options: FitOptions | None = None,
+        values: Mapping[str, float] | None = None,
+        loose: Sequence[str] = (),
     ) -> None:
         self.system = system
         self.options = options or FitOptions()
         if not system.segments:
             raise DataError("the model has no object whose shape could be fitted", hint="give it segments")
         tree = numeric_mechanism(system, values)
+        self._tree = tree
         symbols, theta = system.parameters.symbols, system.parameters.vector(values)
 
         def number(expression: ca.SX) -> Array:
             return np.array(ca.densify(ca.Function("number", [symbols], [expression])(theta))).ravel()
 
         bends = [entry for entry in system.elastic if entry.kind == "bend" and entry.axis]
-        self.free = tuple(tree.joint_index(entry.joint) for entry in bends)
+        self.bends = tuple(tree.joint_index(entry.joint) for entry in bends)
+        self.free = (*self.bends, *(tree.joint_index(name) for name in loose))
         self.rest = np.zeros(system.size)
         for entry in system.elastic:
             self.rest[tree.joint_index(entry.joint)] = number(entry.rest)[0]
         stiffness = np.array([number(entry.stiffness)[0] for entry in bends])
         typical = stiffness.mean() if stiffness.max() > 0 else 1.0
         self._prior = np.sqrt(np.maximum(stiffness / typical, _LEAST_STIFFNESS)) / self.options.bend_std
-        elastic = {entry.joint for entry in system.elastic}
-        self.known = tuple(name for name in tree.joint_names if name not in elastic)
+        self._prior = np.concatenate([self._prior, np.full(len(loose), _LOOSE)])
+        sought = {*(entry.joint for entry in system.elastic), *loose}
+        self.known = tuple(name for name in tree.joint_names if name not in sought)
 
         q = ca.SX.sym("q", system.size)
         kinematics = forward_kinematics(tree, q)
@@ -229,7 +240,6 @@ class ShapeFit:
         sight: Sight,
         q_known: Array,
         starts: Sequence[Array] = (),
-        previous: tuple[Array, float] | None = None,
     ) -> Fit:
         """Fit the shape in one frame.
 
@@ -239,10 +249,8 @@ class ShapeFit:
         q_known : ndarray, shape (n,)
             Configuration whose robot part is right; the object's part is not used.
         starts : sequence of ndarray, each (n,)
-            Where the search for the object's part begins, besides the shape at rest. The passes on the nodes, which
-            cost little, run from all of them, the others from the best that was found.
-        previous : (ndarray of shape (n,), float), optional
-            Configuration in the frame before and the time since then [s]: a prior.
+            Where the search for the object's part begins; at rest where absent. The passes on the nodes, which cost
+            little, run from all of them, the others from the best that was found.
 
         Returns
         -------
@@ -260,9 +268,9 @@ class ShapeFit:
         known = [self.system.mechanism.joint_index(name) for name in self.known]
         q[known] = q_known[known]
         weight = np.minimum(sight.weight, self.options.weight_cap)
-        on_nodes, on_points = self._tasks(sight, weight, previous)
+        on_nodes, on_points = self._tasks(sight, weight)
         tried = []
-        for start in (*starts, self.rest):
+        for start in starts or (self.rest,):
             trial = q.copy()
             trial[free] = start[free]
             tried.append(self._minimise(_Minimum(trial, np.eye(len(free)), math.inf, 0), on_nodes))
@@ -271,18 +279,16 @@ class ShapeFit:
         iterations = sum(minimum.iterations for minimum in tried) + last.iterations - best.iterations
         return self._judged(replace(last, iterations=iterations), sight, weight)
 
-    def _tasks(
-        self, sight: Sight, weight: Array, previous: tuple[Array, float] | None
-    ) -> tuple[list[_Task], list[_Task]]:
+    def _tasks(self, sight: Sight, weight: Array) -> tuple[list[_Task], list[_Task]]:
         """The passes on the nodes and those on the points."""
         options = self.options
         factor = 1.0 / (options.noise_correlation * options.noise**2)
         # nodes weigh together as much as the points, which share their errors
         node_weight = np.full(len(sight.nodes), weight.sum() / len(sight.nodes)) * factor
-        camera = sight.camera
+        camera, anchors = sight.camera, sight.anchors
         return (
-            [_Task(sight.nodes, node_weight, NODE_FACTOR, scale, camera, previous) for scale in options.scales],
-            [_Task(sight.points, weight * factor, 1.0, scale, camera, previous) for scale in options.surface_scales],
+            [_Task(sight.nodes, node_weight, NODE_FACTOR, scale, camera, anchors) for scale in options.scales],
+            [_Task(sight.points, weight * factor, 1.0, scale, camera, anchors) for scale in options.surface_scales],
         )
 
     def _minimise(self, start: _Minimum, tasks: Sequence[_Task]) -> _Minimum:
@@ -379,19 +385,18 @@ class ShapeFit:
                 weighted = block * weight[mine, None]
                 gradient += chain.T @ (weighted.T @ error[mine])
                 hessian += chain.T @ (block.T @ weighted) @ chain
+        for anchor in task.anchors:
+            off = float(anchor.ahead @ (corners.reshape(-1, 3)[anchor.corner] - anchor.place)) / anchor.std
+            by_off = anchor.ahead @ by_q[3 * anchor.corner : 3 * anchor.corner + 3] / anchor.std
+            cost += 0.5 * off**2
+            gradient += by_off * off
+            hessian += np.outer(by_off, by_off)
         held, by_held = (np.array(x) for x in self._held(q))
         held = held.ravel()
         bend = (q - self.rest)[list(self.free)] * self._prior
         cost += 0.5 * float(held @ held + bend @ bend)
         gradient += by_held.T @ held + bend * self._prior
         hessian += by_held.T @ by_held + np.diag(self._prior**2)
-        if task.previous is not None:
-            before, since = task.previous
-            slow = 1.0 / (self.options.rate_std * max(since, 1e-3))
-            change = (q - before)[list(self.free)] * slow
-            cost += 0.5 * float(change @ change)
-            gradient += change * slow
-            hessian += slow**2 * np.eye(len(change))
         return Quadratic(cost, gradient, hessian)
 
     def _coverage(self, link: Integers, along: Array) -> Array:
@@ -409,6 +414,12 @@ class ShapeFit:
     def grips(self, q: ArrayLike) -> Array:
         """Where the grippers are at a configuration, shape (grasps, 3) [m]."""
         return np.array(self._holders(np.asarray(q, float))).reshape(-1, 3)
+
+    def starts(self) -> Starts:
+        """What finds starts for a system whose root is sought (`starts.loosened`)."""
+        lengths = np.linalg.norm(np.diff(np.array(self._corners(self.rest)[0]).reshape(-1, 2, 3), axis=1)[:, 0], axis=1)
+        by_owner = {name: lengths[[name == owner for owner in self.owner]] for name in dict.fromkeys(self.owner)}
+        return Starts(self.system, self._tree, self.rest, self.bends, by_owner)
 
     def place(self, q: ArrayLike) -> Array:
         """The system's points at a configuration, shape (np, 3) [m]."""
@@ -435,11 +446,11 @@ class _Minimum:
 
 @dataclass(frozen=True, eq=False)
 class _Task:
-    """One pass: points, their weights, where they lie on the tubes, the scale of the loss, the camera, the prior."""
+    """One pass: points, their weights, where they lie on the tubes, the scale of the loss, the camera, seen ends."""
 
     points: Array
     weight: Array
     share: float
     scale: float
     camera: Array
-    previous: tuple[Array, float] | None
+    anchors: Sequence[Anchor]

@@ -27,7 +27,7 @@ def unfit(fit: Fit, shape: ShapeFit, options: TrackOptions) -> str:
     if fit.distance > options.d_max:
         limit = 1e3 * options.d_max
         return f"the shape does not fit: {1e3 * fit.distance:.1f} mm off on average, d_max is {limit:g} mm"
-    bend = float(np.abs((fit.q - shape.rest)[list(shape.free)]).max())
+    bend = float(np.abs((fit.q - shape.rest)[list(shape.bends)]).max())
     if bend > options.largest_bend:
         return f"the shape is folded: a joint is bent by {math.degrees(bend):.0f} degrees"
     if fit.inliers < options.least_inliers:

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Literal
 
 from annotated_types import Ge, Gt, Le
 
 from yid_ocp.options import About, check
 from yid_ocp.vision.calibration import CalibrationOptions
 from yid_ocp.vision.clock import ClockOptions
-from yid_ocp.vision.filters import FilterOptions
+from yid_ocp.vision.filters import FilterOptions, Triple
 from yid_ocp.vision.fit import FitOptions
 from yid_ocp.vision.meshes import MeshKind
 from yid_ocp.vision.skeleton import WalkOptions
+
+RootPlace = Literal["model", "fixed", "free"]
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,17 @@ class TrackOptions:
     points: Annotated[
         tuple[str, ...] | None,
         About("points to write down; those that no arm holds when absent, as arms know theirs better"),
+    ] = None
+    root: Annotated[
+        RootPlace,
+        About(
+            "where the object's root is: as the model has it; fixed in one place that is found from the frames; or "
+            "free, anywhere in every frame, as of a rope in a hand or on a table"
+        ),
+    ] = "model"
+    root_near: Annotated[
+        Triple | None,
+        About("place in the world to which the root is nearer than other ends, where root is not model", "m"),
     ] = None
     mesh: Annotated[MeshKind, About("meshes of the robot's self-filter")] = "visual"
     seed: Annotated[int, Ge(0), About("of the walk's random points and of all subsampling")] = 0

@@ -42,6 +42,8 @@ class FrameReport:
     seconds : float
         Processor time from the filtered cloud to the fitted points [s].
     fit : Fit or None
+    other : Fit or None
+        The shape with another end as its root that fits as well, where the root is sought.
     """
 
     index: int
@@ -55,6 +57,7 @@ class FrameReport:
     delay: float
     seconds: float
     fit: Fit | None
+    other: Fit | None = None
 
     @property
     def good(self) -> bool:
@@ -113,6 +116,8 @@ class Track:
     frames : tuple of FrameReport
         All of them, by time stamp.
     calibration : Calibration
+    note : str
+        How the root was told from other ends; empty where the model says where it is.
     stages : tuple of Stages
         Of the frames that were asked for and turned out well.
     """
@@ -125,6 +130,7 @@ class Track:
     common: Array
     frames: tuple[FrameReport, ...]
     calibration: Calibration
+    note: str
     stages: tuple[Stages, ...]
     _system_points: tuple[str, ...]
     _place: Callable[[Array], Array]

@@ -14,14 +14,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import ConfigError, DataError, ModelError, nearest
 from yid_ocp.model.system import System
 from yid_ocp.vision.calibration import Calibration, as_given, calibrate
 from yid_ocp.vision.clock import is_late, own_offset
+from yid_ocp.vision.ends import told, touching
 from yid_ocp.vision.filters import Cloud, ObjectRegion, voxel_grid, without_outliers, without_robot
-from yid_ocp.vision.fit import ShapeFit, Sight
+from yid_ocp.vision.fit import Fit, ShapeFit, Sight
 from yid_ocp.vision.frames import FrameSequence
 from yid_ocp.vision.judgement import judged, measured, unfit
 from yid_ocp.vision.meshes import Scene, Surfaces, numeric_mechanism, robot_meshes
@@ -29,6 +31,8 @@ from yid_ocp.vision.options import TrackOptions
 from yid_ocp.vision.registration import Arm, Glimpse
 from yid_ocp.vision.results import FrameReport, Stages, Track
 from yid_ocp.vision.skeleton import Skeleton, skeleton
+from yid_ocp.vision.starts import Starts, loosened
+from yid_ocp.vision.trace import traced
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
@@ -36,6 +40,7 @@ Progress = Callable[[int, int, str], None]
 _LARGEST = 50.0  # [m]; a depth camera sees no further, a cloud in millimetres always does
 _SAME_TIME = 1e-6  # [s]
 _GRIP = 0.06  # about a grasp, beyond the tube's radius, a point may be the object's [m]
+_AS_GOOD = 1.2  # times the distance of the best shape, up to which another one may be the right one
 
 
 def track(
@@ -85,7 +90,7 @@ def track(
         told(done, total, f"fitting {sequence.names[i]}")
         frames.append(tracker.frame(i, calibration))
     told(total, total, "done")
-    found = tracker.finished(tracker.judged(frames), calibration)
+    found = tracker.finished(*tracker.judged(frames), calibration)
     drawn = (tracker.stages(frame, calibration) for frame in found.frames if frame.index in stages)
     return replace(found, stages=tuple(entry for entry in drawn if entry is not None))
 
@@ -123,11 +128,22 @@ class Tracker:
         self, scene: Scene, recording: Recording | None, sequence: FrameSequence, options: TrackOptions
     ) -> None:
         system, values = scene.system, scene.values
+        loose: tuple[str, ...] = ()
+        anywhere = options.root != "model"
+        if anywhere:
+            if scene.urdf is not None:
+                hint = "set track.options.root to model, or model.robot to null"
+                raise ConfigError(
+                    "a robot holds the object: its root is where the model has it", where="root", hint=hint
+                )
+            system, loose = loosened(system, values)
         self.system, self.sequence, self.options = system, sequence, options
-        self.shape = ShapeFit(system, options.fit, values)
+        self.shape = ShapeFit(system, options.fit, values, loose)
+        self.starts = self.shape.starts() if anywhere else None
         self.names = _chosen_points(system, options.points)
-        self.region = ObjectRegion(system, options.filters, values)
-        self.span, self.angles = _joint_angles(system, recording, self.shape.known)
+        self.region = ObjectRegion(system, options.filters, values, anywhere=anywhere)
+        # of a root that is sought nothing that was recorded is needed
+        self.span, self.angles = _joint_angles(system, recording, () if anywhere else self.shape.known)
         tree = numeric_mechanism(system, values)
         self.robot: Surfaces | None = None
         if scene.urdf is not None:
@@ -226,11 +242,12 @@ class Tracker:
         t = float(calibration.state.time(stamp))
         return FrameReport(index, self.sequence.names[index], stamp, t, reason, 0, 0, 0, math.nan, 0.0, None)
 
-    def judged(self, frames: Sequence[FrameReport]) -> list[FrameReport]:
-        """The frames with those dropped that are unlike the others."""
-        return judged(frames, self.options)
+    def judged(self, frames: Sequence[FrameReport]) -> tuple[list[FrameReport], str]:
+        """The frames with those dropped that are unlike the others, and how the root was told from other ends."""
+        rooted, note = told(frames, self.options)
+        return judged(rooted, self.options), note
 
-    def finished(self, frames: Sequence[FrameReport], calibration: Calibration) -> Track:
+    def finished(self, frames: Sequence[FrameReport], note: str, calibration: Calibration) -> Track:
         """The track of judged frames; `DataError` where none is good."""
         columns = [self.system.points.index(name) for name in self.names]
         points = measured(frames, columns, calibration, self.options, self.sequence.source)
@@ -243,6 +260,7 @@ class Tracker:
             points.common,
             tuple(frames),
             calibration,
+            note,
             (),
             self.system.points,
             self.shape.place,
@@ -277,23 +295,63 @@ class Tracker:
             return work.dropped(f"too few points of the object: {len(cloud)} left")
         if len(cloud) > options.filters.most:
             cloud = cloud.keep(np.sort(rng.choice(len(cloud), options.filters.most, replace=False)))
+            work.report = replace(work.report, filtered=len(cloud))
         self._fit(work, cloud, q, rng, calibration.camera)
         return work
 
     def _fit(self, work: _Work, cloud: Cloud, q: Array, rng: np.random.Generator, camera: Array) -> None:
         begun = time.process_time()
-        found = skeleton(cloud, rng, self.options.walk)
-        work.skeleton = found
-        work.report = replace(work.report, filtered=len(cloud), nodes=len(found.nodes))
-        if not len(found.nodes):
-            work.dropped("no part of the cloud is dense enough for a skeleton")
+        try:
+            fits = (
+                self._held(work, cloud, q, rng, camera)
+                if self.starts is None
+                else self._anywhere(self.starts, work, cloud, rng, camera)
+            )
+        except DataError as error:
+            work.dropped(error.what)
             return
+        reason = unfit(fits[0], self.shape, self.options)
+        if self.starts is not None and not reason and touching(fits[0].centre_line, self.shape.radius):
+            reason = "the object crosses or touches itself"
+        other = fits[1] if len(fits) > 1 else None
+        spent = time.process_time() - begun
+        work.report = replace(work.report, fit=fits[0], other=other, reason=reason, seconds=spent)
+
+    def _held(self, work: _Work, cloud: Cloud, q: Array, rng: np.random.Generator, camera: Array) -> list[Fit]:
+        """The shape of an object whose root is where the model has it."""
+        found = skeleton(cloud, rng, self.options.walk)
+        work.skeleton, work.report = found, replace(work.report, nodes=len(found.nodes))
+        if not len(found.nodes):
+            raise DataError("no part of the cloud is dense enough for a skeleton")
         rest = cloud.keep(found.connected)
         part = found.part[found.label[found.connected]]
         work.filtered = rest
-        fit = self.shape.solve(Sight(rest.points, rest.weight, part, found.nodes, camera), q)
-        spent = time.process_time() - begun
-        work.report = replace(work.report, fit=fit, reason=unfit(fit, self.shape, self.options), seconds=spent)
+        return [self.shape.solve(Sight(rest.points, rest.weight, part, found.nodes, camera), q)]
+
+    def _anywhere(
+        self, starts: Starts, work: _Work, cloud: Cloud, rng: np.random.Generator, camera: Array
+    ) -> list[Fit]:
+        """The best shape with its root anywhere, and one with another root that is as good, if there is one."""
+        diameter, options = 2.0 * float(self.shape.radius.max()), self.options
+        course = traced(cloud, diameter, options.walk.link_length, rng)
+        work.skeleton, work.report = course.skeleton, replace(work.report, nodes=len(course.nodes))
+        if len(course.loops):
+            raise DataError("the object crosses or touches itself: its cloud closes a loop")
+        found = starts.of(course)
+        if options.root_near is not None:
+            place = np.array(options.root_near)
+            near = min(found, key=lambda start: float(np.linalg.norm(start.root - place))).root
+            found = [start for start in found if np.array_equal(start.root, near)]
+        own = cKDTree(course.nodes).query(cloud.points)[0] < 2.0 * diameter
+        rest = cloud.keep(own)
+        work.filtered = rest
+        part = np.zeros(len(rest), dtype=np.int64)
+        fits = []
+        for start in found:
+            sight = Sight(rest.points, rest.weight, part, course.nodes, camera, start.anchors)
+            fits.append(self.shape.solve(sight, self.shape.rest, [start.q]))
+        fits.sort(key=lambda fit: fit.distance)
+        return [fit for fit in fits[:2] if fit.distance < _AS_GOOD * fits[0].distance]
 
 
 def _chosen_points(system: System, wanted: tuple[str, ...] | None) -> tuple[str, ...]:

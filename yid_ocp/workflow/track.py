@@ -117,10 +117,10 @@ def run_track(
                 progress.stage("finding what is common to the frames")
                 calibration = filmed.tasks.calibration()
                 progress.stage("tracking")
-                frames = tracker.judged(filmed.tasks.frames(tracker, calibration, workers, progress))
+                frames, note = tracker.judged(filmed.tasks.frames(tracker, calibration, workers, progress))
                 found: Track | None = None
                 try:
-                    found = tracker.finished(frames, calibration)
+                    found = tracker.finished(frames, note, calibration)
                 except DataError as error:
                     refused = error
         except YidError:
@@ -131,15 +131,16 @@ def run_track(
             stages = tracker.stages(frame, calibration)
             if stages is not None:
                 draw_stages(stages, folder.path / "pictures")
-        result = track_result(frames, calibration, found)
+        result = track_result(frames, calibration, found) | {"root": note}
         told, tracked = [], None
         if found is not None:
             draw_track(found, folder.path / "track.png")
             tracked = found.recording(recording)
             write_recording(tracked, folder.path / "recording.h5")
-            # what was tracked may be elsewhere than the object reaches
-            doubts += [doubt for doubt in of_one(run, system, tracked) if doubt.cause.startswith("point_")]
-            shape = Told("fitted shape", system, system.parameters.vector(), found.t, found.q)
+            # what was tracked may be elsewhere than the object reaches, where the model says where it stands
+            if settings.options.root == "model":
+                doubts += [doubt for doubt in of_one(run, system, tracked) if doubt.cause.startswith("point_")]
+            shape = Told("fitted shape", tracker.system, system.parameters.vector(), found.t, found.q)
             told = [moving("tracked", [shape], tracked)]
             if filmed.made is not None:
                 result["truth_errors"] = truth_errors(system, found, filmed.made)
