@@ -24,6 +24,7 @@ recordings:
 track:
   frames: {data}/frames
   pictures: 1
+  options: {{calibration: {{fix_pose: true}}, clock: {{search: 0}}}}
 """
 
 
@@ -59,7 +60,7 @@ def test_track_makes_a_recording_that_solve_reads(cli, config, tmp_path, small, 
     result = json.loads((tmp_path / "run" / "result.json").read_text())
     assert result["format"] == "yid-track/1"
     assert [frame["reason"] for frame in result["frames"]] == ["", "", ""]
-    assert result["clock"]["estimated"] is False  # the clouds hold no arm
+    assert result["camera"]["estimated"] is False  # the clouds hold no arm
     assert len(result["inputs"]) == 4
     pictures = sorted(path.stem.rpartition("_")[2] for path in (tmp_path / "run" / "pictures").glob("*.png"))
     assert pictures == sorted(STAGES)
@@ -150,7 +151,7 @@ def test_several_workers_find_the_same(cli, config, tmp_path):
 def test_the_examples_run(cli, repository, tmp_path, name):
     pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo")
     file = repository / "configs" / f"{name}.yaml"
-    short = ("duration=1.2", "rate=2.5", "dropped=0.0")
+    short = ("duration=1.6", "rate=3.0", "dropped=0.0")
     arguments = [part for setting in short for part in ("--set", f"track.virtual.{setting}")]
     quick = ("--quiet", "--set", "track.pictures=0", "--set", "track.keep_frames=true")
     done = cli("track", file, "--out", tmp_path / "run", *arguments, *quick)

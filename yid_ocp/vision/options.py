@@ -77,7 +77,7 @@ class TrackOptions:
     ] = 0.02
     std_floor: Annotated[
         float, Gt(0), About("standard deviation that no fit is better than, of straight links in place of a curve", "m")
-    ] = 0.003
+    ] = 0.002
     stamp_std: Annotated[
         float, Ge(0), About("standard deviation of a frame's time stamp, beyond the common offset", "s")
     ] = 0.003
