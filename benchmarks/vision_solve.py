@@ -4,10 +4,10 @@
 
 Films of one arm moving the foam Y in MuJoCo, each with stiffnesses of its own (a quarter either way of those of the
 table), a motion of its own, and the independent camera of `vision_table.py`, whose told pose is 1.5 degrees and 1.5 cm
-off, its depth 1 %, its clock 60 ms. Points are tracked with the estimated pose; what their standard deviations have in
-common is one error of all frames, so a shift of the camera with that standard deviation is estimated beside the
-stiffnesses (`camera_translation`) unless it is kept. A film is right when every parameter that is called identifiable
-lies within two stated standard deviations of the truth.
+off, its depth 1 %, its clock 60 ms. Torques have the noise of the embedded recordings. Points are tracked with the
+estimated pose; what their standard deviations have in common is one error of all frames, so a shift of the camera with
+that standard deviation is estimated beside the stiffnesses (`camera_translation`) unless it is kept. A film is right
+when every parameter that is called identifiable lies within two stated standard deviations of the truth.
 """
 
 from __future__ import annotations
@@ -22,10 +22,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from vision_table import TRUTH, Row, film, played, tracked
+from make_recordings import OFFSET, WHITE
+from vision_table import TRUTH, Played, Row, film, played, tracked
 
 import yid_ocp as yid
-from yid_ocp.data.recording import Recording
+from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import YidError
 from yid_ocp.problem.options import ProblemOptions
@@ -42,7 +43,7 @@ def one_film(number: int, frames: int, camera: str) -> dict[str, Any]:
     rng = np.random.default_rng([number, 9])
     truth = {name: value * math.exp(rng.uniform(-SPREAD, SPREAD)) for name, value in TRUTH.items()}
     begun = time.process_time()
-    play = played(1, 100 + number, ROW.duration, links=4, truth=truth)
+    play = played(1, 100 + number, ROW.duration, links=4, truth=truth, step=5e-5)
     made = film(play, ROW, number, frames)
     found, outcome = tracked(made, TrackOptions())
     entry: dict[str, Any] = {"film": number, "accepted": outcome.accepted, "refused": outcome.refusal}
@@ -51,17 +52,18 @@ def one_film(number: int, frames: int, camera: str) -> dict[str, Any]:
     entry["largest_error"] = float(np.nanmax(outcome.error))
     system, start = made.scene.system, dict.fromkeys(TRUTH, 3.0)
     group = found.group()
-    free, options = list(TRUTH), ProblemOptions()
+    free, priors = list(TRUTH), {}
     if camera == "free":
         # one error of all frames: a shift of the camera, and the rest of the standard deviation for each by itself
         common = np.nanmedian(found.common, axis=(0, 1))
         system = system.with_effects([make_effect("camera_translation", "camera", system)])
         names = [f"camera_translation@camera.{axis}" for axis in AXES]
         free += names
-        options = ProblemOptions(priors=dict(zip(names, map(float, common), strict=True)))
+        priors = dict(zip(names, map(float, common), strict=True))
         own = np.sqrt(np.maximum(found.std**2 - found.common**2, 1e-6))
         group = replace(group, std=own)
-    recording = Recording(made.recording.joints, (play.arm_points(number), group), name=f"film {number}")
+    options = ProblemOptions(priors=priors, feedback="lqr", initial_state="equilibrium")
+    recording = Recording(joints_of(play, number), (play.arm_points(number), group), name=f"film {number}")
     try:
         problem = yid.EstimationProblem(yid.compile_step(system, 0.01), [recording], free, options, start)
         solution = yid.solve(problem, yid.GaussNewton(cost_tolerance=1e-5))
@@ -77,6 +79,15 @@ def one_film(number: int, frames: int, camera: str) -> dict[str, Any]:
         for name in TRUTH
     }
     return entry | {"seconds": time.process_time() - begun}
+
+
+def joints_of(play: Played, number: int) -> JointGroup:
+    """The joints with the torques' noise of the embedded recordings: white, and constant over a recording."""
+    joints, rng = play.joints(number), np.random.default_rng([number, 7])
+    assert joints.effort is not None
+    noise = np.array(WHITE) * rng.standard_normal(joints.effort.shape) + np.array(OFFSET) * rng.standard_normal(7)
+    stated = {"effort_std": np.array(WHITE), "effort_bias_std": np.array(OFFSET)}
+    return replace(joints, effort=joints.effort + noise, **stated)
 
 
 def within(entry: dict[str, Any]) -> tuple[int, int]:

@@ -169,6 +169,7 @@ def played(
     links: int | None = None,
     folder: Path | None = None,
     truth: Mapping[str, float] | None = None,
+    step: float = 2.5e-4,
 ) -> Played:
     """A motion in MuJoCo; kept in a folder, where one is given, as numbers."""
     links = links or LINKS[arms]
@@ -182,7 +183,7 @@ def played(
     posture = initial_posture(system, values)
     excitation = Excitation(travel=TRAVEL[arms] * travel, duration=duration)
     motion = multisine(system, values, seed=seed, posture=posture, excitation=excitation)
-    run = simulate_in_mujoco(system, values, motion, Simulation(duration, time_step=2.5e-4), posture=posture)
+    run = simulate_in_mujoco(system, values, motion, Simulation(duration, time_step=step), posture=posture)
     if kept is not None:
         kept.parent.mkdir(parents=True, exist_ok=True)
         np.savez(kept, t=run.t, q=run.q, effort=run.effort, points=run.points)
