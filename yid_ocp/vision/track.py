@@ -40,7 +40,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Progress = Callable[[int, int, str], None]
 
-_ASKED = 12  # frames, at most, that are asked about the object's sizes
+_ASKED = 8  # frames, at most, that are asked about the object's sizes
 _LARGEST = 50.0  # [m]; a depth camera sees no further, a cloud in millimetres always does
 _SAME_TIME = 1e-6  # [s]
 _GRIP = 0.06  # about a grasp, beyond the tube's radius, a point may be the object's [m]

@@ -8,8 +8,9 @@ the camera itself.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +44,7 @@ class View:
     points: Array
     pose: Array
     pinhole: Pinhole | None = None
+    _last: list[Any] = field(default_factory=list)
 
     def hidden(self, places: Array, radius: Array, margin: float) -> Mask:
         """Which places cannot be seen from the camera.
@@ -71,10 +73,12 @@ class View:
             low, high = self._borders
             reach = (radius / np.maximum(depth, _LEAST_DEPTH))[:, None]
             hidden |= ((asked < low + reach) | (asked > high - reach)).any(axis=1)
-        seen, distance = self._about(asked, hidden)
-        if not len(seen):
+        if hidden.all():
             return hidden
-        tree, wide = cKDTree(seen), radius / np.maximum(depth, _LEAST_DEPTH)
+        tree, distance = self._about(asked[~hidden].min(0), asked[~hidden].max(0))
+        if not len(distance):
+            return hidden
+        wide = radius / np.maximum(depth, _LEAST_DEPTH)
         for i in np.flatnonzero(~hidden):
             there = distance[tree.query_ball_point(asked[i], wide[i])]
             limit = depth[i] - radius[i] - margin
@@ -105,15 +109,16 @@ class View:
                         borders[end, axis] = value
         return borders[0], borders[1]
 
-    def _about(self, asked: Array, hidden: Mask) -> tuple[Array, Array]:
-        """Points of the picture round about the places: where in the picture, and how deep."""
-        if hidden.all():
-            return np.empty((0, 2)), np.empty(0)
-        low, high = asked[~hidden].min(0), asked[~hidden].max(0)
-        middle, half = 0.5 * (low + high), 0.5 * (high - low) + _BASELINE
+    def _about(self, low: Array, high: Array) -> tuple[cKDTree, Array]:
+        """Points of the picture round about a part of it: where in the picture, and how deep."""
+        if self._last and (self._last[0] <= low - _BASELINE).all() and (self._last[1] >= high + _BASELINE).all():
+            return self._last[2], self._last[3]
+        # as much more again, since what is asked next lies near it
+        low, high = low - 2 * _BASELINE, high + 2 * _BASELINE
         seen, depth = self._all
-        near = (np.abs(seen - middle) <= half).all(axis=1)
-        return seen[near], depth[near]
+        near = (seen[:, 0] >= low[0]) & (seen[:, 0] <= high[0]) & (seen[:, 1] >= low[1]) & (seen[:, 1] <= high[1])
+        self._last[:] = [low, high, cKDTree(seen[near]), depth[near]]
+        return self._last[2], self._last[3]
 
     @staticmethod
     def _shadowed(tree: cKDTree, distance: Array, asked: Array, limit: float) -> bool:
