@@ -8,8 +8,8 @@ import pytest
 
 from yid_ocp.cli import main
 from yid_ocp.data.hdf5 import read_recording
-from yid_ocp.vision.fit import ShapeFit
 from yid_ocp.vision.pictures import STAGES
+from yid_ocp.vision.track import Tracker
 
 CONFIG = """\
 model:
@@ -24,6 +24,7 @@ recordings:
 track:
   frames: {data}/frames
   pictures: 1
+  options: {{calibration: {{fix_pose: true}}, clock: {{search: 0}}}}
 """
 
 
@@ -59,7 +60,7 @@ def test_track_makes_a_recording_that_solve_reads(cli, config, tmp_path, small, 
     result = json.loads((tmp_path / "run" / "result.json").read_text())
     assert result["format"] == "yid-track/1"
     assert [frame["reason"] for frame in result["frames"]] == ["", "", ""]
-    assert result["clock"]["estimated"] is False  # the clouds hold no arm
+    assert result["camera"]["estimated"] is False  # the clouds hold no arm
     assert len(result["inputs"]) == 4
     pictures = sorted(path.stem.rpartition("_")[2] for path in (tmp_path / "run" / "pictures").glob("*.png"))
     assert pictures == sorted(STAGES)
@@ -112,27 +113,29 @@ def result_of(folder):
 def test_what_an_interrupted_run_did_is_used(cli, config, tmp_path, monkeypatch):
     """Killed after the first frame: the next run does the others alone, with the same result to the last bit."""
     assert cli("track", config, "--out", tmp_path / "whole").code == 0
-    fitted, work = [], ShapeFit.solve
+    worked, work = [], Tracker.frame
 
-    def interrupted(self, *arguments, **named):
-        if len(fitted) == 1:
+    def interrupted(self, index, common):
+        if len(worked) == 1:
             raise KeyboardInterrupt
-        fitted.append(1)
-        return work(self, *arguments, **named)
+        worked.append(index)
+        return work(self, index, common)
 
-    monkeypatch.setattr(ShapeFit, "solve", interrupted)
+    monkeypatch.setattr(Tracker, "frame", interrupted)
     assert cli("track", config, "--out", tmp_path / "run").code not in (0, 1)
     assert not (tmp_path / "run").exists()
     assert (tmp_path / "run.partial").is_dir()
     later = []
 
-    def counted(self, *arguments, **named):
-        later.append(1)
-        return work(self, *arguments, **named)
+    def counted(self, index, common):
+        later.append(index)
+        return work(self, index, common)
 
-    monkeypatch.setattr(ShapeFit, "solve", counted)
+    monkeypatch.setattr(Tracker, "frame", counted)
+    monkeypatch.setattr(Tracker, "common", None)  # it is known
     assert cli("track", config, "--out", tmp_path / "run", "--set", "track.pictures=0").code == 0
     assert len(later) == 2
+    assert not set(later) & set(worked)
     assert not (tmp_path / "run.partial").exists()
     assert result_of(tmp_path / "run") == result_of(tmp_path / "whole")
     one, other = (read_recording(tmp_path / name / "recording.h5").points[-1] for name in ("run", "whole"))
@@ -150,7 +153,7 @@ def test_several_workers_find_the_same(cli, config, tmp_path):
 def test_the_examples_run(cli, repository, tmp_path, name):
     pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo")
     file = repository / "configs" / f"{name}.yaml"
-    short = ("duration=1.2", "rate=2.5", "dropped=0.0")
+    short = ("duration=1.6", "rate=3.0", "dropped=0.0")
     arguments = [part for setting in short for part in ("--set", f"track.virtual.{setting}")]
     quick = ("--quiet", "--set", "track.pictures=0", "--set", "track.keep_frames=true")
     done = cli("track", file, "--out", tmp_path / "run", *arguments, *quick)

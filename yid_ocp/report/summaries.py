@@ -142,7 +142,7 @@ def track_summary(result: Mapping[str, Any]) -> list[Block]:
         *([Table(rows, "Points", key=True)] if result["points"] else []),
         Statement(said, "verdict"),
         *statements([*dropped, result["camera"]["message"], *result["sizes"]["messages"]]),
-        *statements([thing["text"] for thing in result["things"]]),
+        *statements([*([result["root"]] if result["root"] else []), *(thing["text"] for thing in result["things"])]),
     ]
 
 

@@ -42,12 +42,14 @@ from yid_ocp.vision.registration import (
 Array = NDArray[np.float64]
 
 _LEAST_FRAMES = 3
-_START_FRAMES = 8  # in which starts are tried
+_START_FRAMES = 6  # in which starts are tried
 _STARTS = 4
+_ENOUGH = 0.9  # of the arm is where a start has led: others are not tried
 _WIDE = (0.08, 0.06, 0.045)  # reach of nearest surfaces, from stage to stage [m]
 _REACH = 0.035  # along the camera's rays [m]
 _ROUNDS, _LAST_ROUNDS = 3, 15
-_FEW, _MANY = 250, 700  # points of a frame
+_THIN = 5000  # points of a frame among which starts are tried
+_FEW, _MANY = 250, 700  # of them, near the arm
 _SETTLED = 1e-5  # of a step: [rad], [m], [s]
 _AROUND = 0.3  # of the directions to the arm that are looked at, to every side, as x/z and y/z
 _NOTED = 0.006  # displacement of the arm that is worth a word [m]
@@ -152,7 +154,10 @@ class Calibration:
         slopes[:, :, CLOCK] = velocity
         slopes[:, :, DRIFT] = velocity * (stamps - self.state.about)[:, None]
         variance = np.einsum("nij,jk,nik->ni", slopes, self.covariance, slopes)
-        return np.sqrt(variance + (slopes @ self.beside) ** 2)
+        # a shape that is held by the gripper and seen elsewhere gives way in any direction
+        beside = slopes @ self.beside
+        evenly = np.linalg.norm(beside, axis=1, keepdims=True) / math.sqrt(3.0)
+        return np.asarray(np.sqrt(variance + np.maximum(np.abs(beside), evenly) ** 2))
 
 
 def as_given(pose: Array, options: ClockOptions, reason: str = "") -> Calibration:
@@ -274,9 +279,13 @@ class _Calibrator:
         kept = ((at > towards.min(axis=0) - _AROUND) & (at < towards.max(axis=0) + _AROUND)).all(axis=1)
         return Glimpse(glimpse.stamp, points[kept]) if np.count_nonzero(kept) >= FEWEST else None
 
+    def _thinned(self, glimpse: Glimpse) -> Glimpse:
+        count = len(glimpse.points)
+        return replace(glimpse, points=glimpse.points[self.rng.choice(count, min(count, _THIN), replace=False)])
+
     def _start(self) -> CameraState:
         """The state near which most of the arm is where the camera sees something."""
-        few = _some(self.glimpses, _START_FRAMES)
+        few = [self._thinned(glimpse) for glimpse in _some(self.glimpses, _START_FRAMES)]
         tried = starts(self.arm, few, self.told, self.clock.search, _STARTS)
         if not tried:
             raise _UntoldError("it is hardly in view", "turn the camera so that it sees more of the arm")
@@ -287,6 +296,8 @@ class _Calibrator:
             presence = clouds.presence(self.arm, trial, 0.5 * _REACH)
             if presence.there - presence.through > most:
                 best, most = trial, presence.there - presence.through
+            if most > _ENOUGH:
+                break
         return best
 
     def _settled(self, state: CameraState, glimpses: Sequence[Glimpse]) -> tuple[CameraState, RobustSum, list[Glimpse]]:

@@ -23,7 +23,8 @@ from yid_ocp.vision.registration import FEWEST, Arm, CameraState
 Array = NDArray[np.float64]
 
 _REACH = 0.04  # at which a point stops to be the arm's [m]
-_POINTS, _FEW = 500, 150  # of a frame: for its offset, to see which start is best
+_THIN = 5000  # points of a frame that are looked at
+_POINTS, _FEW = 500, 150  # near the arm: for its offset, to see which start is best
 _COARSE = 0.04  # between starts [s]
 _FURTHEST = 0.4  # of them [s]
 _NARROWING = (1.0, 0.7, 0.5, 0.5)  # of the reach, from iteration to iteration
@@ -112,10 +113,10 @@ def own_offset(
         None where the arm is not in view.
     """
     t, origin = float(state.time(stamp)), state.pose[:3, 3]
-    near = np.flatnonzero(arm.near(points, t, 2 * _REACH))
-    if len(near) < FEWEST:
+    points = points[rng.permutation(len(points))[:_THIN]]
+    chosen = points[arm.near(points, t, 2 * _REACH)][:_POINTS]
+    if len(chosen) < FEWEST:
         return None
-    chosen = points[rng.choice(near, min(len(near), _POINTS), replace=False)]
     trial = _nearby(arm, origin, t, chosen, 0.0)
     if trial.misfit > _UNUSUAL * usual:
         steps = round(_FURTHEST / _COARSE)

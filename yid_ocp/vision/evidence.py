@@ -9,7 +9,7 @@ A station of a tube that no own point lies on is hidden, or it is empty although
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -19,6 +19,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from yid_ocp.vision.starts import Anchor
 from yid_ocp.vision.view import View
 
 Array = NDArray[np.float64]
@@ -188,6 +189,8 @@ class Sight:
     removed : callable, optional
         Which places, shape (S, 3), lie where filters leave no points.
     colour : ndarray, shape (N, 3), optional
+    anchors : sequence of Anchor
+        Ends of the object that were seen.
     """
 
     points: Array
@@ -197,6 +200,7 @@ class Sight:
     view: View | None = None
     removed: Removed | None = None
     colour: Array | None = None
+    anchors: Sequence[Anchor] = ()
 
     @cached_property
     def tree(self) -> cKDTree:

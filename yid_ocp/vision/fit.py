@@ -32,6 +32,7 @@ from yid_ocp.vision.evidence import Evidence, Sight, Tubes, gather, nearest, sle
 from yid_ocp.vision.fitted import Fit, SizeRows
 from yid_ocp.vision.meshes import numeric_mechanism
 from yid_ocp.vision.residuals import along_sight, nearest_way
+from yid_ocp.vision.starts import Anchor, Starts
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -43,6 +44,7 @@ _SIGMAS = 3.0  # of a point, beyond which an end stands elsewhere than the shape
 _NEAR = 3.0  # times the last scale, beyond which a point says nothing of the shape
 _TOUCHING = 1e-3  # [m]
 _LEAST_STIFFNESS = 1e-2  # of the mean; softer bends are still held this much
+_LOOSE = 1e-2  # [1/m, 1/rad]; holds what no point tells, such as a straight rope's turn about itself
 _TOLERANCE = 1e-4  # of a bend [rad] and, relative, of the cost, at which a pass ends
 
 
@@ -76,9 +78,6 @@ class FitOptions:
     bend_std: Annotated[
         float, Gt(0), About("bend of a joint of mean stiffness that costs as much as one standard deviation", "rad")
     ] = 0.3
-    rate_std: Annotated[
-        float, Gt(0), About("change of a bend since the previous frame that costs as much, per time between", "rad/s")
-    ] = 3.0
     iterations: Annotated[int, Ge(1), About("at most so many in a pass")] = 25
     weight_cap: Annotated[float, Gt(0), About("a point counts at most for so many of the camera's")] = 6.0
     least_coverage: Annotated[
@@ -109,6 +108,8 @@ class ShapeFit:
     options : FitOptions, optional
     values : mapping of str to float, optional
         Parameter values (lengths, radii, stiffnesses for the prior); nominal where absent.
+    loose : sequence of str
+        Joints beside the bends that are sought as well, with next to no prior: see `starts.loosened`.
 
     Raises
     ------
@@ -117,29 +118,36 @@ class ShapeFit:
     """
 
     def __init__(
-        self, system: System, options: FitOptions | None = None, values: Mapping[str, float] | None = None
+        self,
+        system: System,
+        options: FitOptions | None = None,
+        values: Mapping[str, float] | None = None,
+        loose: Sequence[str] = (),
     ) -> None:
         self.system = system
         self.options = options or FitOptions()
         if not system.segments:
             raise DataError("the model has no object whose shape could be fitted", hint="give it segments")
         tree = numeric_mechanism(system, values)
+        self._tree = tree
         symbols, theta = system.parameters.symbols, system.parameters.vector(values)
 
         def number(expression: ca.SX) -> Array:
             return np.array(ca.densify(ca.Function("number", [symbols], [expression])(theta))).ravel()
 
         bends = [entry for entry in system.elastic if entry.kind == "bend" and entry.axis]
-        self.free = tuple(tree.joint_index(entry.joint) for entry in bends)
-        self.free_owner = tuple(_owner(system, entry.joint) for entry in bends)
+        self.bends = tuple(tree.joint_index(entry.joint) for entry in bends)
+        self.free = (*self.bends, *(tree.joint_index(name) for name in loose))
+        self.free_owner = (*(_owner(system, entry.joint) for entry in bends), *[""] * len(loose))
         self.rest = np.zeros(system.size)
         for entry in system.elastic:
             self.rest[tree.joint_index(entry.joint)] = number(entry.rest)[0]
         stiffness = np.array([number(entry.stiffness)[0] for entry in bends])
         typical = stiffness.mean() if stiffness.max() > 0 else 1.0
         self._prior = np.sqrt(np.maximum(stiffness / typical, _LEAST_STIFFNESS)) / self.options.bend_std
-        elastic = {entry.joint for entry in system.elastic}
-        self.known = tuple(name for name in tree.joint_names if name not in elastic)
+        self._prior = np.concatenate([self._prior, np.full(len(loose), _LOOSE)])
+        sought = {*(entry.joint for entry in system.elastic), *loose}
+        self.known = tuple(name for name in tree.joint_names if name not in sought)
 
         radii, owners = [], []
         for segment in system.segments:
@@ -184,7 +192,6 @@ class ShapeFit:
         sight: Sight,
         q_known: Array,
         starts: Sequence[Array] = (),
-        previous: tuple[Array, float] | None = None,
     ) -> Fit:
         """Fit the shape in one frame.
 
@@ -194,10 +201,8 @@ class ShapeFit:
         q_known : ndarray, shape (n,)
             Configuration whose robot part is right; the object's part is not used.
         starts : sequence of ndarray, each (n,)
-            Where the search for the object's part begins, besides the shape at rest. The passes on the nodes, which
-            cost little, run from all of them, the others from the best that was found.
-        previous : (ndarray of shape (n,), float), optional
-            Configuration in the frame before and the time since then [s]: a prior.
+            Where the search for the object's part begins; at rest where absent. The passes on the nodes, which cost
+            little, run from all of them, the others from the best that was found.
 
         Returns
         -------
@@ -215,22 +220,22 @@ class ShapeFit:
         known = [self.system.mechanism.joint_index(name) for name in self.known]
         q[known] = q_known[known]
         begun = []
-        for start in (*starts, self.rest):
+        for start in starts or (self.rest,):
             trial = q.copy()
             trial[free] = start[free]
             begun.append(trial)
         everything = _Left(np.ones(len(sight.nodes), bool), np.ones(len(sight.points), bool))
         thin = _Left(*slender(sight, float(self.radius.max())))
-        best = self._attempt(sight, begun, thin if thin.nodes.any() else everything, previous)
+        best = self._attempt(sight, begun, thin if thin.nodes.any() else everything)
         for left in (self._without(best, sight, self._links_of(self._failed(best.evidence))), everything):
             failed = self._failed(best.evidence)
             if not failed:
                 break
             # a part of the object is not where this has it: something like it stood nearer to where the search began
             if left.nodes.any() and left.points.any():
-                other = self._attempt(sight, [self._rested(best.minimum.q, failed), *begun], left, previous)
+                other = self._attempt(sight, [self._rested(best.minimum.q, failed), *begun], left)
                 best = max(best, other, key=lambda attempt: self._covered(attempt.evidence))
-        return self._judged(best, self._rivals(best, sight, previous), sight, previous)
+        return self._judged(best, self._rivals(best, sight), sight)
 
     def _rested(self, q: Array, tubes: Collection[str]) -> Array:
         """A configuration with some tubes as at rest."""
@@ -242,7 +247,7 @@ class ShapeFit:
     def _links_of(self, tubes: Collection[str]) -> NDArray[np.bool_]:
         return np.array([owner in tubes for owner in self.owner])
 
-    def _rivals(self, best: _Attempt, sight: Sight, previous: tuple[Array, float] | None) -> list[Array]:
+    def _rivals(self, best: _Attempt, sight: Sight) -> list[Array]:
         """Other shapes that the cloud speaks for as much: where a thing touches a tube, that may go on along the thing.
 
         Everything is tried that is left without the points on which the tube lies from the contact on.
@@ -257,7 +262,7 @@ class ShapeFit:
             onward = mine & (np.arange(len(mine)) >= min(k for k in touched if mine[k]))
             left = self._without(best, sight, onward)
             if left.nodes.any() and left.points.any():
-                rival = self._attempt(sight, [self._rested(best.minimum.q, {name}), best.minimum.q], left, previous)
+                rival = self._attempt(sight, [self._rested(best.minimum.q, {name}), best.minimum.q], left)
                 if not self._failed(rival.evidence):
                     found.append(rival.minimum.q)
         return found
@@ -285,11 +290,9 @@ class ShapeFit:
         node_link, _, _, distance = nearest(tubes.corners, tubes.radius, sight.nodes, NODE_FACTOR)
         return _Left(~(links[node_link] & (distance < 2 * tubes.radius[node_link])), ~wrong)
 
-    def _attempt(
-        self, sight: Sight, starts: Sequence[Array], left: _Left, previous: tuple[Array, float] | None
-    ) -> _Attempt:
+    def _attempt(self, sight: Sight, starts: Sequence[Array], left: _Left) -> _Attempt:
         """The best shape through some of the nodes and points, then through those that are surely its own."""
-        on_nodes, on_points = self._tasks(sight, left, previous)
+        on_nodes, on_points = self._tasks(sight, left)
         tried = [self._minimise(_Minimum(start, np.eye(len(self.free)), math.inf, 0), on_nodes) for start in starts]
         best = min(tried, key=lambda minimum: minimum.cost)
         last = self._minimise(best, on_points)
@@ -298,7 +301,7 @@ class ShapeFit:
         if on_points:
             keep = ~(evidence.contested | evidence.foreign)
             if keep.any():
-                last = self._minimise(last, self._tasks(sight, _Left(left.nodes, keep), previous)[1])
+                last = self._minimise(last, self._tasks(sight, _Left(left.nodes, keep))[1])
                 evidence = gather(self.tubes(last.q), sight, self.near)
         return _Attempt(replace(last, iterations=iterations + last.iterations), evidence)
 
@@ -307,9 +310,7 @@ class ShapeFit:
         """Distance from the surface beyond which a point says nothing of the shape [m]."""
         return (self.options.surface_scales or self.options.scales)[-1] * _NEAR
 
-    def _tasks(
-        self, sight: Sight, left: _Left, previous: tuple[Array, float] | None
-    ) -> tuple[list[_Task], list[_Task]]:
+    def _tasks(self, sight: Sight, left: _Left) -> tuple[list[_Task], list[_Task]]:
         """The passes on the nodes and those on the points."""
         options, camera = self.options, sight.camera
         factor = 1.0 / (options.noise_correlation * options.noise**2)
@@ -317,9 +318,10 @@ class ShapeFit:
         nodes, points = sight.nodes[left.nodes], sight.points[left.points]
         # nodes weigh together as much as the points, which share their errors
         node_weight = np.full(len(nodes), weight.sum() / max(len(nodes), 1)) * factor
+        anchors = sight.anchors
         return (
-            [_Task(nodes, node_weight, NODE_FACTOR, scale, camera, previous) for scale in options.scales],
-            [_Task(points, weight * factor, 1.0, scale, camera, previous) for scale in options.surface_scales],
+            [_Task(nodes, node_weight, NODE_FACTOR, scale, camera, anchors) for scale in options.scales],
+            [_Task(points, weight * factor, 1.0, scale, camera, anchors) for scale in options.surface_scales],
         )
 
     def _minimise(self, start: _Minimum, tasks: Sequence[_Task]) -> _Minimum:
@@ -344,9 +346,7 @@ class ShapeFit:
             end = _Minimum(q, found.model.hessian, found.model.cost, end.iterations + found.iterations)
         return end
 
-    def _judged(
-        self, attempt: _Attempt, rivals: Sequence[Array], sight: Sight, previous: tuple[Array, float] | None
-    ) -> Fit:
+    def _judged(self, attempt: _Attempt, rivals: Sequence[Array], sight: Sight) -> Fit:
         """The shape with its standard deviations, and what speaks for and against it."""
         minimum, evidence = attempt.minimum, attempt.evidence
         q, on_shape = minimum.q, evidence.own | evidence.contested
@@ -354,7 +354,7 @@ class ShapeFit:
         spread = jacobian @ np.linalg.solve(minimum.hessian, jacobian.T)
         places = points.reshape(-1, 3)
         own, every = (
-            self._tasks(sight, _Left(np.zeros(len(sight.nodes), bool), mask), previous)[1][-1:]
+            self._tasks(sight, _Left(np.zeros(len(sight.nodes), bool), mask))[1][-1:]
             for mask in (~(evidence.contested | evidence.foreign), ~evidence.foreign)
         )
         moved = np.zeros(places.shape)
@@ -407,19 +407,18 @@ class ShapeFit:
                 weighted = block * weight[mine, None]
                 gradient += chain.T @ (weighted.T @ error[mine])
                 hessian += chain.T @ (block.T @ weighted) @ chain
+        for anchor in task.anchors:
+            off = float(anchor.ahead @ (corners.reshape(-1, 3)[anchor.corner] - anchor.place)) / anchor.std
+            by_off = anchor.ahead @ by_q[3 * anchor.corner : 3 * anchor.corner + 3] / anchor.std
+            cost += 0.5 * off**2
+            gradient += by_off * off
+            hessian += np.outer(by_off, by_off)
         held, by_held = (np.array(x) for x in self._held(q))
         held = held.ravel()
         bend = (q - self.rest)[list(self.free)] * self._prior
         cost += 0.5 * float(held @ held + bend @ bend)
         gradient += by_held.T @ held + bend * self._prior
         hessian += by_held.T @ by_held + np.diag(self._prior**2)
-        if task.previous is not None:
-            before, since = task.previous
-            slow = 1.0 / (self.options.rate_std * max(since, 1e-3))
-            change = (q - before)[list(self.free)] * slow
-            cost += 0.5 * float(change @ change)
-            gradient += change * slow
-            hessian += slow**2 * np.eye(len(change))
         return Quadratic(cost, gradient, hessian)
 
     def _seen_points(self, corners: Array, places: Array, evidence: Evidence) -> NDArray[np.bool_]:
@@ -431,6 +430,12 @@ class ShapeFit:
         covered = (apart < _TOUCHING) & sure[:, None]
         held = {grasp.held for grasp in self.system.grasps}
         return np.asarray(covered.any(axis=0) | np.array([name in held for name in self.system.points]))
+
+    def starts(self) -> Starts:
+        """What finds starts for a system whose root is sought (`starts.loosened`)."""
+        lengths = np.linalg.norm(np.diff(np.array(self._corners(self.rest)[0]).reshape(-1, 2, 3), axis=1)[:, 0], axis=1)
+        by_owner = {name: lengths[[name == owner for owner in self.owner]] for name in dict.fromkeys(self.owner)}
+        return Starts(self.system, self._tree, self.rest, self.bends, by_owner)
 
     def _swath_std(self, corners: Array, places: Array, evidence: Evidence, camera: Array) -> Array:
         """Standard deviation of each point, shape (np, 3), that the spread across the links about it leaves [m]."""
@@ -527,14 +532,14 @@ class _Attempt:
 
 @dataclass(frozen=True, eq=False)
 class _Task:
-    """One pass: points, their weights, where they lie on the tubes, the scale of the loss, the camera, the prior."""
+    """One pass: points, their weights, where they lie on the tubes, the scale of the loss, the camera, seen ends."""
 
     points: Array
     weight: Array
     share: float
     scale: float
     camera: Array
-    previous: tuple[Array, float] | None
+    anchors: Sequence[Anchor]
 
 
 def _owner(system: System, joint: str) -> str:

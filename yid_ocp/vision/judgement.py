@@ -34,7 +34,7 @@ def unfit(fit: Fit, shape: ShapeFit, options: TrackOptions) -> str:
     if fit.distance > limit:
         off = f"{1e3 * fit.distance:.1f} mm off on average, d_max allows {1e3 * limit:.1f} mm"
         return f"the shape does not fit: {off}"
-    bend = float(np.abs((fit.q - shape.rest)[list(shape.free)]).max())
+    bend = float(np.abs((fit.q - shape.rest)[list(shape.bends)]).max())
     if bend > options.largest_bend:
         return f"the shape is folded: a joint is bent by {math.degrees(bend):.0f} degrees"
     if fit.covered < options.least_covered:

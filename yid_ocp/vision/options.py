@@ -11,10 +11,12 @@ from yid_ocp.options import About, check
 from yid_ocp.vision.calibration import CalibrationOptions
 from yid_ocp.vision.clock import ClockOptions
 from yid_ocp.vision.doubt import SizeKind
-from yid_ocp.vision.filters import FilterOptions
+from yid_ocp.vision.filters import FilterOptions, Triple
 from yid_ocp.vision.fit import FitOptions
 from yid_ocp.vision.meshes import MeshKind
 from yid_ocp.vision.skeleton import WalkOptions
+
+RootPlace = Literal["model", "fixed", "free"]
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,7 @@ class TrackOptions:
     ] = 0.02
     std_floor: Annotated[
         float, Gt(0), About("standard deviation that no fit is better than, of straight links in place of a curve", "m")
-    ] = 0.003
+    ] = 0.002
     stamp_std: Annotated[
         float, Ge(0), About("standard deviation of a frame's time stamp, beyond the common offset", "s")
     ] = 0.003
@@ -85,6 +87,17 @@ class TrackOptions:
     points: Annotated[
         tuple[str, ...] | None,
         About("points to write down; those that no arm holds when absent, as arms know theirs better"),
+    ] = None
+    root: Annotated[
+        RootPlace,
+        About(
+            "where the object's root is: as the model has it; fixed in one place that is found from the frames; or "
+            "free, anywhere in every frame, as of a rope in a hand or on a table"
+        ),
+    ] = "model"
+    root_near: Annotated[
+        Triple | None,
+        About("place in the world to which the root is nearer than other ends, where root is not model", "m"),
     ] = None
     mesh: Annotated[MeshKind, About("meshes of the robot's self-filter")] = "visual"
     seed: Annotated[int, Ge(0), About("of the walk's random points and of all subsampling")] = 0

@@ -125,9 +125,14 @@ class CameraState:
         pose = self.pose.copy()
         pose[:3, :3] = Rotation.from_rotvec(change[TURN]).as_matrix() @ pose[:3, :3]
         pose[:3, 3] += change[SHIFT]
-        factor = self.factor * math.exp(float(change[SCALE]))
-        rest = (getattr(self, name) + float(change[i]) for name, i in (("depth", 7), ("offset", 8), ("drift", 9)))
-        return CameraState(pose, factor, *rest, self.about)
+        return CameraState(
+            pose,
+            self.factor * math.exp(float(change[SCALE])),
+            self.depth + float(change[DEPTH]),
+            self.offset + float(change[CLOCK]),
+            self.drift + float(change[DRIFT]),
+            self.about,
+        )
 
     def minus(self, other: CameraState) -> Array:
         """The change from another state, shape (10,)."""
@@ -330,7 +335,7 @@ def robust_sum(rows: Sequence[Rows], reach: float) -> RobustSum:
 def improved(state: CameraState, found: RobustSum, told: CameraState, precision: Array) -> tuple[CameraState, Array]:
     """The state after one step, and the step; `precision`: of what is told, shape (10, 10)."""
     hessian, gradient, _ = found.tempered(precision)
-    step = -np.linalg.solve(hessian + precision, gradient + precision @ state.minus(told))
+    step = np.asarray(-np.linalg.solve(hessian + precision, gradient + precision @ state.minus(told)), float)
     return state.moved(step), step
 
 
@@ -384,12 +389,10 @@ class _Field:
     Attributes
     ----------
     cost : ndarray, shape (cells,)
-        min(distance to the cloud, capture)^2, of capture^2.
+        min(distance to the cloud, capture)^2, of capture^2; `_HIDDEN` out of the cloud's view.
     low : ndarray, shape (3,)
         Corner of the grid [m].
     shape : tuple of int
-    view : ndarray, shape (2, 2)
-        Smallest and largest x/z and y/z of the cloud.
     points : ndarray, shape (N, 3)
         In the world at the told state [m].
     part : ndarray of int, shape (N,)
@@ -398,7 +401,6 @@ class _Field:
     cost: NDArray[np.float32]
     low: Array
     shape: tuple[int, ...]
-    view: Array
     points: Array
     part: Integers
 
@@ -409,7 +411,8 @@ class _Field:
         own = told.measured(points)
         at = glimpse.points[:, :2] / glimpse.points[:, 2:]
         view = np.array([at.min(axis=0), at.max(axis=0)])
-        seen = _inside(own, view)
+        towards = own[:, :2] / own[:, 2:]
+        seen = ((towards >= view[0]) & (towards <= view[1])).all(axis=1)
         if np.count_nonzero(seen) < FEWEST:
             return None
         chosen = np.flatnonzero(seen)
@@ -426,8 +429,14 @@ class _Field:
         if empty.all():
             return None
         distance = distance_transform_edt(empty, sampling=_CELL)
-        cost = (np.minimum(distance, _CAPTURE) / _CAPTURE) ** 2
-        return _Field(cost.astype(np.float32).ravel(), low, tuple(int(n) for n in shape), view, points, part)
+        centre = [low[axis] + _CELL * (np.arange(shape[axis]) + 0.5) for axis in range(3)]
+        outside = np.zeros(shape, bool)
+        for axis in (0, 1):
+            at = centre[axis][:, None] / np.maximum(centre[2], _CELL)
+            beyond = (at < view[0, axis]) | (at > view[1, axis])
+            outside |= beyond[:, None] if axis == 0 else beyond
+        cost = np.where(outside, _HIDDEN, (np.minimum(distance, _CAPTURE) / _CAPTURE) ** 2)
+        return _Field(cost.astype(np.float32).ravel(), low, tuple(int(n) for n in shape), points, part)
 
     def costs(self, arm: Arm, told: CameraState, stamp: float, delay: float, cells: Integers) -> Array:
         """Mean cost of the arm as it was `delay` [s] earlier, shifted by cells of the camera's frame."""
@@ -440,14 +449,7 @@ class _Field:
         index = np.clip(index, [_SIDEWAYS, _SIDEWAYS, _AHEAD], limit - 1 - [_SIDEWAYS, _SIDEWAYS, _AHEAD])
         strides = np.array([self.shape[1] * self.shape[2], self.shape[2], 1])
         cost = self.cost[(index @ strides)[None, :] + (cells @ strides)[:, None]]
-        there = own[None] + _CELL * cells[:, None]
-        return np.asarray(np.where(_inside(there, self.view), cost, _HIDDEN).mean(axis=1))
-
-
-def _inside(points: Array, view: Array) -> Mask:
-    """Which points of the camera's frame, shape (..., 3), lie in its view."""
-    at = points[..., :2] / points[..., 2:]
-    return np.asarray(((at >= view[0]) & (at <= view[1])).all(axis=-1))
+        return np.asarray(cost.mean(axis=1), float)
 
 
 # -- how much of the arm is there -------------------------------------------------------------------------------------
@@ -493,4 +495,5 @@ class Clouds:
             covered = known & ~near & (depth < own[:, 2] - within)
             counts += [np.count_nonzero(x) for x in (near, covered, through, known | near)]
         samples = max(int(counts[3]), 1)
-        return Presence(*(counts[:3] / samples), int(counts[3]))
+        there, covered, through = (float(share) for share in counts[:3] / samples)
+        return Presence(there, covered, through, int(counts[3]))

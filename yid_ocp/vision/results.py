@@ -44,6 +44,8 @@ class FrameReport:
     seconds : float
         Processor time from the filtered cloud to the fitted points [s].
     fit : Fit or None
+    other : Fit or None
+        The shape with another end as its root that fits as well, where the root is sought.
     """
 
     index: int
@@ -57,6 +59,7 @@ class FrameReport:
     delay: float
     seconds: float
     fit: Fit | None
+    other: Fit | None = None
 
     @property
     def good(self) -> bool:
@@ -119,6 +122,8 @@ class Track:
         What the frames say of the object's lengths and radii.
     things : tuple of Foreign
         What stood about the object.
+    note : str
+        How the root was told from other ends; empty where the model says where it is.
     stages : tuple of Stages
         Of the frames that were asked for and turned out well.
     """
@@ -133,6 +138,7 @@ class Track:
     calibration: Calibration
     sizes: Sizes
     things: tuple[Foreign, ...]
+    note: str
     stages: tuple[Stages, ...]
     _system_points: tuple[str, ...]
     _place: Callable[[Array], Array]

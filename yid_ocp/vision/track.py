@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import ConfigError, DataError, ModelError, nearest
@@ -23,6 +24,7 @@ from yid_ocp.vision.clock import is_late, own_offset
 from yid_ocp.vision.clutter import Background, Foreign, extra_meshes, foreign
 from yid_ocp.vision.common import Common
 from yid_ocp.vision.doubt import Sizes, ask_sizes
+from yid_ocp.vision.ends import told, touching
 from yid_ocp.vision.evidence import Sight
 from yid_ocp.vision.filters import Cloud, ObjectRegion, of_colours, voxel_grid, without_outliers, without_robot
 from yid_ocp.vision.fit import ShapeFit
@@ -34,15 +36,20 @@ from yid_ocp.vision.options import TrackOptions
 from yid_ocp.vision.registration import Arm, Glimpse
 from yid_ocp.vision.results import FrameReport, Stages, Track
 from yid_ocp.vision.skeleton import Skeleton, skeleton
+from yid_ocp.vision.starts import Starts, loosened
+from yid_ocp.vision.trace import traced
 from yid_ocp.vision.view import View
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Progress = Callable[[int, int, str], None]
+_Given = tuple[Array, View, Callable[[Array], Mask]]
 
 _ASKED = 8  # frames, at most, that are asked about the object's sizes
+_SOME = 2000  # points that tell how far away a cloud is
 _LARGEST = 50.0  # [m]; a depth camera sees no further, a cloud in millimetres always does
 _SAME_TIME = 1e-6  # [s]
+_AS_GOOD = 1.2  # times the distance of the best shape, up to which another one may be the right one
 _GRIP = 0.06  # about a grasp, beyond the tube's radius, a point may be the object's [m]
 
 
@@ -96,7 +103,7 @@ def track(
         told(done, total, f"fitting {sequence.names[i]}")
         frames.append(tracker.frame(i, common))
     told(total, total, "done")
-    found = tracker.finished(tracker.judged(frames), common)
+    found = tracker.finished(*tracker.judged(frames), common)
     drawn = (tracker.stages(frame, common) for frame in found.frames if frame.index in stages)
     return replace(found, stages=tuple(entry for entry in drawn if entry is not None))
 
@@ -116,10 +123,11 @@ class _Work:
 
 @dataclass(frozen=True, eq=False)
 class _Look:
-    """A frame of the sample: what it shows, and the robot's configuration."""
+    """What a frame shows, once for every way in which it may, the robot's configuration, and where searches begin."""
 
-    sight: Sight
+    sights: tuple[Sight, ...]
     q: Array
+    starts: tuple[tuple[Array, ...], ...]
 
 
 class Tracker:
@@ -147,11 +155,22 @@ class Tracker:
         empty: FrameSequence | None = None,
     ) -> None:
         system, values = scene.system, scene.values
+        self._loose: tuple[str, ...] = ()
+        anywhere = options.root != "model"
+        if anywhere:
+            if scene.urdf is not None:
+                hint = "set track.options.root to model, or model.robot to null"
+                raise ConfigError(
+                    "a robot holds the object: its root is where the model has it", where="root", hint=hint
+                )
+            system, self._loose = loosened(system, values)
         self.system, self.values, self.sequence, self.options, self.empty = system, values, sequence, options, empty
-        self.shape = ShapeFit(system, options.fit, values)
+        self.shape = self._shape_of(values)
+        self.starts = self.shape.starts() if anywhere else None
         self.names = _chosen_points(system, options.points)
-        self.region = ObjectRegion(system, options.filters, values)
-        self.span, self.angles = _joint_angles(system, recording, self.shape.known)
+        self.region = ObjectRegion(system, options.filters, values, anywhere=anywhere)
+        # of a root that is sought nothing that was recorded is needed
+        self.span, self.angles = _joint_angles(system, recording, () if anywhere else self.shape.known)
         tree = numeric_mechanism(system, values)
         meshes: dict[int, Mesh] = {}
         if scene.urdf is not None:
@@ -194,10 +213,10 @@ class Tracker:
         last: list[tuple[ShapeFit, Fit]] = []
 
         def fitted(values: Mapping[str, float], starts: Sequence[Array]) -> list[Fit]:
-            shape = ShapeFit(self.system, self.options.fit, values)
+            shape = self._shape_of(values)
             before: list[Array | None] = list(starts) if len(starts) == len(looks) else [None] * len(looks)
             last[:] = [
-                (shape, shape.solve(look.sight, look.q, () if start is None else (start,)))
+                (shape, shape.solve(look.sights[0], look.q, look.starts[0] if start is None else (start,)))
                 for look, start in zip(looks, before, strict=True)
             ]
             return [fit for _, fit in last]
@@ -205,7 +224,7 @@ class Tracker:
         sizes = ask_sizes(self.system, self.values, self.options.estimate, noise, fitted)
         if self.options.background == "frames":
             shapes = [shape.tubes(fit.q) for shape, fit in last if not unfit(fit, shape, self.options)]
-            clouds = [look.sight.points for look in looks]
+            clouds = [look.sights[0].points for look in looks]
             still = Background.still(clouds, shapes, 2 * filters.voxel, noise, self.shape.near)
             if len(background.points):
                 still = Background(
@@ -249,8 +268,11 @@ class Tracker:
         """The object with the sizes that were estimated."""
         key = tuple(np.where(sizes.used, sizes.change, 0.0).tolist()) if any(sizes.used) else ()
         if key not in self._shapes:
-            self._shapes[key] = ShapeFit(self.system, self.options.fit, sizes.values(self.system, self.values))
+            self._shapes[key] = self._shape_of(sizes.values(self.system, self.values))
         return self._shapes[key]
+
+    def _shape_of(self, values: Mapping[str, float] | None) -> ShapeFit:
+        return ShapeFit(self.system, self.options.fit, values, self._loose)
 
     def _removed(self, q: Array, calibration: Calibration, background: Background) -> Callable[[Array], Mask]:
         """Which places the filters leave no points of, the robot at a configuration."""
@@ -273,11 +295,11 @@ class Tracker:
     def _finite(sequence: FrameSequence, index: int) -> tuple[Array, Mask]:
         """A frame's finite points in the camera's frame, and which of all its points they are."""
         points = sequence.load(index)
-        finite: Mask = np.asarray(np.isfinite(points).all(axis=1))
+        finite: Mask = np.isfinite(points[:, 0] + points[:, 1] + points[:, 2])
         points = points[finite]
         if not len(points):
             raise DataError("the cloud is empty")
-        far = float(np.median(np.abs(points).max(axis=1)))
+        far = float(np.median(np.abs(points[:: 1 + len(points) // _SOME]).max(axis=1)))
         if far > _LARGEST:
             raise DataError(f"the cloud is not in metres: half of its points are {far:.0f} m away (millimetres?)")
         return points, finite
@@ -298,9 +320,7 @@ class Tracker:
             inside[inside] = of_colours(colours[finite][inside], filters.colours, filters.colour_angle)
             if not inside.any():
                 raise DataError("no point has one of the object's colours: check filters.colours")
-        cloud = voxel_grid(points[inside], filters.voxel)
-        # before the robot is taken out: among all surfaces, wrong points are few
-        return cloud.keep(without_outliers(cloud, filters.neighbours, filters.outlier_ratio)), points
+        return voxel_grid(points[inside], filters.voxel), points
 
     def frame(self, index: int, common: Common) -> FrameReport:
         """What became of a frame by itself: nothing of any other frame enters."""
@@ -324,11 +344,12 @@ class Tracker:
         t = float(calibration.state.time(stamp))
         return FrameReport(index, self.sequence.names[index], stamp, t, reason, 0, 0, 0, math.nan, 0.0, None)
 
-    def judged(self, frames: Sequence[FrameReport]) -> list[FrameReport]:
-        """The frames with those dropped that are unlike the others."""
-        return judged(frames, self.options)
+    def judged(self, frames: Sequence[FrameReport]) -> tuple[list[FrameReport], str]:
+        """The frames with those dropped that are unlike the others, and how the root was told from other ends."""
+        rooted, note = told(frames, self.options)
+        return judged(rooted, self.options), note
 
-    def finished(self, frames: Sequence[FrameReport], common: Common) -> Track:
+    def finished(self, frames: Sequence[FrameReport], note: str, common: Common) -> Track:
         """The track of judged frames; `DataError` where none is good."""
         columns = [self.system.points.index(name) for name in self.names]
         things = self.things(frames)
@@ -344,6 +365,7 @@ class Tracker:
             common.calibration,
             common.sizes,
             things,
+            note,
             (),
             self.system.points,
             self._shape(common.sizes).place,
@@ -372,36 +394,41 @@ class Tracker:
 
     def _work(self, index: int, common: Common) -> _Work:
         work = _Work(self.unread(index, common.calibration, self._reasons.get(index, "")))
-        sight, q = self._prepared(work, common.calibration, common.background)
-        if sight is not None:
-            begun = time.process_time()
-            shape = self._shape(common.sizes)
-            fit = shape.solve(sight, q)
-            spent = work.report.seconds + time.process_time() - begun
-            work.report = replace(work.report, fit=fit, reason=unfit(fit, shape, self.options), seconds=spent)
+        look = self._prepared(work, common.calibration, common.background)
+        if look is None:
+            return work
+        begun = time.process_time()
+        shape = self._shape(common.sizes)
+        fits = [shape.solve(sight, look.q, starts) for sight, starts in zip(look.sights, look.starts, strict=True)]
+        fits.sort(key=lambda fit: fit.distance)
+        reason = unfit(fits[0], shape, self.options)
+        if self.starts is not None and not reason and touching(fits[0].centre_line, shape.radius):
+            reason = "the object crosses or touches itself"
+        other = fits[1] if len(fits) > 1 and fits[1].distance < _AS_GOOD * fits[0].distance else None
+        spent = work.report.seconds + time.process_time() - begun
+        work.report = replace(work.report, fit=fits[0], other=other, reason=reason, seconds=spent)
         return work
 
     def _look(self, index: int, calibration: Calibration, background: Background) -> _Look | None:
         """A frame that can be fitted; None for others."""
-        work = _Work(self.unread(index, calibration, self._reasons.get(index, "")))
-        sight, q = self._prepared(work, calibration, background)
-        return None if sight is None else _Look(sight, q)
+        return self._prepared(
+            _Work(self.unread(index, calibration, self._reasons.get(index, ""))), calibration, background
+        )
 
-    def _prepared(self, work: _Work, calibration: Calibration, background: Background) -> tuple[Sight | None, Array]:
-        """What a frame shows of the object, None with the reason in its report, and the robot's configuration."""
+    def _prepared(self, work: _Work, calibration: Calibration, background: Background) -> _Look | None:
+        """What a frame shows of the object, None with the reason in its report."""
         options, index, stamp, t = self.options, work.report.index, work.report.stamp, work.report.t
-        nothing = None, self.shape.rest
         if work.report.reason:
-            return nothing
+            return None
         try:
             cloud, raw = self._read(index, calibration)
         except DataError as error:
             work.dropped(error.what)
-            return nothing
+            return None
         work.report = replace(work.report, raw=len(raw))
         if self.span is not None and not self.span[0] <= t <= self.span[1]:
             work.dropped("there are no joint angles at its time")
-            return nothing
+            return None
         rng = np.random.default_rng([options.seed, index])
         usual = calibration.usual
         if self.arm is not None and usual is not None:
@@ -410,30 +437,63 @@ class Tracker:
                 work.report = replace(work.report, delay=own.delay)
                 if is_late(own, options.clock):
                     work.dropped(f"its stamp is late: by {1e3 * own.delay:.0f} ms")
-                    return nothing
+                    return None
         q = self.posture(t)
+        filters, kept = options.filters, np.ones(len(cloud), bool)
         if self.robot is not None:
-            cloud = cloud.keep(without_robot(cloud, self.robot, q, options.filters.padding))
-        cloud = cloud.keep(~background.contains(cloud.points))
+            kept = without_robot(cloud, self.robot, q, filters.padding)
+        kept[kept] = ~background.contains(cloud.points[kept])
+        # beside the robot's points: among all surfaces, wrong points are few
+        cloud = cloud.keep(without_outliers(cloud, filters.neighbours, filters.outlier_ratio, kept))
         work.filtered, work.report = cloud, replace(work.report, filtered=len(cloud))
         if len(cloud) < options.filters.least:
             work.dropped(f"too few points of the object: {len(cloud)} left")
-            return nothing
+            return None
         if len(cloud) > options.filters.most:
             cloud = cloud.keep(np.sort(rng.choice(len(cloud), options.filters.most, replace=False)))
+            work.report = replace(work.report, filtered=len(cloud))
         begun = time.process_time()
-        found = skeleton(cloud, rng, options.walk)
-        work.skeleton = found
-        spent = time.process_time() - begun
-        work.report = replace(work.report, filtered=len(cloud), nodes=len(found.nodes), seconds=spent)
+        view = View(raw, calibration.state.pose, self.sequence.intrinsics)
+        given = calibration.camera, view, self._removed(q, calibration, background)
+        try:
+            look = (
+                self._held(work, cloud, q, rng, given)
+                if self.starts is None
+                else self._anywhere(self.starts, work, cloud, rng, given)
+            )
+        except DataError as error:
+            work.dropped(error.what)
+            return None
+        work.report = replace(work.report, seconds=time.process_time() - begun)
+        return look
+
+    def _held(self, work: _Work, cloud: Cloud, q: Array, rng: np.random.Generator, given: _Given) -> _Look:
+        """What is seen of an object whose root is where the model has it."""
+        found = skeleton(cloud, rng, self.options.walk)
+        work.skeleton, work.report = found, replace(work.report, nodes=len(found.nodes))
         if not len(found.nodes):
-            work.dropped("no part of the cloud is dense enough for a skeleton")
-            return nothing
+            raise DataError("no part of the cloud is dense enough for a skeleton")
         rest = cloud.keep(found.connected)
         work.filtered = rest
-        view = View(raw, calibration.state.pose, self.sequence.intrinsics)
-        removed = self._removed(q, calibration, background)
-        return Sight(rest.points, rest.weight, found.nodes, calibration.camera, view, removed), q
+        return _Look((Sight(rest.points, rest.weight, found.nodes, *given),), q, ((),))
+
+    def _anywhere(self, starts: Starts, work: _Work, cloud: Cloud, rng: np.random.Generator, given: _Given) -> _Look:
+        """What is seen of an object whose root is sought, with the ends that it may have where."""
+        diameter, options = 2.0 * float(self.shape.radius.max()), self.options
+        course = traced(cloud, diameter, options.walk.link_length, rng)
+        work.skeleton, work.report = course.skeleton, replace(work.report, nodes=len(course.nodes))
+        if len(course.loops):
+            raise DataError("the object crosses or touches itself: its cloud closes a loop")
+        found = starts.of(course)
+        if options.root_near is not None:
+            place = np.array(options.root_near)
+            near = min(found, key=lambda start: float(np.linalg.norm(start.root - place))).root
+            found = [start for start in found if np.array_equal(start.root, near)]
+        own = cKDTree(course.nodes).query(cloud.points)[0] < 2.0 * diameter
+        rest = cloud.keep(own)
+        work.filtered = rest
+        sights = tuple(Sight(rest.points, rest.weight, course.nodes, *given, anchors=start.anchors) for start in found)
+        return _Look(sights, self.shape.rest, tuple((start.q,) for start in found))
 
 
 def _link_of(system: System, joint: str) -> str:

@@ -10,13 +10,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from yid_ocp.vision.frames import Pinhole
+from yid_ocp.vision.lens import Pinhole
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -44,7 +43,7 @@ class View:
     points: Array
     pose: Array
     pinhole: Pinhole | None = None
-    _last: list[Any] = field(default_factory=list)
+    _kept: list[tuple[Array, Array, cKDTree, Array]] = field(default_factory=list, repr=False)
 
     def hidden(self, places: Array, radius: Array, margin: float) -> Mask:
         """Which places cannot be seen from the camera.
@@ -75,7 +74,7 @@ class View:
             hidden |= ((asked < low + reach) | (asked > high - reach)).any(axis=1)
         if hidden.all():
             return hidden
-        tree, distance = self._about(asked[~hidden].min(0), asked[~hidden].max(0))
+        tree, distance = self._about(asked[~hidden])
         if not len(distance):
             return hidden
         wide = radius / np.maximum(depth, _LEAST_DEPTH)
@@ -109,16 +108,22 @@ class View:
                         borders[end, axis] = value
         return borders[0], borders[1]
 
-    def _about(self, low: Array, high: Array) -> tuple[cKDTree, Array]:
-        """Points of the picture round about a part of it: where in the picture, and how deep."""
-        if self._last and (self._last[0] <= low - _BASELINE).all() and (self._last[1] >= high + _BASELINE).all():
-            return self._last[2], self._last[3]
-        # as much more again, since what is asked next lies near it
-        low, high = low - 2 * _BASELINE, high + 2 * _BASELINE
+    def _about(self, asked: Array) -> tuple[cKDTree, Array]:
+        """Points of the picture round about the places: where in the picture, and how deep.
+
+        One frame asks again and again for much the same: what was found stays while it is enough.
+        """
+        low, high = asked.min(0) - _BASELINE, asked.max(0) + _BASELINE
+        if self._kept and (self._kept[0][0] <= low).all() and (self._kept[0][1] >= high).all():
+            return self._kept[0][2:]
+        low, high = low - 0.5 * _BASELINE, high + 0.5 * _BASELINE
         seen, depth = self._all
-        near = (seen[:, 0] >= low[0]) & (seen[:, 0] <= high[0]) & (seen[:, 1] >= low[1]) & (seen[:, 1] <= high[1])
-        self._last[:] = [low, high, cKDTree(seen[near]), depth[near]]
-        return self._last[2], self._last[3]
+        near = np.ones(len(seen), bool)
+        for axis in range(2):  # column by column, which is quicker than whole rows
+            near &= (seen[:, axis] >= low[axis]) & (seen[:, axis] <= high[axis])
+        tree = cKDTree(seen[near], compact_nodes=False, balanced_tree=False)
+        self._kept[:] = [(low, high, tree, depth[near])]
+        return tree, depth[near]
 
     @staticmethod
     def _shadowed(tree: cKDTree, distance: Array, asked: Array, limit: float) -> bool:

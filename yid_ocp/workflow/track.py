@@ -119,10 +119,10 @@ def run_track(
                 progress.stage("finding what is common to the frames")
                 common = filmed.tasks.common()
                 progress.stage("tracking")
-                frames = tracker.judged(filmed.tasks.frames(tracker, common, workers, progress))
+                frames, note = tracker.judged(filmed.tasks.frames(tracker, common, workers, progress))
                 found: Track | None = None
                 try:
-                    found = tracker.finished(frames, common)
+                    found = tracker.finished(frames, note, common)
                 except DataError as error:
                     refused = error
         except YidError:
@@ -133,15 +133,16 @@ def run_track(
             stages = tracker.stages(frame, common)
             if stages is not None:
                 draw_stages(stages, folder.path / "pictures")
-        result = track_result(frames, common, tracker.things(frames), found)
+        result = track_result(frames, common, tracker.things(frames), found) | {"root": note}
         told, tracked = [], None
         if found is not None:
             draw_track(found, folder.path / "track.png")
             tracked = found.recording(recording)
             write_recording(tracked, folder.path / "recording.h5")
-            # what was tracked may be elsewhere than the object reaches
-            doubts += [doubt for doubt in of_one(run, system, tracked) if doubt.cause.startswith("point_")]
-            shape = Told("fitted shape", system, system.parameters.vector(), found.t, found.q)
+            # what was tracked may be elsewhere than the object reaches, where the model says where it stands
+            if settings.options.root == "model":
+                doubts += [doubt for doubt in of_one(run, system, tracked) if doubt.cause.startswith("point_")]
+            shape = Told("fitted shape", tracker.system, system.parameters.vector(), found.t, found.q)
             told = [moving("tracked", [shape], tracked)]
             if filmed.made is not None:
                 result["truth_errors"] = truth_errors(system, found, filmed.made)

@@ -15,7 +15,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import OutputSettings, RecordingSettings, Run, dump_config
 from yid_ocp.data.hdf5 import read_recording
 from yid_ocp.data.recording import Recording
-from yid_ocp.errors import OutputError
+from yid_ocp.errors import DataError, OutputError
 from yid_ocp.files import content_hash, file_sha256, reason, write_text
 from yid_ocp.model.system import System
 from yid_ocp.parallel import Task, ThisProcess, Workers, run_tasks, values_of
@@ -80,6 +80,8 @@ class FrameTasks:
         """What is common to the frames; worked out in this process."""
         task = Task("what is common", {"config": self.folder / CONFIG, "inputs": self.inputs})
         [found] = values_of(run_tasks(found_common, [task], self.folder / DONE, ThisProcess()))
+        if "refused" in found:
+            raise DataError(**found["refused"])
         return remade(Common, found)
 
     def frames(
@@ -150,9 +152,12 @@ def empty_scene(run: Run) -> FrameSequence | None:
 
 
 def found_common(config: Path, inputs: Mapping[str, str]) -> dict[str, Any]:
-    """Task: what is common to the frames of a run, as `plain` gives it."""
+    """Task: what is common to the frames of a run, as `plain` gives it, or why they do not tell."""
     del inputs  # they belong to what the result depends on
-    made: dict[str, Any] = plain(_tracker(config.read_text(encoding="utf-8"), config).common())
+    try:
+        made: dict[str, Any] = plain(_tracker(config.read_text(encoding="utf-8"), config).common())
+    except DataError as error:
+        return {"refused": {"what": error.what, "where": error.where, "allowed": error.allowed, "hint": error.hint}}
     return made
 
 
