@@ -45,7 +45,7 @@ Mask = NDArray[np.bool_]
 Progress = Callable[[int, int, str], None]
 _Given = tuple[Array, View, Callable[[Array], Mask]]
 
-_ASKED = 12  # frames, at most, that are asked about the object's sizes
+_ASKED = 8  # frames, at most, that are asked about the object's sizes
 _SOME = 2000  # points that tell how far away a cloud is
 _LARGEST = 50.0  # [m]; a depth camera sees no further, a cloud in millimetres always does
 _SAME_TIME = 1e-6  # [s]
