@@ -93,16 +93,15 @@ def nearest(corners: Array, radius: Array, points: Array, share: float = 1.0) ->
     """
     start, edge = corners[:, 0], corners[:, 1] - corners[:, 0]
     square = np.einsum("ij,ij->i", edge, edge)
-    # (p - a).d for all points and links at once, by one product of matrices
-    t = np.clip((points @ edge.T - np.einsum("ij,ij->i", start, edge)) / square, 0.0, 1.0)
-    apart = np.zeros(t.shape)
-    for axis in range(3):
-        apart += (points[:, axis, None] - start[:, axis] - t * edge[:, axis]) ** 2
-    link = np.argmin(np.sqrt(apart) - share * radius, axis=1)
-    rows = np.arange(len(points))
-    along = t[rows, link]
+    # (p - a).d and |p - a|^2 for all points and links at once, by products of matrices
+    ahead = points @ edge.T - np.einsum("ij,ij->i", start, edge)
+    t = np.clip(ahead / square, 0.0, 1.0)
+    own = np.einsum("ij,ij->i", points, points)[:, None] + np.einsum("ij,ij->i", start, start)
+    apart = own - 2.0 * (points @ start.T) + t * (t * square - 2.0 * ahead)
+    link = np.argmin(np.sqrt(np.maximum(apart, 0.0)) - share * radius, axis=1)
+    along = t[np.arange(len(points)), link]
     normal = points - start[link] - along[:, None] * edge[link]
-    distance = np.sqrt(apart[rows, link])
+    distance = np.sqrt(np.einsum("ij,ij->i", normal, normal))
     return link, along, normal / np.maximum(distance, 1e-9)[:, None], distance
 
 

@@ -282,7 +282,7 @@ class Tracker:
         def removed(places: Array) -> Mask:
             gone = ~region.contains(places)
             if self.robot is not None:
-                gone |= np.isfinite(self.robot.distance(places, q, within))
+                gone |= self.robot.within(places, q, within)
             return gone | background.contains(places, float(self.shape.radius.max()))
 
         return removed
