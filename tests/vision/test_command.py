@@ -8,8 +8,8 @@ import pytest
 
 from yid_ocp.cli import main
 from yid_ocp.data.hdf5 import read_recording
-from yid_ocp.vision.fit import ShapeFit
 from yid_ocp.vision.pictures import STAGES
+from yid_ocp.vision.track import Tracker
 
 CONFIG = """\
 model:
@@ -113,27 +113,29 @@ def result_of(folder):
 def test_what_an_interrupted_run_did_is_used(cli, config, tmp_path, monkeypatch):
     """Killed after the first frame: the next run does the others alone, with the same result to the last bit."""
     assert cli("track", config, "--out", tmp_path / "whole").code == 0
-    fitted, work = [], ShapeFit.solve
+    worked, work = [], Tracker.frame
 
-    def interrupted(self, *arguments, **named):
-        if len(fitted) == 1:
+    def interrupted(self, index, common):
+        if len(worked) == 1:
             raise KeyboardInterrupt
-        fitted.append(1)
-        return work(self, *arguments, **named)
+        worked.append(index)
+        return work(self, index, common)
 
-    monkeypatch.setattr(ShapeFit, "solve", interrupted)
+    monkeypatch.setattr(Tracker, "frame", interrupted)
     assert cli("track", config, "--out", tmp_path / "run").code not in (0, 1)
     assert not (tmp_path / "run").exists()
     assert (tmp_path / "run.partial").is_dir()
     later = []
 
-    def counted(self, *arguments, **named):
-        later.append(1)
-        return work(self, *arguments, **named)
+    def counted(self, index, common):
+        later.append(index)
+        return work(self, index, common)
 
-    monkeypatch.setattr(ShapeFit, "solve", counted)
+    monkeypatch.setattr(Tracker, "frame", counted)
+    monkeypatch.setattr(Tracker, "common", None)  # it is known
     assert cli("track", config, "--out", tmp_path / "run", "--set", "track.pictures=0").code == 0
     assert len(later) == 2
+    assert not set(later) & set(worked)
     assert not (tmp_path / "run.partial").exists()
     assert result_of(tmp_path / "run") == result_of(tmp_path / "whole")
     one, other = (read_recording(tmp_path / name / "recording.h5").points[-1] for name in ("run", "whole"))

@@ -30,6 +30,7 @@ KINDS: tuple[SizeKind, ...] = ("length", "radius")
 
 _PRIOR = (0.2, 0.4)  # standard deviations of the logarithms of lengths and radii
 _SIGMAS = 3.0  # from the model's value, beyond which that is doubted
+_CLEAR = 2.0  # from there, within which a first look finds nothing to doubt
 _KNOWN = 0.1  # standard deviation of a logarithm, above which nothing can be said of a size
 _ROUNDS, _SETTLED, _LONGEST_STEP = 8, 0.004, 0.15
 _LEAST_FRAMES = 3
@@ -171,7 +172,7 @@ def ask_sizes(
         scatter = inverse @ (left.T @ left) @ inverse * frames / (frames - 1)
         covariance = np.asarray(inverse + scatter + np.diag(shared**2))
         change = change + np.clip(step, -_LONGEST_STEP, _LONGEST_STEP)
-        if turn == 0 and not wanted.any() and (np.abs(change) < np.sqrt(np.diag(covariance))).all():
+        if turn == 0 and not wanted.any() and (np.abs(change) < _CLEAR * np.sqrt(np.diag(covariance))).all():
             break  # nothing to doubt
         if np.abs(step).max() < _SETTLED:
             break

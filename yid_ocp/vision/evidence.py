@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,16 +93,15 @@ def nearest(corners: Array, radius: Array, points: Array, share: float = 1.0) ->
     """
     start, edge = corners[:, 0], corners[:, 1] - corners[:, 0]
     square = np.einsum("ij,ij->i", edge, edge)
-    # (p - a).d for all points and links at once, by one product of matrices
-    t = np.clip((points @ edge.T - np.einsum("ij,ij->i", start, edge)) / square, 0.0, 1.0)
-    apart = np.zeros(t.shape)
-    for axis in range(3):
-        apart += (points[:, axis, None] - start[:, axis] - t * edge[:, axis]) ** 2
-    link = np.argmin(np.sqrt(apart) - share * radius, axis=1)
-    rows = np.arange(len(points))
-    along = t[rows, link]
+    # (p - a).d and |p - a|^2 for all points and links at once, by products of matrices
+    ahead = points @ edge.T - np.einsum("ij,ij->i", start, edge)
+    t = np.clip(ahead / square, 0.0, 1.0)
+    own = np.einsum("ij,ij->i", points, points)[:, None] + np.einsum("ij,ij->i", start, start)
+    apart = own - 2.0 * (points @ start.T) + t * (t * square - 2.0 * ahead)
+    link = np.argmin(np.sqrt(np.maximum(apart, 0.0)) - share * radius, axis=1)
+    along = t[np.arange(len(points)), link]
     normal = points - start[link] - along[:, None] * edge[link]
-    distance = np.sqrt(apart[rows, link])
+    distance = np.sqrt(np.einsum("ij,ij->i", normal, normal))
     return link, along, normal / np.maximum(distance, 1e-9)[:, None], distance
 
 
@@ -201,6 +201,18 @@ class Sight:
     colour: Array | None = None
     anchors: Sequence[Anchor] = ()
 
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Of the points."""
+        return cKDTree(self.points)
+
+    @cached_property
+    def spacing(self) -> float:
+        """Usual distance of a point from its nearest neighbour [m]."""
+        if len(self.points) < 2:
+            return math.inf
+        return max(float(np.median(self.tree.query(self.points, k=2)[0][:, 1])), 1e-4)
+
     def hidden(self, places: Array, radius: Array, margin: float) -> Mask:
         """Which places the camera or the filters leave no points of, shape (S,)."""
         hidden = np.zeros(len(places), bool)
@@ -230,11 +242,12 @@ def gather(tubes: Tubes, seen: Sight, near: float) -> Evidence:
     error = np.where(away, -distance, distance) - tubes.radius[link]
     size = np.abs(error)
     close = size < near
+    tree, spacing = seen.tree, seen.spacing
     noise = _TO_SIGMA * _median(size[close], seen.weight[close]) if close.any() else near / _SIGMAS
+    # where points lie in between others is not known better than from one to the next
+    noise = max(noise, spacing / math.sqrt(12.0))
     gate = min(_SIGMAS * noise, near)
     on_shape = size < gate
-    tree = cKDTree(seen.points)
-    spacing = _spacing(tree, seen.points)
     slices = [_Slices.of(tubes, k, spacing) for k in tubes.free_ends]
     beyond = np.zeros(len(on_shape), bool)
     ends = np.full(len(slices), np.nan)
@@ -293,9 +306,9 @@ def slender(sight: Sight, radius: float) -> tuple[Mask, Mask]:
     points : ndarray of bool, shape (N,)
         Those whose nearest node is among them.
     """
-    tree, within = cKDTree(sight.points), _SURROUNDINGS * radius
+    within = _SURROUNDINGS * radius
     thin = np.zeros(len(sight.nodes), bool)
-    for i, around in enumerate(tree.query_ball_point(sight.nodes, within)):
+    for i, around in enumerate(sight.tree.query_ball_point(sight.nodes, within)):
         if len(around) > 3:
             away = sight.points[around] - sight.points[around].mean(axis=0)
             second = float(np.linalg.eigvalsh(away.T @ away / len(around))[1])
@@ -308,13 +321,6 @@ def _median(values: Array, weight: Array) -> float:
     order = np.argsort(values)
     total = np.cumsum(weight[order])
     return float(values[order[np.searchsorted(total, 0.5 * total[-1])]])
-
-
-def _spacing(tree: cKDTree, points: Array) -> float:
-    """Usual distance of a point from its nearest neighbour [m]."""
-    if len(points) < 2:
-        return math.inf
-    return max(float(np.median(tree.query(points, k=2)[0][:, 1])), 1e-4)
 
 
 def _parts(tree: cKDTree, chosen: Mask, within: float) -> Integers:

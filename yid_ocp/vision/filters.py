@@ -24,6 +24,7 @@ Mask = NDArray[np.bool_]
 Part = Annotated[float, Ge(0), Le(255)]
 Colour = tuple[Part, Part, Part]
 
+_USUAL = 3000  # points, at least, that tell how far neighbours usually are
 _TO_SIGMA = 1.4826  # from the median absolute deviation of a normal distribution to its standard deviation
 
 
@@ -248,10 +249,10 @@ def voxel_grid(points: Array, size: float) -> Cloud:
 
 def without_robot(cloud: Cloud, robot: Surfaces, q: ArrayLike, padding: float) -> Mask:
     """Which points are not the robot's: further than `padding` [m] from its surface at a configuration, shape (N,)."""
-    return ~np.isfinite(robot.distance(cloud.points, q, padding))
+    return ~robot.within(cloud.points, q, padding)
 
 
-def without_outliers(cloud: Cloud, neighbours: int, ratio: float) -> Mask:
+def without_outliers(cloud: Cloud, neighbours: int, ratio: float, asked: Mask | None = None) -> Mask:
     """Which points have company: statistical outlier removal.
 
     A point stays where the mean distance d to its nearest neighbours satisfies  d <= median(d) + ratio s,  with s the
@@ -264,18 +265,29 @@ def without_outliers(cloud: Cloud, neighbours: int, ratio: float) -> Mask:
     neighbours : int
         Of every point.
     ratio : float
+    asked : ndarray, shape (N,), optional
+        Points to judge; all when absent. What is usual is told by points all over the cloud, whichever are asked.
 
     Returns
     -------
     ndarray, shape (N,)
-        True for points that stay.
+        True for points that stay; False for those that are not asked.
     """
     if len(cloud) <= neighbours:
         return np.zeros(len(cloud), bool)
-    distance = cKDTree(cloud.points).query(cloud.points, k=neighbours + 1)[0][:, 1:].mean(1)
-    middle = weighted_median(distance, cloud.weight)
-    spread = _TO_SIGMA * weighted_median(np.abs(distance - middle), cloud.weight)
-    return np.asarray(distance <= middle + ratio * spread)
+    tree = cKDTree(cloud.points, compact_nodes=False, balanced_tree=False)
+
+    def apart(index: NDArray[np.int64]) -> Array:
+        return np.asarray(tree.query(cloud.points[index], k=neighbours + 1)[0][:, 1:].mean(axis=1))
+
+    some = np.arange(0, len(cloud), max(1, len(cloud) // _USUAL))
+    distance = apart(some)
+    middle = weighted_median(distance, cloud.weight[some])
+    spread = _TO_SIGMA * weighted_median(np.abs(distance - middle), cloud.weight[some])
+    index = np.flatnonzero(np.ones(len(cloud), bool) if asked is None else asked)
+    stays = np.zeros(len(cloud), bool)
+    stays[index] = apart(index) <= middle + ratio * spread
+    return stays
 
 
 def of_colours(colours: ArrayLike, wanted: ArrayLike, angle: float) -> Mask:

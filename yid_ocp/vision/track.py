@@ -45,7 +45,8 @@ Mask = NDArray[np.bool_]
 Progress = Callable[[int, int, str], None]
 _Given = tuple[Array, View, Callable[[Array], Mask]]
 
-_ASKED = 12  # frames, at most, that are asked about the object's sizes
+_ASKED = 8  # frames, at most, that are asked about the object's sizes
+_SOME = 2000  # points that tell how far away a cloud is
 _LARGEST = 50.0  # [m]; a depth camera sees no further, a cloud in millimetres always does
 _SAME_TIME = 1e-6  # [s]
 _AS_GOOD = 1.2  # times the distance of the best shape, up to which another one may be the right one
@@ -281,7 +282,7 @@ class Tracker:
         def removed(places: Array) -> Mask:
             gone = ~region.contains(places)
             if self.robot is not None:
-                gone |= np.isfinite(self.robot.distance(places, q, within))
+                gone |= self.robot.within(places, q, within)
             return gone | background.contains(places, float(self.shape.radius.max()))
 
         return removed
@@ -294,11 +295,11 @@ class Tracker:
     def _finite(sequence: FrameSequence, index: int) -> tuple[Array, Mask]:
         """A frame's finite points in the camera's frame, and which of all its points they are."""
         points = sequence.load(index)
-        finite: Mask = np.asarray(np.isfinite(points).all(axis=1))
+        finite: Mask = np.isfinite(points[:, 0] + points[:, 1] + points[:, 2])
         points = points[finite]
         if not len(points):
             raise DataError("the cloud is empty")
-        far = float(np.median(np.abs(points).max(axis=1)))
+        far = float(np.median(np.abs(points[:: 1 + len(points) // _SOME]).max(axis=1)))
         if far > _LARGEST:
             raise DataError(f"the cloud is not in metres: half of its points are {far:.0f} m away (millimetres?)")
         return points, finite
@@ -319,9 +320,7 @@ class Tracker:
             inside[inside] = of_colours(colours[finite][inside], filters.colours, filters.colour_angle)
             if not inside.any():
                 raise DataError("no point has one of the object's colours: check filters.colours")
-        cloud = voxel_grid(points[inside], filters.voxel)
-        # before the robot is taken out: among all surfaces, wrong points are few
-        return cloud.keep(without_outliers(cloud, filters.neighbours, filters.outlier_ratio)), points
+        return voxel_grid(points[inside], filters.voxel), points
 
     def frame(self, index: int, common: Common) -> FrameReport:
         """What became of a frame by itself: nothing of any other frame enters."""
@@ -440,9 +439,12 @@ class Tracker:
                     work.dropped(f"its stamp is late: by {1e3 * own.delay:.0f} ms")
                     return None
         q = self.posture(t)
+        filters, kept = options.filters, np.ones(len(cloud), bool)
         if self.robot is not None:
-            cloud = cloud.keep(without_robot(cloud, self.robot, q, options.filters.padding))
-        cloud = cloud.keep(~background.contains(cloud.points))
+            kept = without_robot(cloud, self.robot, q, filters.padding)
+        kept[kept] = ~background.contains(cloud.points[kept])
+        # beside the robot's points: among all surfaces, wrong points are few
+        cloud = cloud.keep(without_outliers(cloud, filters.neighbours, filters.outlier_ratio, kept))
         work.filtered, work.report = cloud, replace(work.report, filtered=len(cloud))
         if len(cloud) < options.filters.least:
             work.dropped(f"too few points of the object: {len(cloud)} left")

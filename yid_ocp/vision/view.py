@@ -8,14 +8,14 @@ the camera itself.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from yid_ocp.vision.frames import Pinhole
+from yid_ocp.vision.lens import Pinhole
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -43,6 +43,7 @@ class View:
     points: Array
     pose: Array
     pinhole: Pinhole | None = None
+    _kept: list[tuple[Array, Array, cKDTree, Array]] = field(default_factory=list, repr=False)
 
     def hidden(self, places: Array, radius: Array, margin: float) -> Mask:
         """Which places cannot be seen from the camera.
@@ -71,10 +72,12 @@ class View:
             low, high = self._borders
             reach = (radius / np.maximum(depth, _LEAST_DEPTH))[:, None]
             hidden |= ((asked < low + reach) | (asked > high - reach)).any(axis=1)
-        seen, distance = self._about(asked, hidden)
-        if not len(seen):
+        if hidden.all():
             return hidden
-        tree, wide = cKDTree(seen), radius / np.maximum(depth, _LEAST_DEPTH)
+        tree, distance = self._about(asked[~hidden])
+        if not len(distance):
+            return hidden
+        wide = radius / np.maximum(depth, _LEAST_DEPTH)
         for i in np.flatnonzero(~hidden):
             there = distance[tree.query_ball_point(asked[i], wide[i])]
             limit = depth[i] - radius[i] - margin
@@ -105,15 +108,23 @@ class View:
                         borders[end, axis] = value
         return borders[0], borders[1]
 
-    def _about(self, asked: Array, hidden: Mask) -> tuple[Array, Array]:
-        """Points of the picture round about the places: where in the picture, and how deep."""
-        if hidden.all():
-            return np.empty((0, 2)), np.empty(0)
-        low, high = asked[~hidden].min(0), asked[~hidden].max(0)
-        middle, half = 0.5 * (low + high), 0.5 * (high - low) + _BASELINE
+    def _about(self, asked: Array) -> tuple[cKDTree, Array]:
+        """Points of the picture round about the places: where in the picture, and how deep.
+
+        One frame asks again and again for much the same: what was found stays while it is enough.
+        """
+        low, high = asked.min(0) - _BASELINE, asked.max(0) + _BASELINE
+        for lower, upper, tree, depth in self._kept:
+            if (lower <= low).all() and (upper >= high).all():
+                return tree, depth
+        low, high = low - 0.5 * _BASELINE, high + 0.5 * _BASELINE
         seen, depth = self._all
-        near = (np.abs(seen - middle) <= half).all(axis=1)
-        return seen[near], depth[near]
+        near = np.ones(len(seen), bool)
+        for axis in range(2):  # column by column, which is quicker than whole rows
+            near &= (seen[:, axis] >= low[axis]) & (seen[:, axis] <= high[axis])
+        tree = cKDTree(seen[near], compact_nodes=False, balanced_tree=False)
+        self._kept.append((low, high, tree, depth[near]))
+        return tree, depth[near]
 
     @staticmethod
     def _shadowed(tree: cKDTree, distance: Array, asked: Array, limit: float) -> bool:
