@@ -243,13 +243,21 @@ class Surfaces:
             if moving_only and self.joints[part] < 0:
                 continue
             local = (points - pose[:3, 3]) @ pose[:3, :3]
-            near = np.flatnonzero(((local > self._low[part] - within) & (local < self._high[part] + within)).all(1))
+            near = np.flatnonzero(self._inside(local, part, within))
             if not len(near):
                 continue
             query = o3d.core.Tensor(np.ascontiguousarray(local[near], dtype=np.float32))
             found = self._scenes[part].compute_distance(query, nthreads=1).numpy().astype(np.float64)
             result[near] = np.minimum(result[near], found)
         return np.where(result <= within, result, np.inf)
+
+    def _inside(self, local: Array, part: int, margin: float) -> NDArray[np.bool_]:
+        """Which points of a part's frame lie in its box, widened by a margin [m], shape (N,)."""
+        inside = np.ones(len(local), bool)
+        for axis in range(3):  # column by column, which is quicker than whole rows
+            inside &= local[:, axis] > self._low[part][axis] - margin
+            inside &= local[:, axis] < self._high[part][axis] + margin
+        return inside
 
     def within(self, points: Array, q: ArrayLike, reach: float) -> NDArray[np.bool_]:
         """Which points are no further from a surface than `reach` [m], shape (N,); the same as by `distance`, quicker.
@@ -268,11 +276,7 @@ class Surfaces:
         for part, pose in enumerate(self.poses(q)):
             asked = np.flatnonzero(~result)
             local = (points[asked] - pose[:3, 3]) @ pose[:3, :3]
-            inside = np.ones(len(asked), bool)
-            for axis in range(3):
-                inside &= local[:, axis] > self._low[part][axis] - reach
-                inside &= local[:, axis] < self._high[part][axis] + reach
-            near = np.flatnonzero(inside)
+            near = np.flatnonzero(self._inside(local, part, reach))
             if len(near):
                 result[asked[near]] = self._cells[part].within(local[near], reach)
         return result
@@ -304,7 +308,7 @@ class Surfaces:
             if self.joints[part] < 0:
                 continue
             local = (points - pose[:3, 3]) @ pose[:3, :3]
-            near = np.flatnonzero(((local > self._low[part] - within) & (local < self._high[part] + within)).all(1))
+            near = np.flatnonzero(self._inside(local, part, within))
             if not len(near):
                 continue
             query = np.ascontiguousarray(local[near], dtype=np.float32)

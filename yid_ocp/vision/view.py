@@ -115,15 +115,16 @@ class View:
         One frame asks again and again for much the same: what was found stays while it is enough.
         """
         low, high = asked.min(0) - _BASELINE, asked.max(0) + _BASELINE
-        if self._kept and (self._kept[0][0] <= low).all() and (self._kept[0][1] >= high).all():
-            return self._kept[0][2:]
+        for lower, upper, tree, depth in self._kept:
+            if (lower <= low).all() and (upper >= high).all():
+                return tree, depth
         low, high = low - 0.5 * _BASELINE, high + 0.5 * _BASELINE
         seen, depth = self._all
         near = np.ones(len(seen), bool)
         for axis in range(2):  # column by column, which is quicker than whole rows
             near &= (seen[:, axis] >= low[axis]) & (seen[:, axis] <= high[axis])
         tree = cKDTree(seen[near], compact_nodes=False, balanced_tree=False)
-        self._kept[:] = [(low, high, tree, depth[near])]
+        self._kept.append((low, high, tree, depth[near]))
         return tree, depth[near]
 
     @staticmethod
