@@ -6,7 +6,7 @@ following: g_f'x + x'S_f x/2 (`SizeRows`). Together, with a wide prior P,
     x = -(S + P)^-1 g,    cov x = (S + P)^-1 + (S + P)^-1 (sum_f r_f r_f') (S + P)^-1 + diag(b^2),    r_f = g_f + S_f x
 
 found by Gauss and Newton's method, the frames fitted anew at every x. The second term is the scatter between frames,
-however alike the errors within one are. b is what all frames share: an end is seen no better than a point is, and stands
+however alike the errors within one are. b is what all frames share: an end is seen no better than a point is and stands
 where the camera's pose has it; noise along the sight makes a tube thinner or thicker by as much as its square over the
 radius.
 """
