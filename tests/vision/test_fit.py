@@ -113,7 +113,7 @@ def test_wrong_points_hardly_matter(alone):
 def test_a_heap_beside_it_does_not_count_against_the_fit(alone):
     shape = ShapeFit(alone)
     clean = seen(shape, np.zeros(alone.size))
-    heap = np.random.default_rng(0).normal([1.3, 0.5, -0.5], 0.02, (200, 3))
+    heap = np.random.default_rng(0).normal([1.3, 0.5, -0.5], 0.01, (200, 3))
     points = np.concatenate([clean.points, heap])
     both = shape.solve(replace(clean, points=points, weight=np.ones(len(points))), np.zeros(alone.size))
     alone_there = shape.solve(clean, np.zeros(alone.size))
