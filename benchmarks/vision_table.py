@@ -2,8 +2,8 @@
 
     python benchmarks/vision_table.py [ROW ...] [--arms 1 2] [--seeds 0 1] [--frames 14] [--motions FOLDER]
 
-The camera is independent of the package's own: MuJoCo moves a chain twice as fine as the fitted one, each tube is a
-smooth rod (a circle swept along a spline through its joints), the robot its own meshes where MuJoCo's kinematics puts
+The camera is independent of the own one: MuJoCo moves a chain, twice as fine as the fitted one with one arm, each tube
+is a smooth rod (a circle swept along a spline through its joints), the robot its own meshes where MuJoCo puts
 them, all in one scene of Open3D's ray caster. Depth errors grow with z^2 and are alike in neighbouring pixels, edges
 fly, depth is quantised, holes are blobs; exposed for longer, a pixel sees one of several instants or their mean. What
 `track` is told of the camera's pose, its clock, the object and the surroundings is wrong as the row says.
@@ -56,6 +56,7 @@ WRONG = 0.04  # [m]; an accepted frame with a point that is further off is the w
 SIDES = 32  # of a rod's cross section
 INSTANTS = 6  # that an exposure mixes
 TRAVEL = {1: 0.15, 2: 0.11}  # [m]
+LINKS = {1: 8, 2: 4}  # of a tube in MuJoCo, whose chains of eight between two arms are not stable at a usable step
 
 
 @dataclass(frozen=True)
@@ -165,11 +166,13 @@ def played(
     seed: int,
     duration: float,
     travel: float = 1.0,
-    links: int = 8,
+    links: int | None = None,
     folder: Path | None = None,
     truth: Mapping[str, float] | None = None,
+    step: float = 2.5e-4,
 ) -> Played:
     """A motion in MuJoCo; kept in a folder, where one is given, as numbers."""
+    links = links or LINKS[arms]
     system = y_system(arms, links)
     values = {name: value * links / 4 for name, value in (truth or TRUTH).items()}
     name = f"{arms}-{links}-{seed}-{duration:g}-{travel:g}{'' if truth is None else '-own'}.npz"
@@ -180,7 +183,7 @@ def played(
     posture = initial_posture(system, values)
     excitation = Excitation(travel=TRAVEL[arms] * travel, duration=duration)
     motion = multisine(system, values, seed=seed, posture=posture, excitation=excitation)
-    run = simulate_in_mujoco(system, values, motion, Simulation(duration, time_step=2.5e-4), posture=posture)
+    run = simulate_in_mujoco(system, values, motion, Simulation(duration, time_step=step), posture=posture)
     if kept is not None:
         kept.parent.mkdir(parents=True, exist_ok=True)
         np.savez(kept, t=run.t, q=run.q, effort=run.effort, points=run.points)

@@ -101,7 +101,7 @@ def test_a_displaced_camera_is_put_right_or_said(system, recording, clean):
     pose[:3, :3] = Rotation.from_rotvec([0.02, -0.01, 0.03]).as_matrix() @ pose[:3, :3]
     stds = []
     for options in (TrackOptions(), TrackOptions(calibration=CalibrationOptions(fix_pose=True), point_std_max=0.2)):
-        options = replace(options, d_max=0.1, worse=20.0, gap_max=0.2, least_inliers=0.0)
+        options = replace(options, d_max=4.0, worse=20.0, gap_max=0.2, least_covered=0.0)
         found = track(Scene(system, "package:baxter"), recording, replace(sequence, pose=pose), options)
         assert "sees the arm" in found.calibration.message or "contradicts" in found.calibration.message
         truth = np.array([found._place(clean.made.course(t)) for t in found.t])[:, [0, 2]]

@@ -30,7 +30,7 @@ Mask = NDArray[np.bool_]
 
 _SIGMAS = 3.0  # of a point, within which it is the background's
 _MOST = 0.5  # of the frames, in which what stands still must be seen: arm and object hide it from time to time
-_ALIKE = 0.5  # of a thing's size, within which it is the same thing in another frame
+_ALIKE = 1.0  # of a thing's size, within which it is the same thing in another frame
 _STILL = 0.3  # of its size, by which a still thing's middle wanders at most
 _FOLLOWS = 0.5  # of how far it wanders in the world, below which it moves with a link
 _FEWEST = 2  # frames in which a thing is worth a word

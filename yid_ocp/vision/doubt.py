@@ -6,8 +6,9 @@ following: g_f'x + x'S_f x/2 (`SizeRows`). Together, with a wide prior P,
     x = -(S + P)^-1 g,    cov x = (S + P)^-1 + (S + P)^-1 (sum_f r_f r_f') (S + P)^-1 + diag(b^2),    r_f = g_f + S_f x
 
 found by Gauss and Newton's method, the frames fitted anew at every x. The second term is the scatter between frames,
-however alike the errors within one are. b is what all frames share: an end is seen no better than a point is, and noise
-along the sight makes a tube thinner or thicker by as much as its square over the radius.
+however alike the errors within one are. b is what all frames share: an end is seen no better than a point is and stands
+where the camera's pose has it; noise along the sight makes a tube thinner or thicker by as much as its square over the
+radius.
 """
 
 from __future__ import annotations
@@ -127,7 +128,7 @@ def ask_sizes(
     system: System,
     given: Mapping[str, float] | None,
     estimate: Sequence[SizeKind],
-    noise: float,
+    std: tuple[float, float],
     fitted: Callable[[Mapping[str, float], Sequence[Array]], list[Fit]],
 ) -> Sizes:
     """Ask some frames about the sizes.
@@ -139,8 +140,9 @@ def ask_sizes(
         Parameter values; nominal where absent.
     estimate : sequence of "length" and "radius"
         What the fit is to use in place of the model's values, where the frames tell it.
-    noise : float
-        Standard deviation of a point's distance from the surface [m].
+    std : (float, float)
+        Standard deviations of a point's distance from the surface, and of the error of places that all frames share
+        with the camera's pose [m].
     fitted : callable
         From parameter values and the configurations of the round before, empty in the first, to the fits of the frames
         that can be used.
@@ -156,7 +158,7 @@ def ask_sizes(
     change, starts = np.zeros(count), list[Array]()
     nothing = Sizes(names, told, change, np.asarray(np.linalg.inv(prior)), (False,) * count, 0)
     wanted = np.array([kind in estimate for kind in KINDS for _ in range(many)])
-    shared = np.concatenate([noise / told[:many], noise**2 / (2 * told[many:] ** 2)])
+    shared = np.concatenate([math.hypot(*std) / told[:many], std[0] ** 2 / (2 * told[many:] ** 2)])
     covariance, frames = nothing.covariance, 0
     for turn in range(_ROUNDS):
         fits = fitted(_changed(system, given, change), starts)

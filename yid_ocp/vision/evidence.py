@@ -121,14 +121,11 @@ class Thing:
     size : ndarray, shape (3,)
         Extents along the world's axes [m].
     points : int
-    colour : ndarray, shape (3,), optional
-        Mean colour, 0 to 1.
     """
 
     centre: Array
     size: Array
     points: int
-    colour: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +184,6 @@ class Sight:
         Everything that the camera saw; without it no place counts as hidden.
     removed : callable, optional
         Which places, shape (S, 3), lie where filters leave no points.
-    colour : ndarray, shape (N, 3), optional
     anchors : sequence of Anchor
         Ends of the object that were seen.
     """
@@ -198,7 +194,6 @@ class Sight:
     camera: Array
     view: View | None = None
     removed: Removed | None = None
-    colour: Array | None = None
     anchors: Sequence[Anchor] = ()
 
     @cached_property
@@ -398,8 +393,7 @@ def _things(part: Integers, seen: Sight) -> tuple[Thing, ...]:
     for number in range(min(_MOST_THINGS, int(part.max(initial=-1)) + 1)):
         mine = part == number
         points = seen.points[mine]
-        colour = None if seen.colour is None else np.mean(seen.colour[mine], axis=0)
-        found.append(Thing(np.median(points, axis=0), np.ptp(points, axis=0), int(mine.sum()), colour))
+        found.append(Thing(np.median(points, axis=0), np.ptp(points, axis=0), int(mine.sum())))
     return tuple(found)
 
 

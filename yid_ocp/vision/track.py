@@ -221,16 +221,18 @@ class Tracker:
             ]
             return [fit for _, fit in last]
 
-        sizes = ask_sizes(self.system, self.values, self.options.estimate, noise, fitted)
+        shared = 0.0
+        if looks:
+            places = self.shape.place(looks[0].q)
+            still = np.zeros(places.shape)
+            shared = float(calibration.common_std(places, still, np.zeros(len(places))).max())
+        sizes = ask_sizes(self.system, self.values, self.options.estimate, (noise, shared), fitted)
         if self.options.background == "frames":
             shapes = [shape.tubes(fit.q) for shape, fit in last if not unfit(fit, shape, self.options)]
             clouds = [look.sights[0].points for look in looks]
-            still = Background.still(clouds, shapes, 2 * filters.voxel, noise, self.shape.near)
-            if len(background.points):
-                still = Background(
-                    np.concatenate([still.points, background.points]), max(still.within, background.within)
-                )
-            background = still
+            found = Background.still(clouds, shapes, 2 * filters.voxel, noise, self.shape.near)
+            points = np.concatenate([found.points, background.points])
+            background = Background(points, max(found.within, background.within))
         return Common(calibration, sizes, background)
 
     def _calibration(self, progress: Callable[[int, str], None]) -> Calibration:

@@ -23,6 +23,7 @@ Mask = NDArray[np.bool_]
 _BASELINE = 0.1  # [m]; between the camera's two eyes, of which no usual depth camera has a wider one
 _HALF = 0.5  # of the points in a direction decide
 _STRIP, _PIECES = 0.02, 20  # of a picture: width of the strip along a side and the pieces of it, half of them filled
+_NARROWEST = 0.3  # of a picture, as x/z: what is narrower is a cloud that was cut out
 _LEAST_DEPTH = 0.05  # [m]; nearer to the camera's plane there is no picture
 
 
@@ -98,7 +99,7 @@ class View:
         seen, _ = self._all
         if len(seen):
             low, high = seen.min(0), seen.max(0)
-            for axis in range(2):
+            for axis in range(2 if (high - low > _NARROWEST).all() else 0):
                 for end, value in enumerate((low[axis], high[axis])):
                     strip = np.abs(seen[:, axis] - value) <= _STRIP * (high[axis] - low[axis])
                     other = 1 - axis
