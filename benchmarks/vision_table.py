@@ -149,9 +149,9 @@ class Played:
         """What the encoders recorded."""
         driven = list(self.system.driven_indices)
         noise = 2e-4 * np.random.default_rng([seed, 5]).standard_normal((len(self.t), len(driven)))
-        return JointGroup(
-            self.system.driven, self.t, self.q[:, driven] + noise, effort=self.effort, position_std=2e-4, effort_std=0.0
-        )
+        position = self.q[:, driven] + noise
+        stated = {"position_std": 2e-4, "effort_std": 0.0, "effort_kind": "command"}
+        return JointGroup(self.system.driven, self.t, position, effort=self.effort, **stated)
 
     def arm_points(self, seed: int) -> PointGroup:
         """What the arms know of the points that they hold."""
