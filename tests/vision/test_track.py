@@ -194,7 +194,8 @@ def test_progress_is_reported(system, small):
     )
     assert [done for done, _, _ in calls] == sorted(done for done, _, _ in calls)
     assert calls[-1] == (3, 3, "done")
-    assert calls[0][2] == "fitting 000000.ply"
+    assert calls[0][2] == "comparing the object's sizes"
+    assert calls[1][2] == "fitting 000000.ply"
 
 
 def test_a_small_sequence_from_disk(system, small):
@@ -221,7 +222,7 @@ def spoilt(small, **changes):
         (lambda points: 1000 * points, "not in metres"),
         (lambda points: points + np.array([30.0, 0.0, 0.0]), "no point lies where the object can be"),
         (lambda points: points[:60], "too few points of the object"),
-        (lambda points: points * [1.0, 1.0, 1.05], "the shape fits worse"),
+        (lambda points: points * [1.0, 1.0, 1.05], "an end is not where its gripper is"),
     ],
 )
 def test_one_bad_cloud_does_not_stop_the_rest(system, small, cloud, reason):
