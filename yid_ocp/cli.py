@@ -136,6 +136,11 @@ def _batch(parser: argparse.ArgumentParser) -> None:
     _working(parser)
 
 
+def _track(parser: argparse.ArgumentParser) -> None:
+    _doubting(parser)
+    _working(parser, "this process alone")
+
+
 def _simulate(parser: argparse.ArgumentParser) -> None:
     _configured(parser)
     parser.add_argument("--seed", type=int, default=0, help="of the noise and of a virtual experiment's motion")
@@ -272,7 +277,7 @@ COMMANDS: tuple[Command, ...] = (
     Command("simulate", "write what the model says would be recorded", "simulate", _simulate),
     Command("check", "validate a configuration, its recordings and the model before a long run", "check", _doubting),
     Command("inspect", "show the model's equations: names, patterns, single entries, numbers", "inspect", _inspect),
-    Command("track", "measure the object's points in the frames of a depth camera", "track", _doubting),
+    Command("track", "measure the object's points in the frames of a depth camera", "track", _track),
     Command("import", "turn a file of another tool into a recording", "import_recording", _import),
     Command("export", "turn a recording into CSV or MCAP, a run into MJCF, URDF, SDF, YAML or MCAP", "export", _export),
     Command(

@@ -9,6 +9,7 @@ import pytest
 from yid_ocp.cli import main
 from yid_ocp.data.hdf5 import read_recording
 from yid_ocp.vision.pictures import STAGES
+from yid_ocp.vision.track import Tracker
 
 CONFIG = """\
 model:
@@ -23,6 +24,7 @@ recordings:
 track:
   frames: {data}/frames
   pictures: 1
+  options: {{calibration: {{fix_pose: true}}, clock: {{search: 0}}}}
 """
 
 
@@ -58,7 +60,7 @@ def test_track_makes_a_recording_that_solve_reads(cli, config, tmp_path, small, 
     result = json.loads((tmp_path / "run" / "result.json").read_text())
     assert result["format"] == "yid-track/1"
     assert [frame["reason"] for frame in result["frames"]] == ["", "", ""]
-    assert result["clock"]["estimated"] is False  # the clouds hold no arm
+    assert result["camera"]["estimated"] is False  # the clouds hold no arm
     assert len(result["inputs"]) == 4
     pictures = sorted(path.stem.rpartition("_")[2] for path in (tmp_path / "run" / "pictures").glob("*.png"))
     assert pictures == sorted(STAGES)
@@ -69,7 +71,6 @@ def test_track_makes_a_recording_that_solve_reads(cli, config, tmp_path, small, 
     ("settings", "message"),
     [
         (["track.frames=nowhere"], "no such folder of frames"),
-        (["track.unit=mm"], "not one frame could be used"),
         (["recordings.estimate=[]"], "no recording with the joint angles"),
         (["track.options.clock.offset=50"], "their clocks are not the same"),
         (["track.pose=[[1,0,0,0],[0,1,0,0],[0,0,2,0],[0,0,0,1]]"], "not a rigid transform"),
@@ -86,11 +87,73 @@ def test_wrong_input_is_said_and_leaves_nothing(cli, config, tmp_path, settings,
     assert not (tmp_path / "run").exists()
 
 
+def test_without_a_good_frame_the_reasons_and_pictures_are_left(cli, config, tmp_path):
+    done = cli("track", config, "--out", tmp_path / "run", "--set", "track.unit=mm")
+    assert done.code == 2
+    assert "not one frame could be used" in done.err
+    assert str(tmp_path / "run") in done.err
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert "not one frame" in result["refused"]
+    assert all("no point lies where the object can be" in frame["reason"] for frame in result["frames"])
+    assert len(list((tmp_path / "run" / "pictures").glob("*_cloud.png"))) == 1
+    assert not (tmp_path / "run" / "recording.h5").exists()
+    assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["run"]
+
+
+def result_of(folder):
+    """Numbers of a run, without what depends on the clock on the wall."""
+    result = json.loads((folder / "result.json").read_text())
+    for key in ("date", "command", "fit_seconds"):
+        del result[key]
+    for frame in result["frames"]:
+        del frame["seconds"]
+    return result
+
+
+def test_what_an_interrupted_run_did_is_used(cli, config, tmp_path, monkeypatch):
+    """Killed after the first frame: the next run does the others alone, with the same result to the last bit."""
+    assert cli("track", config, "--out", tmp_path / "whole").code == 0
+    worked, work = [], Tracker.frame
+
+    def interrupted(self, index, common):
+        if len(worked) == 1:
+            raise KeyboardInterrupt
+        worked.append(index)
+        return work(self, index, common)
+
+    monkeypatch.setattr(Tracker, "frame", interrupted)
+    assert cli("track", config, "--out", tmp_path / "run").code not in (0, 1)
+    assert not (tmp_path / "run").exists()
+    assert (tmp_path / "run.partial").is_dir()
+    later = []
+
+    def counted(self, index, common):
+        later.append(index)
+        return work(self, index, common)
+
+    monkeypatch.setattr(Tracker, "frame", counted)
+    monkeypatch.setattr(Tracker, "common", None)  # it is known
+    assert cli("track", config, "--out", tmp_path / "run", "--set", "track.pictures=0").code == 0
+    assert len(later) == 2
+    assert not set(later) & set(worked)
+    assert not (tmp_path / "run.partial").exists()
+    assert result_of(tmp_path / "run") == result_of(tmp_path / "whole")
+    one, other = (read_recording(tmp_path / name / "recording.h5").points[-1] for name in ("run", "whole"))
+    assert np.array_equal(one.position, other.position)
+    assert np.array_equal(one.std, other.std)
+
+
+def test_several_workers_find_the_same(cli, config, tmp_path):
+    for name, more in (("one", ()), ("two", ("--workers", "2"))):
+        assert cli("track", config, "--out", tmp_path / name, "--set", "track.pictures=0", *more).code == 0
+    assert result_of(tmp_path / "one") == result_of(tmp_path / "two")
+
+
 @pytest.mark.parametrize("name", ["track_single_arm", "track_dual_arm"])
 def test_the_examples_run(cli, repository, tmp_path, name):
     pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo")
     file = repository / "configs" / f"{name}.yaml"
-    short = ("duration=1.2", "rate=2.5", "dropped=0.0")
+    short = ("duration=1.6", "rate=3.0", "dropped=0.0")
     arguments = [part for setting in short for part in ("--set", f"track.virtual.{setting}")]
     quick = ("--quiet", "--set", "track.pictures=0", "--set", "track.keep_frames=true")
     done = cli("track", file, "--out", tmp_path / "run", *arguments, *quick)

@@ -57,12 +57,59 @@ def test_a_sequence_survives_the_disk(folder):
     assert sequence.select([1]).names == ("000001.ply",)
 
 
-@pytest.mark.parametrize("ending", [".pcd", ".ply"])
-def test_both_formats_of_clouds(open3d, folder, ending):
-    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(CLOUD))
-    open3d.io.write_point_cloud(str(folder / f"other{ending}"), cloud)
+COLOURS = np.array([[255, 0, 7], [1, 2, 3], [9, 200, 0]], np.uint8)
+
+
+@pytest.mark.parametrize("coloured", [True, False])
+@pytest.mark.parametrize("ending", [".pcd", ".ply", ".npz", ".xyz"])
+def test_formats_of_clouds(open3d, folder, ending, coloured):
+    file = folder / f"other{ending}"
+    if ending == ".npz":
+        np.savez(file, points=CLOUD, **({"colours": COLOURS} if coloured else {}))
+    elif ending == ".xyz":
+        np.savetxt(file, np.hstack([CLOUD, COLOURS]) if coloured else CLOUD, header="made")
+    else:
+        cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(CLOUD))
+        if coloured:
+            cloud.colors = open3d.utility.Vector3dVector(COLOURS / 255)
+        open3d.io.write_point_cloud(str(file), cloud)
     (folder / "timestamps.csv").write_text(f"file,t\nother{ending},3.5\n")
-    assert np.allclose(read_frames(folder).load(0), CLOUD, atol=1e-6)
+    sequence = read_frames(folder)
+    assert np.allclose(sequence.load(0), CLOUD, atol=1e-6)
+    assert np.array_equal(sequence.colours(0), COLOURS) if coloured else sequence.colours(0) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "make", "message"),
+    [
+        ("a.npz", lambda file: np.savez(file, dots=CLOUD), "no array `points`"),
+        ("a.npz", lambda file: np.savez(file, points=CLOUD[:, :2]), "no array `points`"),
+        ("a.npz", lambda file: np.savez(file, points=np.array([{}])), "damaged"),
+        ("a.npz", lambda file: np.savez(file, points=CLOUD, colours=COLOURS[:2]), "no colour for every point"),
+        ("a.npz", lambda file: file.write_bytes(b"PK nonsense"), "damaged"),
+        ("a.xyz", lambda file: file.write_text("1 2\n3 4\n"), "has 2 columns"),
+        ("a.xyz", lambda file: file.write_text("1 2 here\n"), "cannot be read"),
+        ("a.xyz", lambda file: file.write_text("# nothing\n"), "empty"),
+    ],
+)
+def test_damaged_clouds_are_refused(folder, name, make, message):
+    make(folder / name)
+    (folder / "timestamps.csv").write_text(f"file,t\n{name},3.5\n")
+    with pytest.raises(DataError, match=message):
+        read_frames(folder).load(0)
+
+
+def test_a_lens_with_distortion_survives_the_disk(tmp_path):
+    camera = Pinhole(8, 6, 10.0, 10.0, 3.5, 2.5, "equidistant", (0.01, 0.0, 0.0, 0.0))
+    depth = np.full((6, 8), 1.5)
+    sequence = FrameSequence(np.array([0.1]), ("a",), POSE, lambda i: camera.cloud(depth), camera)
+    write_frames(sequence, tmp_path / "sequence", depth=[depth])
+    again = read_frames(tmp_path / "sequence")
+    assert again.intrinsics == camera
+    assert np.allclose(again.load(0), sequence.load(0), atol=1e-3)
+    changed(tmp_path / "sequence", intrinsics={**again.intrinsics.__dict__, "coefficients": ["far"]})
+    with pytest.raises(DataError, match="coefficients are"):
+        read_frames(tmp_path / "sequence")
 
 
 def test_units_and_frames_of_clouds(folder):
@@ -118,7 +165,7 @@ def test_what_is_wrong_with_the_camera_is_said(folder, entries, message):
         ([["file", "t"]], "no frame"),
         ([["name", "time"], ["000000.ply", "1"]], "the columns are"),
         ([["file", "t"], ["000000.ply", "noon"]], "the time is 'noon'"),
-        ([["file", "t"], ["000000.xyz", "1"]], "neither a cloud nor a depth image"),
+        ([["file", "t"], ["000000.stl", "1"]], "neither a cloud nor a depth image"),
     ],
 )
 def test_what_is_wrong_with_the_stamps_is_said(folder, rows, message):

@@ -54,7 +54,7 @@ def test_rays_meet_a_ball_where_it_is(ball):
     middle = centre(ball, q)
     eye = middle + np.array([1.2, 0.3, 0.1])
     camera = Pinhole(41, 31, 60.0, 60.0, 20.0, 15.0)
-    depth, cosine = ball.cast(camera, look_at(eye, middle), q)
+    depth, cosine, part = ball.cast(camera, look_at(eye, middle), q)
     away = np.linalg.norm([1.2, 0.3, 0.1])
     assert depth[15, 20] == pytest.approx(away - 0.1, abs=1e-3)
     assert cosine[15, 20] == pytest.approx(1.0, abs=0.01)
@@ -62,8 +62,10 @@ def test_rays_meet_a_ball_where_it_is(ball):
     miss = away * np.sqrt(1 - rays[..., 2] ** 2)
     assert np.isfinite(depth[miss < 0.097]).all()
     assert np.isinf(depth[miss > 0.103]).all()
-    behind, _ = ball.cast(camera, look_at(eye, 2 * eye - middle), q)
+    behind, _, nobody = ball.cast(camera, look_at(eye, 2 * eye - middle), q)
     assert np.isinf(behind).all()
+    assert (nobody == -1).all()
+    assert ((part == ball.joints.index(1)) == np.isfinite(depth)).all()
 
 
 def test_baxters_meshes_are_found_and_move(system):

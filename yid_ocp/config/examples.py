@@ -175,7 +175,7 @@ track:
 """,
     "track.options": """\
 track:
-  options: {d_max: 0.02, points: [w_T1, w_T3]}    # [m]
+  options: {d_max: 0.7, points: [w_T1, w_T3]}
 """,
     "track.options.filters": """\
 track:

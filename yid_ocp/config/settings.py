@@ -28,7 +28,8 @@ from yid_ocp.problem.null_test import GapLimits
 from yid_ocp.problem.options import ProblemOptions, SensorOptions
 from yid_ocp.solvers import SOLVERS, GaussNewton, Lifted, MultipleShooting, SingleShooting, SteepestDescent
 from yid_ocp.solvers.base import Solver
-from yid_ocp.vision.track import TrackOptions
+from yid_ocp.vision.meshes import ExtraMesh
+from yid_ocp.vision.options import TrackOptions
 
 Triple = tuple[float, float, float]
 Quadruple = tuple[float, float, float, float]
@@ -232,6 +233,10 @@ class ModelSettings:
     points: Annotated[
         tuple[str, ...] | None, About("frames that sensors may see, such as T1:40%; the segments' tips")
     ] = None
+    extra_meshes: Annotated[
+        tuple[ExtraMesh, ...],
+        About("what a camera sees and the URDF does not have: a gripper's body, a table; `track` leaves it out"),
+    ] = ()
     effects: Annotated[tuple[EffectSettings, ...], About("added to the nominal model, in this order")] = ()
 
 
@@ -389,13 +394,21 @@ class TrackSettings:
     """How points are measured in a depth camera's frames."""
 
     frames: Annotated[
-        FilePath | None, About("folder of clouds or depth images; a virtual frame sequence when absent")
+        FilePath | None,
+        About("folder of clouds or depth images, bag, MCAP or RealSense file; a virtual frame sequence when absent"),
     ] = None
+    topic: Annotated[str | None, About("of the clouds or depth images in a bag, where it has several")] = None
     pose: Annotated[
         tuple[Quadruple, Quadruple, Quadruple, Quadruple] | None,
         About("camera (x right, y down, z ahead) in the world, row by row, instead of the folder's", "m"),
     ] = None
     unit: Annotated[Literal["m", "mm"] | None, About("of the clouds, instead of the folder's")] = None
+    background: Annotated[
+        FilePath | None,
+        About(
+            "frames of the scene without robot and object, by the same camera in the same place: left out of the others"
+        ),
+    ] = None
     virtual: Annotated[VirtualFramesSettings, About("what is filmed without frames")] = field(
         default_factory=VirtualFramesSettings
     )

@@ -2,6 +2,7 @@
 
 from yid_ocp.parallel.lockstep import ask_together as ask_together
 from yid_ocp.parallel.lockstep import map_in_step as map_in_step
+from yid_ocp.parallel.processes import ThisProcess as ThisProcess
 from yid_ocp.parallel.processes import process_pool as process_pool
 from yid_ocp.parallel.tasks import LOCAL as LOCAL
 from yid_ocp.parallel.tasks import Progress as Progress

@@ -6,9 +6,24 @@ import multiprocessing
 import os
 import signal
 import threading
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from typing import Any
 
 from yid_ocp.parallel.threads import THREADS, processors, threads
+
+
+class ThisProcess(Executor):
+    """Does what it is given at once, in the process that asks: for work that is less than what a process costs."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """A future that is done."""
+        future: Future[Any] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
 
 
 def process_pool(workers: int | None = None) -> ProcessPoolExecutor:

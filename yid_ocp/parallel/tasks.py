@@ -35,7 +35,7 @@ from typing import Any
 from yid_ocp.errors import ConfigError, OutputError, WorkerError, YidError
 from yid_ocp.files import content_hash, file_sha256, reason, write_json
 from yid_ocp.parallel.cluster import cluster, unlike_words
-from yid_ocp.parallel.processes import process_pool
+from yid_ocp.parallel.processes import ThisProcess, process_pool
 from yid_ocp.parallel.threads import processors
 from yid_ocp.version import differences, fingerprint, package_code
 
@@ -237,7 +237,8 @@ def _done_by(workers: Workers | Executor, jobs: Sequence[_Job], finished: Finish
         executor, look = workers, None
         if isinstance(executor, Workers):
             executor, look = held.enter_context(cluster(executor.scheduler, jobs[0].function, jobs[0].folder))
-        lost, never = _drain(executor, jobs, len(jobs), finished, look)
+        at_once = 1 if isinstance(executor, ThisProcess) else len(jobs)
+        lost, never = _drain(executor, jobs, at_once, finished, look)
         for job in (*lost, *never):
             finished(job, job.kept() or TaskResult(job.task.name, error="the executor broke"))
 

@@ -140,11 +140,14 @@ def track_summary(result: Mapping[str, Any]) -> list[Block]:
     spent = 1e3 * result["fit_seconds"]
     said = f"{good} of {len(result['frames'])} frames are good, the fit took {spent:.0f} ms each"
     dropped = [f"dropped {number}: {reason}" for reason, number in result["dropped"].items()]
+    if result["refused"]:
+        said = result["refused"]
     return [
         *doubt_blocks(result),
-        Table(rows, "Points", key=True),
+        *([Table(rows, "Points", key=True)] if result["points"] else []),
         Statement(said, "verdict"),
-        *statements([*dropped, result["clock"]["message"]]),
+        *statements([*dropped, result["camera"]["message"], *result["sizes"]["messages"]]),
+        *statements([*([result["root"]] if result["root"] else []), *(thing["text"] for thing in result["things"])]),
     ]
 
 

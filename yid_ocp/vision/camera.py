@@ -21,7 +21,8 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
 from yid_ocp.errors import ConfigError
-from yid_ocp.vision.frames import XTION, FrameSequence, Pinhole, checked_pose
+from yid_ocp.vision.frames import FrameSequence, checked_pose
+from yid_ocp.vision.lens import XTION, Pinhole
 from yid_ocp.vision.meshes import Mesh, Scene, Surfaces, numeric_mechanism, robot_meshes, tube_meshes
 
 Array = NDArray[np.float64]
@@ -237,7 +238,7 @@ class _Images(Sequence[Array]):
         number = int(index)
         if number not in self._kept:
             self._kept.clear()
-            depth, cosine = self.surfaces.cast(self.camera.pinhole, self.pose, self.q[number])
+            depth, cosine, _ = self.surfaces.cast(self.camera.pinhole, self.pose, self.q[number])
             rng = np.random.default_rng([self.seed, number])
             self._kept[number] = self.camera.measure(depth, cosine, rng)
         return self._kept[number]

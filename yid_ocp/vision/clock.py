@@ -1,19 +1,14 @@
-"""Offset between the camera's clock and the joints', from the arm that both of them see.
+"""How the camera's clock is compared with the joints', and which frames were stamped late.
 
-The robot's surface at the joint angles of time t - d should lie where the camera saw it at its time t:
-
-    d = argmin sum_i min(|p_i - surface(q(t_i - d))|, c)^2
-
-over the camera's points near the moving links. Found by a search on a grid, then Gauss and Newton's method, with a
-shift of the camera as a further unknown, so that errors of its pose and of its depth are not taken for time. Clock
-offset and latency cannot be told apart and come as one number, stamp minus joint time. A minimum for every frame by
-itself finds those that were stamped late.
+The common offset of the two clocks and its drift are part of the calibration. Here a frame is taken by itself: its own
+offset is where the robot's surface lies best on its points, and a frame whose own offset is another than the common one
+was stamped late. Clock offset and latency cannot be told apart and come as one number, stamp minus joint time.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -22,23 +17,25 @@ from annotated_types import Ge, Gt
 from numpy.typing import NDArray
 
 from yid_ocp.options import About, check
-from yid_ocp.vision.filters import Cloud, weighted_median
-from yid_ocp.vision.meshes import Surfaces
+from yid_ocp.vision.filters import weighted_median
+from yid_ocp.vision.registration import FEWEST, Arm, CameraState
 
 Array = NDArray[np.float64]
 
-_POINTS, _FEW = 1000, 150  # of every frame: for the result, for the first search
-_COARSE = 0.02  # [s]
-_FEWEST = 40  # points without which nothing is known of a frame
-_CONTRAST = 0.05  # by which a minimum must be lower than the highest sum, of that
-_NARROWING = (1.0, 0.7, 0.5, 0.35, 0.35)  # of the reach, from iteration to iteration
-_SHARE = 0.3  # of a frame's points must lie on the arm, or they are something else
-_CLEARLY = 0.8  # of the misfit at the common offset, below which a frame's own minimum elsewhere is believed
+_REACH = 0.04  # at which a point stops to be the arm's [m]
+_THIN = 5000  # points of a frame that are looked at
+_POINTS, _FEW = 500, 150  # near the arm: for its offset, to see which start is best
+_COARSE = 0.04  # between starts [s]
+_FURTHEST = 0.4  # of them [s]
+_NARROWING = (1.0, 0.7, 0.5, 0.5)  # of the reach, from iteration to iteration
+_SHARE = 0.3  # of the points must lie on the arm, or they are something else
+_UNUSUAL = 1.5  # times the usual misfit, from which on other starts are tried
+_CLEARLY = 0.8  # of the misfit at the common offset, below which another is believed
 _LEAST_LATE = 0.02  # [s]; a stamp that is off by less is like the others
-_SHIFT = 1e-2  # weight, against that of the points, that keeps a shift small which they do not determine
-_NOTED_SHIFT = 0.006  # [m]
-_MEDIAN_SQUARE = 0.4549  # of a normal variable
-_STEP = 0.01  # over which velocities are taken [s]
+_LATE = 4.0  # standard deviations
+_SHIFT_STD = 1e-3  # of the arm in one frame from where it should be by the calibration [m]
+_ALIKE = 3.0  # points drawn at random have errors that are alike in groups of so many
+_TO_SIGMA, _LEAST_SIGMA = 1.4826, 1e-3  # from the median of sizes; [m]
 _LARGEST_CHANGE = 0.05  # of an offset in one iteration [s]
 
 
@@ -49,8 +46,10 @@ class ClockOptions:
     offset: Annotated[float, About("stamp minus joint time, as far as known", "s")] = 0.0
     search: Annotated[
         float, Ge(0), About("how far from there the offset is looked for; 0 to take it as it is", "s")
-    ] = 0.3
-    reach: Annotated[float, Gt(0), About("distance at which a point stops to be the arm's", "m")] = 0.04
+    ] = 0.5
+    drift_std: Annotated[
+        float, Gt(0), About("standard deviation of the drift of the camera's clock, in seconds per second")
+    ] = 1e-3
     determined: Annotated[float, Gt(0), About("an offset of larger standard deviation is not used", "s")] = 0.02
     late: Annotated[
         float,
@@ -66,263 +65,133 @@ class ClockOptions:
         check(self, "clock options")
 
 
-@dataclass(frozen=True, eq=False)
-class Clock:
-    """The camera's clock against the joints'.
+@dataclass(frozen=True)
+class OwnOffset:
+    """One frame by itself.
 
     Attributes
     ----------
-    offset : float
-        Stamp minus joint time, latency included [s].
+    delay : float
+        Its offset beyond the common one [s].
     std : float
-        Its standard deviation; infinite where it was not estimated [s].
-    estimated : bool
-    delay : ndarray, shape (M,)
-        Each frame's own offset minus the common one [s]; NaN where it cannot be told.
-    delay_std : ndarray, shape (M,)
-        [s]
-    shift : ndarray, shape (3,)
-        What would have to be added to the camera's points to bring them onto the arm [m]: an error of its pose, of its
-        depth or of the joints' zeros. It is only reported.
-    message : str
-        In words.
+        Of that; infinite where too few points lie on the arm [s].
+    misfit : float
+        Mean square of its points' distances from the arm there [m^2].
     """
 
-    offset: float
+    delay: float
     std: float
-    estimated: bool
-    delay: Array
-    delay_std: Array
-    shift: Array
-    message: str
+    misfit: float
 
 
-def estimate_clock(
-    robot: Surfaces,
-    clouds: Sequence[Cloud | None],
-    stamps: Array,
-    posture: Callable[[float], Array],
+def own_offset(
+    arm: Arm,
+    state: CameraState,
+    stamp: float,
+    points: Array,
     rng: np.random.Generator,
-    options: ClockOptions | None = None,
-) -> Clock:
-    """Estimate the offset of the camera's clock.
+    usual: float = 0.0,
+) -> OwnOffset | None:
+    """The offset of one frame's own.
 
     Parameters
     ----------
-    robot : Surfaces
-    clouds : sequence of Cloud or None
-        Of every frame, the robot's points among them; None for frames that are of no use.
-    stamps : ndarray, shape (M,)
+    arm : Arm
+    state : CameraState
+        Of the sequence.
+    stamp : float
         [s]
-    posture : callable
-        From a time on the joints' clock to a configuration; outside of the recording it may stay at the ends.
+    points : ndarray, shape (N, 3)
+        Of the frame in the world, the robot's among them [m].
     rng : Generator
-    options : ClockOptions, optional
+    usual : float
+        Misfit of other frames [m^2]; where this one's is not much larger, its offset is looked for nearby only.
 
     Returns
     -------
-    Clock
-        With the offset of the options where the arm is not seen or hardly moves.
+    OwnOffset or None
+        None where the arm is not in view.
     """
-    chosen = options or ClockOptions()
-    try:
-        if chosen.search == 0:
-            raise _UndeterminedError("it was not to be estimated")
-        arm, samples = _Arm(robot, posture), {}
-        for i, cloud in enumerate(clouds):
-            points = arm.points_near(cloud, float(stamps[i]), rng, chosen)
-            if points is not None:
-                samples[i] = points
-        if not samples:
-            raise _UndeterminedError("the arm is not in view")
-        return _estimated(arm, samples, stamps, rng, chosen)
-    except _UndeterminedError as reason:
-        nothing = np.full(len(stamps), np.nan)
-        text = f"clock offset {1e3 * chosen.offset:.0f} ms as given: {reason}"
-        return Clock(chosen.offset, math.inf, False, nothing, nothing, np.zeros(3), text)
+    t, origin = float(state.time(stamp)), state.pose[:3, 3]
+    points = points[rng.permutation(len(points))[:_THIN]]
+    chosen = points[arm.near(points, t, 2 * _REACH)][:_POINTS]
+    if len(chosen) < FEWEST:
+        return None
+    trial = _nearby(arm, origin, t, chosen, 0.0)
+    if trial.misfit > _UNUSUAL * usual:
+        steps = round(_FURTHEST / _COARSE)
+        grid = _COARSE * np.arange(-steps, steps + 1)
+        few = chosen[:_FEW]
+        start = float(grid[int(np.argmin([_misfit(arm, origin, t - delay, few) for delay in grid]))])
+        if abs(start) > _LEAST_LATE:
+            other = _nearby(arm, origin, t, chosen, start)
+            trial = other if other.misfit < _CLEARLY * trial.misfit else trial
+    return trial
 
 
-class _UndeterminedError(Exception):
-    """Why the offset cannot be estimated, so that the given one is used."""
+def _nearby(arm: Arm, origin: Array, t: float, points: Array, start: float) -> OwnOffset:
+    """The offset not far from a start, by Gauss and Newton's method within one reach after the other.
+
+    A shift of the frame is a further unknown, since the calibration is not exact: an arm that moves slowly tells a
+    shift from a delay as little as it should.
+    """
+    x = np.array([start, 0.0, 0.0, 0.0])
+    hessian, sigma = np.zeros((4, 4)), _REACH
+    for share in _NARROWING:
+        met = arm.met(points + x[1:], origin, t - x[0], share * _REACH, along=True)
+        if len(met.error) < FEWEST:
+            break
+        sigma = max(_TO_SIGMA * float(np.median(np.abs(met.error))), _LEAST_SIGMA)
+        slope = np.column_stack([met.rate, met.normal])
+        prior = np.array([0.0, *[_ALIKE * (sigma / _SHIFT_STD) ** 2] * 3])
+        hessian = slope.T @ slope + np.diag(prior) + 1e-9 * np.eye(4)
+        step = -np.linalg.solve(hessian, slope.T @ met.error + prior * x)
+        x += np.clip(step, -_LARGEST_CHANGE, _LARGEST_CHANGE)
+    error = arm.met(points + x[1:], origin, t - x[0], _REACH, along=True).error
+    on_arm = np.count_nonzero(np.abs(error) < _NARROWING[-1] * _REACH)
+    std = math.inf
+    if on_arm >= max(_SHARE * len(points), FEWEST):
+        std = sigma * math.sqrt(_ALIKE * float(np.linalg.inv(hessian)[0, 0]))
+    return OwnOffset(float(x[0]), std, _mean_square(error, len(points)))
 
 
-@dataclass(frozen=True)
-class _OwnOffset:
-    """One frame by itself: its offset [s], mean square of its points' distances there [m^2], how much it says of it."""
+def _misfit(arm: Arm, origin: Array, t: float, points: Array) -> float:
+    return _mean_square(arm.met(points, origin, t, _REACH, along=True).error, len(points))
 
-    offset: float
-    misfit: float
-    information: float
+
+def _mean_square(error: Array, count: int) -> float:
+    """Mean square of errors, those of the other points being beyond the reach."""
+    return float((error @ error + (count - len(error)) * _REACH**2) / count)
 
 
 @dataclass(frozen=True, eq=False)
-class _Arm:
-    """The robot's surface along its recorded motion."""
+class Usual:
+    """What is usual among frames.
 
-    robot: Surfaces
-    posture: Callable[[float], Array]
+    Attributes
+    ----------
+    on_time : tuple of int
+        Those that agree on one offset.
+    misfit : float
+        Median of theirs [m^2].
+    """
 
-    def poses(self, t: float) -> Array:
-        """Poses of the parts, shape (parts, 4, 4)."""
-        return self.robot.poses(self.posture(t))
-
-    def speed(self, t: float) -> float:
-        """Largest component of the velocity of any part's origin [m/s]."""
-        ahead, behind = self.poses(t + _STEP), self.poses(t - _STEP)
-        return float(np.abs((ahead[:, :3, 3] - behind[:, :3, 3]) / (2 * _STEP)).max())
-
-    def points_near(
-        self, cloud: Cloud | None, stamp: float, rng: np.random.Generator, options: ClockOptions
-    ) -> Array | None:
-        """Points of a frame near the moving links, the fastest of them; None for too few."""
-        if cloud is None or len(cloud) < _FEWEST:
-            return None
-        t = stamp - options.offset
-        speed = max(self.speed(t + d) for d in (-options.search, 0.0, options.search))
-        within = options.reach + min(speed * options.search, 0.1)
-        _, _, part = self.robot.closest(cloud.points, self.posture(t), within)
-        near = np.flatnonzero(part >= 0)
-        if len(near) < _FEWEST:
-            return None
-        points = cloud.points[near]
-        before, after = self.poses(t - 0.1)[part[near]], self.poses(t + 0.1)[part[near]]
-        local = np.einsum("nji,nj->ni", before[:, :3, :3], points - before[:, :3, 3])
-        moved = np.einsum("nij,nj->ni", after[:, :3, :3], local) + after[:, :3, 3] - points
-        fastest = np.argsort(-np.linalg.norm(moved, axis=1), kind="stable")[: 2 * _POINTS]
-        return points[rng.choice(fastest, min(_POINTS, len(fastest)), replace=False)]
-
-    def rows(self, points: Array, t: float, reach: float) -> Array:
-        """Linear equations in changes of offset and camera: (rate, normal (3), distance) of each point within reach."""
-        distance, normal, part = self.robot.closest(points, self.posture(t), reach)
-        near = np.flatnonzero(part >= 0)
-        behind, now, ahead = (self.poses(t + d)[part[near]] for d in (-_STEP, 0.0, _STEP))
-        local = np.einsum("nji,nj->ni", now[:, :3, :3], points[near] - now[:, :3, 3])
-        moved = np.einsum("nij,nj->ni", ahead[:, :3, :3] - behind[:, :3, :3], local)
-        velocity = (moved + ahead[:, :3, 3] - behind[:, :3, 3]) / (2 * _STEP)
-        # a later offset takes the surface back along its velocity, away from the point
-        rate = np.einsum("ni,ni->n", normal[near], velocity)
-        return np.column_stack([rate, normal[near], distance[near]])
-
-    def own_offset(
-        self, points: Array, stamp: float, start: float, reach: float, narrowing: Sequence[float]
-    ) -> _OwnOffset:
-        """The offset of one frame, not far from a start."""
-        offset, information = start, 0.0
-        for share in narrowing:
-            rows = self.rows(points, stamp - offset, share * reach)
-            information = float(rows[:, 0] @ rows[:, 0])
-            if information > 0:
-                offset -= float(np.clip(rows[:, 0] @ rows[:, 4] / information, -_LARGEST_CHANGE, _LARGEST_CHANGE))
-        distance = np.full(len(points), reach)
-        last = self.rows(points, stamp - offset, reach)[:, 4]
-        distance[: len(last)] = last
-        on_arm = np.count_nonzero(last < narrowing[-1] * reach)
-        enough = on_arm >= _SHARE * len(points)
-        return _OwnOffset(offset, float(np.mean(distance**2)), information if enough else 0.0)
+    on_time: tuple[int, ...]
+    misfit: float
 
 
-def _estimated(
-    arm: _Arm, samples: Mapping[int, Array], stamps: Array, rng: np.random.Generator, options: ClockOptions
-) -> Clock:
-    """The offset that most frames agree on; `_UndeterminedError` where there is none."""
-    steps = math.ceil(options.search / _COARSE)
-    coarse: Array = options.offset + _COARSE * np.arange(-steps, steps + 1, dtype=float)
-    curves = _coarse_curves(arm, samples, stamps, rng, coarse, options.reach)
-    offset, shift = _lowest(curves, coarse, options), np.zeros(3)
-    usual = sorted(samples)
-    own, information = np.full(len(stamps), np.nan), np.zeros(len(stamps))
-    for narrowing in (_NARROWING, _NARROWING[-2:], _NARROWING[-2:]):
-        chosen = {i: samples[i] for i in usual}
-        offset, shift = _aligned(arm, chosen, stamps, (offset, shift), [share * options.reach for share in narrowing])
-        for i, points in samples.items():
-            moved, stamp = points + shift, float(stamps[i])
-            trial = arm.own_offset(moved, stamp, offset, options.reach, _NARROWING[-3:])
-            lowest = float(coarse[int(np.argmin(curves[i]))])
-            if abs(lowest - offset) > _LEAST_LATE:
-                other = arm.own_offset(moved, stamp, lowest, options.reach, _NARROWING[1:])
-                trial = other if other.misfit < _CLEARLY * trial.misfit else trial
-            own[i], information[i] = trial.offset, trial.information
-        if np.linalg.norm(shift) > options.reach:
-            raise _UndeterminedError("what the camera sees does not lie on the arm")
-        offset, usual = _agreed(own, information, list(samples))
-    return _summary(own, information, usual, offset, shift, options)
+def agreed(own: Sequence[OwnOffset | None]) -> Usual:
+    """Frames whose own offsets agree: those stamped late must not pull the others."""
+    known = [(i, entry) for i, entry in enumerate(own) if entry is not None and math.isfinite(entry.std)]
+    if not known:
+        return Usual((), 0.0)
+    delay, std = (np.array([getattr(entry, name) for _, entry in known]) for name in ("delay", "std"))
+    apart = np.abs(delay - weighted_median(delay, std**-2))
+    near = apart < np.maximum(_LEAST_LATE, _LATE * std)
+    on_time = tuple(i for (i, _), good in zip(known, near, strict=True) if good)
+    return Usual(on_time, float(np.median([entry.misfit for _, entry in known])))
 
 
-def _coarse_curves(
-    arm: _Arm, samples: Mapping[int, Array], stamps: Array, rng: np.random.Generator, coarse: Array, reach: float
-) -> dict[int, Array]:
-    """Mean square distance of some points of every frame at the offsets of a coarse grid [m^2]."""
-    curves = {}
-    for i, points in samples.items():
-        few = points[rng.choice(len(points), min(_FEW, len(points)), replace=False)]
-        sums = np.empty(len(coarse))
-        for k, offset in enumerate(coarse):
-            away = arm.robot.distance(few, arm.posture(stamps[i] - offset), reach, moving_only=True)
-            sums[k] = np.mean(np.minimum(away, reach) ** 2)
-        curves[i] = sums
-    return curves
-
-
-def _lowest(curves: Mapping[int, Array], coarse: Array, options: ClockOptions) -> float:
-    """The offset of the grid at which all frames together fit best [s]."""
-    total = np.sum(list(curves.values()), axis=0)
-    best = int(np.argmin(total))
-    if total.max() - total.min() < _CONTRAST * total.max():
-        raise _UndeterminedError("the arm hardly moves")
-    if best in (0, len(coarse) - 1):
-        raise _UndeterminedError(f"no best offset within {options.search:g} s of it; the clocks may differ by more")
-    return float(coarse[best])
-
-
-def _aligned(
-    arm: _Arm, samples: Mapping[int, Array], stamps: Array, start: tuple[float, Array], reaches: Sequence[float]
-) -> tuple[float, Array]:
-    """Offset and shift of the camera by Gauss-Newton steps on all frames, within one reach after the other."""
-    offset, shift = start
-    for reach in reaches:
-        rows = [arm.rows(points + shift, float(stamps[i]) - offset, reach) for i, points in samples.items()]
-        stacked = np.concatenate(rows)
-        if len(stacked) < _FEWEST:
-            raise _UndeterminedError("the arm is not in view")
-        held = np.diag([1e-9, *[len(stacked) * _SHIFT] * 3])
-        gradient = stacked[:, :4].T @ stacked[:, 4] + held @ np.append(0.0, shift)
-        change = np.linalg.solve(stacked[:, :4].T @ stacked[:, :4] + held, -gradient)
-        offset += float(np.clip(change[0], -_LARGEST_CHANGE, _LARGEST_CHANGE))
-        shift = shift + change[1:]
-    return offset, shift
-
-
-def _agreed(own: Array, information: Array, frames: Sequence[int]) -> tuple[float, list[int]]:
-    """Median of the frames' own offsets, and the frames near it: those stamped late must not pull the others."""
-    usual = [i for i in frames if information[i] > 0]
-    if len(usual) < 2:
-        raise _UndeterminedError("the arm is hardly in view")
-    offset = weighted_median(own[usual], information[usual])
-    apart = own - offset
-    variance = float(np.median((information * apart**2)[usual])) / _MEDIAN_SQUARE
-    limit = np.maximum(_LEAST_LATE, 4 * np.sqrt(variance / np.maximum(information, 1e-12)))
-    usual = [i for i in usual if abs(apart[i]) < limit[i]]
-    if len(usual) < 2:
-        raise _UndeterminedError("the frames do not agree on one")
-    return offset, usual
-
-
-def _summary(
-    own: Array, information: Array, usual: list[int], offset: float, shift: Array, options: ClockOptions
-) -> Clock:
-    """Common offset and standard deviations, from the scatter of the frames' own offsets."""
-    apart = own[usual] - offset
-    weight = information[usual]
-    # the errors of one frame's points are alike to an unknown degree: only the scatter says how much a frame knows
-    variance = max(float(np.mean(weight * apart**2)), 1e-12)
-    own_std = np.sqrt(variance / np.maximum(information, 1e-12))
-    count = len(usual)
-    offset += float(weight @ apart / weight.sum())
-    std = math.sqrt(float(weight**2 @ (own[usual] - offset) ** 2) * count / (count - 1)) / float(weight.sum())
-    if not std < options.determined:
-        raise _UndeterminedError("the arm moves too little to tell")
-    own_std = np.where(np.isfinite(own), own_std, np.nan)
-    text = f"clock offset {1e3 * offset:.1f} ms ± {1e3 * std:.1f} ms (stamp minus joint time, from {count} frames)"
-    if np.linalg.norm(shift) > _NOTED_SHIFT:
-        text += f"; the camera sees the arm {1e3 * np.linalg.norm(shift):.0f} mm from where the joints have it"
-    return Clock(offset, std, True, own - offset, own_std, shift, text)
+def is_late(own: OwnOffset, options: ClockOptions) -> bool:
+    """Whether a frame was stamped late, beyond doubt."""
+    return abs(own.delay) > max(options.late, _LATE * own.std)

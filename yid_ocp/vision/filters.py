@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
 import casadi as ca
 import numpy as np
-from annotated_types import Ge, Gt
+from annotated_types import Ge, Gt, Le
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
@@ -20,7 +21,10 @@ from yid_ocp.vision.meshes import Surfaces, numeric_mechanism
 Array = NDArray[np.float64]
 Triple = tuple[float, float, float]
 Mask = NDArray[np.bool_]
+Part = Annotated[float, Ge(0), Le(255)]
+Colour = tuple[Part, Part, Part]
 
+_USUAL = 3000  # points, at least, that tell how far neighbours usually are
 _TO_SIGMA = 1.4826  # from the median absolute deviation of a normal distribution to its standard deviation
 
 
@@ -83,6 +87,21 @@ class FilterOptions:
             "m",
         ),
     ] = 0.0
+    colours: Annotated[
+        tuple[Colour, ...],
+        About(
+            "of the object: red, green and blue, 0 to 255; points of other colours are left out, where the clouds have "
+            "colours; all are kept when empty"
+        ),
+    ] = ()
+    colour_angle: Annotated[
+        float,
+        Gt(0),
+        Le(math.pi / 2),
+        About(
+            "between a point's and the object's colour as directions, by which light and shade change nothing", "rad"
+        ),
+    ] = 0.2
     neighbours: Annotated[int, Ge(1), About("of every point, whose mean distance tells whether it is alone")] = 12
     outlier_ratio: Annotated[
         float,
@@ -145,9 +164,18 @@ class ObjectRegion:
     options : FilterOptions
     values : mapping of str to float, optional
         Parameter values; nominal where absent.
+    anywhere : bool
+        Whether its root may be anywhere; only the box and the floor of the options bound it then.
     """
 
-    def __init__(self, system: System, options: FilterOptions, values: Mapping[str, float] | None = None) -> None:
+    def __init__(
+        self,
+        system: System,
+        options: FilterOptions,
+        values: Mapping[str, float] | None = None,
+        *,
+        anywhere: bool = False,
+    ) -> None:
         tree = numeric_mechanism(system, values)
         symbols, theta = system.parameters.symbols, system.parameters.vector(values)
         lengths = {
@@ -159,14 +187,14 @@ class ObjectRegion:
         for segment in system.segments:
             reach[segment.name] = lengths[segment.name] + (reach[segment.parent] if segment.parent else 0.0)
         first = next(s for s in system.segments if s.parent is None)
-        self._radius = max(reach.values()) + radius + options.reach_margin
+        self._radius = np.inf if anywhere else max(reach.values()) + radius + options.reach_margin
         base = tree.joint_index(first.links[0][0])
         q = ca.SX.sym("q", system.size)
         kinematics = forward_kinematics(tree, q)
         self._root = ca.Function("root", [q], [kinematics.origins[base]])
         tips = [kinematics.position(f"w_{name}") for name in lengths if f"w_{name}" in tree.frames]
         low = -np.inf if options.floor is None else options.floor
-        if options.floor is None and tree.joints[base].parent < 0 and tips:
+        if options.floor is None and tree.joints[base].parent < 0 and tips and not anywhere:
             rest = np.zeros(system.size)
             root = float(np.array(self._root(rest))[2, 0])
             heights = np.array(ca.Function("tips", [q], [ca.horzcat(*tips)])(rest))[2]
@@ -178,7 +206,7 @@ class ObjectRegion:
         self._lower[2] = max(self._lower[2], low)
         self._behind = options.behind
         elastic = {entry.joint for entry in system.elastic}
-        roots = [j for j in tree.joints if j.parent < 0 and j.name not in elastic]
+        roots = [j for j in tree.joints if j.parent < 0 and j.name not in elastic and not anywhere]
         bases = [np.array(ca.DM(joint.placement.translation)).ravel() for joint in roots]
         self._base = np.mean(bases, axis=0) if bases else None
 
@@ -221,10 +249,10 @@ def voxel_grid(points: Array, size: float) -> Cloud:
 
 def without_robot(cloud: Cloud, robot: Surfaces, q: ArrayLike, padding: float) -> Mask:
     """Which points are not the robot's: further than `padding` [m] from its surface at a configuration, shape (N,)."""
-    return ~np.isfinite(robot.distance(cloud.points, q, padding))
+    return ~robot.within(cloud.points, q, padding)
 
 
-def without_outliers(cloud: Cloud, neighbours: int, ratio: float) -> Mask:
+def without_outliers(cloud: Cloud, neighbours: int, ratio: float, asked: Mask | None = None) -> Mask:
     """Which points have company: statistical outlier removal.
 
     A point stays where the mean distance d to its nearest neighbours satisfies  d <= median(d) + ratio s,  with s the
@@ -237,18 +265,56 @@ def without_outliers(cloud: Cloud, neighbours: int, ratio: float) -> Mask:
     neighbours : int
         Of every point.
     ratio : float
+    asked : ndarray, shape (N,), optional
+        Points to judge; all when absent. What is usual is told by points all over the cloud, whichever are asked.
 
     Returns
     -------
     ndarray, shape (N,)
-        True for points that stay.
+        True for points that stay; False for those that are not asked.
     """
     if len(cloud) <= neighbours:
         return np.zeros(len(cloud), bool)
-    distance = cKDTree(cloud.points).query(cloud.points, k=neighbours + 1)[0][:, 1:].mean(1)
-    middle = weighted_median(distance, cloud.weight)
-    spread = _TO_SIGMA * weighted_median(np.abs(distance - middle), cloud.weight)
-    return np.asarray(distance <= middle + ratio * spread)
+    tree = cKDTree(cloud.points, compact_nodes=False, balanced_tree=False)
+
+    def apart(index: NDArray[np.int64]) -> Array:
+        return np.asarray(tree.query(cloud.points[index], k=neighbours + 1)[0][:, 1:].mean(axis=1))
+
+    some = np.arange(0, len(cloud), max(1, len(cloud) // _USUAL))
+    distance = apart(some)
+    middle = weighted_median(distance, cloud.weight[some])
+    spread = _TO_SIGMA * weighted_median(np.abs(distance - middle), cloud.weight[some])
+    index = np.flatnonzero(np.ones(len(cloud), bool) if asked is None else asked)
+    stays = np.zeros(len(cloud), bool)
+    stays[index] = apart(index) <= middle + ratio * spread
+    return stays
+
+
+def of_colours(colours: ArrayLike, wanted: ArrayLike, angle: float) -> Mask:
+    """Which points have one of some colours.
+
+    Parameters
+    ----------
+    colours : array_like, shape (N, 3)
+        Red, green and blue, 0 to 255 (sRGB).
+    wanted : array_like, shape (C, 3)
+    angle : float
+        Largest angle between two colours as directions of linear light, which brightness does not change [rad].
+
+    Returns
+    -------
+    ndarray, shape (N,)
+    """
+    seen, asked = (_light(np.asarray(entry, float)) for entry in (colours, wanted))
+    return np.asarray((seen @ asked.T).max(axis=1) >= math.cos(angle))
+
+
+def _light(colours: Array) -> Array:
+    """Unit directions of linear light; black, which has none, is grey."""
+    share = colours / 255.0
+    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
+    linear = np.maximum(linear, 1e-6)
+    return np.asarray(linear / np.linalg.norm(linear, axis=1)[:, None])
 
 
 def weighted_median(values: Array, weight: Array) -> float:

@@ -11,10 +11,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import casadi as ca
 import numpy as np
+from annotated_types import Gt
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import DataError, ModelError
@@ -23,14 +24,41 @@ from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Mechanism
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import robot_file
-from yid_ocp.vision.frames import Pinhole, open3d_module
+from yid_ocp.options import About
+from yid_ocp.vision.frames import open3d_module
+from yid_ocp.vision.lens import Pinhole
 
 Array = NDArray[np.float64]
 MeshKind = Literal["visual", "collision"]
+Size = Annotated[float, Gt(0)]
 
 _FACETS = 48  # of a tube: the surface is then within 0.2 % of the radius
 _TOUCHING = 5e-4  # [m]
+_CELL = 0.01  # [m]
+_HALF_CELL = 0.5 * math.sqrt(3.0) * _CELL + 1e-5  # the furthest of a cell from its centre, and rounding [m]
+_CELLS = 1 << 20  # along each axis, more than any robot needs
 _NEAR = 0.05  # [m]; closer than this a box is not projected but taken to fill the image
+
+
+@dataclass(frozen=True)
+class ExtraMesh:
+    """Something that the robot's URDF does not have: a gripper's body, a table, a camera's stand."""
+
+    frame: Annotated[str | None, About("link of the robot that carries it; null for the world")] = None
+    mesh: Annotated[str | None, About("file that trimesh reads, in metres: STL, OBJ, DAE", path=True)] = None
+    box: Annotated[tuple[Size, Size, Size] | None, About("in place of a file: edges along x, y, z", "m")] = None
+    cylinder: Annotated[tuple[Size, Size] | None, About("the same: radius and length along z", "m")] = None
+    sphere: Annotated[float | None, Gt(0), About("the same: radius", "m")] = None
+    xyz: Annotated[tuple[float, float, float], About("of its middle in the link", "m")] = (
+        0.0,
+        0.0,
+        0.0,
+    )
+    rpy: Annotated[tuple[float, float, float], About("roll, pitch and yaw in the link", "rad")] = (
+        0.0,
+        0.0,
+        0.0,
+    )
 
 
 @dataclass(frozen=True)
@@ -44,11 +72,14 @@ class Scene:
         File of the robot, for its meshes (`package:baxter`); None for the object alone.
     values : mapping of str to float, optional
         Parameter values (lengths, radii, relative stiffnesses); nominal where absent.
+    extra : sequence of ExtraMesh
+        What stands about that is neither.
     """
 
     system: System
     urdf: str | Path | None = None
     values: Mapping[str, float] | None = None
+    extra: Sequence[ExtraMesh] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +142,38 @@ class Mesh:
         return Mesh(vertices, np.concatenate(faces))
 
 
+class _Cells:
+    """Distances to a surface at the centres of cells, worked out when a cell is asked for."""
+
+    def __init__(self, scene: Any, origin: Array) -> None:
+        self._scene, self._origin = scene, origin
+        self._keys, self._away = np.empty(0, dtype=np.int64), np.empty(0)
+
+    def distance(self, points: Array) -> Array:
+        """Distance of points of the part's frame to its surface, shape (N,) [m]."""
+        query = open3d_module().core.Tensor(np.ascontiguousarray(points, dtype=np.float32))
+        return np.asarray(self._scene.compute_distance(query, nthreads=1).numpy().astype(np.float64))
+
+    def within(self, points: Array, reach: float) -> NDArray[np.bool_]:
+        """Which points are no further than `reach` [m], shape (N,)."""
+        cell = np.floor((points - self._origin) / _CELL).astype(np.int64) + _CELLS // 2
+        key = (cell[:, 0] * _CELLS + cell[:, 1]) * _CELLS + cell[:, 2]
+        every, index = np.unique(key, return_inverse=True)
+        new = np.setdiff1d(every, self._keys, assume_unique=True)
+        if len(new):
+            place = np.stack([new // _CELLS**2, new // _CELLS % _CELLS, new % _CELLS], axis=1)
+            away = self.distance(self._origin + (place - _CELLS // 2 + 0.5) * _CELL)
+            keys, values = np.append(self._keys, new), np.append(self._away, away)
+            order = np.argsort(keys)
+            self._keys, self._away = keys[order], values[order]
+        away = self._away[np.searchsorted(self._keys, every)][index]
+        close = away + _HALF_CELL < reach
+        unsure = np.flatnonzero(~close & (away - _HALF_CELL < reach))
+        if len(unsure):
+            close[unsure] = self.distance(points[unsure]) <= reach
+        return np.asarray(close)
+
+
 class Surfaces:
     """Meshes on the joints of a mechanism, and what rays and points find of them.
 
@@ -128,6 +191,7 @@ class Surfaces:
         self.joints = tuple(sorted(meshes))
         self._scenes: list[Any] = []
         self._low, self._high = [], []
+        self._cells: list[_Cells] = []
         for joint in self.joints:
             mesh = meshes[joint]
             scene = o3d.t.geometry.RaycastingScene(nthreads=1)
@@ -136,6 +200,7 @@ class Surfaces:
             self._scenes.append(scene)
             self._low.append(mesh.vertices.min(0))
             self._high.append(mesh.vertices.max(0))
+            self._cells.append(_Cells(scene, self._low[-1]))
         q = ca.SX.sym("q", len(mechanism.joints))
         kinematics = forward_kinematics(mechanism, q)
         poses = [
@@ -178,13 +243,43 @@ class Surfaces:
             if moving_only and self.joints[part] < 0:
                 continue
             local = (points - pose[:3, 3]) @ pose[:3, :3]
-            near = np.flatnonzero(((local > self._low[part] - within) & (local < self._high[part] + within)).all(1))
+            near = np.flatnonzero(self._inside(local, part, within))
             if not len(near):
                 continue
             query = o3d.core.Tensor(np.ascontiguousarray(local[near], dtype=np.float32))
             found = self._scenes[part].compute_distance(query, nthreads=1).numpy().astype(np.float64)
             result[near] = np.minimum(result[near], found)
         return np.where(result <= within, result, np.inf)
+
+    def _inside(self, local: Array, part: int, margin: float) -> NDArray[np.bool_]:
+        """Which points of a part's frame lie in its box, widened by a margin [m], shape (N,)."""
+        inside = np.ones(len(local), bool)
+        for axis in range(3):  # column by column, which is quicker than whole rows
+            inside &= local[:, axis] > self._low[part][axis] - margin
+            inside &= local[:, axis] < self._high[part][axis] + margin
+        return inside
+
+    def within(self, points: Array, q: ArrayLike, reach: float) -> NDArray[np.bool_]:
+        """Which points are no further from a surface than `reach` [m], shape (N,); the same as by `distance`, quicker.
+
+        No distance differs from that of a place by more than the way there: the cell in which a point lies, whose
+        centre's distance is kept, mostly tells.
+
+        Parameters
+        ----------
+        points : ndarray, shape (N, 3)
+            In the world [m].
+        q : array_like, shape (n,)
+        reach : float
+        """
+        result = np.zeros(len(points), bool)
+        for part, pose in enumerate(self.poses(q)):
+            asked = np.flatnonzero(~result)
+            local = (points[asked] - pose[:3, 3]) @ pose[:3, :3]
+            near = np.flatnonzero(self._inside(local, part, reach))
+            if len(near):
+                result[asked[near]] = self._cells[part].within(local[near], reach)
+        return result
 
     def closest(self, points: Array, q: ArrayLike, within: float) -> tuple[Array, Array, NDArray[np.int64]]:
         """Nearest moving surface of points, and the way there.
@@ -213,7 +308,7 @@ class Surfaces:
             if self.joints[part] < 0:
                 continue
             local = (points - pose[:3, 3]) @ pose[:3, :3]
-            near = np.flatnonzero(((local > self._low[part] - within) & (local < self._high[part] + within)).all(1))
+            near = np.flatnonzero(self._inside(local, part, within))
             if not len(near):
                 continue
             query = np.ascontiguousarray(local[near], dtype=np.float32)
@@ -230,8 +325,8 @@ class Surfaces:
             normal[chosen] = unit[better] @ pose[:3, :3].T
         return distance, normal, owner
 
-    def cast(self, pinhole: Pinhole, pose: ArrayLike, q: ArrayLike) -> tuple[Array, Array]:
-        """Depth image without noise, and how squarely each pixel's ray meets the surface.
+    def cast(self, pinhole: Pinhole, pose: ArrayLike, q: ArrayLike) -> tuple[Array, Array, NDArray[np.int64]]:
+        """Depth image without noise, how squarely each pixel's ray meets the surface, and whose surface it is.
 
         Parameters
         ----------
@@ -246,12 +341,15 @@ class Surfaces:
             Along the optical axis [m]; infinite where there is nothing.
         cosine : ndarray, shape (height, width)
             Of the angle between ray and surface normal.
+        part : ndarray of int, shape (height, width)
+            Index into `joints`, -1 where there is nothing.
         """
         o3d = open3d_module()
         rays = pinhole.rays
         camera = np.asarray(pose, float)
         depth = np.full(rays.shape[:2], np.inf)
         cosine = np.zeros(rays.shape[:2])
+        owner = np.full(rays.shape[:2], -1)
         for part, placed in enumerate(self.poses(q)):
             rotation = placed[:3, :3].T @ camera[:3, :3]
             origin = placed[:3, :3].T @ (camera[:3, 3] - placed[:3, 3])
@@ -270,7 +368,42 @@ class Surfaces:
             nearer = hit < depth[rows, columns]
             depth[rows, columns] = np.where(nearer, hit, depth[rows, columns])
             cosine[rows, columns] = np.where(nearer, square, cosine[rows, columns])
-        return depth, cosine
+            owner[rows, columns] = np.where(nearer, part, owner[rows, columns])
+        return depth, cosine, owner
+
+    def meet(self, origin: Array, directions: Array, q: ArrayLike) -> tuple[Array, Array, NDArray[np.int64]]:
+        """Where rays first meet a surface, the fixed ones among them.
+
+        Parameters
+        ----------
+        origin : ndarray, shape (3,)
+            Of all rays, in the world [m].
+        directions : ndarray, shape (N, 3)
+        q : array_like, shape (n,)
+
+        Returns
+        -------
+        distance : ndarray, shape (N,)
+            In lengths of the directions; infinite for rays that meet nothing.
+        normal : ndarray, shape (N, 3)
+            Unit vector of the surface, towards the origin.
+        part : ndarray of int, shape (N,)
+            Index into `joints`, -1 for nothing.
+        """
+        o3d = open3d_module()
+        distance, normal = np.full(len(directions), np.inf), np.zeros((len(directions), 3))
+        owner = np.full(len(directions), -1)
+        for part, pose in enumerate(self.poses(q)):
+            local = directions @ pose[:3, :3]
+            start = np.broadcast_to((origin - pose[:3, 3]) @ pose[:3, :3], local.shape)
+            rays = np.ascontiguousarray(np.concatenate([start, local], axis=1), dtype=np.float32)
+            answer = self._scenes[part].cast_rays(o3d.core.Tensor(rays), nthreads=1)
+            hit = answer["t_hit"].numpy().astype(np.float64)
+            nearer = hit < distance
+            distance[nearer], owner[nearer] = hit[nearer], part
+            normal[nearer] = answer["primitive_normals"].numpy()[nearer] @ pose[:3, :3].T
+        away = np.einsum("ij,ij->i", normal, directions) > 0
+        return distance, np.where(away[:, None], -normal, normal), owner
 
     def _window(self, pinhole: Pinhole, rotation: Array, origin: Array, part: int) -> tuple[slice, slice] | None:
         low, high = self._low[part], self._high[part]
@@ -278,7 +411,7 @@ class Surfaces:
         seen = (corners - origin) @ rotation
         if (seen[:, 2] < _NEAR).all():
             return None
-        if (seen[:, 2] < _NEAR).any():
+        if (seen[:, 2] < _NEAR).any() or pinhole.distorted:
             return slice(0, pinhole.height), slice(0, pinhole.width)
         u = pinhole.fx * seen[:, 0] / seen[:, 2] + pinhole.cx
         v = pinhole.fy * seen[:, 1] / seen[:, 2] + pinhole.cy
@@ -344,12 +477,13 @@ def _shape_mesh(geometry: Any, urdf: Path) -> Mesh | None:
     if geometry.mesh is None:
         return None
     scale = np.ones(3) if geometry.mesh.scale is None else np.asarray(geometry.mesh.scale, float)
-    loaded = _loaded(mesh_file(geometry.mesh.filename, urdf))
+    loaded = file_mesh(mesh_file(geometry.mesh.filename, urdf))
     return replace(loaded, vertices=loaded.vertices * scale)
 
 
 @lru_cache(maxsize=64)
-def _loaded(file: Path) -> Mesh:
+def file_mesh(file: Path) -> Mesh:
+    """Triangles of a file; `ModelError` where it cannot be read."""
     import trimesh
 
     try:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from yid_ocp.errors import OutputError
 from yid_ocp.files import new_file
-from yid_ocp.vision.track import Stages, Track
+from yid_ocp.vision.results import Stages, Track
 
 Array = NDArray[np.float64]
 
@@ -25,7 +25,7 @@ STAGES = ("cloud", "filtered", "skeleton", "graph", "fit")
 
 
 def draw_stages(stages: Stages, folder: str | os.PathLike[str]) -> list[Path]:
-    """Write one picture for every stage of a frame: cloud, filtered, skeleton, graph, fit.
+    """Write one picture for every stage that a frame came to: cloud, filtered, skeleton, graph, fit.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def draw_stages(stages: Stages, folder: str | os.PathLike[str]) -> list[Path]:
     Returns
     -------
     list of Path
-        `NAME_1_cloud.png` to `NAME_5_fit.png`.
+        `NAME_1_cloud.png` to `NAME_5_fit.png`; the title of the last one says why the frame was dropped.
 
     Raises
     ------
@@ -48,27 +48,39 @@ def draw_stages(stages: Stages, folder: str | os.PathLike[str]) -> list[Path]:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"the folder cannot be made: {error.strerror}", where=str(path)) from error
-    near = np.concatenate([stages.filtered, stages.fit.centre_line.reshape(-1, 3)])
+    parts = [] if stages.filtered is None else [stages.filtered]
+    parts += [] if stages.fit is None else [stages.fit.centre_line.reshape(-1, 3)]
+    near = np.concatenate([np.empty((0, 3)), *parts])
     stem = "".join(letter if letter.isalnum() else "_" for letter in Path(stages.name).stem)
     written = []
-    for number, (name, (title, draw)) in enumerate(zip(STAGES, _drawings(stages), strict=True), start=1):
+    drawings = _drawings(stages)
+    for number, (name, (title, draw)) in enumerate(zip(STAGES, drawings, strict=False), start=1):
         target = path / f"{stem}_{number}_{name}.png"
-        frame = stages.cloud if name == "cloud" else near
-        _write(target, f"{stages.name}: {title}", frame, stages.camera, draw)
+        frame = stages.cloud if name == "cloud" or not len(near) else near
+        ended = f"\n{stages.reason}" if number == len(drawings) and stages.reason else ""
+        _write(target, f"{stages.name}: {title}{ended}", frame, stages.camera, draw)
         written.append(target)
     return written
 
 
-def _drawings(stages: Stages) -> tuple[tuple[str, Callable[[Any], None]], ...]:
-    """Title and drawing of every stage, in the order of `STAGES`."""
+def _drawings(stages: Stages) -> list[tuple[str, Callable[[Any], None]]]:
+    """Title and drawing of every stage that the frame came to, in the order of `STAGES`."""
     rng = np.random.default_rng(0)
-    skeleton, fit, near = stages.skeleton, stages.fit, stages.filtered
+    near, skeleton, fit = stages.filtered, stages.skeleton, stages.fit
 
     def cloud(axes: Any) -> None:
         _scatter(axes, _some(stages.cloud, rng), _GREY, 0.4)
 
+    made: list[tuple[str, Callable[[Any], None]]] = [(f"{len(stages.cloud)} points of the camera", cloud)]
+    if near is None:
+        return made
+
     def filtered(axes: Any) -> None:
         _scatter(axes, _some(near, rng), _BLUE, 1.5)
+
+    made.append((f"{len(near)} points of the object", filtered))
+    if skeleton is None:
+        return made
 
     def nodes(axes: Any) -> None:
         _scatter(axes, _some(near, rng), _GREY, 0.4)
@@ -79,6 +91,11 @@ def _drawings(stages: Stages) -> tuple[tuple[str, Callable[[Any], None]], ...]:
         for a, b in skeleton.edges:
             axes.plot(*skeleton.nodes[[a, b]].T, color=_BLUE, linewidth=1.2)
 
+    made.append((f"{len(skeleton.nodes)} nodes of the walk", nodes))
+    made.append((f"{len(skeleton.edges)} edges, {len(set(skeleton.part.tolist()))} connected parts", graph))
+    if fit is None:
+        return made
+
     def shape(axes: Any) -> None:
         _scatter(axes, _some(near, rng), _GREY, 0.4)
         for link in fit.centre_line:
@@ -86,13 +103,7 @@ def _drawings(stages: Stages) -> tuple[tuple[str, Callable[[Any], None]], ...]:
         _scatter(axes, fit.centre_line.reshape(-1, 3), _GREEN, 18)
         _scatter(axes, fit.points, _ORANGE, 40)
 
-    return (
-        (f"{len(stages.cloud)} points of the camera", cloud),
-        (f"{len(near)} points of the object", filtered),
-        (f"{len(skeleton.nodes)} nodes of the walk", nodes),
-        (f"{len(skeleton.edges)} edges, {len(set(skeleton.part.tolist()))} connected parts", graph),
-        (f"fitted shape, {1e3 * fit.distance:.1f} mm off on average", shape),
-    )
+    return [*made, (f"fitted shape, {1e3 * fit.distance:.1f} mm off on average", shape)]
 
 
 def draw_track(track: Track, file: str | os.PathLike[str]) -> None:
@@ -122,7 +133,7 @@ def draw_track(track: Track, file: str | os.PathLike[str]) -> None:
         panel.set_ylabel(f"{name} [mm]")
     axes[0].legend(loc="upper right", ncols=3, frameon=False)
     axes[0].set_title(
-        f"about the mean, two standard deviations; dotted: dropped frames\n{track.clock.message}", fontsize=9
+        f"about the mean, two standard deviations; dotted: dropped frames\n{track.calibration.message}", fontsize=9
     )
     axes[-1].set_xlabel("t [s]")
     with new_file(Path(file)) as temporary:

@@ -5,6 +5,7 @@ Format: Turk (1994), The PLY polygon file format, Stanford University.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +23,7 @@ _TYPES = {
     **{"uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4"},
     **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
 }
+AXES, COLOURS = ("x", "y", "z"), ("red", "green", "blue")
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -46,6 +48,17 @@ def read_ply(path: Path) -> Array:
     DataError
         No PLY file, a damaged one, or one whose vertices have no x, y and z.
     """
+    return _columns(path, AXES)
+
+
+def read_ply_colours(path: Path) -> NDArray[np.uint8] | None:
+    """Red, green and blue of the vertices, shape (N, 3), None where they have none; errors as `read_ply`."""
+    colours = _columns(path, COLOURS)
+    return colours.astype(np.uint8) if colours.shape[1] else None
+
+
+def _columns(path: Path, wanted: Sequence[str]) -> Array:
+    """Columns of the vertices, shape (N, number of them), or (N, 0) where the file does not have all of them."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -57,7 +70,7 @@ def read_ply(path: Path) -> Array:
     order, elements = _head(path, head.decode("latin-1"))
     for element in elements:
         if element.name == "vertex":
-            return _vertices(path, element, order, body)
+            return _vertices(path, element, order, body, wanted)
         body = _rest(path, element, order, body)
     raise _damaged(path, "it has no vertices")
 
@@ -98,10 +111,10 @@ def _rest(path: Path, element: _Element, order: str, body: bytes) -> bytes:
     return b"\n".join(body.split(b"\n")[min(element.count, len(body)) :])
 
 
-def _vertices(path: Path, element: _Element, order: str, body: bytes) -> Array:
+def _vertices(path: Path, element: _Element, order: str, body: bytes, wanted: Sequence[str]) -> Array:
     names = [name for name, _ in element.columns]
     kinds = [kind for _, kind in element.columns]
-    if len(set(names)) < len(names) or not {"x", "y", "z"} <= set(names) or "" in kinds:
+    if len(set(names)) < len(names) or not set(AXES) <= set(names) or "" in kinds:
         raise _damaged(path, "its vertices have no x, y and z, or lists")
     size = sum(np.dtype(kind).itemsize for kind in kinds) if order else 2 * len(names)
     if element.count * size > len(body) + (not order):  # the last line of a text may end without a newline
@@ -112,12 +125,14 @@ def _vertices(path: Path, element: _Element, order: str, body: bytes) -> Array:
         )
     if not element.count:
         raise _damaged(path, "it has no vertices")
+    if not set(wanted) <= set(names):
+        return np.empty((element.count, 0))
     if order:
         rows = np.frombuffer(body, [(n, order + k) for n, k in element.columns], element.count)
-        return np.stack([rows[axis].astype(np.float64) for axis in "xyz"], axis=1)
+        return np.stack([rows[name].astype(np.float64) for name in wanted], axis=1)
     try:
         lines = [line.split() for line in body.split(b"\n", element.count)[: element.count]]
-        values = np.array([[float(row[names.index(axis)]) for axis in "xyz"] for row in lines])
+        values = np.array([[float(row[names.index(name)]) for name in wanted] for row in lines])
     except (ValueError, IndexError) as error:
         raise _damaged(path, f"a vertex is not what its head says ({error})") from error
     if len(values) < element.count:

@@ -1,234 +1,66 @@
 """From a frame sequence and the joints' recording to measured points: filter, thin, fit, judge, and write them down.
 
-Every frame ends as a fitted shape or with the reason why it was dropped; nothing in one frame stops the sequence.
+A first pass over some frames finds what is common to the sequence (`calibration`). A second one takes frame by frame
+and keeps no cloud; every frame ends as a fitted shape or with the reason why it was dropped, and nothing in one frame
+stops the sequence. What is left is small and judged in the end (`judgement`).
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Annotated
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-from annotated_types import Ge, Gt, Le
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
+from scipy.spatial import cKDTree
 
-from yid_ocp.data.recording import PointGroup, Recording, validate
+from yid_ocp.data.recording import Recording
 from yid_ocp.errors import ConfigError, DataError, ModelError, nearest
 from yid_ocp.model.system import System
-from yid_ocp.options import About, check
-from yid_ocp.vision.clock import Clock, ClockOptions, estimate_clock
-from yid_ocp.vision.filters import Cloud, FilterOptions, ObjectRegion, voxel_grid, without_outliers, without_robot
-from yid_ocp.vision.fit import Fit, FitOptions, ShapeFit, Sight
+from yid_ocp.vision.calibration import Calibration, as_given, calibrate
+from yid_ocp.vision.clock import is_late, own_offset
+from yid_ocp.vision.clutter import Background, Foreign, extra_meshes, foreign
+from yid_ocp.vision.common import Common
+from yid_ocp.vision.doubt import Sizes, ask_sizes
+from yid_ocp.vision.ends import told, touching
+from yid_ocp.vision.evidence import Sight
+from yid_ocp.vision.filters import Cloud, ObjectRegion, of_colours, voxel_grid, without_outliers, without_robot
+from yid_ocp.vision.fit import ShapeFit
+from yid_ocp.vision.fitted import Fit
 from yid_ocp.vision.frames import FrameSequence
-from yid_ocp.vision.meshes import MeshKind, Scene, Surfaces, numeric_mechanism, robot_meshes
-from yid_ocp.vision.skeleton import Skeleton, WalkOptions, skeleton
+from yid_ocp.vision.judgement import judged, measured, unfit
+from yid_ocp.vision.meshes import Mesh, Scene, Surfaces, numeric_mechanism, robot_meshes
+from yid_ocp.vision.options import TrackOptions
+from yid_ocp.vision.registration import Arm, Glimpse
+from yid_ocp.vision.results import FrameReport, Stages, Track
+from yid_ocp.vision.skeleton import Skeleton, skeleton
+from yid_ocp.vision.starts import Starts, loosened
+from yid_ocp.vision.trace import traced
+from yid_ocp.vision.view import View
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 Progress = Callable[[int, int, str], None]
+_Given = tuple[Array, View, Callable[[Array], Mask]]
 
-GROUP = "points_camera"
+_ASKED = 8  # frames, at most, that are asked about the object's sizes
+_SOME = 2000  # points that tell how far away a cloud is
 _LARGEST = 50.0  # [m]; a depth camera sees no further, a cloud in millimetres always does
 _SAME_TIME = 1e-6  # [s]
-
-
-@dataclass(frozen=True)
-class TrackOptions:
-    """How a frame sequence is turned into measured points, and which of its frames are good."""
-
-    filters: Annotated[FilterOptions, About("what counts as the object")] = field(default_factory=FilterOptions)
-    walk: Annotated[WalkOptions, About("how a cloud is thinned")] = field(default_factory=WalkOptions)
-    fit: Annotated[FitOptions, About("how a shape is fitted")] = field(default_factory=FitOptions)
-    clock: Annotated[ClockOptions, About("how the camera's clock is compared with the joints'")] = field(
-        default_factory=ClockOptions
-    )
-    d_max: Annotated[
-        float, Gt(0), About("a frame whose points are further from the fitted shape on average is dropped", "m")
-    ] = 0.012
-    largest_bend: Annotated[
-        float, Gt(0), About("a frame whose shape has a joint that is bent further is dropped", "rad")
-    ] = 1.2
-    worse: Annotated[
-        float, Gt(0), About("a frame whose distance is so many times the median of all good frames is dropped")
-    ] = 1.7
-    gap_max: Annotated[
-        float,
-        Gt(0),
-        About(
-            "a frame in which an end is further from the gripper that holds it than usual by more is dropped: its time "
-            "is not what its stamp says",
-            "m",
-        ),
-    ] = 0.008
-    least_inliers: Annotated[
-        float, Ge(0), Le(1), About("a frame of which a smaller fraction of the points lies on the shape is dropped")
-    ] = 0.6
-    point_std_max: Annotated[
-        float, Gt(0), About("a point that is known less well in a frame counts as not seen there", "m")
-    ] = 0.02
-    std_floor: Annotated[
-        float,
-        Gt(0),
-        About("standard deviation that no fit is better than: of the camera's pose and of straight links", "m"),
-    ] = 0.003
-    stamp_std: Annotated[
-        float, Ge(0), About("standard deviation of a frame's time stamp, beyond the common offset", "s")
-    ] = 0.003
-    points: Annotated[
-        tuple[str, ...] | None,
-        About("points to write down; those that no arm holds when absent, as arms know theirs better"),
-    ] = None
-    mesh: Annotated[MeshKind, About("meshes of the robot's self-filter")] = "visual"
-    seed: Annotated[int, Ge(0), About("of the walk's random points and of all subsampling")] = 0
-
-    def __post_init__(self) -> None:
-        check(self, "track options")
-
-
-@dataclass(frozen=True, eq=False)
-class FrameReport:
-    """What became of one frame.
-
-    Attributes
-    ----------
-    index : int
-        Of the sequence.
-    name : str
-    stamp : float
-        As the camera gave it [s].
-    t : float
-        On the joints' clock [s].
-    reason : str
-        Why it was dropped; empty for a good one.
-    raw, filtered, nodes : int
-        Points of the cloud, points left by the filters, nodes of the skeleton.
-    delay : float
-        Of its stamp beyond the common offset, NaN where it cannot be told [s].
-    seconds : float
-        Processor time from the filtered cloud to the fitted points [s].
-    fit : Fit or None
-    """
-
-    index: int
-    name: str
-    stamp: float
-    t: float
-    reason: str
-    raw: int
-    filtered: int
-    nodes: int
-    delay: float
-    seconds: float
-    fit: Fit | None
-
-    @property
-    def good(self) -> bool:
-        """Whether it was used."""
-        return not self.reason
-
-
-@dataclass(frozen=True, eq=False)
-class Stages:
-    """One frame on its way, for pictures.
-
-    Attributes
-    ----------
-    name : str
-    cloud, filtered : ndarray, shape (N, 3)
-        In the world [m].
-    skeleton : Skeleton
-    fit : Fit
-    camera : ndarray, shape (3,)
-        [m]
-    """
-
-    name: str
-    cloud: Array
-    filtered: Array
-    skeleton: Skeleton
-    fit: Fit
-    camera: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Track:
-    """Shapes and points of the good frames.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Points written down.
-    t : ndarray, shape (M,)
-        Times of the good frames on the joints' clock [s].
-    q : ndarray, shape (M, n)
-        Configurations, twists at rest.
-    position, std : ndarray, shape (M, np, 3)
-        [m]; NaN where a point was not seen well enough.
-    frames : tuple of FrameReport
-        All of them, by time stamp.
-    clock : Clock
-    stages : tuple of Stages
-        Of the frames that were asked for and turned out well.
-    """
-
-    names: tuple[str, ...]
-    t: Array
-    q: Array
-    position: Array
-    std: Array
-    frames: tuple[FrameReport, ...]
-    clock: Clock
-    stages: tuple[Stages, ...]
-    _system_points: tuple[str, ...]
-    _place: Callable[[Array], Array]
-    _pose: Array
-
-    def shape(self, t: float) -> Array:
-        """Configuration at any time between the good frames, by a cubic spline through theirs, shape (n,).
-
-        Beyond the first and the last frame it stays as it was there.
-        """
-        at = float(np.clip(t, self.t[0], self.t[-1]))
-        return self.q[0].copy() if len(self.t) < 2 else np.asarray(CubicSpline(self.t, self.q, axis=0)(at))
-
-    def points(self, t: float) -> Array:
-        """The written points at any time, by the kinematics of `shape`, shape (np, 3) [m]."""
-        return self._place(self.shape(t))[[self._system_points.index(name) for name in self.names]]
-
-    @property
-    def dropped(self) -> dict[str, int]:
-        """How often each reason dropped a frame; numbers in the reasons are left out."""
-        reasons = (frame.reason.partition(":")[0] for frame in self.frames if not frame.good)
-        return dict(Counter(reasons).most_common())
-
-    def group(self) -> PointGroup:
-        """The points as a group of a recording, called `points_camera`."""
-        return PointGroup(
-            GROUP, self.names, self.t, self.position, self.std, "depth camera, fitted shape", pose=self._pose
-        )
-
-    def recording(self, recording: Recording) -> Recording:
-        """A recording with these points in place of any `points_camera` that it had; `DataError` as `validate`."""
-        others = tuple(group for group in recording.points if group.name != GROUP)
-        text = f"{recording.description} Points of {len(self.t)} of {len(self.frames)} frames; {self.clock.message}."
-        made = replace(recording, points=(*others, self.group()), description=text.strip(), sha256=None)
-        # the positions of a straight object belong to the group that a file lists first
-        if not others or others[0] is not recording.points[0] or others[0].name > GROUP:
-            made = replace(made, straight=None)
-        return validate(made)
+_AS_GOOD = 1.2  # times the distance of the best shape, up to which another one may be the right one
+_GRIP = 0.06  # about a grasp, beyond the tube's radius, a point may be the object's [m]
 
 
 def track(
     scene: Scene,
-    recording: Recording,
+    recording: Recording | None,
     sequence: FrameSequence,
     options: TrackOptions | None = None,
     *,
     stages: Sequence[int] = (),
+    empty: FrameSequence | None = None,
     progress: Progress | None = None,
 ) -> Track:
     """Measure the object's points in a sequence.
@@ -238,12 +70,14 @@ def track(
     scene : Scene
         Robot and object; joints that are not elastic must be in the recording. Without a URDF file there is no
         self-filter and no clock offset.
-    recording : Recording
-        Joint angles, for the self-filter, the grasps and the clock.
+    recording : Recording or None
+        Joint angles, for the self-filter, the grasps and the clock; None where the model has no robot.
     sequence : FrameSequence
     options : TrackOptions, optional
     stages : sequence of int
-        Frames of the frame sequence of which all stages are kept for pictures.
+        Frames of the frame sequence of which all stages are kept for pictures, as far as they can be read.
+    empty : FrameSequence, optional
+        Frames of the scene without robot and object, by the same camera: a background.
     progress : callable, optional
         Called with frames done, frames in all and what is being done.
 
@@ -260,39 +94,104 @@ def track(
     ModelError
         Meshes that cannot be read.
     """
-    tracker = _Tracker(scene, recording, sequence, options or TrackOptions())
-    return tracker.run(frozenset(stages), progress or (lambda done, total, text: None))
+    tracker = Tracker(scene, recording, sequence, options or TrackOptions(), empty)
+    told = progress or (lambda done, total, text: None)
+    total = len(tracker.sample) + len(tracker.order)
+    common = tracker.common(lambda done, text: told(done, total, text))
+    frames = []
+    for done, i in enumerate(tracker.order, start=len(tracker.sample)):
+        told(done, total, f"fitting {sequence.names[i]}")
+        frames.append(tracker.frame(i, common))
+    told(total, total, "done")
+    found = tracker.finished(*tracker.judged(frames), common)
+    drawn = (tracker.stages(frame, common) for frame in found.frames if frame.index in stages)
+    return replace(found, stages=tuple(entry for entry in drawn if entry is not None))
+
+
+@dataclass(eq=False)
+class _Work:
+    """A frame while it is worked on: its report so far and what is left of its cloud."""
+
+    report: FrameReport
+    filtered: Cloud | None = None
+    skeleton: Skeleton | None = None
+
+    def dropped(self, reason: str) -> _Work:
+        self.report = replace(self.report, reason=reason)
+        return self
 
 
 @dataclass(frozen=True, eq=False)
-class _Reading:
-    """A frame that was read: its cloud where the object can be, None with a reason; how many points it had."""
+class _Look:
+    """What a frame shows, once for every way in which it may, the robot's configuration, and where searches begin."""
 
-    index: int
-    cloud: Cloud | None
-    raw: int = 0
-    reason: str = ""
+    sights: tuple[Sight, ...]
+    q: Array
+    starts: tuple[tuple[Array, ...], ...]
 
 
-class _Tracker:
-    """The state of one call of `track`."""
+class Tracker:
+    """What is needed for any frame of a sequence, whichever process works on it.
 
-    def __init__(self, scene: Scene, recording: Recording, sequence: FrameSequence, options: TrackOptions) -> None:
+    Parameters
+    ----------
+    scene, recording, sequence, options, empty
+        As `track`.
+
+    Attributes
+    ----------
+    order : tuple of int
+        All frames by their stamps.
+    sample : tuple of int
+        Frames from which what is common to all of them is found.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        recording: Recording | None,
+        sequence: FrameSequence,
+        options: TrackOptions,
+        empty: FrameSequence | None = None,
+    ) -> None:
         system, values = scene.system, scene.values
-        self.system, self.sequence, self.options = system, sequence, options
-        self.shape = ShapeFit(system, options.fit, values)
+        self._loose: tuple[str, ...] = ()
+        anywhere = options.root != "model"
+        if anywhere:
+            if scene.urdf is not None:
+                hint = "set track.options.root to model, or model.robot to null"
+                raise ConfigError(
+                    "a robot holds the object: its root is where the model has it", where="root", hint=hint
+                )
+            system, self._loose = loosened(system, values)
+        self.system, self.values, self.sequence, self.options, self.empty = system, values, sequence, options, empty
+        self.shape = self._shape_of(values)
+        self.starts = self.shape.starts() if anywhere else None
         self.names = _chosen_points(system, options.points)
-        self.region = ObjectRegion(system, options.filters, values)
-        self.camera = sequence.pose[:3, 3]
-        self.span, self.angles = _joint_angles(system, recording, self.shape.known)
+        self.region = ObjectRegion(system, options.filters, values, anywhere=anywhere)
+        # of a root that is sought nothing that was recorded is needed
+        self.span, self.angles = _joint_angles(system, recording, () if anywhere else self.shape.known)
         tree = numeric_mechanism(system, values)
-        self.robot: Surfaces | None = None
+        meshes: dict[int, Mesh] = {}
         if scene.urdf is not None:
             meshes = robot_meshes(scene.urdf, tree, options.mesh)
             if all(joint < 0 for joint in meshes):
                 raise ModelError("no link of the robot moves with the model's joints", where=str(scene.urdf))
-            self.robot = Surfaces(tree, meshes)
-        self.rng = np.random.default_rng(options.seed)
+        for joint, extra in extra_meshes(scene.extra, tree).items():
+            meshes[joint] = Mesh.joined([*([meshes[joint]] if joint in meshes else []), *extra])
+        self.robot = Surfaces(tree, meshes) if meshes else None
+        self.arm: Arm | None = None
+        if self.robot is not None and self.span is not None and scene.urdf is not None:
+            self.arm = Arm(self.robot, self.posture, self.shape.grips, float(self.shape.radius.max()) + _GRIP)
+        self.order, self._reasons = _by_stamp(sequence.t)
+        usable = [i for i in self.order if i not in self._reasons]
+        self._check_clock(usable)
+        if options.filters.colours and sequence.colours is None:
+            hint = "leave track.options.filters.colours out, or record clouds with colours"
+            raise DataError("the clouds have no colours", where=sequence.source, hint=hint)
+        self._asked = _spread(usable, _ASKED)
+        self._shapes: dict[tuple[float, ...], ShapeFit] = {(): self.shape}
+        self.sample = _spread(usable, options.calibration.frames) if self.arm is not None else []
 
     def posture(self, t: float) -> Array:
         """Configuration at a time on the joints' clock, the object at rest; it stays at the recording's ends beyond."""
@@ -301,50 +200,57 @@ class _Tracker:
             q[[self.system.mechanism.joint_index(name) for name in self.shape.known]] = self.angles(t)
         return q
 
-    def run(self, wanted: frozenset[int], progress: Progress) -> Track:
-        """Both passes over the sequence."""
-        total = 2 * len(self.sequence)
-        readings = self._readings(progress)
-        stamps = self.sequence.t[[reading.index for reading in readings]]
-        progress(len(self.sequence), total, "comparing the clocks")
-        clock = self._clock([reading.cloud for reading in readings], stamps)
-        frames: list[FrameReport] = []
-        kept: list[Stages] = []
-        last: tuple[Array, float] | None = None
-        for k in range(len(readings)):
-            reading = readings[k]
-            readings[k] = replace(reading, cloud=None)  # a long sequence would fill the memory
-            progress(len(self.sequence) + k, total, f"fitting {self.sequence.names[reading.index]}")
-            report, stage = self._frame(reading, clock, k, last)
-            frames.append(report)
-            if report.good and report.fit is not None:
-                last = report.fit.q, report.t
-            if stage is not None and report.good and reading.index in wanted:
-                kept.append(stage())
-        progress(total, total, "done")
-        fits = [frame.fit for frame in frames if frame.good and frame.fit is not None]
-        if fits:
-            usual = float(np.median([fit.distance for fit in fits]))
-            gap = np.median([fit.gap for fit in fits], axis=0)
-            frames = [self._compared(frame, usual, gap) for frame in frames]
-        return self._track(frames, clock, kept)
+    def common(self, progress: Callable[[int, str], None] = lambda done, text: None) -> Common:
+        """What is common to the sequence, from some of its frames."""
+        calibration = self._calibration(progress)
+        progress(len(self.sample), "comparing the object's sizes")
+        background = Background()
+        filters, noise = self.options.filters, self.options.fit.noise
+        if self.empty is not None:
+            clouds = [calibration.state.world(self._finite(self.empty, i)[0]) for i in range(len(self.empty))]
+            background = Background.empty_scene(clouds, filters.voxel, noise)
+        looks = [look for i in self._asked if (look := self._look(i, calibration, background)) is not None]
+        last: list[tuple[ShapeFit, Fit]] = []
 
-    def _readings(self, progress: Progress) -> list[_Reading]:
-        """All frames by their stamps, filtered as far as that needs no clock."""
-        order, reasons = _sorted_frames(self.sequence.t)
-        self._check_clock([i for i in order if i not in reasons])
-        readings = []
-        for done, i in enumerate(order):
-            progress(done, 2 * len(order), f"reading {self.sequence.names[i]}")
-            reading = _Reading(i, None, reason=reasons.get(i, ""))
-            if i not in reasons:
-                try:
-                    cloud, raw = self._read(i)
-                    reading = _Reading(i, cloud, raw)
-                except DataError as error:
-                    reading = _Reading(i, None, reason=error.what)
-            readings.append(reading)
-        return readings
+        def fitted(values: Mapping[str, float], starts: Sequence[Array]) -> list[Fit]:
+            shape = self._shape_of(values)
+            before: list[Array | None] = list(starts) if len(starts) == len(looks) else [None] * len(looks)
+            last[:] = [
+                (shape, shape.solve(look.sights[0], look.q, look.starts[0] if start is None else (start,)))
+                for look, start in zip(looks, before, strict=True)
+            ]
+            return [fit for _, fit in last]
+
+        shared = 0.0
+        if looks:
+            places = self.shape.place(looks[0].q)
+            still = np.zeros(places.shape)
+            shared = float(calibration.common_std(places, still, np.zeros(len(places))).max())
+        sizes = ask_sizes(self.system, self.values, self.options.estimate, (noise, shared), fitted)
+        if self.options.background == "frames":
+            shapes = [shape.tubes(fit.q) for shape, fit in last if not unfit(fit, shape, self.options)]
+            clouds = [look.sights[0].points for look in looks]
+            found = Background.still(clouds, shapes, 2 * filters.voxel, noise, self.shape.near)
+            points = np.concatenate([found.points, background.points])
+            background = Background(points, max(found.within, background.within))
+        return Common(calibration, sizes, background)
+
+    def _calibration(self, progress: Callable[[int, str], None]) -> Calibration:
+        options = self.options
+        if self.arm is None:
+            return as_given(self.sequence.pose, options.clock, "no robot to compare")
+        glimpses = []
+        for done, i in enumerate(self.sample):
+            progress(done, f"reading {self.sequence.names[i]}")
+            try:
+                points = self._points(i)
+            except DataError:
+                continue  # the second pass says why
+            glimpses.append(Glimpse(float(self.sequence.t[i]), voxel_grid(points, options.filters.voxel).points))
+        progress(len(self.sample), "calibrating the camera by the arm")
+        rng = np.random.default_rng(options.seed)
+        pose, source = self.sequence.pose, self.sequence.source
+        return calibrate(self.arm, glimpses, pose, rng, options.calibration, options.clock, source)
 
     def _check_clock(self, usable: Sequence[int]) -> None:
         if self.span is None or not usable:
@@ -360,139 +266,242 @@ class _Tracker:
                 " both started together",
             )
 
-    def _read(self, index: int) -> tuple[Cloud, int]:
-        points = self.sequence.world(index)
-        count = len(points)
-        points = points[np.isfinite(points).all(axis=1)]
+    def _shape(self, sizes: Sizes) -> ShapeFit:
+        """The object with the sizes that were estimated."""
+        key = tuple(np.where(sizes.used, sizes.change, 0.0).tolist()) if any(sizes.used) else ()
+        if key not in self._shapes:
+            self._shapes[key] = self._shape_of(sizes.values(self.system, self.values))
+        return self._shapes[key]
+
+    def _shape_of(self, values: Mapping[str, float] | None) -> ShapeFit:
+        return ShapeFit(self.system, self.options.fit, values, self._loose)
+
+    def _removed(self, q: Array, calibration: Calibration, background: Background) -> Callable[[Array], Mask]:
+        """Which places the filters leave no points of, the robot at a configuration."""
+        region, padding = self.region.at(q, calibration.camera), self.options.filters.padding
+        within = padding + float(self.shape.radius.max())
+
+        def removed(places: Array) -> Mask:
+            gone = ~region.contains(places)
+            if self.robot is not None:
+                gone |= self.robot.within(places, q, within)
+            return gone | background.contains(places, float(self.shape.radius.max()))
+
+        return removed
+
+    def _points(self, index: int) -> Array:
+        """A frame's finite points in the camera's frame."""
+        return self._finite(self.sequence, index)[0]
+
+    @staticmethod
+    def _finite(sequence: FrameSequence, index: int) -> tuple[Array, Mask]:
+        """A frame's finite points in the camera's frame, and which of all its points they are."""
+        points = sequence.load(index)
+        finite: Mask = np.isfinite(points[:, 0] + points[:, 1] + points[:, 2])
+        points = points[finite]
         if not len(points):
             raise DataError("the cloud is empty")
-        far = float(np.median(np.abs(points).max(axis=1)))
+        far = float(np.median(np.abs(points[:: 1 + len(points) // _SOME]).max(axis=1)))
         if far > _LARGEST:
             raise DataError(f"the cloud is not in metres: half of its points are {far:.0f} m away (millimetres?)")
+        return points, finite
+
+    def _read(self, index: int, calibration: Calibration) -> tuple[Cloud, Array]:
+        """A frame's cloud in the world where the object can be, the robot's points among them, and all its points."""
+        found, finite = self._finite(self.sequence, index)
+        points = calibration.state.world(found)
         filters = self.options.filters
-        q = self.posture(float(self.sequence.t[index]) - self.options.clock.offset)
-        inside = self.region.at(q, self.camera).contains(points)
+        q = self.posture(float(calibration.state.time(self.sequence.t[index])))
+        inside = self.region.at(q, calibration.camera).contains(points)
         if not inside.any():
             raise DataError("no point lies where the object can be: check the camera's pose")
-        cloud = voxel_grid(points[inside], filters.voxel)
-        # before the robot is taken out: among all surfaces, wrong points are few
-        return cloud.keep(without_outliers(cloud, filters.neighbours, filters.outlier_ratio)), count
+        if filters.colours and self.sequence.colours is not None:
+            colours = self.sequence.colours(index)
+            if colours is None:
+                raise DataError("the cloud has no colours")
+            inside[inside] = of_colours(colours[finite][inside], filters.colours, filters.colour_angle)
+            if not inside.any():
+                raise DataError("no point has one of the object's colours: check filters.colours")
+        return voxel_grid(points[inside], filters.voxel), points
 
-    def _clock(self, clouds: Sequence[Cloud | None], stamps: Array) -> Clock:
-        options = self.options.clock
-        if self.robot is None or self.span is None:
-            nothing = np.full(len(stamps), np.nan)
-            text = f"clock offset {1e3 * options.offset:.0f} ms as given: no robot to compare"
-            return Clock(options.offset, math.inf, False, nothing, nothing, np.zeros(3), text)
-        return estimate_clock(self.robot, clouds, stamps, self.posture, self.rng, options)
+    def frame(self, index: int, common: Common) -> FrameReport:
+        """What became of a frame by itself: nothing of any other frame enters."""
+        return self._work(index, common).report
 
-    def _frame(
-        self, reading: _Reading, clock: Clock, row: int, last: tuple[Array, float] | None
-    ) -> tuple[FrameReport, Callable[[], Stages] | None]:
-        """What became of a frame, and its stages if it has a shape; `last`: shape and time of the good frame before."""
-        options, index, cloud = self.options, reading.index, reading.cloud
+    def stages(self, frame: FrameReport, common: Common) -> Stages | None:
+        """A frame once more, for pictures; None where its cloud cannot be read."""
+        try:
+            cloud = common.calibration.state.world(self.sequence.load(frame.index))
+        except DataError:
+            return None
+        work = self._work(frame.index, common)
+        filtered = None if work.filtered is None else work.filtered.points
+        return Stages(
+            frame.name, frame.reason, common.calibration.camera, cloud, filtered, work.skeleton, work.report.fit
+        )
+
+    def unread(self, index: int, calibration: Calibration, reason: str) -> FrameReport:
+        """A frame of which nothing is known but why it is dropped, empty if it is not."""
         stamp = float(self.sequence.t[index])
-        t, delay = stamp - clock.offset, float(clock.delay[row])
-        name = self.sequence.names[index]
-        report = FrameReport(index, name, stamp, t, reading.reason, reading.raw, 0, 0, delay, 0.0, None)
-        if reading.reason or cloud is None:
-            return report, None
-        if self.span is not None and not self.span[0] <= t <= self.span[1]:
-            return replace(report, reason="there are no joint angles at its time"), None
-        if abs(delay) > max(options.clock.late, 4 * float(clock.delay_std[row])):
-            return replace(report, reason=f"its stamp is late: by {1e3 * delay:.0f} ms"), None
-        q = self.posture(t)
-        if self.robot is not None:
-            cloud = cloud.keep(without_robot(cloud, self.robot, q, options.filters.padding))
-        if len(cloud) < options.filters.least:
-            return replace(report, filtered=len(cloud), reason=f"too few points of the object: {len(cloud)} left"), None
-        if len(cloud) > options.filters.most:
-            cloud = cloud.keep(np.sort(self.rng.choice(len(cloud), options.filters.most, replace=False)))
-        begun = time.process_time()
-        found = skeleton(cloud, self.rng, options.walk)
-        report = replace(report, filtered=len(cloud), nodes=len(found.nodes))
-        if not len(found.nodes):
-            return replace(report, reason="no part of the cloud is dense enough for a skeleton"), None
-        rest = cloud.keep(found.connected)
-        part = found.part[found.label[found.connected]]
-        sight = Sight(rest.points, rest.weight, part, found.nodes, self.camera)
-        before = () if last is None else (last[0],)
-        fit = self.shape.solve(sight, q, before, None if last is None else (last[0], t - last[1]))
-        spent = time.process_time() - begun
-        report = replace(report, fit=fit, reason=self._judge(fit), seconds=spent)
-        return report, lambda: Stages(name, self.sequence.world(index), rest.points, found, fit, self.camera)
+        t = float(calibration.state.time(stamp))
+        return FrameReport(index, self.sequence.names[index], stamp, t, reason, 0, 0, 0, math.nan, 0.0, None)
 
-    def _judge(self, fit: Fit) -> str:
-        options = self.options
-        if not np.isfinite(fit.q).all():
-            return "the fit failed"
-        if fit.distance > options.d_max:
-            limit = 1e3 * options.d_max
-            return f"the shape does not fit: {1e3 * fit.distance:.1f} mm off on average, d_max is {limit:g} mm"
-        bend = float(np.abs((fit.q - self.shape.rest)[list(self.shape.free)]).max())
-        if bend > options.largest_bend:
-            return f"the shape is folded: a joint is bent by {math.degrees(bend):.0f} degrees"
-        if fit.inliers < options.least_inliers:
-            return f"the shape does not fit: only {100 * fit.inliers:.0f} % of the points lie on it"
-        return ""
+    def judged(self, frames: Sequence[FrameReport]) -> tuple[list[FrameReport], str]:
+        """The frames with those dropped that are unlike the others, and how the root was told from other ends."""
+        rooted, note = told(frames, self.options)
+        return judged(rooted, self.options), note
 
-    def _compared(self, frame: FrameReport, usual: float, gap: Array) -> FrameReport:
-        if not frame.good or frame.fit is None:
-            return frame
-        if frame.fit.distance > self.options.worse * usual:
-            off = f"{1e3 * frame.fit.distance:.1f} mm off on average, {1e3 * usual:.1f} mm are usual"
-            return replace(frame, reason=f"the shape fits worse than in other frames: {off}")
-        apart = float(np.linalg.norm(frame.fit.gap - gap, axis=1).max(initial=0.0))
-        if apart > self.options.gap_max:
-            off = f"{1e3 * apart:.0f} mm more than usual (a late stamp?)"
-            return replace(frame, reason=f"an end is not where its gripper is: {off}")
-        return frame
-
-    def _track(self, frames: Sequence[FrameReport], clock: Clock, kept: Sequence[Stages]) -> Track:
-        good = [frame for frame in frames if frame.good]
-        if not good:
-            count = Counter(frame.reason for frame in frames).most_common(3)
-            listed = "; ".join(f"{reason} ({number} of {len(frames)})" for reason, number in count)
-            hint = (
-                "check the camera's pose, the unit of the clouds and the filters, and look at the pictures of a frame"
-            )
-            if "metres" in listed:
-                hint = "say in camera.json that the unit is mm"
-            raise DataError(f"not one frame could be used: {listed}", where=self.sequence.source, hint=hint)
-        fits = [frame.fit for frame in good if frame.fit is not None]
-        t = np.array([frame.t for frame in good])
+    def finished(self, frames: Sequence[FrameReport], note: str, common: Common) -> Track:
+        """The track of judged frames; `DataError` where none is good."""
         columns = [self.system.points.index(name) for name in self.names]
-        position = np.array([fit.points[columns] for fit in fits])
-        std = np.hypot(np.array([fit.std[columns] for fit in fits]), self.options.std_floor)
-        # where the arm seems displaced, so may the object be
-        std = np.hypot(std, np.abs(clock.shift))
-        uncertain = math.hypot(self.options.stamp_std, clock.std if clock.estimated else 0.0)
-        if len(t) > 1:
-            velocity = np.asarray(CubicSpline(t, position, axis=0)(t, 1))
-            std = np.hypot(std, np.abs(velocity) * uncertain)
-        unseen = np.linalg.norm(std, axis=2) > math.sqrt(3.0) * self.options.point_std_max
-        unseen |= ~np.array([fit.seen[columns] for fit in fits])
-        if unseen.all():
-            best = 1e3 * float(np.sqrt((std**2).mean(axis=2)).min())
-            raise DataError(
-                f"no point is known well enough in any frame: the best within {best:.0f} mm,"
-                f" point_std_max is {1e3 * self.options.point_std_max:g} mm",
-                where=self.sequence.source,
-                hint=f"check the camera's pose and clock ({clock.message}), or look at the pictures of a frame",
-            )
+        things = self.things(frames)
+        points = measured(frames, columns, common, things, self.options, self.sequence.source)
         return Track(
             self.names,
-            t,
-            np.array([fit.q for fit in fits]),
-            np.where(unseen[..., None], np.nan, position),
-            np.where(unseen[..., None], np.nan, std),
+            points.t,
+            points.q,
+            points.position,
+            points.std,
+            points.common,
             tuple(frames),
-            clock,
-            tuple(kept),
+            common.calibration,
+            common.sizes,
+            things,
+            note,
+            (),
             self.system.points,
-            self.shape.place,
-            self.sequence.pose,
+            self._shape(common.sizes).place,
         )
+
+    def things(self, frames: Sequence[FrameReport]) -> tuple[Foreign, ...]:
+        """What stood about the object in the frames that were fitted."""
+        fitted = [(frame.t, frame.fit) for frame in frames if frame.fit is not None]
+        if not fitted:
+            return ()
+        corners = np.concatenate([fit.centre_line.reshape(-1, 3) for _, fit in fitted])
+        radius = float(self.shape.radius.max())
+        box = corners.min(axis=0) - radius, corners.max(axis=0) + radius
+        seen, noise = [(t, fit.things) for t, fit in fitted], self.options.fit.noise
+        return foreign(seen, len(fitted), noise, box, self._links, self.sequence.colours is not None)
+
+    def _links(self, t: float) -> dict[str, Array]:
+        """Poses of what moves with the robot at a time, by the names of the joints."""
+        if self.robot is None:
+            return {}
+        poses = self.robot.poses(self.posture(t))
+        names = self.system.mechanism.joint_names
+        return {
+            _link_of(self.system, names[j]): pose for j, pose in zip(self.robot.joints, poses, strict=True) if j >= 0
+        }
+
+    def _work(self, index: int, common: Common) -> _Work:
+        work = _Work(self.unread(index, common.calibration, self._reasons.get(index, "")))
+        look = self._prepared(work, common.calibration, common.background)
+        if look is None:
+            return work
+        begun = time.process_time()
+        shape = self._shape(common.sizes)
+        fits = [shape.solve(sight, look.q, starts) for sight, starts in zip(look.sights, look.starts, strict=True)]
+        fits.sort(key=lambda fit: fit.distance)
+        reason = unfit(fits[0], shape, self.options)
+        if self.starts is not None and not reason and touching(fits[0].centre_line, shape.radius):
+            reason = "the object crosses or touches itself"
+        other = fits[1] if len(fits) > 1 and fits[1].distance < _AS_GOOD * fits[0].distance else None
+        spent = work.report.seconds + time.process_time() - begun
+        work.report = replace(work.report, fit=fits[0], other=other, reason=reason, seconds=spent)
+        return work
+
+    def _look(self, index: int, calibration: Calibration, background: Background) -> _Look | None:
+        """A frame that can be fitted; None for others."""
+        return self._prepared(
+            _Work(self.unread(index, calibration, self._reasons.get(index, ""))), calibration, background
+        )
+
+    def _prepared(self, work: _Work, calibration: Calibration, background: Background) -> _Look | None:
+        """What a frame shows of the object, None with the reason in its report."""
+        options, index, stamp, t = self.options, work.report.index, work.report.stamp, work.report.t
+        if work.report.reason:
+            return None
+        try:
+            cloud, raw = self._read(index, calibration)
+        except DataError as error:
+            work.dropped(error.what)
+            return None
+        work.report = replace(work.report, raw=len(raw))
+        if self.span is not None and not self.span[0] <= t <= self.span[1]:
+            work.dropped("there are no joint angles at its time")
+            return None
+        rng = np.random.default_rng([options.seed, index])
+        usual = calibration.usual
+        if self.arm is not None and usual is not None:
+            own = own_offset(self.arm, calibration.state, stamp, cloud.points, rng, usual.misfit)
+            if own is not None and math.isfinite(own.std):
+                work.report = replace(work.report, delay=own.delay)
+                if is_late(own, options.clock):
+                    work.dropped(f"its stamp is late: by {1e3 * own.delay:.0f} ms")
+                    return None
+        q = self.posture(t)
+        filters, kept = options.filters, np.ones(len(cloud), bool)
+        if self.robot is not None:
+            kept = without_robot(cloud, self.robot, q, filters.padding)
+        kept[kept] = ~background.contains(cloud.points[kept])
+        # beside the robot's points: among all surfaces, wrong points are few
+        cloud = cloud.keep(without_outliers(cloud, filters.neighbours, filters.outlier_ratio, kept))
+        work.filtered, work.report = cloud, replace(work.report, filtered=len(cloud))
+        if len(cloud) < options.filters.least:
+            work.dropped(f"too few points of the object: {len(cloud)} left")
+            return None
+        if len(cloud) > options.filters.most:
+            cloud = cloud.keep(np.sort(rng.choice(len(cloud), options.filters.most, replace=False)))
+            work.report = replace(work.report, filtered=len(cloud))
+        begun = time.process_time()
+        view = View(raw, calibration.state.pose, self.sequence.intrinsics)
+        given = calibration.camera, view, self._removed(q, calibration, background)
+        try:
+            look = (
+                self._held(work, cloud, q, rng, given)
+                if self.starts is None
+                else self._anywhere(self.starts, work, cloud, rng, given)
+            )
+        except DataError as error:
+            work.dropped(error.what)
+            return None
+        work.report = replace(work.report, seconds=time.process_time() - begun)
+        return look
+
+    def _held(self, work: _Work, cloud: Cloud, q: Array, rng: np.random.Generator, given: _Given) -> _Look:
+        """What is seen of an object whose root is where the model has it."""
+        found = skeleton(cloud, rng, self.options.walk)
+        work.skeleton, work.report = found, replace(work.report, nodes=len(found.nodes))
+        if not len(found.nodes):
+            raise DataError("no part of the cloud is dense enough for a skeleton")
+        rest = cloud.keep(found.connected)
+        work.filtered = rest
+        return _Look((Sight(rest.points, rest.weight, found.nodes, *given),), q, ((),))
+
+    def _anywhere(self, starts: Starts, work: _Work, cloud: Cloud, rng: np.random.Generator, given: _Given) -> _Look:
+        """What is seen of an object whose root is sought, with the ends that it may have where."""
+        diameter, options = 2.0 * float(self.shape.radius.max()), self.options
+        course = traced(cloud, diameter, options.walk.link_length, rng)
+        work.skeleton, work.report = course.skeleton, replace(work.report, nodes=len(course.nodes))
+        if len(course.loops):
+            raise DataError("the object crosses or touches itself: its cloud closes a loop")
+        found = starts.of(course)
+        if options.root_near is not None:
+            place = np.array(options.root_near)
+            near = min(found, key=lambda start: float(np.linalg.norm(start.root - place))).root
+            found = [start for start in found if np.array_equal(start.root, near)]
+        own = cKDTree(course.nodes).query(cloud.points)[0] < 2.0 * diameter
+        rest = cloud.keep(own)
+        work.filtered = rest
+        sights = tuple(Sight(rest.points, rest.weight, course.nodes, *given, anchors=start.anchors) for start in found)
+        return _Look(sights, self.shape.rest, tuple((start.q,) for start in found))
+
+
+def _link_of(system: System, joint: str) -> str:
+    """Name of a frame that stands still beside a joint's moving side: its link, as far as the model has it."""
+    index = system.mechanism.joint_index(joint)
+    return next((name for name, frame in system.mechanism.frames.items() if frame.joint == index), joint)
 
 
 def _chosen_points(system: System, wanted: tuple[str, ...] | None) -> tuple[str, ...]:
@@ -507,16 +516,18 @@ def _chosen_points(system: System, wanted: tuple[str, ...] | None) -> tuple[str,
 
 
 def _joint_angles(
-    system: System, recording: Recording, known: Sequence[str]
+    system: System, recording: Recording | None, known: Sequence[str]
 ) -> tuple[tuple[float, float] | None, Callable[[float], Array] | None]:
     """Time span of the joints and their angles in the order of `known`, None without a robot."""
     if not known:
         return None, None
+    need = "which the self-filter and the grasps need"
+    if recording is None:
+        hint = "list the recording that was made with the frames under recordings.estimate, or set model.robot to null"
+        raise DataError(f"there is no recording with the joint angles, {need}", where="track", hint=hint)
     joints = recording.joints
     if joints is None:
-        raise DataError(
-            "the recording has no joint angles, which the self-filter and the grasps need", where=recording.name
-        )
+        raise DataError(f"the recording has no joint angles, {need}", where=recording.name)
     for name in known:
         if name not in joints.names:
             raise DataError(
@@ -537,8 +548,8 @@ def _joint_angles(
     return (float(t[0]), float(t[-1])), angles
 
 
-def _sorted_frames(stamps: Array) -> tuple[list[int], dict[int, str]]:
-    """Frames by time stamp, and why some of them cannot be used: no time, or the time of the one before."""
+def _by_stamp(stamps: Array) -> tuple[tuple[int, ...], dict[int, str]]:
+    """Frames by time stamp, and why some are of no use: they have none, or that of the one before."""
     reasons = {int(i): "its time stamp is not a number" for i in np.flatnonzero(~np.isfinite(stamps))}
     order = sorted(range(len(stamps)), key=lambda i: (math.inf if i in reasons else float(stamps[i]), i))
     before = -math.inf
@@ -548,4 +559,11 @@ def _sorted_frames(stamps: Array) -> tuple[list[int], dict[int, str]]:
                 reasons[i] = "its time stamp is that of the frame before: a duplicate"
             else:
                 before = float(stamps[i])
-    return order, reasons
+    return tuple(order), reasons
+
+
+def _spread(indices: Sequence[int], most: int) -> tuple[int, ...]:
+    """So many of the indices at most, evenly spread."""
+    if len(indices) <= most:
+        return tuple(indices)
+    return tuple(indices[int(k)] for k in np.linspace(0, len(indices) - 1, most).round())

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+import shutil
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,25 +15,32 @@ from numpy.typing import NDArray
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import Run, VirtualFramesSettings
-from yid_ocp.data.hdf5 import read_recording, write_recording
+from yid_ocp.data.hdf5 import write_recording
 from yid_ocp.data.recording import Recording
-from yid_ocp.errors import ConfigError
-from yid_ocp.files import file_sha256
+from yid_ocp.errors import DataError, YidError
 from yid_ocp.model.system import System
+from yid_ocp.parallel import Workers
 from yid_ocp.progress import SILENT, Progress
 from yid_ocp.report.scene import Told
 from yid_ocp.report.scene import scene as moving
 from yid_ocp.report.summaries import track_summary
+from yid_ocp.vision.calibration import Calibration
 from yid_ocp.vision.camera import DepthCamera, FrameTiming, VirtualCamera, VirtualFrames, virtual_frames
+from yid_ocp.vision.clutter import Foreign
+from yid_ocp.vision.common import Common
+from yid_ocp.vision.doubt import Sizes
 from yid_ocp.vision.fit import ShapeFit
-from yid_ocp.vision.frames import FrameSequence, look_at, read_frames, write_frames
-from yid_ocp.vision.meshes import Scene
+from yid_ocp.vision.folders import write_frames
+from yid_ocp.vision.frames import look_at
 from yid_ocp.vision.pictures import draw_stages, draw_track
-from yid_ocp.vision.track import Track, track
+from yid_ocp.vision.registration import CLOCK, DEPTH, DRIFT, SCALE, SHIFT, TURN
+from yid_ocp.vision.results import FrameReport, Track, dropped
+from yid_ocp.vision.track import Tracker
 from yid_ocp.workflow.build import build_system, located, recording_file
-from yid_ocp.workflow.command import DONE, carry_out
+from yid_ocp.workflow.command import DONE, carry_out, given_workers
 from yid_ocp.workflow.doubts import doubts_result, of_one
-from yid_ocp.workflow.folder import new_run_folder
+from yid_ocp.workflow.folder import RunFolder, new_run_folder
+from yid_ocp.workflow.tracked_frames import FrameTasks, empty_scene, opened, scene_of
 
 FORMAT = "yid-track/1"
 Array = NDArray[np.float64]
@@ -61,20 +70,30 @@ class TrackOutcome:
 def run(arguments: argparse.Namespace) -> int:
     """The command."""
     settings = load_config(arguments.config, arguments.overrides)
-    carry_out(lambda shown: run_track(settings, arguments.out, shown), track_summary, arguments)
+    workers = given_workers(arguments)
+    carry_out(lambda shown: run_track(settings, arguments.out, shown, workers), track_summary, arguments)
     return DONE
 
 
-def run_track(run: Run, out: str | Path | None = None, progress: Progress = SILENT) -> TrackOutcome:
+def run_track(
+    run: Run,
+    out: str | Path | None = None,
+    progress: Progress = SILENT,
+    workers: Workers | Executor | None = None,
+) -> TrackOutcome:
     """Track the frames of `track.frames`, or of a virtual camera where there are none.
 
-    The joint angles are those of the first recording under `recordings.estimate`; a virtual frame sequence has its own.
+    The joint angles are those of the first recording under `recordings.estimate`; a virtual frame sequence has its own,
+    and an object without a robot needs none. Frames are done one by one; what an interrupted run did of them is used
+    by the next one of the same settings and files.
 
     Parameters
     ----------
     run : Run
     out : str or Path, optional
     progress : Progress, optional
+    workers : Workers or Executor, optional
+        Who works on the frames; this process alone when absent.
 
     Returns
     -------
@@ -82,71 +101,130 @@ def run_track(run: Run, out: str | Path | None = None, progress: Progress = SILE
 
     Raises
     ------
-    ConfigError, DataError, ModelError, OutputError
+    DataError
+        Among others: not one frame is good. The run folder is there then, with the reason of every frame and pictures.
+    ConfigError, ModelError, OutputError, WorkerError
     """
     settings = run.track
     with new_run_folder(run, out, "track") as folder:
         folder.begin(run, "track")
         system = build_system(run)
-        made: VirtualFrames | None = None
-        if settings.frames is None:
-            progress.stage("simulating a virtual experiment in MuJoCo")
-            recording, made = simulated_frames(run, system, settings.virtual)
-            seen = made.sequence
-            if settings.keep_frames:
-                write_frames(seen, folder.path / "frames")
-        else:
-            recording, seen = _recorded(run, settings.frames)
-            folder.inputs[settings.frames] = file_sha256(Path(settings.frames))
-        doubts = of_one(run, system, recording)
-        progress.stage("tracking")
-        drawn = sorted({int(i) for i in np.linspace(0, len(seen) - 1, settings.pictures + 2)[1:-1]})
-        with located(run, "track"):
-            scene = Scene(system, run.model.robot)
-            found = track(scene, recording, seen, settings.options, stages=drawn, progress=progress.advance)
+        filmed = _filmed(run, system, folder, progress)
+        refused: DataError | None = None
+        try:
+            with located(run, "track"):
+                seen, recording = opened(filmed.tasks.run)
+                tracker = Tracker(scene_of(run, system), recording, seen, settings.options, empty_scene(run))
+                doubts = [] if recording is None else of_one(run, system, recording)
+                progress.stage("finding what is common to the frames")
+                common = filmed.tasks.common()
+                progress.stage("tracking")
+                frames, note = tracker.judged(filmed.tasks.frames(tracker, common, workers, progress))
+                found: Track | None = None
+                try:
+                    found = tracker.finished(frames, note, common)
+                except DataError as error:
+                    refused = error
+        except YidError:
+            filmed.clear()
+            raise
         progress.stage("drawing")
-        for stages in found.stages:
-            draw_stages(stages, folder.path / "pictures")
-        draw_track(found, folder.path / "track.png")
-        tracked = found.recording(recording)
-        write_recording(tracked, folder.path / "recording.h5")
-        # what was tracked may be elsewhere than the object reaches
-        doubts += [doubt for doubt in of_one(run, system, tracked) if doubt.cause.startswith("point_")]
-        result = track_result(found) | {
-            "doubts": doubts_result(doubts),
-            "truth_errors": {} if made is None else truth_errors(system, found, made),
-        }
+        for frame in _drawn(frames, settings.pictures):
+            stages = tracker.stages(frame, common)
+            if stages is not None:
+                draw_stages(stages, folder.path / "pictures")
+        result = track_result(frames, common, tracker.things(frames), found) | {"root": note}
+        told, tracked = [], None
+        if found is not None:
+            draw_track(found, folder.path / "track.png")
+            tracked = found.recording(recording)
+            write_recording(tracked, folder.path / "recording.h5")
+            # what was tracked may be elsewhere than the object reaches, where the model says where it stands
+            if settings.options.root == "model":
+                doubts += [doubt for doubt in of_one(run, system, tracked) if doubt.cause.startswith("point_")]
+            shape = Told("fitted shape", tracker.system, system.parameters.vector(), found.t, found.q)
+            told = [moving("tracked", [shape], tracked)]
+            if filmed.made is not None:
+                result["truth_errors"] = truth_errors(system, found, filmed.made)
+        result |= {"doubts": doubts_result(doubts), "refused": "" if refused is None else refused.what}
         written = folder.finish(result)
-        told = Told("fitted shape", system, system.parameters.vector(), found.t, found.q)
         files = [folder.path / "track.png", *sorted((folder.path / "pictures").glob("*.png"))]
         more = {"pictures": [path for path in files if path.exists()]}
-        folder.report(run, written, progress, scenes=[moving("tracked", [told], tracked)], more=more)
+        folder.report(run, written, progress, scenes=told, more=more)
+        filmed.clear()
+    if refused is not None or found is None or tracked is None:
+        raise _with_folder(refused, folder.path)
     return TrackOutcome(folder.path, written, found, tracked)
 
 
-def track_result(found: Track) -> dict[str, Any]:
-    """`yid-track/1` without the errors of a virtual frame sequence, inputs and versions."""
-    seen = np.asarray(np.isfinite(found.position).all(axis=2))
-    spent = [frame.seconds for frame in found.frames if frame.fit is not None]
-    clock = found.clock
+@dataclass(frozen=True, eq=False)
+class _Filmed:
+    """The frames of a run as files, and the truth of virtual ones; `own`: what was made for it."""
+
+    tasks: FrameTasks
+    made: VirtualFrames | None = None
+    own: tuple[Path, ...] = ()
+
+    def clear(self) -> None:
+        """Remove what stands beside the run folder."""
+        for path in self.own:
+            shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
+        self.tasks.clear()
+
+
+def _filmed(run: Run, system: System, folder: RunFolder, progress: Progress) -> _Filmed:
+    settings = run.track
+    if settings.frames is not None:
+        opened(run)  # says in words of the settings what is wrong with the files
+        joints = recording_file(run.recordings.estimate[0]) if run.recordings.estimate else None
+        with located(run, "track", "frames"):
+            tasks = FrameTasks.of(run, Path(settings.frames), joints, folder.partial)
+        folder.inputs[settings.frames] = tasks.inputs["frames"]
+        return _Filmed(tasks)
+    progress.stage("simulating a virtual experiment in MuJoCo")
+    recording, made = simulated_frames(run, system, settings.virtual)
+    progress.stage("filming it")
+    folder.partial.mkdir(parents=True, exist_ok=True)
+    frames, joints = folder.partial / "frames", folder.partial / f"{run.name}.h5"
+    write_frames(made.sequence, frames)
+    write_recording(recording, joints)
+    if settings.keep_frames:
+        shutil.copytree(frames, folder.path / "frames")
+    return _Filmed(FrameTasks.of(run, frames, joints, folder.partial), made, (frames, joints))
+
+
+def _drawn(frames: Sequence[FrameReport], count: int) -> list[FrameReport]:
+    """Frames to draw: some of all, evenly spread, and as many of those that were dropped, each for another reason."""
+    chosen = {int(i) for i in np.linspace(0, len(frames) - 1, count + 2)[1:-1]}
+    reasons = [frames[k].reason.partition(":")[0] for k in sorted(chosen)]
+    for k, frame in enumerate(frames):
+        kind = frame.reason.partition(":")[0]
+        if kind and kind not in reasons and len(chosen) < 2 * count:
+            chosen.add(k)
+            reasons.append(kind)
+    return [frames[k] for k in sorted(chosen)]
+
+
+def _with_folder(refused: DataError | None, folder: Path) -> DataError:
+    assert refused is not None
+    hint = f"{refused.hint}; {folder} has the reason of every frame and pictures"
+    return DataError(refused.what, where=refused.where, allowed=refused.allowed, hint=hint)
+
+
+def track_result(
+    frames: Sequence[FrameReport], common: Common, things: Sequence[Foreign], found: Track | None
+) -> dict[str, Any]:
+    """`yid-track/1` without doubts, inputs and versions; `found` is None where no frame is good."""
+    spent = [frame.seconds for frame in frames if frame.fit is not None]
     return {
         "format": FORMAT,
-        "clock": {
-            "offset": clock.offset,
-            "std": clock.std if clock.estimated else None,
-            "estimated": clock.estimated,
-            "shift": clock.shift,
-            "message": clock.message,
-        },
-        "points": {
-            name: {
-                "frames": int(seen[:, i].sum()),
-                "std": float(np.median(found.std[seen[:, i], i])) if seen[:, i].any() else None,
-            }
-            for i, name in enumerate(found.names)
-        },
-        "dropped": found.dropped,
-        "fit_seconds": float(np.mean(spent)),
+        "camera": camera_result(common.calibration),
+        "sizes": sizes_result(common.sizes),
+        "things": [asdict(thing) for thing in things],
+        "points": {} if found is None else _points(found),
+        "truth_errors": {},
+        "dropped": dropped(frames),
+        "fit_seconds": float(np.mean(spent)) if spent else 0.0,
         "frames": [
             {
                 "name": frame.name,
@@ -158,11 +236,70 @@ def track_result(found: Track) -> dict[str, Any]:
                 "nodes": frame.nodes,
                 "delay": None if np.isnan(frame.delay) else frame.delay,
                 "distance": None if frame.fit is None else frame.fit.distance,
-                "inliers": None if frame.fit is None else frame.fit.inliers,
+                "covered": None if frame.fit is None else frame.fit.covered,
+                "contested": None if frame.fit is None else frame.fit.contested,
                 "seconds": frame.seconds,
             }
-            for frame in found.frames
+            for frame in frames
         ],
+    }
+
+
+def sizes_result(sizes: Sizes) -> dict[str, Any]:
+    """Lengths and radii: the model's, the values that fit the frames with their standard deviations, and what of it."""
+    fits = sizes.told * np.exp(sizes.change)
+    return {
+        "frames": sizes.frames,
+        "messages": list(sizes.messages),
+        "of": {
+            name: {
+                "model": sizes.told[i],
+                "fits": fits[i] if sizes.known[i] else None,
+                "std": fits[i] * sizes.std[i] if sizes.known[i] else None,
+                "doubted": bool(sizes.doubted[i]),
+                "used": sizes.used[i],
+            }
+            for i, name in enumerate(sizes.names)
+        },
+    }
+
+
+def camera_result(calibration: Calibration) -> dict[str, Any]:
+    """The camera of a sequence: what is used, what was told, how well it is known."""
+    state, told, change = calibration.state, calibration.told, calibration.state.minus(calibration.told)
+    std = np.sqrt(np.diag(calibration.covariance))
+    return {
+        "message": calibration.message,
+        "estimated": calibration.frames > 0,
+        "frames": calibration.frames,
+        "pose": state.pose,
+        "told_pose": told.pose,
+        "turned": float(np.linalg.norm(change[TURN])),
+        "turn_std": std[TURN],
+        "shifted": float(np.linalg.norm(change[SHIFT])),
+        "shift_std": std[SHIFT],
+        "depth_factor": state.factor,
+        "depth_factor_std": std[SCALE],
+        "depth_offset": state.depth,
+        "depth_offset_std": std[DEPTH],
+        "clock_offset": state.offset,
+        "clock_offset_std": std[CLOCK],
+        "clock_about": state.about,
+        "clock_drift": state.drift,
+        "clock_drift_std": std[DRIFT],
+        "presence": None if calibration.presence is None else asdict(calibration.presence),
+    }
+
+
+def _points(found: Track) -> dict[str, Any]:
+    seen = np.asarray(np.isfinite(found.position).all(axis=2))
+    return {
+        name: {
+            "frames": int(seen[:, i].sum()),
+            "std": float(np.median(found.std[seen[:, i], i])) if seen[:, i].any() else None,
+            "common_std": float(np.median(found.common[seen[:, i], i])) if seen[:, i].any() else None,
+        }
+        for i, name in enumerate(found.names)
     }
 
 
@@ -220,20 +357,5 @@ def simulated_frames(run: Run, system: System, settings: VirtualFramesSettings) 
         )
         pose = look_at(settings.eye, settings.target)
         camera = VirtualCamera(pose, DepthCamera(outliers=settings.outliers), timing, seed=settings.seed)
-        made = virtual_frames(Scene(system, run.model.robot), truth.t, truth.q, camera)
+        made = virtual_frames(scene_of(run, system), truth.t, truth.q, camera)
     return recording, made
-
-
-def _recorded(run: Run, frames: str) -> tuple[Recording, FrameSequence]:
-    if not run.recordings.estimate:
-        raise ConfigError(
-            "there is no recording with the joint angles",
-            where=run.where("recordings", "estimate"),
-            hint="list the recording that was made with the frames",
-        )
-    with located(run, "recordings", "estimate", 0):
-        path = recording_file(run.recordings.estimate[0])
-        recording = read_recording(path, allow_nan_effort=True)
-    with located(run, "track", "frames"):
-        seen = read_frames(frames, pose=run.track.pose, unit=run.track.unit)
-    return replace(recording, name=path.stem), seen

@@ -297,7 +297,8 @@ def check_reach(
             far = float(np.nanmedian(size))
             allowed = (1 + STRETCH) * bound + 6 * noise + CLOSE
             if far / allowed > worst:
-                worst, ratio = far / allowed, far / bound
+                # a point at the very root tells nothing of a scale
+                worst, ratio = far / allowed, far / bound if bound > 0 else 1.0
                 words = f"{said_as} is {far:.3g} m, {bound:.3g} m along the object"
         if worst > 1:
             unit = ratio > 5

@@ -1,0 +1,258 @@
+"""Frames in bags of ROS 1 and ROS 2, MCAP and RealSense files, which the tests write themselves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from yid_ocp.errors import DataError
+from yid_ocp.vision import Pinhole, look_at, read_frames
+
+rosbags = pytest.importorskip("rosbags", reason="bags need rosbags: pip install 'yid-ocp[bags]'")
+from rosbags.rosbag1 import Writer as Writer1  # noqa: E402
+from rosbags.rosbag2 import StoragePlugin  # noqa: E402
+from rosbags.rosbag2 import Writer as Writer2  # noqa: E402
+from rosbags.typesys import Stores, get_typestore  # noqa: E402
+
+POSE = look_at([2.0, 0.5, 0.3], [0.0, 0.0, 0.0])
+START = 1_700_000_000 * 10**9
+CLOUDS = [np.random.default_rng(i).uniform(0.5, 2.0, (5 + i, 3)).astype(np.float32) for i in range(3)]
+COLOURS = [np.random.default_rng(i).integers(0, 256, (5 + i, 3)).astype(np.uint8) for i in range(3)]
+DEPTH = np.arange(1200, 1200 + 6 * 8, dtype=np.uint16).reshape(6, 8)
+DEPTH[0, :2] = 0
+LENS = Pinhole(8, 6, 10.0, 11.0, 3.5, 2.5, "plumb_bob", (-0.2, 0.05, 1e-3, -1e-3, 0.0))
+STAMPS = (0.3, 0.1, 0.2)
+"""Since the first joint states [s]; messages come out of order."""
+KINDS = ("ros1", "ros2", "mcap")
+
+
+class Bag:
+    """A bag in the making, of any kind."""
+
+    def __init__(self, folder, kind, big=False):
+        self.kind, self.big = kind, big
+        self.store = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
+        self.path = folder / ("film.bag" if kind == "ros1" else f"film_{kind}")
+        plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
+        self.writer = Writer1(self.path) if kind == "ros1" else Writer2(self.path, version=9, storage_plugin=plugin)
+        self.connections, self.log = {}, START
+
+    def __enter__(self):
+        self.writer.open()
+        return self
+
+    def __exit__(self, *error):
+        self.writer.close()
+
+    def make(self, kind, **fields):
+        return self.store.types[kind](**fields)
+
+    def header(self, stamp):
+        time = self.make("builtin_interfaces/msg/Time", sec=int(stamp // 10**9), nanosec=int(stamp % 10**9))
+        seq = {"seq": 0} if self.kind == "ros1" else {}
+        return self.make("std_msgs/msg/Header", stamp=time, frame_id="camera_depth_optical_frame", **seq)
+
+    def put(self, topic, message):
+        kind = message.__msgtype__
+        if topic not in self.connections:
+            self.connections[topic] = self.writer.add_connection(topic, kind, typestore=self.store)
+        pack = self.store.serialize_ros1 if self.kind == "ros1" else self.store.serialize_cdr
+        self.log += 10**6
+        self.writer.write(self.connections[topic], self.log, bytes(pack(message, kind)))
+
+    def joints(self, seconds):
+        stamp = START + round(1e9 * seconds)
+        empty = np.zeros(0)
+        self.put(
+            "/joint_states",
+            self.make(
+                "sensor_msgs/msg/JointState",
+                header=self.header(stamp),
+                name=["a"],
+                position=np.zeros(1),
+                velocity=empty,
+                effort=empty,
+            ),
+        )
+
+    def cloud(self, seconds, points, colours=None, topic="/camera/points", names="xyz"):
+        order = ">" if self.big else "<"
+        columns = [(name, f"{order}f4") for name in names] + [("gap", "V4")]
+        columns += [] if colours is None else [("rgb", f"{order}u4")]
+        rows = np.zeros(len(points), columns)
+        for name, column in zip(names, points.T, strict=True):
+            rows[name] = column
+        if colours is not None:
+            wide = colours.astype(np.uint32)
+            rows["rgb"] = (wide[:, 0] << 16) | (wide[:, 1] << 8) | wide[:, 2]
+        kind = "sensor_msgs/msg/PointField"
+        fields = [
+            self.make(kind, name=name, offset=rows.dtype.fields[name][1], datatype=7, count=1)
+            for name, _ in columns
+            if name != "gap"
+        ]
+        message = self.make(
+            "sensor_msgs/msg/PointCloud2",
+            header=self.header(START + round(1e9 * seconds)),
+            height=1,
+            width=len(rows),
+            fields=fields,
+            is_bigendian=self.big,
+            point_step=rows.dtype.itemsize,
+            row_step=rows.dtype.itemsize * len(rows),
+            data=np.frombuffer(rows.tobytes(), np.uint8),
+            is_dense=False,
+        )
+        self.put(topic, message)
+
+    def image(self, seconds, image, encoding, topic="/camera/depth/image_raw"):
+        padded = np.zeros((image.shape[0], image.shape[1] + 1), image.dtype)  # rows may be longer than the picture
+        padded[:, :-1] = image
+        packed = padded.astype(padded.dtype.newbyteorder(">" if self.big else "<"))
+        message = self.make(
+            "sensor_msgs/msg/Image",
+            header=self.header(0 if seconds is None else START + round(1e9 * seconds)),
+            height=image.shape[0],
+            width=image.shape[1],
+            encoding=encoding,
+            is_bigendian=int(self.big),
+            step=packed.strides[0],
+            data=np.frombuffer(packed.tobytes(), np.uint8),
+        )
+        self.put(topic, message)
+
+    def info(self, lens=LENS, topic="/camera/depth/camera_info", model=None):
+        matrix = np.array([lens.fx, 0, lens.cx, 0, lens.fy, lens.cy, 0, 0, 1])
+        own = np.array([2 * lens.fx, 0, lens.cx, 0, 0, 2 * lens.fy, lens.cy, 0, 0, 0, 1, 0])
+        names = {"k": matrix, "d": np.array(lens.coefficients), "r": np.eye(3).ravel(), "p": own}
+        if self.kind == "ros1":
+            names = {key.upper(): value for key, value in names.items()}
+        region = self.make(
+            "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+        )
+        message = self.make(
+            "sensor_msgs/msg/CameraInfo",
+            header=self.header(START),
+            height=lens.height,
+            width=lens.width,
+            distortion_model=model or lens.model,
+            **names,
+            binning_x=0,
+            binning_y=0,
+            roi=region,
+        )
+        self.put(topic, message)
+
+
+@pytest.mark.parametrize("big", [False, True])
+@pytest.mark.parametrize("kind", KINDS)
+def test_clouds(tmp_path, kind, big):
+    with Bag(tmp_path, kind, big) as bag:
+        bag.joints(0.0)
+        for stamp, cloud, colours in zip(STAMPS, CLOUDS, COLOURS, strict=True):
+            bag.cloud(stamp, cloud, colours)
+    sequence = read_frames(bag.path, pose=POSE)
+    assert np.allclose(sequence.t, STAMPS, atol=1e-9)
+    for i in (2, 0, 1):
+        assert np.array_equal(sequence.load(i), CLOUDS[i].astype(float))
+        assert np.array_equal(sequence.colours(i), COLOURS[i])
+    assert np.allclose(sequence.select([1]).colours(0), COLOURS[1])
+    assert np.allclose(read_frames(bag.path, pose=POSE, unit="mm").load(0), 1e-3 * CLOUDS[0])
+
+
+@pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_depth_images_with_the_lens_of_the_camera(tmp_path, kind, encoding):
+    image = DEPTH if encoding == "16UC1" else (1e-3 * DEPTH).astype(np.float32)
+    with Bag(tmp_path, kind) as bag:
+        bag.info()
+        bag.info(Pinhole(8, 6, 1.0, 1.0, 0.0, 0.0), topic="/camera/colour/camera_info")
+        bag.image(0.5, image, encoding)
+        bag.image(0.1, image, "rgb8", topic="/camera/colour/image_raw")
+    sequence = read_frames(bag.path, pose=POSE)
+    assert np.array_equal(sequence.t, [0.0])  # without joint states, since the first frame
+    assert sequence.intrinsics == LENS
+    assert np.allclose(sequence.load(0), LENS.cloud(1e-3 * DEPTH), atol=1e-6)
+    assert len(sequence.load(0)) == 46
+    assert sequence.colours(0) is None
+
+
+def test_rectified_images_have_no_distortion(tmp_path):
+    with Bag(tmp_path, "ros2") as bag:
+        bag.info()
+        bag.image(0.0, DEPTH, "16UC1", topic="/camera/depth/image_rect")
+    lens = read_frames(bag.path, pose=POSE).intrinsics
+    assert (lens.fx, lens.fy, lens.cx, lens.cy, lens.distorted) == (20.0, 22.0, 3.5, 2.5, False)
+
+
+def test_a_file_of_a_realsense_camera(tmp_path):
+    """Its topics, its encoding and its unit, as librealsense writes them."""
+    sensor = "/device_0/sensor_0"
+    with Bag(tmp_path, "ros1") as bag:
+        bag.info(topic=f"{sensor}/Depth_0/info/camera_info")
+        bag.info(Pinhole(8, 6, 1.0, 1.0, 0.0, 0.0), topic="/device_0/sensor_1/Color_0/info/camera_info")
+        bag.put(f"{sensor}/option/Depth_Units/value", bag.make("std_msgs/msg/Float32", data=1e-4))
+        bag.image(0.0, DEPTH, "mono16", topic=f"{sensor}/Depth_0/image/data")
+        bag.image(0.0, DEPTH.astype(np.uint8), "rgb8", topic="/device_0/sensor_1/Color_0/image/data")
+    sequence = read_frames(bag.path, pose=POSE)
+    assert np.allclose(sequence.load(0), LENS.cloud(1e-4 * DEPTH), atol=1e-9)
+
+
+def test_messages_without_stamps_have_the_time_of_recording(tmp_path):
+    with Bag(tmp_path, "ros2") as bag:
+        bag.info()
+        bag.image(0.7, DEPTH, "16UC1")
+        bag.image(None, DEPTH, "16UC1")
+    assert np.allclose(read_frames(bag.path, pose=POSE).t, [0.0, 1e-3], atol=1e-9)
+
+
+def test_messages_of_one_time_are_told_apart(tmp_path):
+    with Bag(tmp_path, "ros2") as bag:
+        for stamp, cloud in zip(STAMPS, CLOUDS, strict=True):
+            bag.log = START
+            bag.cloud(stamp, cloud)
+    sequence = read_frames(bag.path, pose=POSE)
+    assert {len(sequence.load(i)) for i in range(3)} == {5, 6, 7}
+
+
+@pytest.mark.parametrize(
+    ("fill", "options", "message"),
+    [
+        (lambda bag: bag.cloud(0, CLOUDS[0]), {"pose": None}, "pose of the camera is missing"),
+        (lambda bag: bag.cloud(0, CLOUDS[0]), {"topic": "/camera/point"}, "no clouds or depth images on the topic"),
+        (lambda bag: bag.cloud(0, CLOUDS[0]), {"unit": "cm"}, "the unit is 'cm'"),
+        (lambda bag: bag.joints(0), {}, "no clouds and no depth images"),
+        (lambda bag: [bag.cloud(0, CLOUDS[0], topic=name) for name in ("/a", "/b")], {}, "2 topics of clouds"),
+        (lambda bag: bag.image(0, DEPTH, "16UC1"), {}, "intrinsics are not known"),
+        (lambda bag: [bag.image(0, DEPTH, "16UC1"), bag.info(Pinhole(8, 6, 0, 0, 0, 0))], {}, "is not calibrated"),
+        (lambda bag: [bag.image(0, DEPTH, "16UC1"), bag.info(model="odd")], {}, "the distortion is 'odd'"),
+    ],
+)
+def test_what_a_bag_lacks_is_said(tmp_path, fill, options, message):
+    with Bag(tmp_path, "ros2") as bag:
+        fill(bag)
+    with pytest.raises(DataError, match=message):
+        read_frames(bag.path, **{"pose": POSE, **options})
+
+
+def test_a_cloud_without_places_and_a_cut_off_one_are_bad_frames(tmp_path):
+    with Bag(tmp_path, "ros2") as bag:
+        bag.cloud(0.0, CLOUDS[0], names="xyi")
+        bag.cloud(0.1, CLOUDS[1])
+    sequence = read_frames(bag.path, pose=POSE)
+    with pytest.raises(DataError, match="the cloud has the fields x, y, i"):
+        sequence.load(0)
+    assert np.array_equal(sequence.load(1), CLOUDS[1].astype(float))
+
+
+def test_damaged_bags_and_other_files_are_refused(tmp_path):
+    for name, text in (("a.bag", b"#ROSBAG V2.0\nnonsense"), ("b.mcap", b"x" * 40), ("c.db3", b"")):
+        (tmp_path / name).write_bytes(text)
+        with pytest.raises(DataError, match="bag"):
+            read_frames(tmp_path / name, pose=POSE)
+    (tmp_path / "d.txt").write_bytes(b"")
+    with pytest.raises(DataError, match="no sequence of frames"):
+        read_frames(tmp_path / "d.txt", pose=POSE)
+    (tmp_path / "e.mkv").write_bytes(b"nothing")
+    with pytest.raises(DataError, match="film"):
+        read_frames(tmp_path / "e.mkv", pose=POSE)

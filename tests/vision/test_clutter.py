@@ -1,0 +1,152 @@
+"""Things about smooth rods: they are set apart, named, and left out where they are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from smooth_rods import EYE, TARGET, SmoothY, box, filmed, floor_and_wall, pole, seen
+
+from yid_ocp.errors import ConfigError, DataError, ModelError
+from yid_ocp.model.system import System
+from yid_ocp.model.y_object import y_object
+from yid_ocp.vision import ExtraMesh, FilterOptions, FrameSequence, Scene, TrackOptions, look_at, track
+from yid_ocp.vision.clutter import Background, extra_meshes, foreign
+from yid_ocp.vision.evidence import Thing, Tubes
+from yid_ocp.vision.filters import of_colours
+from yid_ocp.vision.meshes import numeric_mechanism
+
+FRAMES = 2
+NAMES = ["w_T1", "w_T2", "w_T3"]
+TABLE = [0.6, 0.5, -0.2], [0.6, 0.8, 0.04]
+
+
+@pytest.fixture(scope="module")
+def alone():
+    """The Y without a robot."""
+    return System.build(objects=[(y_object(), None, None)])
+
+
+def measured(alone, sequence, truth, extra=(), empty=None, **options):
+    found = track(Scene(alone, extra=extra), None, sequence, TrackOptions(points=alone.points, **options), empty=empty)
+    good = [frame.index for frame in found.frames if frame.good]
+    order = [NAMES.index(name) for name in found.names]
+    return found, found.position - truth[good][:, order]
+
+
+def emptied(things):
+    """The scene without the object."""
+    pose = look_at(EYE, TARGET)
+    clouds = [seen([*floor_and_wall(), *things(k)], [9, k]) for k in range(2)]
+    return FrameSequence.of([0.0, 1.0], clouds, pose)
+
+
+@pytest.mark.parametrize(
+    ("things", "junction"),
+    [
+        (lambda k: [pole([1.05 + 0.02 * k, -0.75, -0.9], 1.5, 0.12), pole([1.05, -0.6, -0.1], 0.1, 0.3)], 0.9),
+        (lambda k: [box([0.85, -0.5, -0.3], [0.2, 0.2, 0.2])], 0.9),
+        (lambda k: [box([0.93, 0.0, -0.5], [0.1, 0.3, 0.1])], 0.5),  # before the trunk, touching it
+        (lambda k: [pole([0.9, -0.25, -0.93], 1.6, 0.02)], 0.9),  # as thick as the branch that touches it
+    ],
+)
+def test_things_in_reach_neither_drop_frames_nor_mislead(alone, things, junction):
+    found, error = measured(alone, *filmed(SmoothY(), FRAMES, things))
+    assert np.isfinite(error[:, 0, 0]).sum() >= junction * FRAMES
+    assert np.nanmax(np.linalg.norm(error, axis=2)) < 0.04
+    relative = np.abs(error / found.std)[np.isfinite(error)]
+    assert np.mean(relative < 2) > 0.9
+
+
+def test_messages_name_the_thing_and_what_helps(alone):
+    sequence, truth = filmed(SmoothY(), FRAMES, lambda k: [box(*TABLE)])
+    found, _ = measured(alone, sequence, truth)
+    thing = found.things[0]
+    assert thing.centre == pytest.approx([0.7, 0.5, -0.18], abs=0.15)
+    assert thing.size[1] == pytest.approx(0.8, abs=0.1)
+    assert not thing.moving
+    assert thing.frames == FRAMES
+    assert "track.options.background: frames" in thing.text
+    assert thing.text in found.notes
+
+
+def test_every_remedy_takes_the_table_away(alone):
+    """A background of frames or of an empty scene, and its mesh."""
+    sequence, truth = filmed(SmoothY(), FRAMES, lambda k: [box(*TABLE)])
+    empty = emptied(lambda k: [box(*TABLE)])
+    mesh = ExtraMesh(box=TABLE[1], xyz=TABLE[0])
+    for how in ({"background": "frames"}, {"extra": [mesh]}, {"empty": empty}):
+        found, error = measured(alone, sequence, truth, **how)
+        assert np.nanmax(np.linalg.norm(error, axis=2)) < 0.02
+        assert all(np.linalg.norm(thing.size) < 0.6 for thing in found.things)
+
+
+def test_an_empty_scene_is_a_background():
+    rng = np.random.default_rng(0)
+    wall = np.column_stack([rng.uniform(0, 1, (20000, 2)), 0.003 * rng.standard_normal(20000)])
+    background = Background.empty_scene([wall[::2], wall[1::2]], 0.008, 0.006)
+    asked = np.array([[0.5, 0.5, 0.01], [0.5, 0.5, 0.06], [2.0, 0.5, 0.0]])
+    assert background.contains(asked).tolist() == [True, False, False]
+    assert background.contains(asked, 0.05).tolist() == [True, True, False]
+    assert not Background().contains(asked).any()
+
+
+def test_what_stands_still_is_a_background_but_for_the_object():
+    rng = np.random.default_rng(1)
+    heap = np.array([0.5, 0.0, 0.0]) + rng.uniform(-0.05, 0.05, (3000, 3))
+    rod = np.column_stack([rng.uniform(0, 0.3, 2000), 0.01 * rng.standard_normal((2000, 2))])
+    elsewhere = [np.array([0.0, 1.0 + k, 0.0]) + rng.uniform(-0.05, 0.05, (3000, 3)) for k in range(4)]
+    clouds = [np.concatenate([heap, rod, other]) for other in elsewhere]
+    shape = Tubes(np.array([[[0.0, 0.0, 0.0], [0.3, 0.0, 0.0]]]), np.array([0.02]), (0,), np.array([0.3]))
+    background = Background.still(clouds, [shape] * 4, 0.016, 0.006, 0.045)
+    assert background.contains(heap).mean() > 0.95
+    assert not background.contains(rod).any()
+    assert not background.contains(elsewhere[0]).any()
+
+
+def test_what_moves_with_a_link_is_told_from_what_moves_by_itself():
+    times = np.arange(6) / 20
+    links = {t: {"hand": np.array([[1, 0, 0, t], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])} for t in times}
+    size, box_ = np.full(3, 0.1), (np.zeros(3), np.ones(3))
+
+    def looked(place):
+        return [(t, [Thing(np.asarray(place(t), float), size, 100)]) for t in times]
+
+    for place, moving, link, help_ in (
+        (lambda t: [0.5, 0.5, 0.5], False, "", "background"),
+        (lambda t: [t + 0.1, 0.0, 0.2], True, "hand", "extra_meshes"),
+        (lambda t: [0.5, 0.3 * t, 0.5], True, "", "take it out of view"),
+        (lambda t: [3.0, 0.3 * t, 0.5], True, "", "lower and upper"),
+    ):
+        [thing] = foreign(looked(place), 6, 0.006, box_, links.__getitem__, False)
+        assert (thing.moving, thing.link, thing.frames) == (moving, link, 6)
+        assert help_ in thing.text
+    [thing] = foreign(looked(lambda t: [0.5, 0.3 * t, 0.5]), 6, 0.006, box_, links.__getitem__, True)
+    assert "colour" in thing.text
+
+
+def test_extra_meshes_hang_on_links(system):
+    tree = numeric_mechanism(system)
+    made = extra_meshes(
+        [ExtraMesh(frame="left_gripper", box=(0.1, 0.1, 0.1)), ExtraMesh(sphere=0.2, xyz=(1, 2, 3))], tree
+    )
+    assert set(made) == {-1, tree.frames["left_gripper"].joint}
+    assert made[-1][0].vertices.mean(axis=0) == pytest.approx([1, 2, 3], abs=0.01)
+    with pytest.raises(ConfigError, match="no link 'left_griper'"):
+        extra_meshes([ExtraMesh(frame="left_griper", sphere=0.1)], tree)
+    with pytest.raises(ConfigError, match="box and sphere"):
+        extra_meshes([ExtraMesh(box=(1, 1, 1), sphere=0.1)], tree)
+    with pytest.raises(ModelError, match="no mesh"):
+        extra_meshes([ExtraMesh(mesh="nowhere.stl")], tree)
+
+
+def test_colours_in_light_and_shade():
+    red = [200, 40, 30]
+    seen = np.array([[200, 40, 30], [100, 18, 13], [40, 200, 30], [120, 120, 120], [0, 0, 0]])
+    assert of_colours(seen, [red], 0.2).tolist() == [True, True, False, False, False]
+    assert of_colours(seen, [red, [128, 128, 128]], 0.2).tolist() == [True, True, False, True, True]
+
+
+def test_a_colour_mask_needs_colours(alone):
+    sequence, truth = filmed(SmoothY(), 1)
+    with pytest.raises(DataError, match="no colours"):
+        measured(alone, sequence, truth, filters=FilterOptions(colours=((200.0, 40.0, 30.0),)))

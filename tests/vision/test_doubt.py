@@ -1,0 +1,119 @@
+"""Lengths and radii against clouds of smooth rods."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from smooth_rods import Y_LENGTHS, Y_RADII, SmoothY, filmed
+
+from yid_ocp.errors import DataError
+from yid_ocp.model.system import System
+from yid_ocp.model.y_object import y_object
+from yid_ocp.vision import FilterOptions, Scene, TrackOptions, track
+from yid_ocp.vision.doubt import Sizes
+
+FRAMES = 5
+NAMES = ["w_T1", "w_T2", "w_T3"]
+
+
+@pytest.fixture(scope="module")
+def alone():
+    """The Y without a robot."""
+    return System.build(objects=[(y_object(), None, None)])
+
+
+@pytest.fixture(scope="module")
+def measured(alone):
+    """measured(lengths, radii, **options): a track of smooth rods of other sizes, and its errors [m]."""
+    kept = {}
+
+    def make(lengths=None, radii=None, frames=FRAMES, **options):
+        key = str((lengths, radii, frames, options))
+        if key not in kept:
+            sequence, truth = filmed(SmoothY(Y_LENGTHS | (lengths or {}), Y_RADII | (radii or {})), frames)
+            found = track(Scene(alone), None, sequence, TrackOptions(points=alone.points, **options))
+            good = [frame.index for frame in found.frames if frame.good]
+            order = [NAMES.index(name) for name in found.names]
+            kept[key] = found, found.position - truth[good][:, order]
+        return kept[key]
+
+    return make
+
+
+def ratio(found, name):
+    return np.exp(found.sizes.change[found.sizes.names.index(name)])
+
+
+def test_right_sizes_are_not_doubted(measured):
+    found, error = measured()
+    assert found.sizes.frames == FRAMES
+    assert not found.sizes.doubted.any()
+    assert not found.sizes.messages
+    assert np.nanmax(np.linalg.norm(error, axis=2)) < 0.006
+    assert np.isfinite(error).mean() > 0.9
+
+
+@pytest.mark.parametrize(("factor", "value"), [(1.1, "811 mm"), (0.9, "663 mm")])
+def test_a_wrong_length_is_said_and_its_point_is_not_written(measured, factor, value):
+    found, error = measured({"T3": factor * Y_LENGTHS["T3"]})
+    assert found.sizes.doubted.tolist() == [False, False, True, False, False, False]
+    assert ratio(found, "T3.length") == pytest.approx(factor, abs=0.02)
+    [message] = found.sizes.messages
+    assert "T3.length seems to be wrong" in message
+    assert "the model says 737 mm" in message
+    assert "estimate: [length]" in message
+    # the interval holds the truth
+    i = found.sizes.names.index("T3.length")
+    assert abs(found.sizes.change[i] - np.log(factor)) < 2 * found.sizes.std[i]
+    assert np.isnan(error[:, found.names.index("w_T3")]).all()
+    assert np.nanmax(np.abs(error)) < 0.006
+
+
+def test_a_wrong_length_further_up_moves_everything_and_is_found(measured):
+    found, error = measured({"T1": 1.1 * Y_LENGTHS["T1"]}, frames=3, estimate=("length",))
+    assert ratio(found, "T1.length") == pytest.approx(1.1, abs=0.02)
+    assert np.nanmax(np.linalg.norm(error, axis=2)) < 0.012
+    assert "T1.length is estimated: " in found.sizes.messages[0]
+    with pytest.raises(DataError, match=r"no point is known|not one frame") as caught:
+        measured({"T1": 1.1 * Y_LENGTHS["T1"]}, frames=3)
+    assert "T1.length seems to be wrong" in caught.value.hint
+
+
+def test_radii_wrong_by_a_third_are_said_and_enter_the_standard_deviation(measured):
+    found, error = measured(radii={name: 1.3 * radius for name, radius in Y_RADII.items()})
+    sizes = found.sizes
+    assert sizes.doubted.tolist() == [False, False, False, True, True, True]
+    assert np.exp(sizes.change[3:]) == pytest.approx(1.3, abs=0.1)
+    # the camera's side of a thicker tube is nearer to it: all points are off by that, and say so
+    assert np.nanmean((error / found.std) ** 2) < 1.5
+    plain, _ = measured()
+    assert np.nanmedian(found.std) > 1.5 * np.nanmedian(plain.std)
+
+
+def test_estimated_radii_are_used(measured):
+    found, error = measured(radii={name: 0.7 * radius for name, radius in Y_RADII.items()}, estimate=("radius",))
+    assert np.exp(found.sizes.change[3:]) == pytest.approx(0.7, abs=0.06)
+    assert np.nanmax(np.linalg.norm(error, axis=2)) < 0.012
+
+
+def test_an_end_outside_of_the_filters_box_tells_nothing_of_a_length(measured, alone):
+    """What was cut off by a filter is no missing end."""
+    found, _ = measured(filters=FilterOptions(lower=(0.0, -0.45, -2.0), upper=(2.0, 2.0, 2.0)))
+    i = found.sizes.names.index("T3.length")
+    assert not found.sizes.doubted[i]
+    assert all(np.isnan(frame.fit.ends[1]) for frame in found.frames if frame.fit is not None)
+
+
+def test_what_sizes_do_to_points():
+    """One size moves a point by 1 m per unit of its logarithm along x, another one along y."""
+    moves = np.zeros((1, 3, 2))
+    moves[0, 0, 0] = moves[0, 1, 1] = 1.0
+    covariance = np.diag([0.01**2, 0.02**2])
+    change = np.array([0.05, 0.05])  # five and two and a half standard deviations
+
+    def std(used):
+        return Sizes(("a.length", "a.radius"), np.ones(2), change, covariance, used, 5).std_of(moves)[0]
+
+    assert std((False, False)) == pytest.approx([0.05, 0.0, 0.0])
+    assert std((True, False)) == pytest.approx([0.01, 0.0, 0.0])
+    assert std((True, True)) == pytest.approx([0.01, 0.02, 0.0])

@@ -1,0 +1,201 @@
+"""Ropes and branched objects without a robot: smooth curves, not the model's own links, seen from one side."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from yid_ocp.cli import main
+from yid_ocp.data.hdf5 import read_recording
+from yid_ocp.errors import ConfigError, DataError
+from yid_ocp.model.flexible import Segment, flexible_object
+from yid_ocp.model.system import System
+from yid_ocp.vision import FilterOptions, FrameSequence, Scene, TrackOptions, look_at, track, write_frames
+from yid_ocp.vision.ends import touching
+
+MILLIMETRE = 1e-3
+RADIUS = 0.006
+TABLE = look_at([0.0, 0.0, 1.0], [0.0, 0.0, 0.0], up=(0, 1, 0))
+WALL = look_at([1.2, 0.0, -0.4], [0.0, 0.0, -0.4])
+OPTIONS = TrackOptions(root="free", filters=FilterOptions(voxel=0.004), std_floor=0.002)
+CONFIG = """\
+model:
+  robot: null
+  object:
+    kind: segments
+    segments: {rope: {length: 1.0, mass: 0.1, radius: 0.006, links: 16}}
+  points: ["rope:0%", w_rope]
+track: {frames: FRAMES, pictures: 1, options: {root: free, root_near: [-0.5, 0, 0], filters: {voxel: 0.004}}}
+"""
+
+
+def line(course, length):
+    """Places along a curve of a length, shape (2000, 3), evenly spaced: `course` from (0, 1) to places of any scale."""
+    fine = course(np.linspace(0.0, 1.0, 8001))
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(fine, axis=0), axis=1))])
+    even = np.linspace(0.0, along[-1], 2000)
+    return np.stack([np.interp(even, along, fine[:, a]) for a in range(3)], axis=1) * (length / along[-1])
+
+
+def seen(places, pose, rng, count=3500, noise=MILLIMETRE):
+    """Points of the side of a rope that a camera sees, in the camera's frame."""
+    index = rng.integers(1, len(places) - 1, count)
+    centre, ahead = places[index], places[index + 1] - places[index - 1]
+    ahead /= np.linalg.norm(ahead, axis=1)[:, None]
+    view = pose[:3, 3] - centre
+    across = np.cross(ahead, view)
+    across /= np.linalg.norm(across, axis=1)[:, None]
+    angle = rng.uniform(-0.5 * np.pi, 0.5 * np.pi, count)[:, None]
+    points = centre + RADIUS * (np.sin(angle) * across + np.cos(angle) * np.cross(across, ahead))
+    return (points + noise * rng.standard_normal(points.shape) - pose[:3, 3]) @ pose[:3, :3]
+
+
+def film(lines, pose, **how):
+    rng = np.random.default_rng(7)
+    return FrameSequence.of(0.2 * np.arange(len(lines)), [seen(places, pose, rng, **how) for places in lines], pose)
+
+
+def snake(k):
+    places = line(lambda s: np.stack([s, (0.05 + 0.02 * k) * np.sin(6 * s + 0.2 * k), 0 * s], axis=1), 1.0)
+    return places - [0.5, 0.0, 0.0]
+
+
+def swing(k):
+    angle = 0.5 * np.sin(0.9 * k)
+    return line(
+        lambda s: np.stack([0.1 * np.cos(k) * s**2, np.sin(angle * s) * s, -np.cos(angle * s) * s], axis=1), 1.0
+    )
+
+
+@pytest.fixture(scope="module")
+def rope():
+    segment = Segment("rope", 1.0, 0.1, RADIUS, links=16)
+    return System.build(objects=[(flexible_object([segment]), None, None)], points=("rope:0%", "rope:50%", "w_rope"))
+
+
+def ends(places):
+    return places[[0, len(places) // 2, -1]]
+
+
+def errors(found, lines):
+    truth = np.array([ends(lines[frame.index]) for frame in found.frames if frame.good])
+    return np.linalg.norm(found.position - truth, axis=2), found.position - truth
+
+
+def test_a_rope_on_a_table(rope):
+    lines = [snake(k) for k in range(4)]
+    found = track(Scene(rope), None, film(lines, TABLE), replace(OPTIONS, root_near=(-0.5, 0.0, 0.0)))
+    apart, off = errors(found, lines)
+    assert len(found.t) == 4
+    assert apart.max() < 4 * MILLIMETRE
+    assert (np.abs(off) < 3 * found.std).all()
+    assert "root_near" in found.note
+    other = track(Scene(rope), None, film(lines[:1], TABLE), replace(OPTIONS, root_near=(0.5, 0.0, 0.0)))
+    assert np.linalg.norm(other.position[0, 0] - lines[0][-1]) < 4 * MILLIMETRE
+    assert found.recording(None).points[0].names == ("rope:0%", "rope:50%", "w_rope")
+
+
+@pytest.mark.parametrize(("root", "word"), [("fixed", "stays in its place"), ("free", "higher")])
+def test_the_root_of_a_hanging_rope_is_found(rope, root, word):
+    lines = [swing(k) for k in range(5)]
+    found = track(Scene(rope), None, film(lines, WALL), replace(OPTIONS, root=root))
+    assert errors(found, lines)[0].max() < 5 * MILLIMETRE
+    assert word in found.note
+
+
+def test_a_rope_that_hands_turn_over_keeps_its_root(rope):
+    """The end that was lower goes above the other; nothing but the frames before says which one it is."""
+    turns = np.linspace(0.0, 0.9 * np.pi, 8)
+    lines = [swing(1) @ np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]]).T for a in turns]
+    found = track(Scene(rope), None, film([places - [0, 0, 0.4] for places in lines], WALL), OPTIONS)
+    roots = found.position[:, 0] + [0, 0, 0.4]
+    truth = [np.array([places[k] for places in lines]) for k in (0, -1)]
+    assert min(np.linalg.norm(roots - places, axis=1).max() for places in truth) < 5 * MILLIMETRE
+
+
+def test_either_end_where_nothing_tells(rope):
+    lines = [snake(k) for k in range(2)]
+    found = track(Scene(rope), None, film(lines, TABLE), OPTIONS)
+    assert "either end" in found.note
+    assert all(frame.other is not None for frame in found.frames)
+
+
+def test_branches_tell_where_the_root_is():
+    segments = [Segment("stem", 0.4, 0.1, RADIUS, links=5)]
+    segments += [
+        Segment(name, length, 0.1, RADIUS, links=4, parent="stem") for name, length in (("a", 0.3), ("b", 0.2))
+    ]
+    names = ("stem:0%", "w_stem", "w_a", "w_b")
+    system = System.build(objects=[(flexible_object(segments), None, None)], points=names)
+
+    def bow(start, angle, length, curve):
+        s = np.linspace(0.0, length, 3000)
+        steps = np.stack([np.cos(angle + curve * s), np.sin(angle + curve * s), 0 * s], axis=1) * (s[1] - s[0])
+        return start + np.cumsum(steps, axis=0)
+
+    rng, clouds, truth = np.random.default_rng(3), [], []
+    for k in range(3):
+        stem = bow([-0.35, 0.05 * k, 0.0], 0.1 * k, 0.4, 1.0 - 0.5 * k)
+        angle = 0.1 * k + 0.4 * (1.0 - 0.5 * k)
+        parts = (stem, bow(stem[-1], angle + 0.6, 0.3, 1.5), bow(stem[-1], angle - 0.7, 0.2, -1.0))
+        counts = (1600, 1200, 800)
+        clouds.append(np.concatenate([seen(p, TABLE, rng, count=n) for p, n in zip(parts, counts, strict=True)]))
+        truth.append([stem[0], *(part[-1] for part in parts)])
+    found = track(Scene(system), None, FrameSequence.of(np.arange(3.0), clouds, TABLE), OPTIONS)
+    assert np.linalg.norm(found.position - truth, axis=2).max() < 4 * MILLIMETRE
+    assert "lengths and branches" in found.note
+
+
+def crossing(s):
+    angle = 2.8 * np.pi * s
+    return np.stack([0.3 * np.sin(angle) + 0.8 * s, 0.3 * np.cos(angle), 0 * s], axis=1)
+
+
+def folded(s):
+    return np.stack([0.5 - np.abs(s - 0.5), 0.02 * (s > 0.5), 0 * s], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("make", "reason"),
+    [
+        (lambda: line(crossing, 1.0) - [0.3, 0, 0], "crosses or touches itself"),
+        (lambda: line(folded, 1.0) - [0.3, 0, 0], "cannot be followed from end to end"),
+        (lambda: snake(1)[:1500], "the cloud has 0.7"),
+        (lambda: snake(1)[::20][:20], "cannot be followed"),
+    ],
+)
+def test_what_cannot_be_followed_is_refused_with_the_reason(rope, make, reason):
+    with pytest.raises(DataError, match="not one frame could be used") as caught:
+        track(Scene(rope), None, film([make()], TABLE), OPTIONS)
+    assert reason in caught.value.what
+
+
+def test_shapes_that_touch_themselves():
+    def links(places):
+        return np.stack([places[:-1], places[1:]], axis=1)
+
+    radius = np.full(40, RADIUS)
+    assert not touching(links(snake(2)[::50]), radius[:39])
+    cross = line(crossing, 1.0)[::50]
+    assert touching(links(cross), radius[:39])
+    cross[:, 2] = np.linspace(0.0, 0.3, 40)  # a coil crosses nothing
+    assert not touching(links(cross), radius[:39])
+
+
+def test_a_robot_says_where_the_root_is(rope):
+    with pytest.raises(ConfigError, match="a robot holds the object"):
+        track(Scene(rope, "package:baxter"), None, film([snake(0)], TABLE), OPTIONS)
+
+
+def test_the_command_needs_no_recording(tmp_path, capsys):
+    lines = [snake(k) for k in range(2)]
+    write_frames(film(lines, TABLE), tmp_path / "frames")
+    (tmp_path / "rope.yaml").write_text(CONFIG.replace("FRAMES", str(tmp_path / "frames")))
+    assert main(["track", str(tmp_path / "rope.yaml"), "--out", str(tmp_path / "run")]) == 0, capsys.readouterr().err
+    group = read_recording(tmp_path / "run" / "recording.h5").points[0]
+    truth = np.array([places[[0, -1]] for places in lines])
+    assert np.linalg.norm(group.position - truth, axis=2).max() < 4 * MILLIMETRE
+    assert "root_near" in json.loads((tmp_path / "run" / "result.json").read_text())["root"]

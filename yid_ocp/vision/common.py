@@ -1,0 +1,28 @@
+"""What is common to all frames of a sequence, found from some of them before any is judged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from yid_ocp.vision.calibration import Calibration
+from yid_ocp.vision.clutter import Background
+from yid_ocp.vision.doubt import Sizes
+
+
+@dataclass(frozen=True, eq=False)
+class Common:
+    """Camera, object and surroundings of a sequence.
+
+    Attributes
+    ----------
+    calibration : Calibration
+        Where the camera stands, how it scales depth, and its clock.
+    sizes : Sizes
+        What the frames say of the object's lengths and radii.
+    background : Background
+        What stands there in all frames.
+    """
+
+    calibration: Calibration
+    sizes: Sizes
+    background: Background

@@ -1,0 +1,218 @@
+"""Are the tubes as long and as thick as the model says? Asked of the clouds of many frames together.
+
+Every frame has a least cost about the sizes x (logarithms of lengths and radii, relative to the model's), the bends
+following: g_f'x + x'S_f x/2 (`SizeRows`). Together, with a wide prior P,
+
+    x = -(S + P)^-1 g,    cov x = (S + P)^-1 + (S + P)^-1 (sum_f r_f r_f') (S + P)^-1 + diag(b^2),    r_f = g_f + S_f x
+
+found by Gauss and Newton's method, the frames fitted anew at every x. The second term is the scatter between frames,
+however alike the errors within one are. b is what all frames share: an end is seen no better than a point is and stands
+where the camera's pose has it; noise along the sight makes a tube thinner or thicker by as much as its square over the
+radius.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.model.system import System
+from yid_ocp.vision.fitted import Fit
+
+Array = NDArray[np.float64]
+SizeKind = Literal["length", "radius"]
+KINDS: tuple[SizeKind, ...] = ("length", "radius")
+
+_PRIOR = (0.2, 0.4)  # standard deviations of the logarithms of lengths and radii
+_SIGMAS = 3.0  # from the model's value, beyond which that is doubted
+_CLEAR = 2.0  # from there, within which a first look finds nothing to doubt
+_KNOWN = 0.1  # standard deviation of a logarithm, above which nothing can be said of a size
+_ROUNDS, _SETTLED, _LONGEST_STEP = 8, 0.004, 0.15
+_LEAST_FRAMES = 3
+_APART = 3.0  # robust standard deviations from the other frames' ends, at which a frame's end is a wrong one
+_TO_SIGMA = 1.4826
+
+
+@dataclass(frozen=True, eq=False)
+class Sizes:
+    """What the frames say of the tubes' lengths and radii.
+
+    Attributes
+    ----------
+    names : tuple of str
+        `T1.length` and so on: lengths of all segments, then their radii.
+    told : ndarray, shape (2 s,)
+        The model's values [m].
+    change : ndarray, shape (2 s,)
+        Logarithm of the value that fits over the model's.
+    covariance : ndarray, shape (2 s, 2 s)
+        Of `change`.
+    used : tuple of bool
+        Which of them the fit uses in place of the model's.
+    frames : int
+        That were asked; 0 where nothing could be said.
+    """
+
+    names: tuple[str, ...]
+    told: Array
+    change: Array
+    covariance: Array
+    used: tuple[bool, ...]
+    frames: int
+
+    @property
+    def std(self) -> Array:
+        """Of `change`, shape (2 s,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Which sizes the frames say anything of, shape (2 s,)."""
+        return np.asarray((self.std < _KNOWN) & (self.frames > 0))
+
+    @property
+    def doubted(self) -> NDArray[np.bool_]:
+        """Which of the model's values contradict the frames, shape (2 s,)."""
+        return np.asarray(self.known & (np.abs(self.change) > _SIGMAS * self.std))
+
+    @property
+    def messages(self) -> tuple[str, ...]:
+        """Of every size that is doubted or estimated: the value that fits, with its interval."""
+        lines = []
+        for i, name in enumerate(self.names):
+            value = self.told[i] * math.exp(self.change[i])
+            two = 2 * value * self.std[i]
+            found = f"{1e3 * value:.3g} mm ± {1e3 * two:.2g} mm (two standard deviations) fits {self.frames} frames"
+            if self.used[i]:
+                lines.append(f"{name} is estimated: {found}; the model says {1e3 * self.told[i]:.3g} mm")
+            elif self.doubted[i]:
+                kind = name.rpartition(".")[2]
+                lines.append(
+                    f"{name} seems to be wrong: {found}, the model says {1e3 * self.told[i]:.3g} mm. Measure it again,"
+                    f" or estimate it: track.options.estimate: [{kind}]"
+                )
+        return tuple(lines)
+
+    def std_of(self, points: Array) -> Array:
+        """What wrong and uncertain sizes do to points.
+
+        Parameters
+        ----------
+        points : ndarray, shape (np, 3, 2 s)
+            How they move with the sizes (`SizeRows`) [m].
+
+        Returns
+        -------
+        ndarray, shape (np, 3)
+            Standard deviations [m]: the whole displacement of what is doubted and yet used, and what remains uncertain
+            of what is estimated.
+        """
+        used = np.array(self.used)
+        wrong = np.where(self.doubted & ~used, self.change, 0.0)
+        chosen = points[..., used]
+        spread = np.einsum("ijk,kl,ijl->ij", chosen, self.covariance[np.ix_(used, used)], chosen)
+        return np.asarray(np.sqrt((points @ wrong) ** 2 + np.maximum(spread, 0.0)))
+
+    def values(self, system: System, given: Mapping[str, float] | None) -> dict[str, float]:
+        """Parameter values with the estimated sizes in place of the model's."""
+        return _changed(system, given, np.where(self.used, self.change, 0.0))
+
+
+def ask_sizes(
+    system: System,
+    given: Mapping[str, float] | None,
+    estimate: Sequence[SizeKind],
+    std: tuple[float, float],
+    fitted: Callable[[Mapping[str, float], Sequence[Array]], list[Fit]],
+) -> Sizes:
+    """Ask some frames about the sizes.
+
+    Parameters
+    ----------
+    system : System
+    given : mapping of str to float, optional
+        Parameter values; nominal where absent.
+    estimate : sequence of "length" and "radius"
+        What the fit is to use in place of the model's values, where the frames tell it.
+    std : (float, float)
+        Standard deviations of a point's distance from the surface, and of the error of places that all frames share
+        with the camera's pose [m].
+    fitted : callable
+        From parameter values and the configurations of the round before, empty in the first, to the fits of the frames
+        that can be used.
+
+    Returns
+    -------
+    Sizes
+    """
+    told = _told(system, given)
+    count, many = len(told), len(told) // 2
+    names = tuple(f"{s.name}.{kind}" for kind in KINDS for s in system.segments)
+    prior = np.diag(np.repeat(1.0 / np.square(_PRIOR), many))
+    change, starts = np.zeros(count), list[Array]()
+    nothing = Sizes(names, told, change, np.asarray(np.linalg.inv(prior)), (False,) * count, 0)
+    wanted = np.array([kind in estimate for kind in KINDS for _ in range(many)])
+    shared = np.concatenate([math.hypot(*std) / told[:many], std[0] ** 2 / (2 * told[many:] ** 2)])
+    covariance, frames = nothing.covariance, 0
+    for turn in range(_ROUNDS):
+        fits = fitted(_changed(system, given, change), starts)
+        chosen = _believed(fits)
+        if len(chosen) < _LEAST_FRAMES:
+            return nothing
+        starts, frames = [fit.q for fit in fits], len(chosen)
+        gradient = np.array([fit.sizes.gradient for fit in chosen])
+        curvature = np.array([fit.sizes.curvature for fit in chosen])
+        inverse = np.linalg.inv(curvature.sum(axis=0) + prior)
+        step = -inverse @ (gradient.sum(axis=0) + prior @ change)
+        left = gradient + curvature @ step
+        scatter = inverse @ (left.T @ left) @ inverse * frames / (frames - 1)
+        covariance = np.asarray(inverse + scatter + np.diag(shared**2))
+        change = change + np.clip(step, -_LONGEST_STEP, _LONGEST_STEP)
+        if turn == 0 and not wanted.any() and (np.abs(change) < _CLEAR * np.sqrt(np.diag(covariance))).all():
+            break  # nothing to doubt
+        if np.abs(step).max() < _SETTLED:
+            break
+    known = np.sqrt(np.diag(covariance)) < _KNOWN
+    return Sizes(names, told, change, covariance, tuple(bool(x) for x in wanted & known), frames)
+
+
+def _believed(fits: Sequence[Fit]) -> list[Fit]:
+    """Fits whose free ends stand where those of the others do, as seen from the shape's."""
+    if not fits:
+        return []
+    ends = np.array([fit.ends for fit in fits])
+    keep = np.ones(len(fits), bool)
+    for column in ends.T:
+        seen = np.isfinite(column)
+        if seen.any():
+            middle = float(np.median(column[seen]))
+            spread = _TO_SIGMA * float(np.median(np.abs(column[seen] - middle)))
+            usual = max(spread, float(np.median([fit.noise for fit in fits])))
+            keep &= ~seen | (np.abs(column - middle) < _APART * usual)
+    return [fit for fit, good in zip(fits, keep, strict=True) if good]
+
+
+def _symbols(system: System) -> list[list[str]]:
+    """Parameters that each size is made of."""
+    found = [[x.name() for x in ca.symvar(ca.vertcat(*s.lengths))] for s in system.segments]
+    return found + [[x.name() for x in ca.symvar(s.radius)] for s in system.segments]
+
+
+def _told(system: System, given: Mapping[str, float] | None) -> Array:
+    symbols, theta = system.parameters.symbols, system.parameters.vector(given)
+    sums = [ca.sum1(ca.vertcat(*s.lengths)) for s in system.segments] + [s.radius for s in system.segments]
+    return np.array(ca.Function("told", [symbols], [ca.densify(ca.vertcat(*sums))])(theta)).ravel()
+
+
+def _changed(system: System, given: Mapping[str, float] | None, change: Array) -> dict[str, float]:
+    values = dict(zip(system.parameters.names, system.parameters.vector(given).tolist(), strict=True))
+    for i, names in enumerate(_symbols(system)):
+        for name in names:
+            values[name] *= math.exp(float(change[i]))
+    return values

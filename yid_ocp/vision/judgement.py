@@ -1,0 +1,163 @@
+"""Which frames are good, and how well their points are known: judged over the small results of all frames."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from yid_ocp.errors import DataError
+from yid_ocp.vision.clutter import Foreign
+from yid_ocp.vision.common import Common
+from yid_ocp.vision.fit import ShapeFit
+from yid_ocp.vision.fitted import Fit
+from yid_ocp.vision.options import TrackOptions
+from yid_ocp.vision.results import FrameReport
+
+Array = NDArray[np.float64]
+
+_MOST_NOTES = 4  # in a hint
+_MEAN_ABS = math.sqrt(2.0 / math.pi)  # of a normal variable, in standard deviations
+
+
+def unfit(fit: Fit, shape: ShapeFit, options: TrackOptions) -> str:
+    """Why a frame's fit cannot be used, by itself; empty for a good one."""
+    if not np.isfinite(fit.q).all():
+        return "the fit failed"
+    # a mean distance of normal noise is 0.8 of its standard deviation
+    limit = math.hypot(options.d_max * float(shape.radius.mean()), _MEAN_ABS * shape.options.noise)
+    if fit.distance > limit:
+        off = f"{1e3 * fit.distance:.1f} mm off on average, d_max allows {1e3 * limit:.1f} mm"
+        return f"the shape does not fit: {off}"
+    bend = float(np.abs((fit.q - shape.rest)[list(shape.bends)]).max())
+    if bend > options.largest_bend:
+        return f"the shape is folded: a joint is bent by {math.degrees(bend):.0f} degrees"
+    if fit.covered < options.least_covered:
+        share = 100 * fit.covered
+        return f"the shape does not fit: only {share:.0f} % of its visible length has points of its own"
+    return ""
+
+
+def judged(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameReport]:
+    """Drop those of the good frames that are unlike the others."""
+    fits = [frame.fit for frame in frames if frame.good and frame.fit is not None]
+    if not fits:
+        return list(frames)
+    usual = float(np.median([fit.distance for fit in fits]))
+    gap = np.median([fit.gap for fit in fits], axis=0)
+    return [_compared(frame, usual, gap, options) for frame in frames]
+
+
+def _compared(frame: FrameReport, usual: float, gap: Array, options: TrackOptions) -> FrameReport:
+    if not frame.good or frame.fit is None:
+        return frame
+    if frame.fit.distance > options.worse * usual:
+        off = f"{1e3 * frame.fit.distance:.1f} mm off on average, {1e3 * usual:.1f} mm are usual"
+        return replace(frame, reason=f"the shape fits worse than in other frames: {off}")
+    apart = float(np.linalg.norm(frame.fit.gap - gap, axis=1).max(initial=0.0))
+    if apart > options.gap_max:
+        off = f"{1e3 * apart:.0f} mm more than usual (a late stamp?)"
+        return replace(frame, reason=f"an end is not where its gripper is: {off}")
+    return frame
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Points of the good frames.
+
+    Attributes
+    ----------
+    t : ndarray, shape (M,)
+        [s]
+    q : ndarray, shape (M, n)
+    position, std, common : ndarray, shape (M, np, 3)
+        [m]; NaN where a point was not seen well enough.
+    """
+
+    t: Array
+    q: Array
+    position: Array
+    std: Array
+    common: Array
+
+
+def measured(
+    frames: Sequence[FrameReport],
+    columns: Sequence[int],
+    common: Common,
+    things: Sequence[Foreign],
+    options: TrackOptions,
+    source: str,
+) -> Measured:
+    """Points of the good frames with standard deviations.
+
+    Parameters
+    ----------
+    frames : sequence of FrameReport
+        All of them, judged.
+    columns : sequence of int
+        Of the system's points, those that are wanted.
+    common : Common
+    things : sequence of Foreign
+        That stood about the object.
+    options : TrackOptions
+    source : str
+        Where the frames come from.
+
+    Raises
+    ------
+    DataError
+        No good frame, or no point that is known well enough in any.
+    """
+    good = [frame for frame in frames if frame.good]
+    if not good:
+        raise _none_good(frames, [*common.sizes.messages, *(thing.text for thing in things)], source)
+    fits = [frame.fit for frame in good if frame.fit is not None]
+    t = np.array([frame.t for frame in good])
+    position = np.array([fit.points[list(columns)] for fit in fits])
+    std = np.hypot(np.array([fit.std[list(columns)] for fit in fits]), options.std_floor)
+    sizes = common.sizes
+    std = np.hypot(std, np.array([sizes.std_of(fit.sizes.points[list(columns)]) for fit in fits]))
+    velocity = np.zeros_like(position)
+    if len(t) > 1:
+        velocity = np.asarray(CubicSpline(t, position, axis=0)(t, 1))
+    # a point is where it was at some time of the exposure, which is uniform over that
+    std = np.hypot(std, np.abs(velocity) * math.hypot(options.stamp_std, options.exposure / math.sqrt(12.0)))
+    stamps = np.repeat([frame.stamp for frame in good], len(columns))
+    calibration = common.calibration
+    shared = calibration.common_std(position.reshape(-1, 3), velocity.reshape(-1, 3), stamps).reshape(std.shape)
+    std = np.hypot(std, shared)
+    unseen = np.linalg.norm(std, axis=2) > math.sqrt(3.0) * options.point_std_max
+    unseen |= ~np.array([fit.seen[list(columns)] for fit in fits])
+    if unseen.all():
+        best = 1e3 * float(np.sqrt((std**2).mean(axis=2)).min())
+        raise DataError(
+            f"no point is known well enough in any frame: the best within {best:.0f} mm,"
+            f" point_std_max is {1e3 * options.point_std_max:g} mm",
+            where=source,
+            hint=_hint(
+                [*sizes.messages, *(thing.text for thing in things)],
+                f"check the camera's pose and clock ({calibration.message}), or look at the pictures of a frame",
+            ),
+        )
+    hidden = unseen[..., None]
+    q = np.array([fit.q for fit in fits])
+    return Measured(t, q, *(np.where(hidden, np.nan, entry) for entry in (position, std, shared)))
+
+
+def _none_good(frames: Sequence[FrameReport], notes: Sequence[str], source: str) -> DataError:
+    count = Counter(frame.reason for frame in frames).most_common(3)
+    listed = "; ".join(f"{reason} ({number} of {len(frames)})" for reason, number in count)
+    hint = "check the camera's pose, the unit of the clouds and the filters, and look at the pictures of a frame"
+    hint = "say in camera.json that the unit is mm" if "metres" in listed else _hint(notes, hint)
+    return DataError(f"not one frame could be used: {listed}", where=source, hint=hint)
+
+
+def _hint(notes: Sequence[str], otherwise: str) -> str:
+    """What is known to be wrong with the object or stands about it comes before general advice."""
+    return "; ".join([*notes[:_MOST_NOTES], otherwise])

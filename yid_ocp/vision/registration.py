@@ -1,0 +1,499 @@
+"""A camera's pose, depth and clock against the robot that it sees: equations of single frames, search, and steps.
+
+A point p that the camera measured at its time s should lie on the robot's surface at the joint angles of that time:
+
+    P = t + R (g + o/z) p,      e = n . (P - surface(q(s - tau0 - beta (s - s0)))),
+
+with the camera's pose (R, t), a factor g and an offset o on its depth z along the ray, and its clock, ahead by tau0 and
+by beta in every second. The surface's point is where the camera's ray through P meets the robot, so that depth's noise,
+which is along the ray, leaves e without bias; the nearest point of the surface instead (noise of 6 mm: 1 mm too near on
+Baxter's links) leads from further away. Steps are those of Gauss and Newton on a robust sum (Geman and McClure) of e,
+with what is told as the mean of a normal prior.
+
+The points' errors are alike, from pixel to pixel of a frame and, where a mesh is not quite the robot's surface, from
+frame to frame at one place of a link. The covariance is therefore the sandwich H^-1 B H^-1 with B summed over frames
+and over patches of the links as wholes, not over points, and data weigh against the prior by how much larger B is than
+H.
+
+References
+----------
+Chen and Medioni (1992), Image and Vision Computing 10:145, doi:10.1016/0262-8856(92)90066-C. Blais and Levine (1995),
+IEEE Trans. Pattern Analysis 17:820, doi:10.1109/34.400574, for points along the camera's rays. Cameron, Gelbach and
+Miller (2011), J. Business & Economic Statistics 29:238, doi:10.1198/jbes.2010.07136, for sums over two kinds of blocks.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from yid_ocp.vision.frames import Pinhole
+from yid_ocp.vision.meshes import Surfaces
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+TURN, SHIFT, SCALE, DEPTH, CLOCK, DRIFT = slice(0, 3), slice(3, 6), 6, 7, 8, 9
+"""Where a change of a `CameraState` has its parts."""
+SIZE = 10
+FEWEST = 40
+"""Points of the arm without which a frame says nothing."""
+
+_LOOK = Pinhole.of_view(160, 120, math.radians(80.0))  # through which the robot's visible surface is sampled
+_SAMPLES = 150  # of it, in every frame
+_CELL = 0.02  # of the field of distances in which starts are tried [m]
+_SIDEWAYS, _AHEAD, _EVERY = 12, 10, 2  # cells to either side of starts tried, and between them
+_CLOCK_STEP = 0.08  # between starts of the clock [s]
+_CAPTURE = 0.06  # how near to the cloud a start must bring the surface [m]
+_HIDDEN = 0.5  # cost of a sample out of view, of that of one without a point near it
+_APART = 0.08  # starts nearer together are one [m]
+_GRAZING = 0.3  # cosine of ray and normal below which a point says little
+_STEP = 0.01  # over which velocities are taken [s]
+_PATCH = 0.08  # of a link, over which its mesh is alike wrong [m]
+_TO_SIGMA = 1.4826
+_CUT = 2.5  # scale of the robust sum in standard deviations
+_LEAST_SIGMA = 1e-3  # [m]
+_LEAST_CURVATURE = 0.2  # of the robust sum, of that of its weights
+
+
+@dataclass(frozen=True, eq=False)
+class CameraState:
+    """What is estimated.
+
+    Attributes
+    ----------
+    pose : ndarray, shape (4, 4)
+        Camera in the world, R and t.
+    factor : float
+        On a measured depth, g.
+    depth : float
+        Added to that, o [m].
+    offset : float
+        Stamp minus joint time at the stamp `about`, tau0 [s].
+    drift : float
+        Growth of that per second, beta.
+    about : float
+        s0 [s]
+    """
+
+    pose: Array
+    factor: float = 1.0
+    depth: float = 0.0
+    offset: float = 0.0
+    drift: float = 0.0
+    about: float = 0.0
+
+    def world(self, points: Array) -> Array:
+        """Measured points in the world, both shape (N, 3) [m]."""
+        if self.factor != 1.0 or self.depth != 0.0:
+            points = points * (self.factor + self.depth / points[:, 2:3])
+        return np.asarray(points @ self.pose[:3, :3].T + self.pose[:3, 3])
+
+    def measured(self, points: Array) -> Array:
+        """Where the camera would measure points of the world, both shape (N, 3) [m]."""
+        own = (points - self.pose[:3, 3]) @ self.pose[:3, :3]
+        return np.asarray(own * ((1.0 - self.depth / own[:, 2:3]) / self.factor))
+
+    def time(self, stamp: ArrayLike) -> Array:
+        """Time on the joints' clock of stamps [s]."""
+        at = np.asarray(stamp, float)
+        return np.asarray(at - self.offset - self.drift * (at - self.about))
+
+    def slopes(self, points: Array) -> Array:
+        """Derivatives of points of the world, shape (N, 3), by pose and depth, shape (N, 3, 8)."""
+        away = points - self.pose[:3, 3]
+        ahead = away @ self.pose[:3, 2]
+        result = np.zeros((len(points), 3, CLOCK))
+        result[:, 0, 1], result[:, 0, 2] = away[:, 2], -away[:, 1]
+        result[:, 1, 0], result[:, 1, 2] = -away[:, 2], away[:, 0]
+        result[:, 2, 0], result[:, 2, 1] = away[:, 1], -away[:, 0]
+        result[:, :, SHIFT] = np.eye(3)
+        result[:, :, SCALE] = away
+        result[:, :, DEPTH] = away / ahead[:, None]
+        return result
+
+    def moved(self, change: Array) -> CameraState:
+        """After a change of turn about the camera (world axes), shift, log of the factor, depth, offset, drift."""
+        pose = self.pose.copy()
+        pose[:3, :3] = Rotation.from_rotvec(change[TURN]).as_matrix() @ pose[:3, :3]
+        pose[:3, 3] += change[SHIFT]
+        return CameraState(
+            pose,
+            self.factor * math.exp(float(change[SCALE])),
+            self.depth + float(change[DEPTH]),
+            self.offset + float(change[CLOCK]),
+            self.drift + float(change[DRIFT]),
+            self.about,
+        )
+
+    def minus(self, other: CameraState) -> Array:
+        """The change from another state, shape (10,)."""
+        turn = Rotation.from_matrix(self.pose[:3, :3] @ other.pose[:3, :3].T).as_rotvec()
+        rest = (self.depth - other.depth, self.offset - other.offset, self.drift - other.drift)
+        return np.array([*turn, *(self.pose[:3, 3] - other.pose[:3, 3]), math.log(self.factor / other.factor), *rest])
+
+
+@dataclass(frozen=True, eq=False)
+class Glimpse:
+    """One frame: its stamp [s] and points in the camera's frame, shape (N, 3) [m]."""
+
+    stamp: float
+    points: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Linear equations of the points of one frame near the arm.
+
+    Attributes
+    ----------
+    slope : ndarray, shape (N, 10)
+        Derivatives of `error`.
+    error : ndarray, shape (N,)
+        [m]
+    place : ndarray of int, shape (N, 4)
+        Part of the robot, and the patch of it.
+    """
+
+    slope: Array
+    error: Array
+    place: Integers
+
+
+class Arm:
+    """The robot's surface along its recorded motion.
+
+    Parameters
+    ----------
+    robot : Surfaces
+    posture : callable
+        From a time on the joints' clock to a configuration.
+    grasps : callable
+        From a configuration to where the grippers hold the object, shape (G, 3) [m]: points near there may be the
+        object's.
+    around : float
+        How near [m].
+    """
+
+    def __init__(
+        self,
+        robot: Surfaces,
+        posture: Callable[[float], Array],
+        grasps: Callable[[Array], Array],
+        around: float,
+    ) -> None:
+        self.robot, self.posture, self.grasps, self.around = robot, posture, grasps, around
+        self._moving = np.array([joint >= 0 for joint in robot.joints])
+
+    def poses(self, t: float) -> Array:
+        """Poses of the parts, shape (parts, 4, 4)."""
+        return self.robot.poses(self.posture(t))
+
+    def visible(self, state: CameraState, stamp: float) -> tuple[Array, Integers]:
+        """Points of moving surfaces that the camera sees if nothing is before the robot, in the world; their parts."""
+        depth, cosine, part = self.robot.cast(_LOOK, state.pose, self.posture(float(state.time(stamp))))
+        seen = np.isfinite(depth) & (cosine > _GRAZING) & (part >= 0) & self._moving[part]
+        points = _LOOK.rays[seen] * depth[seen][:, None]
+        return points @ state.pose[:3, :3].T + state.pose[:3, 3], part[seen]
+
+    def near(self, points: Array, t: float, within: float) -> Mask:
+        """Which points of the world are near a moving surface, and not near a grasp."""
+        q = self.posture(t)
+        result = np.isfinite(self.robot.distance(points, q, within, moving_only=True))
+        for held in self.grasps(q):
+            result &= np.linalg.norm(points - held, axis=1) > self.around
+        return np.asarray(result)
+
+    def met(self, points: Array, origin: Array, t: float, reach: float, along: bool) -> Met:
+        """Where points of the world lie beside the arm: along rays from the camera, or at the nearest surface."""
+        q = self.posture(t)
+        if along:
+            ahead = points - origin
+            distance, normal, part = self.robot.meet(origin, ahead, q)
+            chosen = np.flatnonzero((part >= 0) & self._moving[part])
+            square = -np.einsum("ij,ij->i", normal[chosen], ahead[chosen])
+            error = (distance[chosen] - 1.0) * square  # n . (P - (origin + d (P - origin)))
+            clear = square > _GRAZING * np.linalg.norm(ahead[chosen], axis=1)
+            kept = clear & (np.abs(error) < reach)
+            chosen, error = chosen[kept], error[kept]
+        else:
+            distance, normal, part = self.robot.closest(points, q, reach)
+            chosen = np.flatnonzero((part >= 0) & self._moving[part])
+            error = distance[chosen]
+        behind, now, later = (self.poses(t + d)[part[chosen]] for d in (-_STEP, 0.0, _STEP))
+        local = np.einsum("nji,nj->ni", now[:, :3, :3], points[chosen] - now[:, :3, 3])
+        moved = np.einsum("nij,nj->ni", later[:, :3, :3] - behind[:, :3, :3], local)
+        velocity = (moved + later[:, :3, 3] - behind[:, :3, 3]) / (2 * _STEP)
+        rate = np.einsum("ni,ni->n", normal[chosen], velocity)
+        return Met(chosen, error, normal[chosen], rate, part[chosen], local)
+
+    def rows(self, state: CameraState, glimpse: Glimpse, reach: float, along: bool) -> Rows:
+        """Equations of a frame's points within reach."""
+        points = state.world(glimpse.points)
+        met = self.met(points, state.pose[:3, 3], float(state.time(glimpse.stamp)), reach, along)
+        slope = np.empty((len(met.chosen), SIZE))
+        slope[:, :CLOCK] = np.einsum("ni,nij->nj", met.normal, state.slopes(points[met.chosen]))
+        # a later offset takes the surface back along its velocity, away from the point
+        slope[:, CLOCK] = met.rate
+        slope[:, DRIFT] = met.rate * (glimpse.stamp - state.about)
+        return Rows(slope, met.error, np.column_stack([met.part, np.floor(met.local / _PATCH).astype(np.int64)]))
+
+
+@dataclass(frozen=True, eq=False)
+class Met:
+    """Points beside the arm: which ones, e [m], the surface's normal, velocity along that [m/s], part, place there."""
+
+    chosen: Integers
+    error: Array
+    normal: Array
+    rate: Array
+    part: Integers
+    local: Array
+
+
+# -- the robust sum ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class RobustSum:
+    """The robust sum about a state.
+
+    Attributes
+    ----------
+    gradient : ndarray, shape (10,)
+    hessian : ndarray, shape (10, 10)
+        Of Gauss and Newton.
+    curvature : float
+        Of the sum, as a share of that.
+    blocks : ndarray, shape (10, 10)
+        Sum over frames and patches of the outer products of their gradients.
+    sigma : float
+        Standard deviation of a point's error [m].
+    count : int
+        Points.
+    """
+
+    gradient: Array
+    hessian: Array
+    curvature: float
+    blocks: Array
+    sigma: float
+    count: int
+
+    def tempered(self, precision: Array) -> tuple[Array, Array, float]:
+        """Hessian and gradient of the data by a weight for how much they know, and that; `precision`: the prior's."""
+        scale = 1.0 / np.sqrt(np.diag(self.hessian) + np.diag(precision))
+        whole = (self.hessian + 1e-6 * precision) * np.outer(scale, scale)
+        excess = np.linalg.solve(whole, self.blocks * np.outer(scale, scale))
+        weight = 1.0 / max(1.0, float(np.trace(excess)) / SIZE)
+        return weight * self.hessian, weight * self.gradient, weight
+
+    def covariance(self, precision: Array) -> Array:
+        """Of the minimum of data and prior, shape (10, 10)."""
+        hessian, _, weight = self.tempered(precision)
+        bread = np.linalg.inv(self.curvature * hessian + precision)
+        return np.asarray(bread @ (weight**2 * self.blocks + precision) @ bread)
+
+
+def robust_sum(rows: Sequence[Rows], reach: float) -> RobustSum:
+    """Sum over all points of all frames, its scale from the median of their errors."""
+    size = np.abs(np.concatenate([r.error for r in rows]))
+    sigma = max(_TO_SIGMA * float(np.median(size)) if len(size) else reach, _LEAST_SIGMA)
+    scale = min(_CUT * sigma, reach)
+    gradient, hessian, blocks = np.zeros(SIZE), np.zeros((SIZE, SIZE)), np.zeros((SIZE, SIZE))
+    scores, places = [], []
+    bent, straight = 0.0, 0.0
+    for r in rows:
+        square = (r.error / scale) ** 2
+        weight = 1 / (1 + square) ** 2 / sigma**2
+        score = r.slope * (weight * r.error)[:, None]
+        hessian += r.slope.T @ (weight[:, None] * r.slope)
+        frame = score.sum(axis=0)
+        gradient += frame
+        blocks += np.outer(frame, frame)
+        straight += float(weight.sum())
+        bent += float((weight * (1 - 3 * square) / (1 + square)).sum())
+        scores.append(score)
+        places.append(r.place)
+    if len(size):
+        _, patch = np.unique(np.concatenate(places), axis=0, return_inverse=True)
+        stacked = np.concatenate(scores)
+        totals = np.stack([np.bincount(patch.ravel(), stacked[:, k]) for k in range(SIZE)], axis=1)
+        blocks += totals.T @ totals
+    curvature = max(bent / max(straight, 1e-12), _LEAST_CURVATURE)
+    return RobustSum(gradient, hessian, curvature, blocks, sigma, len(size))
+
+
+def improved(state: CameraState, found: RobustSum, told: CameraState, precision: Array) -> tuple[CameraState, Array]:
+    """The state after one step, and the step; `precision`: of what is told, shape (10, 10)."""
+    hessian, gradient, _ = found.tempered(precision)
+    step = np.asarray(-np.linalg.solve(hessian + precision, gradient + precision @ state.minus(told)), float)
+    return state.moved(step), step
+
+
+# -- where to begin ---------------------------------------------------------------------------------------------------
+
+
+def starts(arm: Arm, glimpses: Sequence[Glimpse], told: CameraState, search: float, most: int) -> list[CameraState]:
+    """Shifts of the camera and offsets of its clock at which the arm's visible surface lies on the clouds.
+
+    Parameters
+    ----------
+    arm : Arm
+    glimpses : sequence of Glimpse
+    told : CameraState
+    search : float
+        How far from its offset others are tried [s].
+    most : int
+        Of starts, at least `_APART` from one another, best first.
+    """
+    steps = math.ceil(search / _CLOCK_STEP) if search > 0 else 0
+    delays = np.linspace(-search, search, 2 * steps + 1) if steps else np.zeros(1)
+    sides, ahead = (np.arange(-n, n + 1, _EVERY) for n in (_SIDEWAYS, _AHEAD))
+    cells = np.stack(np.meshgrid(sides, sides, ahead, indexing="ij"), axis=-1).reshape(-1, 3)
+    total = np.zeros((len(delays), len(cells)))
+    for glimpse in glimpses:
+        field = _Field.of(arm, glimpse, told)
+        if field is None:
+            continue
+        for k, delay in enumerate(delays):
+            total[k] += field.costs(arm, told, glimpse.stamp, delay, cells)
+    result: list[CameraState] = []
+    for index in np.argsort(total, axis=None):
+        delay, cell = np.unravel_index(index, total.shape)
+        change = np.zeros(SIZE)
+        # the cloud has to go where the surface was, and the surface went along the cells
+        change[SHIFT] = -told.pose[:3, :3] @ (_CELL * cells[cell])
+        change[CLOCK] = delays[delay]
+        trial = told.moved(change)
+        apart = [np.linalg.norm(trial.minus(other)[SHIFT]) + 0.5 * abs(trial.offset - other.offset) for other in result]
+        if min(apart, default=math.inf) >= _APART:
+            result.append(trial)
+        if len(result) == most:
+            break
+    return result
+
+
+@dataclass(frozen=True, eq=False)
+class _Field:
+    """Cost of a surface's point by its place in the camera's frame, and the arm's visible points.
+
+    Attributes
+    ----------
+    cost : ndarray, shape (cells,)
+        min(distance to the cloud, capture)^2, of capture^2; `_HIDDEN` out of the cloud's view.
+    low : ndarray, shape (3,)
+        Corner of the grid [m].
+    shape : tuple of int
+    points : ndarray, shape (N, 3)
+        In the world at the told state [m].
+    part : ndarray of int, shape (N,)
+    """
+
+    cost: NDArray[np.float32]
+    low: Array
+    shape: tuple[int, ...]
+    points: Array
+    part: Integers
+
+    @staticmethod
+    def of(arm: Arm, glimpse: Glimpse, told: CameraState) -> _Field | None:
+        """The field about one frame; None where the camera would see too little of the arm."""
+        points, part = arm.visible(told, glimpse.stamp)
+        own = told.measured(points)
+        at = glimpse.points[:, :2] / glimpse.points[:, 2:]
+        view = np.array([at.min(axis=0), at.max(axis=0)])
+        towards = own[:, :2] / own[:, 2:]
+        seen = ((towards >= view[0]) & (towards <= view[1])).all(axis=1)
+        if np.count_nonzero(seen) < FEWEST:
+            return None
+        chosen = np.flatnonzero(seen)
+        chosen = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), _SAMPLES)).astype(np.int64)]
+        points, part, own = points[chosen], part[chosen], own[chosen]
+        # room for the shifts, and for the arm's own way
+        margin = _CELL * (np.array([_SIDEWAYS, _SIDEWAYS, _AHEAD]) + 2) + 0.2
+        low = own.min(axis=0) - margin
+        shape = np.ceil((own.max(axis=0) + margin - low) / _CELL).astype(int) + 1
+        cell = np.floor((glimpse.points - low) / _CELL).astype(int)
+        cell = cell[((cell >= 0) & (cell < shape)).all(axis=1)]
+        empty = np.ones(shape, bool)
+        empty[tuple(cell.T)] = False
+        if empty.all():
+            return None
+        distance = distance_transform_edt(empty, sampling=_CELL)
+        centre = [low[axis] + _CELL * (np.arange(shape[axis]) + 0.5) for axis in range(3)]
+        outside = np.zeros(shape, bool)
+        for axis in (0, 1):
+            at = centre[axis][:, None] / np.maximum(centre[2], _CELL)
+            beyond = (at < view[0, axis]) | (at > view[1, axis])
+            outside |= beyond[:, None] if axis == 0 else beyond
+        cost = np.where(outside, _HIDDEN, (np.minimum(distance, _CAPTURE) / _CAPTURE) ** 2)
+        return _Field(cost.astype(np.float32).ravel(), low, tuple(int(n) for n in shape), points, part)
+
+    def costs(self, arm: Arm, told: CameraState, stamp: float, delay: float, cells: Integers) -> Array:
+        """Mean cost of the arm as it was `delay` [s] earlier, shifted by cells of the camera's frame."""
+        t = float(told.time(stamp))
+        before, after = arm.poses(t)[self.part], arm.poses(t - delay)[self.part]
+        local = np.einsum("nji,nj->ni", before[:, :3, :3], self.points - before[:, :3, 3])
+        own = told.measured(np.einsum("nij,nj->ni", after[:, :3, :3], local) + after[:, :3, 3])
+        index = np.floor((own - self.low) / _CELL).astype(np.int64)
+        limit = np.array(self.shape)
+        index = np.clip(index, [_SIDEWAYS, _SIDEWAYS, _AHEAD], limit - 1 - [_SIDEWAYS, _SIDEWAYS, _AHEAD])
+        strides = np.array([self.shape[1] * self.shape[2], self.shape[2], 1])
+        cost = self.cost[(index @ strides)[None, :] + (cells @ strides)[:, None]]
+        return np.asarray(cost.mean(axis=1), float)
+
+
+# -- how much of the arm is there -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Presence:
+    """Of the arm's surface that should be seen: shares where a cloud has it, where something is before it, and where
+    the camera saw through it; in how many samples."""
+
+    there: float
+    covered: float
+    through: float
+    samples: int
+
+
+class Clouds:
+    """Some frames, made ready to be asked how much of the arm they show.
+
+    Parameters
+    ----------
+    glimpses : sequence of Glimpse
+    """
+
+    def __init__(self, glimpses: Sequence[Glimpse]) -> None:
+        self._glimpses = glimpses
+        self._places = [cKDTree(g.points) for g in glimpses]
+        self._rays = [cKDTree(g.points[:, :2] / g.points[:, 2:]) for g in glimpses]
+
+    def presence(self, arm: Arm, state: CameraState, within: float) -> Presence:
+        """How much of the arm's visible surface has a point within a distance [m]."""
+        counts = np.zeros(4)
+        for glimpse, places, rays in zip(self._glimpses, self._places, self._rays, strict=True):
+            points, _ = arm.visible(state, glimpse.stamp)
+            own = state.measured(points)
+            away, _ = places.query(own, distance_upper_bound=within)
+            # as wide as the gaps between points of a cloud that was thinned
+            apart, index = rays.query(own[:, :2] / own[:, 2:], distance_upper_bound=0.015)
+            near = np.isfinite(away)
+            known = np.isfinite(apart)
+            depth = glimpse.points[np.minimum(index, len(glimpse.points) - 1), 2]
+            through = known & ~near & (depth > own[:, 2] + within)
+            covered = known & ~near & (depth < own[:, 2] - within)
+            counts += [np.count_nonzero(x) for x in (near, covered, through, known | near)]
+        samples = max(int(counts[3]), 1)
+        there, covered, through = (float(share) for share in counts[:3] / samples)
+        return Presence(there, covered, through, int(counts[3]))

@@ -1,0 +1,149 @@
+"""What stands in a camera's line of sight: whether a place that has no points is hidden, or is seen to be empty.
+
+A depth camera that measures something behind a place has looked through it: nothing was there. Something measured
+before it hides it. Without any point in that direction the place counts as empty, unless something nearer stands so
+close beside the line of sight that its shadow falls there: a projector or second lens beside the camera sees less than
+the camera itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from yid_ocp.vision.lens import Pinhole
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_BASELINE = 0.1  # [m]; between the camera's two eyes, of which no usual depth camera has a wider one
+_HALF = 0.5  # of the points in a direction decide
+_STRIP, _PIECES = 0.02, 20  # of a picture: width of the strip along a side and the pieces of it, half of them filled
+_NARROWEST = 0.3  # of a picture, as x/z: what is narrower is a cloud that was cut out
+_LEAST_DEPTH = 0.05  # [m]; nearer to the camera's plane there is no picture
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """All points of a frame as the camera saw them.
+
+    Attributes
+    ----------
+    points : ndarray, shape (N, 3)
+        In the world, before anything is left out [m].
+    pose : ndarray, shape (4, 4)
+        Camera (x right, y down, z ahead) in the world.
+    pinhole : Pinhole, optional
+        Without it the picture ends where points stand along most of a side.
+    """
+
+    points: Array
+    pose: Array
+    pinhole: Pinhole | None = None
+    _kept: list[tuple[Array, Array, cKDTree, Array]] = field(default_factory=list, repr=False)
+
+    def hidden(self, places: Array, radius: Array, margin: float) -> Mask:
+        """Which places cannot be seen from the camera.
+
+        Parameters
+        ----------
+        places : ndarray, shape (S, 3)
+            In the world [m].
+        radius : ndarray, shape (S,)
+            How far about its line of sight each place reaches [m].
+        margin : float
+            What is nearer to the camera than a place by more than its radius and this stands before it [m].
+
+        Returns
+        -------
+        ndarray, shape (S,)
+            True where something nearer stands before it, throws its shadow on it, or where the picture ends.
+        """
+        asked, depth = _picture(places, self.pose)
+        hidden = depth < _LEAST_DEPTH
+        if self.pinhole is not None:
+            camera = self.pinhole
+            u, v = camera.fx * asked[:, 0] + camera.cx, camera.fy * asked[:, 1] + camera.cy
+            hidden |= (u < 0) | (u > camera.width - 1) | (v < 0) | (v > camera.height - 1)
+        else:
+            low, high = self._borders
+            reach = (radius / np.maximum(depth, _LEAST_DEPTH))[:, None]
+            hidden |= ((asked < low + reach) | (asked > high - reach)).any(axis=1)
+        if hidden.all():
+            return hidden
+        tree, distance = self._about(asked[~hidden])
+        if not len(distance):
+            return hidden
+        wide = radius / np.maximum(depth, _LEAST_DEPTH)
+        for i in np.flatnonzero(~hidden):
+            there = distance[tree.query_ball_point(asked[i], wide[i])]
+            limit = depth[i] - radius[i] - margin
+            hidden[i] = (
+                np.mean(there < limit) > _HALF if len(there) else self._shadowed(tree, distance, asked[i], limit)
+            )
+        return hidden
+
+    @cached_property
+    def _all(self) -> tuple[Array, Array]:
+        seen, depth = _picture(self.points, self.pose)
+        return seen[depth > _LEAST_DEPTH], depth[depth > _LEAST_DEPTH]
+
+    @cached_property
+    def _borders(self) -> tuple[Array, Array]:
+        """Where the picture ends, as far as points along all of a side show it; infinite at other sides."""
+        borders = np.array([[-np.inf, -np.inf], [np.inf, np.inf]])
+        seen, _ = self._all
+        if len(seen):
+            low, high = seen.min(0), seen.max(0)
+            for axis in range(2 if (high - low > _NARROWEST).all() else 0):
+                for end, value in enumerate((low[axis], high[axis])):
+                    strip = np.abs(seen[:, axis] - value) <= _STRIP * (high[axis] - low[axis])
+                    other = 1 - axis
+                    along = (seen[strip, other] - low[other]) / max(high[other] - low[other], 1e-12)
+                    filled = np.bincount(np.minimum((along * _PIECES).astype(np.int64), _PIECES - 1), minlength=_PIECES)
+                    if np.mean(filled > 0) > _HALF:
+                        borders[end, axis] = value
+        return borders[0], borders[1]
+
+    def _about(self, asked: Array) -> tuple[cKDTree, Array]:
+        """Points of the picture round about the places: where in the picture, and how deep.
+
+        One frame asks again and again for much the same: what was found stays while it is enough.
+        """
+        low, high = asked.min(0) - _BASELINE, asked.max(0) + _BASELINE
+        for lower, upper, tree, depth in self._kept:
+            if (lower <= low).all() and (upper >= high).all():
+                return tree, depth
+        low, high = low - 0.5 * _BASELINE, high + 0.5 * _BASELINE
+        seen, depth = self._all
+        near = np.ones(len(seen), bool)
+        for axis in range(2):  # column by column, which is quicker than whole rows
+            near &= (seen[:, axis] >= low[axis]) & (seen[:, axis] <= high[axis])
+        tree = cKDTree(seen[near], compact_nodes=False, balanced_tree=False)
+        self._kept.append((low, high, tree, depth[near]))
+        return tree, depth[near]
+
+    @staticmethod
+    def _shadowed(tree: cKDTree, distance: Array, asked: Array, limit: float) -> bool:
+        """Whether something nearer stands where the other eye would have to look through it."""
+        if limit <= _LEAST_DEPTH:
+            return False
+        nearest = float(distance.min())
+        widest = _BASELINE * (1.0 / max(nearest, _LEAST_DEPTH) - 1.0 / limit)
+        if widest <= 0:
+            return False
+        around = np.asarray(tree.query_ball_point(asked, widest), dtype=np.int64)
+        around = around[distance[around] < limit]
+        apart = np.linalg.norm(tree.data[around] - asked, axis=1)
+        return bool((apart <= _BASELINE * (1.0 / distance[around] - 1.0 / limit)).any())
+
+
+def _picture(points: Array, pose: Array) -> tuple[Array, Array]:
+    """Where points stand in the picture, x/z and y/z, shape (N, 2), and their depth z [m]."""
+    local = (points - pose[:3, 3]) @ pose[:3, :3]
+    depth = local[:, 2]
+    return local[:, :2] / np.maximum(depth, _LEAST_DEPTH)[:, None], depth
