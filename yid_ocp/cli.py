@@ -138,6 +138,8 @@ def _batch(parser: argparse.ArgumentParser) -> None:
 
 def _track(parser: argparse.ArgumentParser) -> None:
     _doubting(parser)
+    text = "keep the told pose and depth of the camera, as of a hand-eye calibration; the arm then checks them"
+    parser.add_argument("--fix-pose", action="store_true", help=text)
     _working(parser, "this process alone")
 
 

@@ -10,6 +10,7 @@ from yid_ocp.cli import main
 from yid_ocp.data.hdf5 import read_recording
 from yid_ocp.vision.pictures import STAGES
 from yid_ocp.vision.track import Tracker
+from yid_ocp.workflow import track as command
 
 CONFIG = """\
 model:
@@ -163,3 +164,12 @@ def test_the_examples_run(cli, repository, tmp_path, name):
     assert all(entry["largest"] < 0.015 for entry in result["truth_errors"].values())
     assert set(result["truth_errors"]) == ({"w_T1", "w_T3"} if name == "track_single_arm" else {"w_T1"})
     assert len(list((tmp_path / "run" / "frames").glob("*.ply"))) == len(result["frames"])
+
+
+def test_a_flag_keeps_the_told_pose(repository, monkeypatch):
+    asked = []
+    monkeypatch.setattr(command, "run_track", lambda run, *rest: asked.append(run.track.options.calibration.fix_pose))
+    monkeypatch.setattr(command, "carry_out", lambda work, *rest: work(None))
+    config = str(repository / "configs" / "track_single_arm.yaml")
+    assert main(["track", config]) == main(["track", config, "--fix-pose"]) == 0
+    assert asked == [False, True]

@@ -28,6 +28,12 @@ model:
   clamps:
     hand: {origin: marker_a, towards: marker_b, roll: transported}
 """,
+    "model.extra_meshes": """\
+model:
+  extra_meshes:
+    - {mesh: gripper.stl, frame: left_hand}
+    - {box: [0.8, 1.2, 0.05], xyz: [0.9, 0.0, -0.4]}  # a table [m]
+""",
     "model.arms": """\
 model:
   arms:
@@ -191,6 +197,11 @@ track:
 track:
   options:
     fit: {surface_scales: [], noise: 0.004}  # [m]
+""",
+    "track.options.calibration": """\
+track:
+  options:
+    calibration: {fix_pose: true, shift_std: 0.01}    # a hand-eye calibration, known to 1 cm [m]
 """,
     "track.options.clock": """\
 track:

@@ -69,7 +69,8 @@ class TrackOutcome:
 
 def run(arguments: argparse.Namespace) -> int:
     """The command."""
-    settings = load_config(arguments.config, arguments.overrides)
+    overrides = (*arguments.overrides, *(["track.options.calibration.fix_pose=true"] if arguments.fix_pose else ()))
+    settings = load_config(arguments.config, overrides)
     workers = given_workers(arguments)
     carry_out(lambda shown: run_track(settings, arguments.out, shown, workers), track_summary, arguments)
     return DONE
