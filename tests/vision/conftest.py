@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,6 +27,7 @@ from yid_ocp.vision import (
 )
 from yid_ocp.vision.fit import ShapeFit
 from yid_ocp.vision.frames import open3d_module
+from yid_ocp.vision.lens import Pinhole
 
 DATA = Path(__file__).parent / "data"
 TRUTH = {
@@ -84,6 +86,10 @@ def recording(system, run):
     return Recording(JointGroup(system.driven, run.t, noisy, position_std=2e-4), source="test", name="virtual")
 
 
+# a quarter of an Xtion's pixels, each as good: a test has four times as many frames in the time
+COARSE = DepthCamera(Pinhole.of_view(320, 240, math.radians(58.0)), disparity_std=1 / 32, disparity_step=1 / 16)
+
+
 @pytest.fixture(scope="session")
 def tracked(system, run, recording, shape):
     """tracked(options, **camera and timing): frames, their track, the errors of all points in the good ones [m]."""
@@ -91,7 +97,7 @@ def tracked(system, run, recording, shape):
     def make(options=None, outliers=0.0, seed=0, frames=None, stages=(), **timing):
         when = FrameTiming(**{"rate": 4.0, "latency": LATENCY, **timing})
         scene = Scene(system, "package:baxter")
-        camera = VirtualCamera(POSE, DepthCamera(outliers=outliers), when, seed=seed)
+        camera = VirtualCamera(POSE, replace(COARSE, outliers=outliers), when, seed=seed)
         made = virtual_frames(scene, run.t, run.q, camera)
         seen = made.sequence if frames is None else made.sequence.select(frames)
         chosen = replace(options or TrackOptions(), points=system.points)

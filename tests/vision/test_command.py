@@ -154,7 +154,7 @@ def test_several_workers_find_the_same(cli, config, tmp_path):
 def test_the_examples_run(cli, repository, tmp_path, name):
     pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo")
     file = repository / "configs" / f"{name}.yaml"
-    short = ("duration=1.6", "rate=3.0", "dropped=0.0")
+    short = ("duration=1.2", "rate=4.0", "dropped=0.0")
     arguments = [part for setting in short for part in ("--set", f"track.virtual.{setting}")]
     quick = ("--quiet", "--set", "track.pictures=0", "--set", "track.keep_frames=true")
     done = cli("track", file, "--out", tmp_path / "run", *arguments, *quick)
