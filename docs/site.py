@@ -13,8 +13,8 @@ import yid_ocp
 REPOSITORY = Path(__file__).resolve().parents[1]
 SECTIONS = {
     "Start": ("index.md", "tutorial.md", "choosing.md", "recordings.md", "settings.md", "real_data.md"),
-    "Questions": ("diagnosis.md", "identifiability.md", "comparison.md", "plan.md", "vision.md"),
-    "Tools": ("export.md", "extending.md", "inspection.md", "program.md", "workers.md"),
+    "Questions": ("diagnosis.md", "identifiability.md", "comparison.md", "plan.md", "vision.md", "servo.md"),
+    "Tools": ("export.md", "extending.md", "inspection.md", "program.md", "reports.md", "workers.md"),
     "Inside": ("theory.md", "architecture.md"),
 }
 
@@ -35,7 +35,9 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add what is generated: the README as start page, and a page for every public object from its docstring."""
     readme = (REPOSITORY / "README.md").read_text(encoding="utf-8")
-    files.append(File.generated(config, "index.md", content=readme.replace("](docs/", "](")))
+    # what stands beside the README is no page; `on_page_markdown` takes a link that leads upwards for a name
+    inside = re.sub(r"\]\((?=[\w-]+\.md)", "](../", readme).replace("](docs/", "](")
+    files.append(File.generated(config, "index.md", content=inside))
     for name in public():
         entry = getattr(yid_ocp, name)
         text = f"# {name}\n\n`yid_ocp.{name}`\n\n::: {entry.__module__}.{entry.__qualname__}\n"
