@@ -25,7 +25,7 @@ from yid_ocp.diagnosis.pulses import RARE, History, Pulse, pulses
 from yid_ocp.diagnosis.smoother import Smoothed, history_of_force
 from yid_ocp.diagnosis.smoother_model import Linear, linear_model, seen_by
 from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
-from yid_ocp.diagnosis.torque_terms import torque_terms
+from yid_ocp.diagnosis.torque_terms import TorqueModel
 from yid_ocp.effects.base import robot_joints
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.constant_errors import without_constants
@@ -222,9 +222,10 @@ def find_events(
         for event in _wrong_samples(problem, run)
         if event.end < until.get(event.recording, math.inf)
     ]
-    histories = [history for run in runs for history in _read_forces(problem, run, limits)]
+    torques = TorqueModel(problem.step)
+    histories = [history for run in runs for history in _read_forces(problem, run, torques, limits)]
     if smoothed is not None:
-        histories += _driving_forces(problem, x, evaluation, runs, smoothed, limits)
+        histories += _driving_forces(problem, x, evaluation, runs, smoothed, torques, limits)
     cut = [entry for entry in (_before_fall(history, falls, limits) for history in histories) if entry is not None]
     found: list[tuple[History, Pulse]] = []
     tries = 0.0
@@ -276,24 +277,24 @@ def _before_fall(history: History, falls: Sequence[Fall], limits: Thresholds) ->
     return history.at(keep)
 
 
-def _allowed(problem: EstimationProblem, run: Run, nodes: NDArray[np.int64], limits: Thresholds) -> tuple[Array, Array]:
+def _allowed(torques: TorqueModel, run: Run, nodes: NDArray[np.int64], limits: Thresholds) -> tuple[Array, Array]:
     """What the model of every coordinate's torque may be wrong by, and what friction may hold, shape (M, n)."""
     episode, result, theta = run
-    terms = torque_terms(problem.step, theta, result.rollout, nodes)
+    terms = torques.terms(theta, result.rollout, nodes)
     joints = episode.recording.joints
     # a torque is known at no better time than that of a sample
     late = 0.0 if joints is None else float(np.median(np.diff(joints.t)))
     return np.hypot(limits.term_error * terms.size, late * terms.rate), terms.held
 
 
-def _read_forces(problem: EstimationProblem, run: Run, limits: Thresholds) -> Iterator[History]:
+def _read_forces(problem: EstimationProblem, run: Run, torques: TorqueModel, limits: Thresholds) -> Iterator[History]:
     """Histories of prescribed joints whose efforts are compared: needed less measured torque."""
     episode, result, _ = run
     tree = problem.system.mechanism
     for samples, predicted in zip(without_constants(episode.samples, result.predicted), result.predicted, strict=True):
         if not samples.sensor.efforts or samples.node.ndim > 1 or len(samples.node) < 10:
             continue
-        error, held = _allowed(problem, run, samples.node, limits)
+        error, held = _allowed(torques, run, samples.node, limits)
         weight = np.where(samples.seen, samples.weight, 0.0)
         value = np.where(samples.seen, predicted - samples.value, 0.0)
         times = sample_times(episode, samples)
@@ -335,6 +336,7 @@ def _driving_forces(
     evaluation: Evaluation,
     runs: Sequence[Run],
     smoothed: Smoothed,
+    torques: TorqueModel,
     limits: Thresholds,
 ) -> list[History]:
     """Histories of coordinates that move under unknown forces, where the smoother found some for part of the time."""
@@ -344,8 +346,13 @@ def _driving_forces(
     found = []
     with threadpoolctl.threadpool_limits(1):
         for model, run in zip(linear_model(problem, x, evaluation, limits, INTERVAL), runs, strict=False):
+            if not sought[model.recording]:
+                continue
+            middle = (model.edges[:-1] + model.edges[1:]) / 2
+            allowed = _allowed(torques, run, np.rint(middle / run[0].grid.time_step).astype(np.int64), limits)
             for unknown in sought[model.recording]:
-                found.append(_driving_force(problem, model, run, model.unknowns.index(unknown), smoothed, limits))
+                index = model.unknowns.index(unknown)
+                found.append(_driving_force(problem, model, index, smoothed, middle, allowed))
     return found
 
 
@@ -362,13 +369,17 @@ def _short(smoothed: Smoothed, recording: int, limits: Thresholds) -> list[str]:
 
 
 def _driving_force(
-    problem: EstimationProblem, model: Linear, run: Run, unknown: int, smoothed: Smoothed, limits: Thresholds
+    problem: EstimationProblem,
+    model: Linear,
+    unknown: int,
+    smoothed: Smoothed,
+    middle: Array,
+    allowed: tuple[Array, Array],
 ) -> History:
     source, tree = model.sources[unknown], problem.system.mechanism
     at = tree.joint_index(model.unknowns[unknown])
     score, information = history_of_force(model, smoothed.variance | {source: 0.0}, unknown)
-    middle = (model.edges[:-1] + model.edges[1:]) / 2
-    error, held = _allowed(problem, run, np.rint(middle / run[0].grid.time_step).astype(np.int64), limits)
+    error, held = allowed
     unit = "N" if tree.joints[at].kind == "prismatic" else "N m"
     size = model.reference[unknown]
     # the last interval is shorter than the others

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -40,31 +41,45 @@ class TorqueTerms:
     held: Array
 
 
-def torque_terms(step: Step, theta: Array, rollout: Rollout, nodes: NDArray[np.int64]) -> TorqueTerms:
-    """Terms of M(q) a + c(q, v) + g(q) = tau along a rollout, accelerations by differences of its nodes.
+class TorqueModel:
+    """M(q) a + c(q, v) + g(q) = tau of a model, made once for all recordings: with many joints that takes long.
 
     Parameters
     ----------
     step : Step
-    theta : ndarray, shape (ntheta,)
-    rollout : Rollout
-    nodes : ndarray of int, shape (M,)
-        At which the terms are wanted, in order.
     """
-    system, time_step = step.system, step.time_step
-    n = system.size
-    q, z = rollout.state[:, :n], rollout.state[:, 2 * n :]
-    v = np.gradient(q, time_step, axis=0)
-    a = np.gradient(v, time_step, axis=0)
-    function = _function(system, time_step).map(len(nodes))
-    squares, needed, held = (np.array(part).T for part in function(*(x[nodes].T for x in (q, v, a, z)), theta))
-    applied = np.zeros((len(nodes), n))
-    torque = applied_torque(step, theta, rollout)
-    for indices, effort in ((system.driven_indices, torque), (system.prescribed_indices, rollout.effort)):
-        if indices:
-            applied[:, list(indices)] = effort[np.minimum(nodes, len(effort) - 1)]
-    rate = np.gradient(needed, time_step * nodes, axis=0) if len(nodes) > 1 else np.zeros_like(needed)
-    return TorqueTerms(np.sqrt(squares + applied**2), np.asarray(rate), np.abs(held))
+
+    def __init__(self, step: Step) -> None:
+        self._step = step
+
+    @cached_property
+    def _function(self) -> ca.Function:
+        return _function(self._step.system, self._step.time_step)
+
+    def terms(self, theta: Array, rollout: Rollout, nodes: NDArray[np.int64]) -> TorqueTerms:
+        """Terms along a rollout, accelerations by differences of its nodes.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (ntheta,)
+        rollout : Rollout
+        nodes : ndarray of int, shape (M,)
+            At which the terms are wanted, in order.
+        """
+        system, time_step = self._step.system, self._step.time_step
+        n = system.size
+        q, z = rollout.state[:, :n], rollout.state[:, 2 * n :]
+        v = np.gradient(q, time_step, axis=0)
+        a = np.gradient(v, time_step, axis=0)
+        function = self._function.map(len(nodes))
+        squares, needed, held = (np.array(part).T for part in function(*(x[nodes].T for x in (q, v, a, z)), theta))
+        applied = np.zeros((len(nodes), n))
+        torque = applied_torque(self._step, theta, rollout)
+        for indices, effort in ((system.driven_indices, torque), (system.prescribed_indices, rollout.effort)):
+            if indices:
+                applied[:, list(indices)] = effort[np.minimum(nodes, len(effort) - 1)]
+        rate = np.gradient(needed, time_step * nodes, axis=0) if len(nodes) > 1 else np.zeros_like(needed)
+        return TorqueTerms(np.sqrt(squares + applied**2), np.asarray(rate), np.abs(held))
 
 
 def _function(system: System, time_step: float) -> ca.Function:
