@@ -82,6 +82,16 @@ class Sizes:
         return np.asarray(self.known & (np.abs(self.change) > _SIGMAS * self.std))
 
     @property
+    def contradiction(self) -> str:
+        """Which of the sizes that are used cannot be right, in a clause; empty for none."""
+        wrong = [
+            f"{self.names[i]} {1e3 * self.told[i]:.3g} mm where {1e3 * self.told[i] * math.exp(self.change[i]):.3g} mm"
+            " fits"
+            for i in np.flatnonzero(self.doubted & ~np.array(self.used))
+        ]
+        return f"the object is not as the model says: {', '.join(wrong)}" if wrong else ""
+
+    @property
     def messages(self) -> tuple[str, ...]:
         """Of every size that is doubted or estimated: the value that fits, with its interval."""
         lines = []

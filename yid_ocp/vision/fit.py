@@ -398,15 +398,17 @@ class ShapeFit:
         square = (error / task.scale) ** 2
         cost = 0.5 * task.scale**2 * float(np.sum(task.weight * square / (1 + square)))
         weight = task.weight / (1 + square) ** 2
-        count = len(self.radius)
-        gradient, hessian = np.zeros(by_q.shape[1]), np.zeros((by_q.shape[1],) * 2)
-        for k in range(count):
-            mine = np.flatnonzero(link == k)
-            if len(mine):
-                block, chain = rows[mine], by_q[6 * k : 6 * k + 6]
-                weighted = block * weight[mine, None]
-                gradient += chain.T @ (weighted.T @ error[mine])
-                hessian += chain.T @ (block.T @ weighted) @ chain
+        # sums over the points of each link, by the start and the end of its centre line
+        order = np.argsort(link, kind="stable")
+        some, first = np.unique(link[order], return_index=True)
+        weighted, block = (rows * weight[:, None])[order], rows[order]
+        pull, stiff = np.zeros((len(self.radius), 6)), np.zeros((len(self.radius), 6, 6))
+        pull[some] = np.add.reduceat(weighted * error[order, None], first, axis=0)
+        for k, mine in zip(some, np.split(np.arange(len(order)), first[1:]), strict=True):
+            stiff[k] = block[mine].T @ weighted[mine]
+        chain = by_q.reshape(len(self.radius), 6, -1)
+        gradient = by_q.T @ pull.ravel()
+        hessian = by_q.T @ np.matmul(stiff, chain).reshape(by_q.shape)
         for anchor in task.anchors:
             off = float(anchor.ahead @ (corners.reshape(-1, 3)[anchor.corner] - anchor.place)) / anchor.std
             by_off = anchor.ahead @ by_q[3 * anchor.corner : 3 * anchor.corner + 3] / anchor.std

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -14,6 +13,7 @@ from scipy.interpolate import CubicSpline
 from yid_ocp.errors import DataError
 from yid_ocp.vision.clutter import Foreign
 from yid_ocp.vision.common import Common
+from yid_ocp.vision.doubt import Sizes
 from yid_ocp.vision.fit import ShapeFit
 from yid_ocp.vision.fitted import Fit
 from yid_ocp.vision.options import TrackOptions
@@ -116,7 +116,7 @@ def measured(
     """
     good = [frame for frame in frames if frame.good]
     if not good:
-        raise _none_good(frames, [*common.sizes.messages, *(thing.text for thing in things)], source)
+        raise _none_good(frames, common.sizes, things, source)
     fits = [frame.fit for frame in good if frame.fit is not None]
     t = np.array([frame.t for frame in good])
     position = np.array([fit.points[list(columns)] for fit in fits])
@@ -136,8 +136,9 @@ def measured(
     unseen |= ~np.array([fit.seen[list(columns)] for fit in fits])
     if unseen.all():
         best = 1e3 * float(np.sqrt((std**2).mean(axis=2)).min())
+        cause = f"{sizes.contradiction}; so " if sizes.contradiction else ""
         raise DataError(
-            f"no point is known well enough in any frame: the best within {best:.0f} mm,"
+            f"{cause}no point is known well enough in any frame: the best within {best:.0f} mm,"
             f" point_std_max is {1e3 * options.point_std_max:g} mm",
             where=source,
             hint=_hint(
@@ -150,12 +151,20 @@ def measured(
     return Measured(t, q, *(np.where(hidden, np.nan, entry) for entry in (position, std, shared)))
 
 
-def _none_good(frames: Sequence[FrameReport], notes: Sequence[str], source: str) -> DataError:
-    count = Counter(frame.reason for frame in frames).most_common(3)
-    listed = "; ".join(f"{reason} ({number} of {len(frames)})" for reason, number in count)
+def _none_good(frames: Sequence[FrameReport], sizes: Sizes, things: Sequence[Foreign], source: str) -> DataError:
+    kinds: dict[str, list[str]] = {}
+    for frame in frames:
+        kinds.setdefault(frame.reason.partition(":")[0], []).append(frame.reason)
+    often = sorted(kinds.values(), key=len, reverse=True)[:3]
+    listed = "; ".join(
+        f"{reasons[0]} ({len(reasons)} of {len(frames)}{', for example' if len(set(reasons)) > 1 else ''})"
+        for reasons in often
+    )
+    cause = f"{sizes.contradiction}; so " if sizes.contradiction else ""
+    notes = [*sizes.messages, *(thing.text for thing in things)]
     hint = "check the camera's pose, the unit of the clouds and the filters, and look at the pictures of a frame"
     hint = "say in camera.json that the unit is mm" if "metres" in listed else _hint(notes, hint)
-    return DataError(f"not one frame could be used: {listed}", where=source, hint=hint)
+    return DataError(f"{cause}not one frame could be used: {listed}", where=source, hint=hint)
 
 
 def _hint(notes: Sequence[str], otherwise: str) -> str:

@@ -30,6 +30,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import eigh
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -95,7 +96,9 @@ class CameraState:
         """Measured points in the world, both shape (N, 3) [m]."""
         if self.factor != 1.0 or self.depth != 0.0:
             points = points * (self.factor + self.depth / points[:, 2:3])
-        return np.asarray(points @ self.pose[:3, :3].T + self.pose[:3, 3])
+        placed = np.asarray(points @ self.pose[:3, :3].T)
+        placed += self.pose[:3, 3]
+        return placed
 
     def measured(self, points: Array) -> Array:
         """Where the camera would measure points of the world, both shape (N, 3) [m]."""
@@ -274,7 +277,8 @@ class RobustSum:
     curvature : float
         Of the sum, as a share of that.
     blocks : ndarray, shape (10, 10)
-        Sum over frames and patches of the outer products of their gradients.
+        Outer products of gradients summed over frames and over patches, less those of each patch in each frame, which
+        both have (two-way clusters, https://doi.org/10.1198/jbes.2010.07136).
     sigma : float
         Standard deviation of a point's error [m].
     count : int
@@ -309,27 +313,38 @@ def robust_sum(rows: Sequence[Rows], reach: float) -> RobustSum:
     sigma = max(_TO_SIGMA * float(np.median(size)) if len(size) else reach, _LEAST_SIGMA)
     scale = min(_CUT * sigma, reach)
     gradient, hessian, blocks = np.zeros(SIZE), np.zeros((SIZE, SIZE)), np.zeros((SIZE, SIZE))
-    scores, places = [], []
+    scores = []
     bent, straight = 0.0, 0.0
     for r in rows:
         square = (r.error / scale) ** 2
         weight = 1 / (1 + square) ** 2 / sigma**2
         score = r.slope * (weight * r.error)[:, None]
         hessian += r.slope.T @ (weight[:, None] * r.slope)
-        frame = score.sum(axis=0)
-        gradient += frame
-        blocks += np.outer(frame, frame)
+        gradient += score.sum(axis=0)
         straight += float(weight.sum())
         bent += float((weight * (1 - 3 * square) / (1 + square)).sum())
         scores.append(score)
-        places.append(r.place)
     if len(size):
-        _, patch = np.unique(np.concatenate(places), axis=0, return_inverse=True)
         stacked = np.concatenate(scores)
-        totals = np.stack([np.bincount(patch.ravel(), stacked[:, k]) for k in range(SIZE)], axis=1)
-        blocks += totals.T @ totals
+        frame = np.repeat(np.arange(len(rows)), [len(r.error) for r in rows])
+        place = np.concatenate([r.place for r in rows])
+
+        def summed(key: Integers) -> Array:
+            _, group = np.unique(key, axis=0, return_inverse=True)
+            totals = np.stack([np.bincount(group.ravel(), stacked[:, k]) for k in range(SIZE)], axis=1)
+            return np.asarray(totals.T @ totals)
+
+        alone = summed(np.column_stack([frame, place]))
+        blocks = _at_least(alone, summed(frame) + summed(place) - alone)
     curvature = max(bent / max(straight, 1e-12), _LEAST_CURVATURE)
     return RobustSum(gradient, hessian, curvature, blocks, sigma, len(size))
+
+
+def _at_least(least: Array, matrix: Array) -> Array:
+    """A symmetric matrix that is in no direction below another one, which is positive."""
+    values, vectors = eigh(matrix, least + 1e-12 * np.diag(np.diag(least)) + 1e-300 * np.eye(len(least)))
+    back = np.linalg.inv(vectors)
+    return np.asarray(back.T @ np.diag(np.maximum(values, 1.0)) @ back)
 
 
 def improved(state: CameraState, found: RobustSum, told: CameraState, precision: Array) -> tuple[CameraState, Array]:

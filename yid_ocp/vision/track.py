@@ -298,7 +298,7 @@ class Tracker:
         """A frame's finite points in the camera's frame, and which of all its points they are."""
         points = sequence.load(index)
         finite: Mask = np.isfinite(points[:, 0] + points[:, 1] + points[:, 2])
-        points = points[finite]
+        points = points if finite.all() else points[finite]
         if not len(points):
             raise DataError("the cloud is empty")
         far = float(np.median(np.abs(points[:: 1 + len(points) // _SOME]).max(axis=1)))
@@ -455,7 +455,7 @@ class Tracker:
             cloud = cloud.keep(np.sort(rng.choice(len(cloud), options.filters.most, replace=False)))
             work.report = replace(work.report, filtered=len(cloud))
         begun = time.process_time()
-        view = View(raw, calibration.state.pose, self.sequence.intrinsics)
+        view = View(raw, calibration.state.pose, self.sequence.intrinsics, cloud.points)
         given = calibration.camera, view, self._removed(q, calibration, background)
         try:
             look = (

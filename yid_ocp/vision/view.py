@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _BASELINE = 0.1  # [m]; between the camera's two eyes, of which no usual depth camera has a wider one
+_MORE = 0.02  # of the picture, as x/z, that is sorted beyond what is asked for
 _HALF = 0.5  # of the points in a direction decide
 _STRIP, _PIECES = 0.02, 20  # of a picture: width of the strip along a side and the pieces of it, half of them filled
 _NARROWEST = 0.3  # of a picture, as x/z: what is narrower is a cloud that was cut out
@@ -39,11 +40,14 @@ class View:
         Camera (x right, y down, z ahead) in the world.
     pinhole : Pinhole, optional
         Without it the picture ends where points stand along most of a side.
+    expected : ndarray, shape (M, 3), optional
+        Points about which will be asked, so that what stands before them is sorted once [m].
     """
 
     points: Array
     pose: Array
     pinhole: Pinhole | None = None
+    expected: Array | None = None
     _kept: list[tuple[Array, Array, cKDTree, Array]] = field(default_factory=list, repr=False)
 
     def hidden(self, places: Array, radius: Array, margin: float) -> Mask:
@@ -63,7 +67,8 @@ class View:
         ndarray, shape (S,)
             True where something nearer stands before it, throws its shadow on it, or where the picture ends.
         """
-        asked, depth = _picture(places, self.pose)
+        seen, depth = _picture(places, self.pose)
+        asked = seen.T
         hidden = depth < _LEAST_DEPTH
         if self.pinhole is not None:
             camera = self.pinhole
@@ -90,20 +95,21 @@ class View:
     @cached_property
     def _all(self) -> tuple[Array, Array]:
         seen, depth = _picture(self.points, self.pose)
-        return seen[depth > _LEAST_DEPTH], depth[depth > _LEAST_DEPTH]
+        ahead = depth > _LEAST_DEPTH
+        return (seen, depth) if ahead.all() else (seen[:, ahead], depth[ahead])
 
     @cached_property
     def _borders(self) -> tuple[Array, Array]:
         """Where the picture ends, as far as points along all of a side show it; infinite at other sides."""
         borders = np.array([[-np.inf, -np.inf], [np.inf, np.inf]])
         seen, _ = self._all
-        if len(seen):
-            low, high = seen.min(0), seen.max(0)
+        if seen.size:
+            low, high = seen.min(1), seen.max(1)
             for axis in range(2 if (high - low > _NARROWEST).all() else 0):
                 for end, value in enumerate((low[axis], high[axis])):
-                    strip = np.abs(seen[:, axis] - value) <= _STRIP * (high[axis] - low[axis])
+                    strip = np.abs(seen[axis] - value) <= _STRIP * (high[axis] - low[axis])
                     other = 1 - axis
-                    along = (seen[strip, other] - low[other]) / max(high[other] - low[other], 1e-12)
+                    along = (seen[other, strip] - low[other]) / max(high[other] - low[other], 1e-12)
                     filled = np.bincount(np.minimum((along * _PIECES).astype(np.int64), _PIECES - 1), minlength=_PIECES)
                     if np.mean(filled > 0) > _HALF:
                         borders[end, axis] = value
@@ -118,12 +124,13 @@ class View:
         for lower, upper, tree, depth in self._kept:
             if (lower <= low).all() and (upper >= high).all():
                 return tree, depth
-        low, high = low - 0.5 * _BASELINE, high + 0.5 * _BASELINE
+        if self.expected is not None and len(self.expected):
+            likely = _picture(self.expected, self.pose)[0]
+            low, high = np.minimum(low, likely.min(1) - _BASELINE), np.maximum(high, likely.max(1) + _BASELINE)
+        low, high = low - _MORE, high + _MORE
         seen, depth = self._all
-        near = np.ones(len(seen), bool)
-        for axis in range(2):  # column by column, which is quicker than whole rows
-            near &= (seen[:, axis] >= low[axis]) & (seen[:, axis] <= high[axis])
-        tree = cKDTree(seen[near], compact_nodes=False, balanced_tree=False)
+        near = np.flatnonzero(((seen >= low[:, None]) & (seen <= high[:, None])).all(axis=0))
+        tree = cKDTree(seen.take(near, axis=1).T, compact_nodes=False, balanced_tree=False)
         self._kept.append((low, high, tree, depth[near]))
         return tree, depth[near]
 
@@ -143,7 +150,10 @@ class View:
 
 
 def _picture(points: Array, pose: Array) -> tuple[Array, Array]:
-    """Where points stand in the picture, x/z and y/z, shape (N, 2), and their depth z [m]."""
-    local = (points - pose[:3, 3]) @ pose[:3, :3]
-    depth = local[:, 2]
-    return local[:, :2] / np.maximum(depth, _LEAST_DEPTH)[:, None], depth
+    """Where points stand in the picture, x/z and y/z, shape (2, N), and their depth z [m]."""
+    local = pose[:3, :3].T @ points.T
+    local -= (pose[:3, :3].T @ pose[:3, 3])[:, None]
+    depth = local[2]
+    seen = local[:2]
+    seen /= np.maximum(depth, _LEAST_DEPTH)
+    return seen, depth
