@@ -15,7 +15,7 @@ from yid_ocp.vision import CalibrationOptions, ClockOptions, Pinhole, look_at
 from yid_ocp.vision.calibration import as_given, calibrate
 from yid_ocp.vision.clock import agreed, is_late, own_offset
 from yid_ocp.vision.meshes import Surfaces, robot_meshes
-from yid_ocp.vision.registration import CLOCK, DRIFT, SCALE, SHIFT, SIZE, Arm, CameraState, Glimpse
+from yid_ocp.vision.registration import CLOCK, DRIFT, SCALE, SHIFT, SIZE, Arm, CameraState, Glimpse, Rows, robust_sum
 
 ARM = """<robot name="arm"><link name="base"><visual><geometry><box size="0.3 0.3 0.2"/></geometry></visual></link>
 <joint name="yaw" type="revolute"><parent link="base"/><child link="upper"/><origin xyz="0 0 0.1"/><axis xyz="0 0 1"/>
@@ -180,6 +180,35 @@ def test_standard_deviations_are_honest(robot):
     assert size.max() < 2.2
     assert size[0] > 0.2
     assert 0.2 < np.median(size) < 1.5
+
+
+def rows_of(errors, places):
+    """Frames of points that all have the slope one by the first unknown."""
+    slope = np.eye(1, SIZE)
+    return [
+        Rows(np.repeat(slope, len(error), axis=0), error, np.column_stack([place, np.zeros((len(place), 3), int)]))
+        for error, place in zip(errors, places, strict=True)
+    ]
+
+
+def test_errors_alike_in_a_frame_or_on_a_patch_count_as_one_and_others_only_once():
+    """Variance of a sum of scores: of independent errors that of their number, of errors alike that of their groups."""
+    rng = np.random.default_rng(0)
+    frames, patches, each = 200, 150, 2
+    places = np.tile(np.repeat(np.arange(patches), each), (frames, 1))
+    own = 1e-2 * rng.standard_normal((frames, patches * each))
+    by_frame = own * 0.1 + 1e-2 * rng.standard_normal((frames, 1))
+    by_patch = own * 0.1 + 1e-2 * rng.standard_normal(patches)[np.newaxis, places[0]]
+
+    def variance(errors):
+        found = robust_sum(rows_of(errors, places), 10.0)
+        return found.blocks[0, 0] / found.hessian[0, 0]
+
+    alone = variance(own)
+    assert variance(by_frame) / alone == pytest.approx(patches * each, rel=0.5)
+    assert variance(by_patch) / alone == pytest.approx(frames * each, rel=0.5)
+    # E[w^2 z^2] / E[w] of a normal z and w = 1/(1 + (z/2.5)^2)^2, once although both ways of grouping have it
+    assert alone == pytest.approx(0.414, rel=0.3)
 
 
 def test_drift_is_found_where_the_recording_is_long(robot):

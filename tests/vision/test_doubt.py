@@ -117,3 +117,15 @@ def test_what_sizes_do_to_points():
     assert std((False, False)) == pytest.approx([0.05, 0.0, 0.0])
     assert std((True, False)) == pytest.approx([0.01, 0.0, 0.0])
     assert std((True, True)) == pytest.approx([0.01, 0.02, 0.0])
+
+
+def test_a_refusal_names_the_sizes_that_cannot_be_right():
+    """Only what contradicts the frames and is used all the same, with the value that fits."""
+    covariance, change = np.diag([0.01**2, 0.02**2]), np.array([0.1, 0.05])
+
+    def clause(used):
+        return Sizes(("a.length", "a.radius"), np.ones(2), change, covariance, used, 5).contradiction
+
+    told = "the object is not as the model says: a.length 1000 mm where 1105 mm fits"
+    assert clause((False, False)) == told
+    assert clause((True, False)) == ""

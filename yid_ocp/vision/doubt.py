@@ -85,7 +85,7 @@ class Sizes:
     def contradiction(self) -> str:
         """Which of the sizes that are used cannot be right, in a clause; empty for none."""
         wrong = [
-            f"{self.names[i]} {1e3 * self.told[i]:.3g} mm where {1e3 * self.told[i] * math.exp(self.change[i]):.3g} mm"
+            f"{self.names[i]} {1e3 * self.told[i]:.4g} mm where {1e3 * self.told[i] * math.exp(self.change[i]):.4g} mm"
             " fits"
             for i in np.flatnonzero(self.doubted & ~np.array(self.used))
         ]
