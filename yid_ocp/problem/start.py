@@ -257,12 +257,12 @@ class StartFit:
             y, by_q, _, _, by_theta = self._sensor(group.sensor)(q, np.zeros(nz), np.zeros(step.system.size), theta)
             weight = group.weight[row] / task.softness
             value = np.where(weight > 0, group.value[row], 0.0)
-            wide = np.hstack([np.array(ca.densify(by_q))[:, free], np.array(ca.densify(by_theta))[:, :wanted]])
+            wide = np.hstack([np.array(ca.densify(by_q))[:, free], np.array(ca.densify(by_theta[:, :wanted]))])
             residuals.append(weight * (np.array(y).ravel() - value))
             jacobians.append(weight[:, None] * wide)
         if m:
             gap, by_q, by_theta = self._phi(q, np.zeros(nz), np.zeros(m), theta, step.time_step)
-            wide = np.hstack([np.array(ca.densify(by_q))[:, free], np.array(ca.densify(by_theta))[:, :wanted]])
+            wide = np.hstack([np.array(ca.densify(by_q))[:, free], np.array(ca.densify(by_theta[:, :wanted]))])
             residuals.append(np.array(gap).ravel() / (CONSTRAINT_STD * task.softness))
             jacobians.append(wide / (CONSTRAINT_STD * task.softness))
         residuals.append(((q - task.rest) * task.prior)[free])
