@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import shutil
+import subprocess
 from dataclasses import replace
 from importlib import resources
 
@@ -182,6 +183,27 @@ MACHINES = {
 }
 
 
+def arithmetic_source(function):
+    """C source of a function of two numbers for members that march together, with what tries it."""
+    body = lane_functions_source([function])
+    assert body is not None
+    arithmetic = resources.files("yid_ocp.integrator").joinpath("lanes.c").read_text(encoding="utf-8")
+    return f"#define BATCHED\n#define OUTPUTS {function.numel_out(0)}\n{arithmetic}\n{body}\n{DRIVER}"
+
+
+def tried_points():
+    rng = np.random.default_rng(0)
+    scale = 10.0 ** rng.uniform(-3, 2, size=(400, 2))
+    return np.vstack([rng.normal(size=(400, 2)) * scale, [[0, 0], [1, 1], [0.5, -0.0], [np.pi, 0], [3e9, 2]] * 8])
+
+
+def assert_those_of_casadi(found, function, points, tolerance):
+    expected = np.array([np.array(function(point)).ravel() for point in points])
+    usable = np.isfinite(expected)
+    np.testing.assert_array_equal(np.isnan(found), np.isnan(expected))
+    np.testing.assert_allclose(found[usable], expected[usable], rtol=tolerance, atol=1e-16)
+
+
 @pytest.mark.parametrize("machine", MACHINES)
 @pytest.mark.parametrize("program", ["cc", "clang"])
 def test_arithmetic_of_lanes_is_that_of_one(monkeypatch, machine, program):
@@ -193,21 +215,44 @@ def test_arithmetic_of_lanes_is_that_of_one(monkeypatch, machine, program):
     monkeypatch.setattr(compiler, "compiler", lambda: path)
     monkeypatch.setattr(compiler, "NATIVE", MACHINES[machine])
     function = everything()
-    body = lane_functions_source([function])
-    assert body is not None
-    arithmetic = resources.files("yid_ocp.integrator").joinpath("lanes.c").read_text(encoding="utf-8")
-    count = function.numel_out(0)
-    library = compiler.compile_library(f"#define BATCHED\n#define OUTPUTS {count}\n{arithmetic}\n{body}\n{DRIVER}")
+    library = compiler.compile_library(arithmetic_source(function))
     assert library.yid_lanes() == (8 if machine == "this" and "avx512f" in compiler._machine() else 4)
-    rng = np.random.default_rng(0)
-    scale = 10.0 ** rng.uniform(-3, 2, size=(400, 2))
-    points = np.vstack([rng.normal(size=(400, 2)) * scale, [[0, 0], [1, 1], [0.5, -0.0], [np.pi, 0], [3e9, 2]] * 8])
-    found = np.zeros((len(points), count))
+    points = tried_points()
+    found = np.zeros((len(points), function.numel_out(0)))
     library.yid_try(ctypes.c_void_p(points.ctypes.data), ctypes.c_void_p(found.ctypes.data), len(points))
-    expected = np.array([np.array(function(point)).ravel() for point in points])
-    usable = np.isfinite(expected)
-    np.testing.assert_array_equal(np.isnan(found), np.isnan(expected))
-    np.testing.assert_allclose(found[usable], expected[usable], rtol=1e-13, atol=1e-16)
+    assert_those_of_casadi(found, function, points, 1e-13)
+
+
+MAIN = """
+#include <stdio.h>
+#include <stdlib.h>
+int main(int count, char **said) {
+    const int many = atoi(said[1]);
+    double *in = malloc(2 * many * sizeof(double)), *out = malloc(OUTPUTS * many * sizeof(double));
+    if (count != 2 || fread(in, sizeof(double), 2 * many, stdin) != (size_t)(2 * many)) return 1;
+    yid_try(in, out, many);
+    fwrite(out, sizeof(double), OUTPUTS * many, stdout);
+    return yid_lanes() == LANES ? 0 : 2;
+}
+"""
+
+
+def test_arithmetic_of_lanes_on_another_processor(tmp_path):
+    """ARM, by a cross compiler and an emulator; its C library rounds here and there otherwise."""
+    cross = shutil.which("aarch64-linux-gnu-gcc")
+    emulator = shutil.which("qemu-aarch64-static") or shutil.which("qemu-aarch64")
+    if cross is None or emulator is None:
+        pytest.skip("there is no cross compiler for ARM (gcc-aarch64-linux-gnu), or no emulator (qemu-user-static)")
+    function, points = everything(), tried_points()
+    text, program = tmp_path / "lanes.c", tmp_path / "lanes"
+    text.write_text(arithmetic_source(function) + MAIN)
+    flags = [flag for flag in compiler.FLAGS if flag not in ("-fPIC", "-shared")]
+    subprocess.run([cross, "-O2", *flags, "-static", str(text), "-o", str(program), "-lm"], check=True)
+    said = subprocess.run(
+        [emulator, program, str(len(points))], input=points.tobytes(), capture_output=True, check=True
+    )
+    found = np.frombuffer(said.stdout).reshape(len(points), function.numel_out(0))
+    assert_those_of_casadi(found, function, points, 1e-12)
 
 
 def test_an_operation_without_a_form_is_refused():
