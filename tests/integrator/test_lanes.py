@@ -232,7 +232,7 @@ int main(int count, char **said) {
     if (count != 2 || fread(in, sizeof(double), 2 * many, stdin) != (size_t)(2 * many)) return 1;
     yid_try(in, out, many);
     fwrite(out, sizeof(double), OUTPUTS * many, stdout);
-    return yid_lanes() == LANES ? 0 : 2;
+    return yid_lanes() == 4 ? 0 : 2;
 }
 """
 

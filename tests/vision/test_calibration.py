@@ -15,7 +15,19 @@ from yid_ocp.vision import CalibrationOptions, ClockOptions, Pinhole, look_at
 from yid_ocp.vision.calibration import as_given, calibrate
 from yid_ocp.vision.clock import agreed, is_late, own_offset
 from yid_ocp.vision.meshes import Surfaces, robot_meshes
-from yid_ocp.vision.registration import CLOCK, DRIFT, SCALE, SHIFT, SIZE, Arm, CameraState, Glimpse, Rows, robust_sum
+from yid_ocp.vision.registration import (
+    CLOCK,
+    DRIFT,
+    SCALE,
+    SHIFT,
+    SIZE,
+    Arm,
+    CameraState,
+    Glimpse,
+    Rows,
+    _at_least,
+    robust_sum,
+)
 
 ARM = """<robot name="arm"><link name="base"><visual><geometry><box size="0.3 0.3 0.2"/></geometry></visual></link>
 <joint name="yaw" type="revolute"><parent link="base"/><child link="upper"/><origin xyz="0 0 0.1"/><axis xyz="0 0 1"/>
@@ -209,6 +221,25 @@ def test_errors_alike_in_a_frame_or_on_a_patch_count_as_one_and_others_only_once
     assert variance(by_patch) / alone == pytest.approx(frames * each, rel=0.5)
     # E[w^2 z^2] / E[w] of a normal z and w = 1/(1 + (z/2.5)^2)^2, once although both ways of grouping have it
     assert alone == pytest.approx(0.414, rel=0.3)
+
+
+def test_one_frame_at_its_minimum_has_the_errors_of_its_patches():
+    """The sum over a frame is zero at the minimum: without a least value its errors would seem to be none."""
+    rng = np.random.default_rng(1)
+    error = np.tile(1e-2 * rng.standard_normal(50), 2) * np.repeat([1.0, -1.0], 50)
+    found = robust_sum(rows_of([error], [np.arange(100)]), 10.0)
+    assert abs(found.gradient[0]) < 1e-9 * found.hessian[0, 0]
+    assert found.blocks[0, 0] / found.hessian[0, 0] == pytest.approx(0.41, rel=0.3)
+
+
+def test_a_matrix_at_least_another_one_in_every_direction():
+    least = np.array([[2.0, 1.0, 0.0], [1.0, 3.0, 0.0], [0.0, 0.0, 0.0]])
+    above = least + np.array([[1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
+    np.testing.assert_allclose(_at_least(least, above), above, atol=1e-9)
+    np.testing.assert_allclose(_at_least(least, np.zeros((3, 3))), least, atol=1e-9)
+    # as much as asked for along one direction only: that one is raised, the other one stays
+    mixed = _at_least(np.eye(2), np.array([[2.5, 2.0], [2.0, 2.5]]))
+    np.testing.assert_allclose(mixed, [[2.75, 1.75], [1.75, 2.75]], atol=1e-9)
 
 
 def test_drift_is_found_where_the_recording_is_long(robot):

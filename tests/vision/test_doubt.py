@@ -76,6 +76,7 @@ def test_a_wrong_length_further_up_moves_everything_and_is_found(measured):
     assert "T1.length is estimated: " in found.sizes.messages[0]
     with pytest.raises(DataError, match=r"no point is known|not one frame") as caught:
         measured({"T1": 1.1 * Y_LENGTHS["T1"]}, frames=3)
+    assert caught.value.what.startswith("the object seems to be other than the model says (T1.length")
     assert "T1.length seems to be wrong" in caught.value.hint
 
 
@@ -120,12 +121,12 @@ def test_what_sizes_do_to_points():
 
 
 def test_a_refusal_names_the_sizes_that_cannot_be_right():
-    """Only what contradicts the frames and is used all the same, with the value that fits."""
+    """Only what contradicts the frames and has no estimate in its place, with the value that fits."""
     covariance, change = np.diag([0.01**2, 0.02**2]), np.array([0.1, 0.05])
 
     def clause(used):
         return Sizes(("a.length", "a.radius"), np.ones(2), change, covariance, used, 5).contradiction
 
-    told = "the object is not as the model says: a.length 1000 mm where 1105 mm fits"
+    told = "the object seems to be other than the model says (a.length 1000 mm where 1105 mm fits)"
     assert clause((False, False)) == told
     assert clause((True, False)) == ""

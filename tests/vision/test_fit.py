@@ -176,6 +176,15 @@ def test_derivatives_agree_with_differences(system, shape, run):
     assert np.linalg.eigvalsh(model.hessian).min() > 0
 
 
+def test_without_points_near_it_a_shape_has_its_priors_alone(shape, run):
+    nothing = _Task(np.empty((0, 3)), np.empty(0), 1.0, 0.03, CAMERA, ())
+    q = run.q[200].copy()
+    model = shape._quadratic(q, nothing)
+    far = _Task(q[:3] + 100.0 + np.eye(3), np.full(3, 1e-9), 1.0, 0.03, CAMERA, ())
+    assert model.cost == pytest.approx(shape._quadratic(q, far).cost, rel=1e-6)
+    assert np.linalg.eigvalsh(model.hessian).min() > 0
+
+
 def test_what_cannot_be_fitted_is_said(alone, urdf_folder):
 
     with pytest.raises(DataError, match="no object"):

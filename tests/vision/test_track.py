@@ -253,6 +253,8 @@ def test_nothing_but_bad_clouds_is_an_error(system, small, cloud, message):
     with pytest.raises(DataError, match="not one frame could be used") as caught:
         track(Scene(system), small.recording, spoilt(small, **clouds))
     assert message in caught.value.what
+    assert caught.value.what.endswith(f"({len(small.clouds)} of {len(small.clouds)})")  # all for one reason
+    assert "other than the model says" not in caught.value.what
     assert caught.value.hint
 
 

@@ -26,10 +26,14 @@ def patch(centre, size, step=0.004):
         (patch([0.4, 0.0, 3.0], 0.1), False),  # nothing in that direction
         (patch([-0.04, 0.0, 1.0], 0.05), True),  # in the shadow of something beside the line of sight
         (patch([-0.2, 0.0, 1.0], 0.05), False),  # too far beside it for a shadow
+        (patch([-0.072, 0.0, 0.4], 0.02), True),  # the nearer it is, the further its shadow falls
     ],
 )
 def test_a_place_without_points_is_hidden_or_empty(points, hidden):
     assert View(points, POSE).hidden(PLACE, RADIUS, 0.01).tolist() == [hidden]
+    # what is expected to be asked about saves work and changes nothing
+    for expected in (PLACE, PLACE + 0.3, np.empty((0, 3))):
+        assert View(points, POSE, expected=expected).hidden(PLACE, RADIUS, 0.01).tolist() == [hidden]
 
 
 def test_nothing_is_seen_beside_the_picture():

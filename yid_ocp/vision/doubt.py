@@ -83,13 +83,13 @@ class Sizes:
 
     @property
     def contradiction(self) -> str:
-        """Which of the sizes that are used cannot be right, in a clause; empty for none."""
+        """Which of the model's values contradict the frames and have no estimate in their place; empty for none."""
         wrong = [
             f"{self.names[i]} {1e3 * self.told[i]:.4g} mm where {1e3 * self.told[i] * math.exp(self.change[i]):.4g} mm"
             " fits"
             for i in np.flatnonzero(self.doubted & ~np.array(self.used))
         ]
-        return f"the object is not as the model says: {', '.join(wrong)}" if wrong else ""
+        return f"the object seems to be other than the model says ({', '.join(wrong)})" if wrong else ""
 
     @property
     def messages(self) -> tuple[str, ...]:
@@ -98,13 +98,13 @@ class Sizes:
         for i, name in enumerate(self.names):
             value = self.told[i] * math.exp(self.change[i])
             two = 2 * value * self.std[i]
-            found = f"{1e3 * value:.3g} mm ± {1e3 * two:.2g} mm (two standard deviations) fits {self.frames} frames"
+            found = f"{1e3 * value:.4g} mm ± {1e3 * two:.2g} mm (two standard deviations) fits {self.frames} frames"
             if self.used[i]:
-                lines.append(f"{name} is estimated: {found}; the model says {1e3 * self.told[i]:.3g} mm")
+                lines.append(f"{name} is estimated: {found}; the model says {1e3 * self.told[i]:.4g} mm")
             elif self.doubted[i]:
                 kind = name.rpartition(".")[2]
                 lines.append(
-                    f"{name} seems to be wrong: {found}, the model says {1e3 * self.told[i]:.3g} mm. Measure it again,"
+                    f"{name} seems to be wrong: {found}, the model says {1e3 * self.told[i]:.4g} mm. Measure it again,"
                     f" or estimate it: track.options.estimate: [{kind}]"
                 )
         return tuple(lines)

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Annotated
 
 import casadi as ca
@@ -226,7 +227,7 @@ class ShapeFit:
             begun.append(trial)
         everything = _Left(np.ones(len(sight.nodes), bool), np.ones(len(sight.points), bool))
         thin = _Left(*slender(sight, float(self.radius.max())))
-        best = self._attempt(sight, begun, thin if thin.nodes.any() else everything)
+        best = self._attempt(sight, begun, thin if thin.nodes.any() and thin.points.any() else everything)
         for left in (self._without(best, sight, self._links_of(self._failed(best.evidence))), everything):
             failed = self._failed(best.evidence)
             if not failed:
@@ -400,12 +401,13 @@ class ShapeFit:
         weight = task.weight / (1 + square) ** 2
         # sums over the points of each link, by the start and the end of its centre line
         order = np.argsort(link, kind="stable")
-        some, first = np.unique(link[order], return_index=True)
-        weighted, block = (rows * weight[:, None])[order], rows[order]
+        block, apart = rows[order], error[order]
+        weighted = block * weight[order, None]
         pull, stiff = np.zeros((len(self.radius), 6)), np.zeros((len(self.radius), 6, 6))
-        pull[some] = np.add.reduceat(weighted * error[order, None], first, axis=0)
-        for k, mine in zip(some, np.split(np.arange(len(order)), first[1:]), strict=True):
-            stiff[k] = block[mine].T @ weighted[mine]
+        bounds = np.searchsorted(link[order], np.arange(len(self.radius) + 1))
+        for k, (begin, end) in enumerate(pairwise(bounds)):
+            pull[k] = apart[begin:end] @ weighted[begin:end]
+            stiff[k] = block[begin:end].T @ weighted[begin:end]
         chain = by_q.reshape(len(self.radius), 6, -1)
         gradient = by_q.T @ pull.ravel()
         hessian = by_q.T @ np.matmul(stiff, chain).reshape(by_q.shape)

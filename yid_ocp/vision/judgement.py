@@ -21,6 +21,8 @@ from yid_ocp.vision.results import FrameReport
 
 Array = NDArray[np.float64]
 
+_NO_FIT, _END_ELSEWHERE = "the shape does not fit", "an end is not where its gripper is"
+_MISFITS = (_NO_FIT, _END_ELSEWHERE)
 _MOST_NOTES = 4  # in a hint
 _MEAN_ABS = math.sqrt(2.0 / math.pi)  # of a normal variable, in standard deviations
 
@@ -33,13 +35,13 @@ def unfit(fit: Fit, shape: ShapeFit, options: TrackOptions) -> str:
     limit = math.hypot(options.d_max * float(shape.radius.mean()), _MEAN_ABS * shape.options.noise)
     if fit.distance > limit:
         off = f"{1e3 * fit.distance:.1f} mm off on average, d_max allows {1e3 * limit:.1f} mm"
-        return f"the shape does not fit: {off}"
+        return f"{_NO_FIT}: {off}"
     bend = float(np.abs((fit.q - shape.rest)[list(shape.bends)]).max())
     if bend > options.largest_bend:
         return f"the shape is folded: a joint is bent by {math.degrees(bend):.0f} degrees"
     if fit.covered < options.least_covered:
         share = 100 * fit.covered
-        return f"the shape does not fit: only {share:.0f} % of its visible length has points of its own"
+        return f"{_NO_FIT}: only {share:.0f} % of its visible length has points of its own"
     return ""
 
 
@@ -62,7 +64,7 @@ def _compared(frame: FrameReport, usual: float, gap: Array, options: TrackOption
     apart = float(np.linalg.norm(frame.fit.gap - gap, axis=1).max(initial=0.0))
     if apart > options.gap_max:
         off = f"{1e3 * apart:.0f} mm more than usual (a late stamp?)"
-        return replace(frame, reason=f"an end is not where its gripper is: {off}")
+        return replace(frame, reason=f"{_END_ELSEWHERE}: {off}")
     return frame
 
 
@@ -122,7 +124,8 @@ def measured(
     position = np.array([fit.points[list(columns)] for fit in fits])
     std = np.hypot(np.array([fit.std[list(columns)] for fit in fits]), options.std_floor)
     sizes = common.sizes
-    std = np.hypot(std, np.array([sizes.std_of(fit.sizes.points[list(columns)]) for fit in fits]))
+    by_sizes = np.array([sizes.std_of(fit.sizes.points[list(columns)]) for fit in fits])
+    std = np.hypot(std, by_sizes)
     velocity = np.zeros_like(position)
     if len(t) > 1:
         velocity = np.asarray(CubicSpline(t, position, axis=0)(t, 1))
@@ -136,9 +139,9 @@ def measured(
     unseen |= ~np.array([fit.seen[list(columns)] for fit in fits])
     if unseen.all():
         best = 1e3 * float(np.sqrt((std**2).mean(axis=2)).min())
-        cause = f"{sizes.contradiction}; so " if sizes.contradiction else ""
+        wrong_sizes = bool((np.linalg.norm(by_sizes, axis=2) > math.sqrt(3.0) * options.point_std_max).all())
         raise DataError(
-            f"{cause}no point is known well enough in any frame: the best within {best:.0f} mm,"
+            f"{_because(sizes, wrong_sizes)}no point is known well enough in any frame: the best within {best:.0f} mm,"
             f" point_std_max is {1e3 * options.point_std_max:g} mm",
             where=source,
             hint=_hint(
@@ -157,14 +160,19 @@ def _none_good(frames: Sequence[FrameReport], sizes: Sizes, things: Sequence[For
         kinds.setdefault(frame.reason.partition(":")[0], []).append(frame.reason)
     often = sorted(kinds.values(), key=len, reverse=True)[:3]
     listed = "; ".join(
-        f"{reasons[0]} ({len(reasons)} of {len(frames)}{', for example' if len(set(reasons)) > 1 else ''})"
+        f"{'for example ' if len(set(reasons)) > 1 else ''}{reasons[0]} ({len(reasons)} of {len(frames)})"
         for reasons in often
     )
-    cause = f"{sizes.contradiction}; so " if sizes.contradiction else ""
+    cause = _because(sizes, often[0][0].startswith(_MISFITS))
     notes = [*sizes.messages, *(thing.text for thing in things)]
     hint = "check the camera's pose, the unit of the clouds and the filters, and look at the pictures of a frame"
     hint = "say in camera.json that the unit is mm" if "metres" in listed else _hint(notes, hint)
     return DataError(f"{cause}not one frame could be used: {listed}", where=source, hint=hint)
+
+
+def _because(sizes: Sizes, matters: bool) -> str:
+    """What begins a refusal where the sizes of the object are the likely cause."""
+    return f"{sizes.contradiction}: " if matters and sizes.contradiction else ""
 
 
 def _hint(notes: Sequence[str], otherwise: str) -> str:

@@ -12,8 +12,8 @@ with what is told as the mean of a normal prior.
 
 The points' errors are alike, from pixel to pixel of a frame and, where a mesh is not quite the robot's surface, from
 frame to frame at one place of a link. The covariance is therefore the sandwich H^-1 B H^-1 with B summed over frames
-and over patches of the links as wholes, not over points, and data weigh against the prior by how much larger B is than
-H.
+and over patches of the links as wholes, less what each patch has in each frame, which both hold, and not over points;
+data weigh against the prior by how much larger B is than H.
 
 References
 ----------
@@ -278,7 +278,7 @@ class RobustSum:
         Of the sum, as a share of that.
     blocks : ndarray, shape (10, 10)
         Outer products of gradients summed over frames and over patches, less those of each patch in each frame, which
-        both have (two-way clusters, https://doi.org/10.1198/jbes.2010.07136).
+        both have, and no less than these (two-way clusters of Cameron, Gelbach and Miller 2011).
     sigma : float
         Standard deviation of a point's error [m].
     count : int
@@ -327,24 +327,25 @@ def robust_sum(rows: Sequence[Rows], reach: float) -> RobustSum:
     if len(size):
         stacked = np.concatenate(scores)
         frame = np.repeat(np.arange(len(rows)), [len(r.error) for r in rows])
-        place = np.concatenate([r.place for r in rows])
+        patch = np.unique(np.concatenate([r.place for r in rows]), axis=0, return_inverse=True)[1].ravel()
 
         def summed(key: Integers) -> Array:
-            _, group = np.unique(key, axis=0, return_inverse=True)
-            totals = np.stack([np.bincount(group.ravel(), stacked[:, k]) for k in range(SIZE)], axis=1)
+            group = np.unique(key, return_inverse=True)[1]
+            totals = np.stack([np.bincount(group, stacked[:, k]) for k in range(SIZE)], axis=1)
             return np.asarray(totals.T @ totals)
 
-        alone = summed(np.column_stack([frame, place]))
-        blocks = _at_least(alone, summed(frame) + summed(place) - alone)
+        both = summed(frame * (patch.max() + 1) + patch)
+        blocks = _at_least(both, summed(frame) + summed(patch) - both)
     curvature = max(bent / max(straight, 1e-12), _LEAST_CURVATURE)
     return RobustSum(gradient, hessian, curvature, blocks, sigma, len(size))
 
 
 def _at_least(least: Array, matrix: Array) -> Array:
     """A symmetric matrix that is in no direction below another one, which is positive."""
-    values, vectors = eigh(matrix, least + 1e-12 * np.diag(np.diag(least)) + 1e-300 * np.eye(len(least)))
-    back = np.linalg.inv(vectors)
-    return np.asarray(back.T @ np.diag(np.maximum(values, 1.0)) @ back)
+    base = least + 1e-12 * np.diag(np.diag(least)) + 1e-300 * np.eye(len(least))
+    values, vectors = eigh(matrix, base)
+    back = vectors.T @ base  # the inverse of the vectors, which are orthonormal in the base
+    return np.asarray(back.T @ (np.maximum(values, 1.0)[:, None] * back))
 
 
 def improved(state: CameraState, found: RobustSum, told: CameraState, precision: Array) -> tuple[CameraState, Array]:

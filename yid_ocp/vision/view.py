@@ -80,10 +80,10 @@ class View:
             hidden |= ((asked < low + reach) | (asked > high - reach)).any(axis=1)
         if hidden.all():
             return hidden
-        tree, distance = self._about(asked[~hidden])
+        wide = radius / np.maximum(depth, _LEAST_DEPTH)
+        tree, distance = self._about(asked[~hidden], float(wide[~hidden].max()))
         if not len(distance):
             return hidden
-        wide = radius / np.maximum(depth, _LEAST_DEPTH)
         for i in np.flatnonzero(~hidden):
             there = distance[tree.query_ball_point(asked[i], wide[i])]
             limit = depth[i] - radius[i] - margin
@@ -115,18 +115,25 @@ class View:
                         borders[end, axis] = value
         return borders[0], borders[1]
 
-    def _about(self, asked: Array) -> tuple[cKDTree, Array]:
+    @cached_property
+    def _shadow(self) -> float:
+        """How far beside its place in the picture the shadow of the nearest point can fall, as x/z."""
+        _, depth = self._all
+        return _BASELINE / float(depth.min()) if len(depth) else 0.0
+
+    def _about(self, asked: Array, wide: float) -> tuple[cKDTree, Array]:
         """Points of the picture round about the places: where in the picture, and how deep.
 
         One frame asks again and again for much the same: what was found stays while it is enough.
         """
-        low, high = asked.min(0) - _BASELINE, asked.max(0) + _BASELINE
+        reach = max(wide, self._shadow)
+        low, high = asked.min(0) - reach, asked.max(0) + reach
         for lower, upper, tree, depth in self._kept:
             if (lower <= low).all() and (upper >= high).all():
                 return tree, depth
         if self.expected is not None and len(self.expected):
             likely = _picture(self.expected, self.pose)[0]
-            low, high = np.minimum(low, likely.min(1) - _BASELINE), np.maximum(high, likely.max(1) + _BASELINE)
+            low, high = np.minimum(low, likely.min(1) - reach), np.maximum(high, likely.max(1) + reach)
         low, high = low - _MORE, high + _MORE
         seen, depth = self._all
         near = np.flatnonzero(((seen >= low[:, None]) & (seen <= high[:, None])).all(axis=0))
