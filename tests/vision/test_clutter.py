@@ -122,6 +122,11 @@ def test_what_moves_with_a_link_is_told_from_what_moves_by_itself():
         assert help_ in thing.text
     [thing] = foreign(looked(lambda t: [0.5, 0.3 * t, 0.5]), 6, 0.006, box_, links.__getitem__, True)
     assert "colour" in thing.text
+    still = looked(lambda t: [0.5, 0.5, 0.5])
+    for left_out in (False, True):  # what is done already is no advice
+        [thing] = foreign(still, 6, 0.006, box_, links.__getitem__, False, left_out)
+        assert ("background: frames" in thing.text) != left_out
+        assert "film the scene without object and robot" in thing.text
 
 
 def test_extra_meshes_hang_on_links(system):

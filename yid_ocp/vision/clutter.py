@@ -180,6 +180,7 @@ def foreign(
     box: tuple[Array, Array],
     links: Callable[[float], Mapping[str, Array]],
     coloured: bool,
+    background: bool = False,
 ) -> tuple[Foreign, ...]:
     """Put together what the frames saw of the same things, and say what helps.
 
@@ -197,6 +198,8 @@ def foreign(
         From a time to the poses of the robot's links in the world, shape (4, 4) each.
     coloured : bool
         Whether clouds have colours.
+    background : bool
+        Whether what stands still in the frames is left out already.
     """
     groups: list[list[tuple[float, Thing]]] = []
     for t, seen in things:
@@ -208,7 +211,7 @@ def foreign(
                 groups.append([(t, thing)])
     groups = [group for group in groups if len(group) >= min(_FEWEST, total)]
     groups.sort(key=lambda group: -sum(thing.points for _, thing in group))
-    return tuple(_named(group, total, noise, box, links, coloured) for group in groups)
+    return tuple(_named(group, total, noise, box, links, coloured, background) for group in groups)
 
 
 def _apart(one: Thing, other: Thing) -> float:
@@ -228,6 +231,7 @@ def _named(
     box: tuple[Array, Array],
     links: Callable[[float], Mapping[str, Array]],
     coloured: bool,
+    background: bool,
 ) -> Foreign:
     places = np.array([thing.centre for _, thing in group])
     centre = np.median(places, axis=0)
@@ -260,7 +264,8 @@ def _named(
         text += "take it out of view" if not beside else "leave it out with track.options.filters.lower and upper"
         text += ", or give the object's colour under track.options.filters.colours" if coloured else ""
     else:
-        text += "set track.options.background: frames, or film the scene without object and robot for track.background"
+        text += "" if background else "set track.options.background: frames, or "
+        text += "film the scene without object and robot for track.background"
         text += "; or leave it out with track.options.filters.lower and upper" if beside else ""
         text += "; if it is another arm, lock its joints (model.arms.locked)" if links(group[0][0]) else ""
     return Foreign(centre, size, len(group), moving, link, text)

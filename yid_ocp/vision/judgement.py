@@ -33,6 +33,8 @@ def unfit(fit: Fit, shape: ShapeFit, options: TrackOptions) -> str:
         return "the fit failed"
     # a mean distance of normal noise is 0.8 of its standard deviation
     limit = math.hypot(options.d_max * float(shape.radius.mean()), _MEAN_ABS * shape.options.noise)
+    if not math.isfinite(fit.distance):
+        return f"{_NO_FIT}: no point of the cloud is near it"
     if fit.distance > limit:
         off = f"{1e3 * fit.distance:.1f} mm off on average, d_max allows {1e3 * limit:.1f} mm"
         return f"{_NO_FIT}: {off}"

@@ -382,7 +382,8 @@ class Tracker:
         radius = float(self.shape.radius.max())
         box = corners.min(axis=0) - radius, corners.max(axis=0) + radius
         seen, noise = [(t, fit.things) for t, fit in fitted], self.options.fit.noise
-        return foreign(seen, len(fitted), noise, box, self._links, self.sequence.colours is not None)
+        coloured, still = self.sequence.colours is not None, self.options.background == "frames"
+        return foreign(seen, len(fitted), noise, box, self._links, coloured, still)
 
     def _links(self, t: float) -> dict[str, Array]:
         """Poses of what moves with the robot at a time, by the names of the joints."""
