@@ -94,9 +94,9 @@ class CameraState:
 
     def world(self, points: Array) -> Array:
         """Measured points in the world, both shape (N, 3) [m]."""
-        if self.factor != 1.0 or self.depth != 0.0:
-            points = points * (self.factor + self.depth / points[:, 2:3])
         placed = np.asarray(points @ self.pose[:3, :3].T)
+        if self.factor != 1.0 or self.depth != 0.0:
+            placed *= (self.factor + self.depth / points[:, 2])[:, None]
         placed += self.pose[:3, 3]
         return placed
 

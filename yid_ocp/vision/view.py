@@ -8,6 +8,7 @@ the camera itself.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -21,6 +22,8 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _BASELINE = 0.1  # [m]; between the camera's two eyes, of which no usual depth camera has a wider one
+_PLENTY = 24  # points about the narrowest place; of more, some are left out
+_NARROWER = 0.8  # times the narrowest place, up to which what is sorted stays enough
 _MORE = 0.02  # of the picture, as x/z, that is sorted beyond what is asked for
 _HALF = 0.5  # of the points in a direction decide
 _STRIP, _PIECES = 0.02, 20  # of a picture: width of the strip along a side and the pieces of it, half of them filled
@@ -48,7 +51,7 @@ class View:
     pose: Array
     pinhole: Pinhole | None = None
     expected: Array | None = None
-    _kept: list[tuple[Array, Array, cKDTree, Array]] = field(default_factory=list, repr=False)
+    _kept: list[tuple[Array, Array, float, cKDTree, Array]] = field(default_factory=list, repr=False)
 
     def hidden(self, places: Array, radius: Array, margin: float) -> Mask:
         """Which places cannot be seen from the camera.
@@ -81,7 +84,7 @@ class View:
         if hidden.all():
             return hidden
         wide = radius / np.maximum(depth, _LEAST_DEPTH)
-        tree, distance = self._about(asked[~hidden], float(wide[~hidden].max()))
+        tree, distance = self._about(asked[~hidden], wide[~hidden])
         if not len(distance):
             return hidden
         for i in np.flatnonzero(~hidden):
@@ -121,24 +124,28 @@ class View:
         _, depth = self._all
         return _BASELINE / float(depth.min()) if len(depth) else 0.0
 
-    def _about(self, asked: Array, wide: float) -> tuple[cKDTree, Array]:
+    def _about(self, asked: Array, wide: Array) -> tuple[cKDTree, Array]:
         """Points of the picture round about the places: where in the picture, and how deep.
 
         One frame asks again and again for much the same: what was found stays while it is enough.
         """
-        reach = max(wide, self._shadow)
+        reach, narrow = max(float(wide.max()), self._shadow), float(wide.min())
         low, high = asked.min(0) - reach, asked.max(0) + reach
-        for lower, upper, tree, depth in self._kept:
-            if (lower <= low).all() and (upper >= high).all():
+        for lower, upper, least, tree, depth in self._kept:
+            if (lower <= low).all() and (upper >= high).all() and narrow >= least:
                 return tree, depth
         if self.expected is not None and len(self.expected):
             likely = _picture(self.expected, self.pose)[0]
             low, high = np.minimum(low, likely.min(1) - reach), np.maximum(high, likely.max(1) + reach)
         low, high = low - _MORE, high + _MORE
         seen, depth = self._all
-        near = np.flatnonzero(((seen >= low[:, None]) & (seen <= high[:, None])).all(axis=0))
-        tree = cKDTree(seen.take(near, axis=1).T, compact_nodes=False, balanced_tree=False)
-        self._kept.append((low, high, tree, depth[near]))
+        x, y = seen
+        near = np.flatnonzero((x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1]))
+        narrow *= _NARROWER
+        about = len(near) * math.pi * narrow**2 / float(np.prod(high - low))
+        near = near[:: max(1, int(about / _PLENTY))]
+        tree = cKDTree(seen.take(near, axis=1).T, leafsize=64, compact_nodes=False, balanced_tree=False)
+        self._kept.append((low, high, narrow, tree, depth[near]))
         return tree, depth[near]
 
     @staticmethod
