@@ -1,4 +1,4 @@
-"""Damaged inputs are read or refused in words: a minute of them, and many as a slow test; see benchmarks/fuzz.py."""
+"""Damaged inputs are read or refused in words: some of them, and many as a slow test; see benchmarks/fuzz.py."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ def assert_sound(fuzz: ModuleType, inputs: int, seconds: float, first: int) -> i
     return int(count)
 
 
-def test_a_minute_of_damaged_inputs(fuzz):
-    assert assert_sound(fuzz, 2000, 40.0, 0) >= 20
+def test_some_damaged_inputs(fuzz):
+    assert assert_sound(fuzz, 2000, 20.0, 0) >= 10
 
 
 @pytest.mark.slow
