@@ -19,6 +19,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from yid_ocp.vision.filters import weighted_median
 from yid_ocp.vision.starts import Anchor
 from yid_ocp.vision.view import View
 
@@ -238,7 +239,7 @@ def gather(tubes: Tubes, seen: Sight, near: float) -> Evidence:
     size = np.abs(error)
     close = size < near
     tree, spacing = seen.tree, seen.spacing
-    noise = _TO_SIGMA * _median(size[close], seen.weight[close]) if close.any() else near / _SIGMAS
+    noise = _TO_SIGMA * weighted_median(size[close], seen.weight[close]) if close.any() else near / _SIGMAS
     # where points lie in between others is not known better than from one to the next
     noise = max(noise, spacing / math.sqrt(12.0))
     gate = min(_SIGMAS * noise, near)
@@ -310,12 +311,6 @@ def slender(sight: Sight, radius: float) -> tuple[Mask, Mask]:
             # halfway between a tube, r/sqrt(3), and a disc, within/2
             thin[i] = math.sqrt(max(second, 0.0)) < 0.5 * (radius / math.sqrt(3.0) + 0.5 * within)
     return thin, thin[cKDTree(sight.nodes).query(sight.points)[1]]
-
-
-def _median(values: Array, weight: Array) -> float:
-    order = np.argsort(values)
-    total = np.cumsum(weight[order])
-    return float(values[order[np.searchsorted(total, 0.5 * total[-1])]])
 
 
 def _parts(tree: cKDTree, chosen: Mask, within: float) -> Integers:

@@ -147,7 +147,8 @@ def measured(
             f" point_std_max is {1e3 * options.point_std_max:g} mm",
             where=source,
             hint=_hint(
-                [*sizes.messages, *(thing.text for thing in things)],
+                sizes,
+                things,
                 f"check the camera's pose and clock ({calibration.message}), or look at the pictures of a frame",
             ),
         )
@@ -165,10 +166,9 @@ def _none_good(frames: Sequence[FrameReport], sizes: Sizes, things: Sequence[For
         f"{'for example ' if len(set(reasons)) > 1 else ''}{reasons[0]} ({len(reasons)} of {len(frames)})"
         for reasons in often
     )
-    cause = _because(sizes, often[0][0].startswith(_MISFITS))
-    notes = [*sizes.messages, *(thing.text for thing in things)]
+    cause = _because(sizes, bool(often) and often[0][0].startswith(_MISFITS))
     hint = "check the camera's pose, the unit of the clouds and the filters, and look at the pictures of a frame"
-    hint = "say in camera.json that the unit is mm" if "metres" in listed else _hint(notes, hint)
+    hint = "say in camera.json that the unit is mm" if "metres" in listed else _hint(sizes, things, hint)
     return DataError(f"{cause}not one frame could be used: {listed}", where=source, hint=hint)
 
 
@@ -177,6 +177,7 @@ def _because(sizes: Sizes, matters: bool) -> str:
     return f"{sizes.contradiction}: " if matters and sizes.contradiction else ""
 
 
-def _hint(notes: Sequence[str], otherwise: str) -> str:
+def _hint(sizes: Sizes, things: Sequence[Foreign], otherwise: str) -> str:
     """What is known to be wrong with the object or stands about it comes before general advice."""
+    notes = [*sizes.messages, *(thing.text for thing in things)]
     return "; ".join([*notes[:_MOST_NOTES], otherwise])

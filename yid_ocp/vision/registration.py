@@ -329,8 +329,7 @@ def robust_sum(rows: Sequence[Rows], reach: float) -> RobustSum:
         frame = np.repeat(np.arange(len(rows)), [len(r.error) for r in rows])
         patch = np.unique(np.concatenate([r.place for r in rows]), axis=0, return_inverse=True)[1].ravel()
 
-        def summed(key: Integers) -> Array:
-            group = np.unique(key, return_inverse=True)[1]
+        def summed(group: Integers) -> Array:
             totals = np.stack([np.bincount(group, stacked[:, k]) for k in range(SIZE)], axis=1)
             return np.asarray(totals.T @ totals)
 

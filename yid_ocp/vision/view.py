@@ -71,7 +71,7 @@ class View:
             True where something nearer stands before it, throws its shadow on it, or where the picture ends.
         """
         seen, depth = _picture(places, self.pose)
-        asked = seen.T
+        asked, wide = seen.T, radius / np.maximum(depth, _LEAST_DEPTH)
         hidden = depth < _LEAST_DEPTH
         if self.pinhole is not None:
             camera = self.pinhole
@@ -79,11 +79,9 @@ class View:
             hidden |= (u < 0) | (u > camera.width - 1) | (v < 0) | (v > camera.height - 1)
         else:
             low, high = self._borders
-            reach = (radius / np.maximum(depth, _LEAST_DEPTH))[:, None]
-            hidden |= ((asked < low + reach) | (asked > high - reach)).any(axis=1)
+            hidden |= ((asked < low + wide[:, None]) | (asked > high - wide[:, None])).any(axis=1)
         if hidden.all():
             return hidden
-        wide = radius / np.maximum(depth, _LEAST_DEPTH)
         tree, distance = self._about(asked[~hidden], wide[~hidden])
         if not len(distance):
             return hidden
