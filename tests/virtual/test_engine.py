@@ -11,8 +11,11 @@ from virtual_examples import SYSTEMS, TRUTH, Runs
 
 from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.model.kinematics import forward_kinematics, rigid_body
-from yid_ocp.model.system import Grasp
-from yid_ocp.virtual.engine import SimulatedRun, Simulation, simulate_in_mujoco
+from yid_ocp.model.system import Grasp, System
+from yid_ocp.model.urdf import read_urdf
+from yid_ocp.model.y_object import y_object
+from yid_ocp.virtual.engine import Scene, SimulatedRun, Simulation, simulate_in_mujoco
+from yid_ocp.virtual.mjcf import compiled_model, mujoco_xml
 from yid_ocp.virtual.motion import multisine
 from yid_ocp.virtual.posture import initial_posture
 
@@ -136,3 +139,37 @@ def test_without_mujoco_the_error_says_what_to_install(monkeypatch: pytest.Monke
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(DataError, match=r"yid-ocp\[blind\]"):
         simulate_in_mujoco(SYSTEMS[1], None, multisine(SYSTEMS[1], seed=0))
+
+
+def test_the_constraint_solver_converges_on_a_fine_chain() -> None:
+    coarse = SYSTEMS[2]
+    fine = System.build(
+        read_urdf("package:baxter", joints=list(coarse.driven)),
+        objects=[(y_object(links=8), None, None)],
+        grasps=coarse.grasps,
+        driven=coarse.driven,
+        damping=0.1,
+    )
+    assert fine.size > 80  # MuJoCo takes sparse matrices for more than 60, if it is let
+    model = compiled_model(mujoco_xml(fine, {name: 2 * value for name, value in TRUTH.items()}, time_step=1e-4))
+    scene = Scene.of(fine, mujoco, model)
+    scene.data.qpos[:] = model.qpos_spring
+    for name, angle in initial_posture(coarse, TRUTH).items():
+        scene.data.qpos[model.joint(name).id] = angle + 0.1  # beside what is held, as where an object hangs bent
+    mujoco.mj_step(model, scene.data, nstep=3)
+    assert scene.data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number == 0
+    assert scene.data.solver_niter[0] < 10
+
+
+def test_settling_ends_where_the_state_is_lost() -> None:
+    class Thrown:
+        def prepare(self, model: Any) -> None: ...
+        def begin(self, data: Any) -> None: ...
+
+        def force(self, model: Any, data: Any) -> None:
+            data.qfrc_passive[:] += 1e14
+
+    system = SYSTEMS[1]
+    motion = multisine(system, TRUTH, seed=1)
+    with pytest.raises(ModelError, match="diverged before the motion began"):
+        simulate_in_mujoco(system, TRUTH, motion, Simulation(0.1), injected=Thrown())

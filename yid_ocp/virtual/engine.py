@@ -37,7 +37,8 @@ _SETTLING_FACTOR = 10.0  # on the object's damping: equilibrium does not depend 
 _SETTLING_LIMIT = 60.0  # [s]
 _POSTURE_TOLERANCE = 1e-6  # [rad]
 _REST = 1e-7  # [rad/s]
-_BAD_ACCELERATION = 6  # mjWARN_BADQACC: MuJoCo then resets its state and goes on
+_LOST = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
+"""Warnings after which MuJoCo resets its state and goes on; their numbers differ between its versions."""
 
 
 class EngineTerms(Protocol):
@@ -221,7 +222,7 @@ def simulate_in_mujoco(
             injected.begin(scene.data)
         frames = np.round(np.asarray(frame_times, float) / chosen.time_step).astype(int)
         result = _play(scene, controller, chosen, frames)
-        lost = scene.data.warning[_BAD_ACCELERATION].number > 0
+        lost = _lost(scene)
     if lost or not (np.isfinite(result.q).all() and np.isfinite(result.effort).all()):
         raise ModelError("the simulation diverged", where="MuJoCo", hint="take a shorter time_step or a calmer motion")
     return result
@@ -282,6 +283,7 @@ def settle(scene: Scene, damping: Array) -> Array:
     block = max(1, round(0.1 / model.opt.timestep))
     for _ in range(math.ceil(_SETTLING_LIMIT / (block * model.opt.timestep))):
         scene.mujoco.mj_step(held, data, nstep=block)
+        _refuse_lost(scene)
         calm, error = float(np.abs(data.qvel).max()), target - data.qpos[driven]
         if np.abs(error).max() > _POSTURE_TOLERANCE:
             held.qpos_spring[driven] += error
@@ -292,6 +294,21 @@ def settle(scene: Scene, damping: Array) -> Array:
     balance = _HOLD_STIFFNESS * (held.qpos_spring[driven] - data.qpos[driven])
     data.qvel[:], data.qacc_warmstart[:], data.time = 0.0, 0.0, 0.0
     return balance
+
+
+def _lost(scene: Scene) -> bool:
+    """Whether MuJoCo lost the state at some time, and began again from its first one."""
+    kinds = scene.mujoco.mjtWarning
+    return any(scene.data.warning[int(getattr(kinds, name))].number > 0 for name in _LOST)
+
+
+def _refuse_lost(scene: Scene) -> None:
+    if _lost(scene):
+        raise ModelError(
+            "the simulation diverged before the motion began",
+            where="MuJoCo",
+            hint="take a shorter time_step, or a posture whose grippers are nearer to what they hold",
+        )
 
 
 class Controller:
@@ -382,6 +399,7 @@ def settle_servos(scene: Scene, damping: Array, commands: Array) -> None:
     block = max(1, round(0.1 / model.opt.timestep))
     for _ in range(math.ceil(_SETTLING_LIMIT / (block * model.opt.timestep))):
         scene.mujoco.mj_step(held, data, nstep=block)
+        _refuse_lost(scene)
         if np.abs(data.qvel).max() < _REST:
             break
     else:

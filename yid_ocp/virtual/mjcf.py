@@ -105,6 +105,7 @@ def mujoco_xml(
         gravity=_text(value(system.gravity)),
         iterations="100",
         tolerance="1e-14",
+        jacobian="dense",  # the Newton solver of MuJoCo 4.0 does not converge on fine chains in its sparse form
     )
     ElementTree.SubElement(option, "flag", contact="disable")
     sites = _sites(system, tree, value)
