@@ -136,6 +136,21 @@ def test_one_recording_is_split_in_blocks_and_the_report_says_so(bench):
     assert "blocks" in result["summary"]
 
 
+def test_a_candidate_that_is_left_out_is_composed_and_not_tried(bench):
+    recordings = [bench.recording({"joint_coulomb@elbow": {"tau_c": 0.1}}, seed) for seed in (1, 2)]
+    problem = bench.problem(recordings[:1])
+    finding = diagnose(problem, FRICTION, recordings[1:], leave_out=["joint_coulomb@elbow", "effort_offset"])
+    tried = {score.effect.label for score in finding.scores}
+    assert tried == {"joint_coulomb@shoulder", "link_mass@elbow"}
+    assert "joint_coulomb@elbow.tau_c" in finding.nominal.problem.system.parameters.names
+    assert "joint_coulomb@elbow" not in {effect.label for effect in finding.effects}
+    for name, said in (("joint_viscous", "no candidate here"), ("joint_coulomb@tail", "no candidate here")):
+        with pytest.raises(YidError, match=said):
+            diagnose(problem, FRICTION, recordings[1:], leave_out=[name])
+    with pytest.raises(YidError, match="no candidate is left"):
+        diagnose(problem, FRICTION, recordings[1:], leave_out=["joint_coulomb", "link_mass", "effort_offset"])
+
+
 def test_an_effect_that_is_not_in_the_library_is_unknown_but_placed(bench):
     def rattle(t):
         return np.stack([0 * t, 0.15 * np.sin(2 * np.pi * 7.3 * t)], axis=1)

@@ -332,6 +332,7 @@ class DiagnosisSettings(Thresholds):
     candidates: Annotated[
         Literal["all"] | tuple[str, ...], About("effects to try: all, or a list of kind or kind@location")
     ] = "all"
+    leave_out: Annotated[tuple[str, ...], About("candidates not to try, by kind or kind@location")] = ()
     noise_fraction: Annotated[
         float,
         Gt(0),

@@ -18,7 +18,7 @@ from yid_ocp.diagnosis.carry_over import carried_over, counting_both
 from yid_ocp.diagnosis.earlier import UNTOLD, Earlier
 from yid_ocp.diagnosis.events import NOTHING, Events, find_events, without_events
 from yid_ocp.diagnosis.finding import Finding, absorption
-from yid_ocp.diagnosis.hypotheses import MARGINS, CandidateProblem, Choice, Cut, chosen_effects
+from yid_ocp.diagnosis.hypotheses import MARGINS, CandidateProblem, Choice, Cut, chosen_effects, left_out
 from yid_ocp.diagnosis.localise import Place, attributed, localise, main_places, merged
 from yid_ocp.diagnosis.refit import Fit, Search, Store, recalled, refit
 from yid_ocp.diagnosis.screening import Screened, screen
@@ -52,6 +52,7 @@ def diagnose(
     store: Store | None = None,
     baseline: Estimates | Sequence[Estimates] = (),
     without: Sequence[Recording] = (),
+    leave_out: Sequence[str] = (),
 ) -> Finding:
     """Say whether there is a gap between model and recordings, where, which effect makes it, and how far it closes.
 
@@ -75,6 +76,8 @@ def diagnose(
         what differs now. A problem that has them already (`with_baseline`) is taken as it is.
     without : sequence of Recording, optional
         Made without what is looked for: what the effects found are taken out for (`counterfactual`).
+    leave_out : sequence of str, optional
+        Candidates that are not tried, `kind` or `kind@location`.
 
     Returns
     -------
@@ -96,7 +99,7 @@ def diagnose(
         earlier = Earlier.of(runs, tuple(without))
         if earlier.known is not None and not problem.options.joint_prior.names:
             problem = with_baseline(problem, earlier.known)
-        composed = _composed(problem, candidates, held_out, told)
+        composed = _composed(problem, candidates, leave_out, held_out, told)
         clock.lap("compose")
         search = Search(composed, thresholds or DEFAULTS, told, store)
         return _diagnosed(problem, search, solution, clock, earlier)
@@ -338,7 +341,11 @@ def _nearer(
 
 
 def _composed(
-    problem: EstimationProblem, candidates: Choice, held_out: Sequence[Recording], progress: Progress
+    problem: EstimationProblem,
+    candidates: Choice,
+    leave_out: Sequence[str],
+    held_out: Sequence[Recording],
+    progress: Progress,
 ) -> CandidateProblem:
     """The problem with all candidates; see `diagnose` for what is refused."""
     if problem.options.weighting != "whitened":
@@ -349,8 +356,9 @@ def _composed(
             hint="set problem.weighting: whitened and the noise levels under `sensors`",
         )
     effects = chosen_effects(problem.system, [episode.recording for episode in problem.episodes], candidates)
+    tried = tuple(left_out(effects, leave_out))
     progress.stage(f"composing {len(effects)} candidates into one step")
-    return CandidateProblem.of(problem, effects, held_out)
+    return replace(CandidateProblem.of(problem, effects, held_out), effects=tried)
 
 
 def _after(

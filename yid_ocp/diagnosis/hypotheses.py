@@ -83,6 +83,34 @@ def chosen_effects(system: System, recordings: Sequence[Recording], choice: Choi
     return [make_effect(kind, place, system) for kind, place in pairs]
 
 
+def left_out(effects: Sequence[EffectBase], names: Sequence[str]) -> list[EffectBase]:
+    """Those of the candidates that are tried where some are left out.
+
+    They stay part of the composed step, neutral: whoever leaves others out the next time has it compiled already.
+
+    Parameters
+    ----------
+    effects : sequence of EffectBase
+    names : sequence of str
+        `kind` or `kind@location`.
+
+    Raises
+    ------
+    ConfigError
+        A name that is no candidate, or none is left.
+    """
+    where = "diagnosis.leave_out"
+    known = {name for effect in effects for name in (effect.kind, effect.label)}
+    for name in names:
+        if name not in known:
+            allowed = ", ".join(dict.fromkeys(effect.kind for effect in effects))
+            raise ConfigError(f"'{name}' is no candidate here", where=where, allowed=f"{allowed}, or kind@location")
+    kept = [effect for effect in effects if not {effect.kind, effect.label} & set(names)]
+    if not kept:
+        raise ConfigError("no candidate is left to try", where=where, hint="leave fewer out")
+    return kept
+
+
 @dataclass(frozen=True)
 class Cut:
     """A held-out recording that the nominal model cannot follow to its end.
@@ -113,7 +141,7 @@ class CandidateProblem:
     problem : EstimationProblem
         Of the system with all candidates at their neutral values; frees the nominal parameters.
     effects : tuple of EffectBase
-        All candidates.
+        The candidates that are tried: all of the system's that are neutral, but for those left out.
     blocks : bool
         Whether a single recording is both estimated on and held out, in alternate blocks.
     """

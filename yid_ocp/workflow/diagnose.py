@@ -165,6 +165,7 @@ def _found(
         store=refits,
         baseline=runs,
         without=without,
+        leave_out=said.leave_out,
     )
 
 

@@ -13,7 +13,6 @@ from yid_ocp.diagnosis.refit import refit
 from yid_ocp.diagnosis.select import closure
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects.base import Quantity
-from yid_ocp.model.system import System
 from yid_ocp.progress import Progress
 
 
@@ -26,14 +25,9 @@ def answer(
 ) -> Finding:
     """The diagnosis of a case, from its recordings alone."""
     problem = ensemble.of(case.estimate)
-    choice = library(problem.system, case, candidates)
-    return diagnose(problem, choice, [case.held_out], thresholds=thresholds, progress=progress)
-
-
-def library(system: System, case: Case, candidates: Choice) -> list[str]:
-    """Candidates of a case, as `kind@location`."""
-    effects = chosen_effects(system, case.estimate, candidates)
-    return [effect.label for effect in effects if effect.kind not in case.without]
+    return diagnose(
+        problem, candidates, [case.held_out], thresholds=thresholds, progress=progress, leave_out=case.without
+    )
 
 
 def best_closure(ensemble: Ensemble, case: Case, label: Label, candidates: Choice = "all") -> float:
