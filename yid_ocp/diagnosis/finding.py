@@ -17,6 +17,7 @@ from yid_ocp.diagnosis.refit import Fit
 from yid_ocp.diagnosis.screening import Confusability, Score, Visibility
 from yid_ocp.diagnosis.select import Added, Closure, closure
 from yid_ocp.diagnosis.smoother import Smoothed
+from yid_ocp.diagnosis.statistics import statistics
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import Reason
 from yid_ocp.effects import EffectBase
@@ -200,6 +201,7 @@ class Finding(Shown):
             "side": None if self.smoothed is None else self.smoothed.side,
             "evidence": {} if self.smoothed is None else dict(self.smoothed.evidence),
             "explainable": None if self.smoothed is None else self.smoothed.explainable,
+            "statistics": statistics(self),
             "summary": self.summary,
             "message": self.message,
             "held_out_in_blocks": self.in_blocks,

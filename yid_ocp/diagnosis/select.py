@@ -179,12 +179,14 @@ def relevant(before: Loss, after: Loss, limits: Thresholds = DEFAULTS) -> bool:
     """
     if far_likelier(before, after, limits) or not np.isfinite(before.mean):
         return True
-    least = 1.0 - limits.relevance
-    falls = [np.sqrt(after.mean) <= least * np.sqrt(before.mean)]
-    falls += [
-        after.channels[name][0] <= least * rmse for name, (rmse, _) in before.channels.items() if name in after.channels
-    ]
-    return any(falls)
+    return fall(before, after) >= limits.relevance
+
+
+def fall(before: Loss, after: Loss) -> float:
+    """Part of the held-out error that is gone, of all channels together or of that which gains most."""
+    pairs = [(np.sqrt(before.mean), np.sqrt(after.mean))]
+    pairs += [(rmse, after.channels[name][0]) for name, (rmse, _) in before.channels.items() if name in after.channels]
+    return float(max(1.0 - later / earlier if earlier > 0 else 0.0 for earlier, later in pairs))
 
 
 # -- several effects --------------------------------------------------------------------------------------------------

@@ -39,7 +39,7 @@ def has_gap(
     stated = [score.p_value for score in ranked if score.effect.kind == "effort_offset"] if offsets else []
     if stated and min(stated) * len(ranked) < limits.level:
         return True
-    best = _best_of(ranked)
+    best = best_of(ranked)
     largest = max((*before.channels.values(), *held_out.channels.values()), default=1.0)
     return best < limits.level and largest > 1 + limits.smallest_gap
 
@@ -51,12 +51,12 @@ def shapeless(
 
     A sure excess without shape stays a gap: stated noise that is too small looks like that.
     """
-    best = _best_of(ranked)
+    best = best_of(ranked)
     barely = min(before.p_value, held_out.p_value) > limits.shapeless * limits.level
     return barely and best >= limits.level and (smoothed is None or smoothed.side == "none")
 
 
-def _best_of(ranked: Sequence[Score]) -> float:
+def best_of(ranked: Sequence[Score]) -> float:
     """Smallest p-value of candidates as the best of that many tries, one where there is none (Bonferroni)."""
     return min((score.p_value for score in ranked), default=1.0) * max(len(ranked), 1)
 

@@ -26,10 +26,12 @@ from yid_ocp.diagnosis.blind import (
     best_closure,
     mark,
     opened,
+    opened_wide,
     planned,
     score,
     seal,
 )
+from yid_ocp.diagnosis.statistics import statistics
 from yid_ocp.errors import ConfigError, OutputError, YidError
 from yid_ocp.files import jsonable, write_json, write_text
 from yid_ocp.parallel import LOCAL, Task, Workers, run_tasks, values_of
@@ -305,7 +307,10 @@ def diagnosed(
     held_out: Path,
     without: Sequence[str],
 ) -> dict[str, Any]:
-    """The answer to a case, from its recordings alone: {seconds, result}, result as `yid-diagnosis/1`."""
+    """The answer to a case, from its recordings alone: {seconds, result}, result as `yid-diagnosis/1`.
+
+    For calibration, one without a gap has `open` too: the statistics of a diagnosis that takes anything for a gap.
+    """
     run, ensemble = Experiment(config, variation, seed, purpose).ensemble(first)
     case = _case(name, estimate, held_out, without)
     begun = time.perf_counter()
@@ -314,6 +319,12 @@ def diagnosed(
     except YidError as error:
         result = _nothing(str(error))
     found: dict[str, Any] = jsonable({"seconds": time.perf_counter() - begun, "result": result})
+    if purpose == PURPOSES[1] and result["verdict"] == "no_gap":
+        anything = opened_wide(run.diagnosis)
+        try:
+            found["open"] = jsonable(statistics(answer(ensemble, case, run.diagnosis.candidates, anything)))
+        except YidError as error:
+            found["open"] = {"message": str(error)}
     return found
 
 
