@@ -31,7 +31,7 @@ from yid_ocp.diagnosis.blind import (
     score,
     seal,
 )
-from yid_ocp.diagnosis.statistics import statistics
+from yid_ocp.diagnosis.finding import statistics
 from yid_ocp.errors import ConfigError, OutputError, YidError
 from yid_ocp.files import jsonable, write_json, write_text
 from yid_ocp.parallel import LOCAL, Task, Workers, run_tasks, values_of
