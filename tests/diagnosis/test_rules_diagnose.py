@@ -263,7 +263,7 @@ class Steps:
         monkeypatch.setattr(module, "screen", self.step("screen", self.given["screened"]))
         monkeypatch.setattr(module, "elsewhere", self.step("elsewhere", self.given["elsewhere"]))
         monkeypatch.setattr(module, "smooth_fit", self.step("smooth", self.given["smoothed"]))
-        happened = list(self.given["events"])
+        happened = [module._Happened(events) for events in self.given["events"]]
         monkeypatch.setattr(module, "_undivided", lambda composed, problem: "whole")
         monkeypatch.setattr(
             module, "_happened", lambda whole, of, limits: happened.pop(0) if len(happened) > 1 else happened[0]

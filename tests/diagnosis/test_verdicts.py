@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -10,8 +11,11 @@ import pytest
 from jsonschema import validate
 
 from yid_ocp.diagnosis import Thresholds, diagnose
+from yid_ocp.diagnosis.events import NOTHING
+from yid_ocp.diagnosis.hypotheses import CandidateProblem
 from yid_ocp.diagnosis.smoother import smooth
 from yid_ocp.diagnosis.verdict import shapeless
+from yid_ocp.effects import make_effect
 from yid_ocp.errors import YidError
 from yid_ocp.problem import ProblemOptions, SensorOptions
 
@@ -149,6 +153,42 @@ def test_a_candidate_that_is_left_out_is_composed_and_not_tried(bench):
             diagnose(problem, FRICTION, recordings[1:], leave_out=[name])
     with pytest.raises(YidError, match="no candidate is left"):
         diagnose(problem, FRICTION, recordings[1:], leave_out=["joint_coulomb", "link_mass", "effort_offset"])
+
+
+def test_candidates_are_composed_once_for_a_step(bench):
+    recordings = [bench.recording({}, seed) for seed in (1, 2)]
+    system = bench.system
+
+    def composed(*labels: str, **values: float) -> CandidateProblem:
+        effects = [make_effect(*label.split("@"), system, values or None) for label in labels]
+        return CandidateProblem.of(bench.problem(recordings[:1]), effects, recordings[1:])
+
+    first, again = (
+        composed("joint_coulomb@elbow", "link_mass@elbow"),
+        composed("joint_coulomb@elbow", "link_mass@elbow"),
+    )
+    assert again.problem.step is first.problem.step
+    assert again.effects == first.effects, "those whose symbols the step has"
+    assert composed("link_mass@elbow", "joint_coulomb@elbow").problem.step is not first.problem.step
+    at_work = composed("joint_coulomb@elbow", tau_c=0.1)
+    assert at_work.problem.step is not composed("joint_coulomb@elbow").problem.step
+
+
+def test_where_nothing_happened_the_smoother_runs_once(bench, monkeypatch):
+    module = sys.modules["yid_ocp.diagnosis.diagnose"]
+    ran = []
+
+    def counted(*given):
+        ran.append(given)
+        return smooth(*given)
+
+    monkeypatch.setattr(module, "smooth", counted)
+    monkeypatch.setattr(module, "find_events", lambda *_: NOTHING)
+    finding, _ = found(bench, {"joint_coulomb@elbow": {"tau_c": 0.1}}, FRICTION[1:])
+    assert finding.verdict == "unknown"
+    about_the_nominal_fit = [given for given in ran if given[0].system is finding.nominal.problem.system]
+    assert len(about_the_nominal_fit) == 1
+    assert finding.smoothed is not None
 
 
 def test_an_effect_that_is_not_in_the_library_is_unknown_but_placed(bench):

@@ -6,7 +6,7 @@ import logging
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import threadpoolctl
@@ -28,6 +28,7 @@ from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
 from yid_ocp.diagnosis.verdict import decide, explained_part, has_gap, shapeless, why_unknown
 from yid_ocp.diagnosis.words import cut_short, next_experiment, sentences, shortage
 from yid_ocp.errors import DataError, SolverError
+from yid_ocp.parallel import map_in_step
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.constant_errors import without_constants
 from yid_ocp.problem.null_test import NullTest, noise_floor, null_test, residual_series
@@ -115,7 +116,8 @@ def _diagnosed(
     clock.lap("nominal")
     progress.stage("looking for events")
     whole = _undivided(search.problem, problem)
-    search, nominal, events = _without_events(search, nominal, whole)
+    search, nominal, happened = _without_events(search, nominal, whole)
+    events, about = happened.events, nominal
     clock.lap("events")
     search, before, held, screened = _tested(search, nominal)
     clock.lap("screening")
@@ -133,7 +135,9 @@ def _diagnosed(
     gap = gap or moved
     if gap and enough:
         progress.stage("locating the gap")
-        smoothed = smooth_fit(nominal, limits)
+        # where nothing happened it was run on all that was fitted already
+        known = happened.smoothed if nominal is about and not search.problem.blocks else None
+        smoothed = smooth_fit(nominal, limits) if known is None else known
         # it knows noise of torques by its spectrum only: too little for a verdict to rest on what it explains
         trusted = None if nominal.problem.disturbed else smoothed
         gap = not shapeless(trusted, screened.scores, before, held, limits)
@@ -157,7 +161,7 @@ def _diagnosed(
     remaining, where, rest_where = _after(nominal, accepted, smoothed, before, held, limits)
     if accepted:
         # what a better model explains was no event
-        events = _happened(whole, accepted[-1].fit, limits)
+        events = _happened(whole, accepted[-1].fit, limits).events
     clock.lap("remaining")
     finding = Finding(
         verdict=verdict,
@@ -200,8 +204,16 @@ def _undivided(composed: CandidateProblem, problem: EstimationProblem) -> Estima
     return composed.problem.on(episodes, () if composed.blocks else composed.problem.held_out)
 
 
-def _happened(whole: EstimationProblem, fit: Fit, limits: Thresholds) -> Events:
-    """Events about a fit in all that was recorded; NOTHING where that cannot be predicted.
+@dataclass(frozen=True)
+class _Happened:
+    """Events about a fit, and what the smoother says about it where it was asked."""
+
+    events: Events = NOTHING
+    smoothed: Smoothed | None = None
+
+
+def _happened(whole: EstimationProblem, fit: Fit, limits: Thresholds) -> _Happened:
+    """Events about a fit in all that was recorded; nothing where that cannot be predicted.
 
     Forces that take little of the gap with them are the largest errors of a model that errs everywhere.
     """
@@ -211,7 +223,7 @@ def _happened(whole: EstimationProblem, fit: Fit, limits: Thresholds) -> Events:
         judged = own.weighted_at(x, fit.evaluation.warm) if own.disturbed else own
         residual = judged.evaluate(x, False, fit.evaluation.warm)
         if not residual.ok:
-            return NOTHING
+            return _Happened()
         test = null_test(residual_series(judged), residual.residual, len(fit.values), limits.level, limits.window)
         if any(window.flagged for window in test.windows):
             evaluation = own.evaluate(x, warm=fit.evaluation.warm)
@@ -219,12 +231,12 @@ def _happened(whole: EstimationProblem, fit: Fit, limits: Thresholds) -> Events:
     if smoothed is None:
         evaluation = own.evaluate(x, False, fit.evaluation.warm)
     if not evaluation.ok:
-        return NOTHING
+        return _Happened()
     found = find_events(own, x, evaluation, smoothed, limits)
     pushed = found.forces_alone
     if pushed and _excess(fit, without_events(own, pushed)) > (1 - limits.event_share) * _excess(fit, own):
-        return found.without_forces
-    return found
+        found = found.without_forces
+    return _Happened(found, smoothed)
 
 
 def _excess(fit: Fit, problem: EstimationProblem) -> float:
@@ -242,27 +254,28 @@ def _excess(fit: Fit, problem: EstimationProblem) -> float:
     return float(counted @ counted) - np.count_nonzero(counted)
 
 
-def _without_events(search: Search, nominal: Fit, whole: EstimationProblem) -> tuple[Search, Fit, Events]:
+def _without_events(search: Search, nominal: Fit, whole: EstimationProblem) -> tuple[Search, Fit, _Happened]:
     """All that follows without what events explain, the nominal model fitted to that, and the events about it.
 
     Pushes pull a fit towards them: about a fit without those that were found, others may show.
     """
     composed, limits = search.problem, search.limits
-    events = _happened(whole, nominal, limits)
+    happened = _happened(whole, nominal, limits)
     for round_ in range(ROUNDS):
-        if not events:
-            return search, nominal, events
-        cleaned = replace(composed, problem=without_events(composed.problem, events))
-        search.progress.stage(f"fitting the nominal model without {len(events.found)} events")
+        if not happened.events:
+            return search, nominal, happened
+        cleaned = replace(composed, problem=without_events(composed.problem, happened.events))
+        search.progress.stage(f"fitting the nominal model without {len(happened.events.found)} events")
         name = f"the nominal model without events, round {round_ + 1}"
         again = _settled(cleaned, nominal.values, search.store, name, limits)
         if again is None:
             break
-        search, nominal, before = replace(search, problem=cleaned), again, events
-        events = _happened(whole, nominal, limits)
-        if events.like(before):
+        search, nominal, before = replace(search, problem=cleaned), again, happened.events
+        # what the smoother says is of all recordings, events not taken out
+        happened = replace(_happened(whole, nominal, limits), smoothed=None)
+        if happened.events.like(before):
             break
-    return search, nominal, events
+    return search, nominal, happened
 
 
 def _tested(search: Search, nominal: Fit) -> tuple[Search, NullTest, NullTest, Screened]:
@@ -307,13 +320,16 @@ def elsewhere(search: Search, nominal: Fit) -> Fit | None:
     """
     search.progress.stage("fitting the nominal model from other starts")
     problem, limits = search.problem.problem, search.limits
-    best = nominal
-    for factor in RESTARTS:
+
+    def begun(factor: float) -> Fit | None:
         start = problem.named(
             np.where(problem.positive, np.clip(factor * problem.start, *problem.bounds), problem.start)
         )
         name = f"the nominal model from {factor:g} times its start"
-        found = refit(search.problem, (), start, search.store, name, limits)
+        return refit(search.problem, (), start, search.store, name, limits)
+
+    best = nominal
+    for found in map_in_step(begun, RESTARTS):
         if found is not None and found.cost < best.cost - limits.worth:
             best = found
     if best is nominal:
@@ -356,9 +372,10 @@ def _composed(
             hint="set problem.weighting: whitened and the noise levels under `sensors`",
         )
     effects = chosen_effects(problem.system, [episode.recording for episode in problem.episodes], candidates)
-    tried = tuple(left_out(effects, leave_out))
+    left_out(effects, leave_out)
     progress.stage(f"composing {len(effects)} candidates into one step")
-    return replace(CandidateProblem.of(problem, effects, held_out), effects=tried)
+    composed = CandidateProblem.of(problem, effects, held_out)
+    return replace(composed, effects=tuple(left_out(composed.effects, leave_out)))
 
 
 def _after(

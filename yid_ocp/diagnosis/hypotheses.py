@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from yid_ocp.data.recording import Recording
 from yid_ocp.effects import EFFECTS, EffectBase, candidates, make_effect
 from yid_ocp.errors import ConfigError, DataError
-from yid_ocp.integrator.step import compile_alike
+from yid_ocp.integrator.step import Step, compile_alike
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, beginning
@@ -161,8 +162,7 @@ class CandidateProblem:
         DataError
             A recording is both estimated on and held out.
         """
-        step = problem.step
-        joint = compile_alike(step, step.system.with_effects(effects))
+        joint, effects = _joint(problem.step, tuple(effects))
         estimate = [episode.recording for episode in problem.episodes]
         held = [*held_out] if held_out else [episode.recording for episode in problem.held_out]
         _check_apart(estimate, held)
@@ -171,7 +171,7 @@ class CandidateProblem:
         made = EstimationProblem(joint, estimate, problem.free, problem.options, values, held, extra)
         if not held:
             made = _in_blocks(made)
-        return CandidateProblem(made, tuple(effects), not held)
+        return CandidateProblem(made, effects, not held)
 
     @property
     def nominal(self) -> tuple[str, ...]:
@@ -215,6 +215,22 @@ class CandidateProblem:
     def freeing(self, effects: Sequence[EffectBase]) -> EstimationProblem:
         """The problem with the parameters of some effects free beside the nominal ones."""
         return self.problem.freeing((*self.nominal, *(name for effect in effects for name in effect.parameters.names)))
+
+
+_JOINT: WeakKeyDictionary[Step, tuple[Step, tuple[EffectBase, ...]]] = WeakKeyDictionary()
+"""The last step composed with candidates, and these: another diagnosis with the same step finds it again."""
+
+
+def _joint(step: Step, effects: tuple[EffectBase, ...]) -> tuple[Step, tuple[EffectBase, ...]]:
+    """A step with candidates composed, and the candidates whose symbols it has."""
+    known = _JOINT.get(step)
+    if known is None or list(map(_told, known[1])) != list(map(_told, effects)):
+        known = _JOINT[step] = compile_alike(step, step.system.with_effects(effects)), effects
+    return known
+
+
+def _told(effect: EffectBase) -> tuple[object, ...]:
+    return effect.label, effect.quantities, tuple(effect.parameters.vector())
 
 
 def _check_apart(estimate: Sequence[Recording], held: Sequence[Recording]) -> None:

@@ -8,7 +8,7 @@ import logging
 import math
 import shlex
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -129,7 +129,7 @@ def run_blind(
     try:
         cases = _made(_named(runs), folder, count, seed, progress, workers, purpose)
         progress.stage(f"diagnosing {count} cases")
-        answers = values_of(run_tasks(diagnosed, cases, folder / ANSWERS, workers, progress.advance))
+        answers = _done(diagnosed, cases, folder / ANSWERS, workers, progress)
         commitment = json.loads((folder / COMMITMENT).read_text("utf-8"))
         labels = opened((folder / LABELS).read_text("utf-8"), commitment["sha256"])
         progress.stage("scoring")
@@ -239,7 +239,7 @@ def _make(
     used = [name for name in experiments if any(entry.experiment == name for entry in plan)]
     progress.stage(f"preparing {len(used)} {'experiment' if len(used) == 1 else 'experiments'}")
     tasks = [Task(name, {**experiments[name].told, "folder": str(folder / PREPARED), "name": name}) for name in used]
-    values_of(run_tasks(prepared, tasks, folder / PREPARED / "tasks", workers, progress.advance))
+    _done(prepared, tasks, folder / PREPARED / "tasks", workers, progress)
     progress.stage(f"making {count} cases")
     tasks = []
     for entry in plan:
@@ -247,7 +247,7 @@ def _make(
         known = {"first": folder / PREPARED / f"{name}.h5", "detectable": folder / PREPARED / f"{name}.json"}
         wanted = {"planned": asdict(entry), "folder": str(folder / CASES)}
         tasks.append(Task(f"case {entry.number}", {**experiments[name].told, **known, **wanted}))
-    made = values_of(run_tasks(drawn, tasks, folder / DRAWN, workers, progress.advance))
+    made = _done(drawn, tasks, folder / DRAWN, workers, progress)
     text, digest = seal([Label.from_dict(entry["label"]) for entry in made])
     write_text(folder / LABELS, text)
     write_json(folder / CASES / "cases.json", [entry["case"] for entry in made])
@@ -255,7 +255,16 @@ def _make(
     write_json(folder / COMMITMENT, said | {"code": package_code()})
 
 
-# -- tasks: each builds the problem again, which takes a twentieth of the time of a diagnosis -------------------------
+# -- tasks ------------------------------------------------------------------------------------------------------------
+
+
+def _done(
+    function: Callable[..., Any], tasks: Sequence[Task], folder: Path, workers: Workers | Executor, progress: Progress
+) -> list[Any]:
+    """What a function finds for each task; one experiment after the other, so that a worker builds each once."""
+    order = sorted(range(len(tasks)), key=lambda i: [str(tasks[i].arguments[key]) for key in ("config", "variation")])
+    found = values_of(run_tasks(function, [tasks[i] for i in order], folder, workers, progress.advance))
+    return [value for _, value in sorted(zip(order, found, strict=True), key=lambda pair: pair[0])]
 
 
 def prepared(config: Path, variation: str, seed: int, purpose: str, folder: str, name: str) -> dict[str, int]:
@@ -368,7 +377,7 @@ def _best(
         if gap and label.category in ("single", "pair"):
             arguments = {key: value for key, value in case.arguments.items() if key != "without"}
             tasks.append(Task(case.name, {**arguments, "label": label.to_dict()}))
-    best = values_of(run_tasks(closed_at_best, tasks, folder / BEST, workers, progress.advance))
+    best = _done(closed_at_best, tasks, folder / BEST, workers, progress)
     return {task.name: value for task, value in zip(tasks, best, strict=True) if value is not None}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import logging
 from collections.abc import Mapping, Sequence
@@ -152,22 +153,28 @@ class Experiment:
         ------
         ConfigError, DataError, ModelError
         """
-        varied, simulated_run = VARIATIONS[self.variation], self.simulated()
-        simulated = build_system(simulated_run)
-        begun = (f"recordings.estimate=[{json.dumps(str(first))}]", "recordings.held_out=[]")
-        run = load_config(self.config, (*varied.diagnosed(simulated.driven), *begun))
-        problem = build_problem(run)
-        finer = (lambda times: build_system(simulated_run, times)) if simulated.segments else None
-        ensemble = Ensemble(
-            problem,
-            self.seed,
-            finer,
-            run.diagnosis.candidates,
-            run.diagnosis,
-            simulated=simulated,
-            conditions=self.conditions,
-        )
-        return run, ensemble
+        return _ensemble(self, first, first.stat().st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=1)
+def _ensemble(experiment: Experiment, first: Path, written: int) -> tuple[Run, Ensemble]:
+    """See `Experiment.ensemble`; kept with its compiled step for the next task of the same experiment."""
+    varied, simulated_run = VARIATIONS[experiment.variation], experiment.simulated()
+    simulated = build_system(simulated_run)
+    begun = (f"recordings.estimate=[{json.dumps(str(first))}]", "recordings.held_out=[]")
+    run = load_config(experiment.config, (*varied.diagnosed(simulated.driven), *begun))
+    problem = build_problem(run)
+    finer = (lambda times: build_system(simulated_run, times)) if simulated.segments else None
+    ensemble = Ensemble(
+        problem,
+        experiment.seed,
+        finer,
+        run.diagnosis.candidates,
+        run.diagnosis,
+        simulated=simulated,
+        conditions=experiment.conditions,
+    )
+    return run, ensemble
 
 
 def refuse_unfit(run: Run) -> None:

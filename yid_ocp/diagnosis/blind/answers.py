@@ -37,7 +37,7 @@ def best_closure(ensemble: Ensemble, case: Case, label: Label, candidates: Choic
     composed = CandidateProblem.of(problem, effects, [case.held_out])
     nominal = nominal_fit(problem, composed)
     true = {entry.label: entry for entry in label.injected}
-    chosen = [effect for effect in effects if effect.label in true]
+    chosen = [effect for effect in composed.effects if effect.label in true]
     start = {}
     for effect in chosen:
         start.update(_internal(effect.label, true[effect.label].values, effect.quantities))
