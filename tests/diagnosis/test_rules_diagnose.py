@@ -248,6 +248,7 @@ class Steps:
             "elsewhere": None,
             "carried": (),
             "events": [NOTHING],
+            "smoothed_for_events": None,
         } | given
         self.taken, self.heard = [], Heard()
         self.nominal = fit(lost=loss(2.0, 2.1), cost=100.0, values=VALUES)
@@ -263,7 +264,7 @@ class Steps:
         monkeypatch.setattr(module, "screen", self.step("screen", self.given["screened"]))
         monkeypatch.setattr(module, "elsewhere", self.step("elsewhere", self.given["elsewhere"]))
         monkeypatch.setattr(module, "smooth_fit", self.step("smooth", self.given["smoothed"]))
-        happened = [module._Happened(events) for events in self.given["events"]]
+        happened = [module._Happened(events, self.given["smoothed_for_events"]) for events in self.given["events"]]
         monkeypatch.setattr(module, "_undivided", lambda composed, problem: "whole")
         monkeypatch.setattr(
             module, "_happened", lambda whole, of, limits: happened.pop(0) if len(happened) > 1 else happened[0]
@@ -477,6 +478,23 @@ def test_what_events_explain_is_taken_out_before_the_rest_is_judged(monkeypatch)
     assert steps.names.count("settled") == 1
     assert found.events is events
     assert "elbow is pushed by up to +0.5 N m from 1.00 to 1.40 s in run (+0.1 ± 0.01 N m s)" in found.summary
+
+
+def test_where_nothing_happened_the_smoother_is_not_run_twice(monkeypatch):
+    steps = Steps(monkeypatch, smoothed_for_events=SEEN)
+    assert steps.run().smoothed is SEEN
+    assert "smooth" not in steps.names
+    # a recording in blocks was smoothed whole, one with events before they were taken out, another fit not at all
+    events = Events((happening(1.0),))
+    other = fit(lost=loss(2.0, 2.1), cost=90.0, values=VALUES)
+    before = outcome(p=1e-9, chi2=1.05, degrees=100.0)
+    for given in ({"blocks": True}, {"events": [events, NOTHING]}, {"elsewhere": other, "before": before}):
+        steps = Steps(monkeypatch, smoothed_for_events=SEEN, **given)
+        if "elsewhere" in given:
+            object.__setattr__(other, "problem", steps.nominal.problem)
+            monkeypatch.setattr(module, "held_out_test", lambda of, limits: outcome(p=1e-9, chi2=2.0))
+        steps.run()
+        assert "smooth" in steps.names, given
 
 
 def test_events_are_sought_again_about_the_fit_without_them_until_they_stay(monkeypatch):

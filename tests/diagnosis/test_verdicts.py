@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +10,6 @@ import pytest
 from jsonschema import validate
 
 from yid_ocp.diagnosis import Thresholds, diagnose
-from yid_ocp.diagnosis.events import NOTHING
 from yid_ocp.diagnosis.hypotheses import CandidateProblem
 from yid_ocp.diagnosis.smoother import smooth
 from yid_ocp.diagnosis.verdict import shapeless
@@ -172,23 +170,6 @@ def test_candidates_are_composed_once_for_a_step(bench):
     assert composed("link_mass@elbow", "joint_coulomb@elbow").problem.step is not first.problem.step
     at_work = composed("joint_coulomb@elbow", tau_c=0.1)
     assert at_work.problem.step is not composed("joint_coulomb@elbow").problem.step
-
-
-def test_where_nothing_happened_the_smoother_runs_once(bench, monkeypatch):
-    module = sys.modules["yid_ocp.diagnosis.diagnose"]
-    ran = []
-
-    def counted(*given):
-        ran.append(given)
-        return smooth(*given)
-
-    monkeypatch.setattr(module, "smooth", counted)
-    monkeypatch.setattr(module, "find_events", lambda *_: NOTHING)
-    finding, _ = found(bench, {"joint_coulomb@elbow": {"tau_c": 0.1}}, FRICTION[1:])
-    assert finding.verdict == "unknown"
-    about_the_nominal_fit = [given for given in ran if given[0].system is finding.nominal.problem.system]
-    assert len(about_the_nominal_fit) == 1
-    assert finding.smoothed is not None
 
 
 def test_an_effect_that_is_not_in_the_library_is_unknown_but_placed(bench):
