@@ -214,14 +214,16 @@ def test_rates_are_over_the_cases_that_they_speak_of():
     assert found["cases"] == 15
     assert found["false_alarms"] == 0.25
     assert found["detection"] == {
-        "1": {"cases": 1, "gap": 0.0, "right": 0.0},
-        "3": {"cases": 4, "gap": 1.0, "right": 0.75},
+        "1": {"cases": 1, "gap": 0.0, "first": 0.0, "right": 0.0},
+        "3": {"cases": 4, "gap": 1.0, "first": 0.5, "right": 0.75},
     }
     assert found["kind_first"] == pytest.approx(3 / 5)
     assert found["kind_in_two"] == pytest.approx(4 / 5)
     assert found["location_first"] == pytest.approx(4 / 5)
-    assert (found["confusable_covers"], found["confusable_size"]) == (0.5, 2.5)
+    # an effect that is named alone is a set of one
+    assert (found["sets_cover"], found["set_size"]) == (0.8, 1.6)
     assert found["unknown_recall"] == pytest.approx(1 / 3)
+    assert (found["unknown_outside"], found["unknown_left_out"]) == (1.0, 0.0)
     assert found["unknown_location"] == 0.5
     assert found["pairs_right"] == 0.0
     assert found["closure_of_best"] == pytest.approx((0.9 + 0.6) / 2)

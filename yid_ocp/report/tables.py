@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -198,20 +198,21 @@ def blind_tables(result: Mapping[str, Any]) -> dict[str, Rows]:
         ("true kind and place first, of the gaps found", sure["kind_first"]),
         ("among the first two", sure["kind_in_two"]),
         ("place first", sure["location_first"]),
-        ("sets named as not separable hold the truth", sure["confusable_covers"]),
-        ("their size", "-" if result["confusable_size"] is None else f"{result['confusable_size']:.1f}"),
-        ("unknown said of effects outside the library", sure["unknown_recall"]),
-        ("their place", sure["unknown_location"]),
+        ("what was named, alone or as not separable, holds the truth", sure["sets_cover"]),
+        ("how many were named, on average", "-" if result["set_size"] is None else f"{result['set_size']:.2f}"),
+        ("unknown said of effects that the library never had", sure["unknown_outside"]),
+        ("unknown said of effects taken out of it", sure["unknown_left_out"]),
+        ("place first of both", sure["unknown_location"]),
         ("pairs found", sure["pairs_right"]),
         ("closure over that of the true effect refitted", share(result["closure_of_best"])),
         ("median error of the effects' parameters", share(result["parameter_error"], 1)),
         ("their 95 % intervals that hold the truth", sure["interval_coverage"]),
         ("time of one diagnosis", "-" if result["seconds"] is None else f"{result['seconds']:.0f} s"),
     ]
-    sizes: Rows = [("size / detectable", "cases", "gap seen", "right")]
+    sizes: Rows = [("size / detectable", "cases", "gap seen", "kind and place first", "alone or in a set of three")]
     for size, entry in result["detection"].items():
         own = result["detection_intervals"][size]
-        sizes.append((size, str(entry["cases"]), rate(own["gap"]), rate(own["right"])))
+        sizes.append((size, str(entry["cases"]), *(rate(own[key]) for key in ("gap", "first", "right"))))
     experiments: Rows = [("experiment", "cases", "false alarms", "right")]
     for name, own in result["experiments"].items():
         experiments.append((name, str(own["cases"]), rate(own["false_alarms"]), rate(own["right"])))
@@ -233,7 +234,23 @@ def blind_tables(result: Mapping[str, Any]) -> dict[str, Rows]:
             share(entry["best"]),
             "-" if entry["seconds"] is None else f"{entry['seconds']:.0f} s",
         ))  # fmt: skip
-    return {"Score": marks, "Detection by size": sizes, "Experiments": experiments, "Cases": cases}
+    tables = {"Score": marks, "Detection by size": sizes, "Experiments": experiments, "Cases": cases}
+    known: Mapping[str, Any] = result.get("calibration_of_thresholds") or {"thresholds": {}}
+    if known["thresholds"]:
+        tables["Thresholds"] = _threshold_rows(known, rate)
+    return tables
+
+
+def _threshold_rows(calibration: Mapping[str, Any], rate: Callable[[Mapping[str, Any]], str]) -> Rows:
+    """Quantiles of a `yid-calibration/1` beside what is set."""
+    rows: Rows = [("diagnosis.", "is", "quantile", "coverage", "of", "effects beyond it, by size", "strange ones")]
+    for name, own in calibration["thresholds"].items():
+        value = "-" if own["quantile"] is None else f"{own['quantile']:.3g}"
+        kind = {"clean": "clean recordings", "effect": "effects named right"}[own["of"]]
+        sizes = ", ".join(f"{size}: {rate(found)}" for size, found in own["effects_beyond"].items())
+        cells = (f"{own['setting']:.3g}", value, f"{100 * own['coverage']:.0f} %", f"{own['cases']} {kind}")
+        rows.append((name, *cells, sizes or "-", rate(own["strange_beyond"])))
+    return rows
 
 
 def blind_markdown(result: Mapping[str, Any]) -> list[str]:

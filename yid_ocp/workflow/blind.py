@@ -24,6 +24,7 @@ from yid_ocp.diagnosis.blind import (
     Planned,
     answer,
     best_closure,
+    calibrate,
     mark,
     opened,
     opened_wide,
@@ -155,6 +156,8 @@ def run_blind(
         "candidates": {entry.name: entry.diagnosis.candidates for entry in runs},
         "variations": {name: varied.words for name, varied in VARIATIONS.items()},
     }
+    if purpose == PURPOSES[1]:
+        result["calibration_of_thresholds"] = calibrate(labels, marks, answers, runs[0].diagnosis)
     written = jsonable(result)
     write_json(folder / RESULT, written)
     write_text(folder / TABLE, "\n".join(blind_markdown(written)) + "\n")

@@ -2,6 +2,7 @@
 
 from yid_ocp.diagnosis.blind.answers import answer as answer
 from yid_ocp.diagnosis.blind.answers import best_closure as best_closure
+from yid_ocp.diagnosis.blind.calibrate import calibrate as calibrate
 from yid_ocp.diagnosis.blind.calibrate import opened_wide as opened_wide
 from yid_ocp.diagnosis.blind.ensemble import Case as Case
 from yid_ocp.diagnosis.blind.ensemble import Conditions as Conditions

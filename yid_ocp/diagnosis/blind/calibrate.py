@@ -1,11 +1,25 @@
-"""Thresholds from an ensemble whose labels are known: quantiles of what clean recordings, and true effects, show."""
+"""Thresholds from an ensemble whose labels are known: quantiles of what clean recordings, and true effects, show.
+
+With n values of a statistic on cases of one kind, a further such case stays at or below the k-th smallest of them with
+probability k/(n + 1) at least (split conformal prediction: Vovk, Gammerman and Shafer 2005, doi:10.1007/b106715).
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
-from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.diagnosis.blind.ensemble import Label
+from yid_ocp.diagnosis.blind.score import Mark, proportion
+from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
+
+FORMAT = "yid-calibration/1"
+COVERAGE = 0.95
+"""Part of the cases of its kind which a threshold is to leave on their side."""
+
+Statistics = Mapping[str, Any]
 
 
 def opened_wide(limits: Thresholds) -> Thresholds:
@@ -15,3 +29,141 @@ def opened_wide(limits: Thresholds) -> Thresholds:
     """
     limits = replace(limits, level=1.0 + 1e-9, smallest_gap=-1.0, shapeless=1.0)
     return replace(limits, worth=1e-9, places=1, closure=-math.inf, relevance=-math.inf, effects=1)
+
+
+@dataclass(frozen=True)
+class Rule:
+    """How a threshold follows from cases.
+
+    Attributes
+    ----------
+    statistic : callable
+        Of `finding.statistics` and the thresholds of the diagnosis; -inf where the case did not come to it.
+    words : str
+        What it is.
+    of : {'clean', 'effect'}
+        Cases whose quantile it is: clean recordings, or effects that were named right.
+    side : {'most', 'least'}
+        Whether these cases are to stay below the threshold or above it.
+    """
+
+    statistic: Callable[[Statistics, Thresholds], float]
+    words: str
+    of: Literal["clean", "effect"]
+    side: Literal["most", "least"]
+
+
+def _excess(said: Statistics, limits: Thresholds) -> float:
+    """chi2/n - 1 by which a residual counts as a gap, if it is significant at all."""
+    whole = said["chi2_per_dof"] - 1 if said["p_value"] < limits.level else -math.inf
+    along = (said["largest_channel"] or 1.0) - 1 if said["candidate"] < limits.level else -math.inf
+    return max(whole, along)
+
+
+def _of(name: str) -> Callable[[Statistics, Thresholds], float]:
+    return lambda said, limits: -math.inf if said.get(name) is None else float(said[name])
+
+
+RULES: Mapping[str, Rule] = {
+    "smallest_gap": Rule(_excess, "chi2/n - 1 of a significant residual", "clean", "most"),
+    "worth": Rule(_of("evidence"), "rise of the log evidence by the best place", "clean", "most"),
+    "closure": Rule(_of("closure_low"), "lower end of the closure by the best candidate", "clean", "most"),
+    "relevance": Rule(_of("fall"), "part of a held-out error that the best candidate takes away", "clean", "most"),
+    "explained": Rule(_of("explained"), "part of the smoother's explanation", "effect", "least"),
+    "carried_stds": Rule(_of("carried"), "standard deviations between recordings", "effect", "most"),
+}
+"""By the setting of `diagnosis` that they calibrate."""
+
+
+def conformal(
+    sample: Sequence[float], side: Literal["most", "least"], coverage: float = COVERAGE
+) -> tuple[float, float]:
+    """The value that a further case like those of the sample does not exceed (or fall below), and how surely.
+
+    Parameters
+    ----------
+    sample : sequence of float
+    side : {'most', 'least'}
+    coverage : float
+        Asked for.
+
+    Returns
+    -------
+    value, coverage : float
+        NaN and 0 without a sample; the extreme one and n/(n + 1) where there are too few for what is asked.
+    """
+    n = len(sample)
+    if not n:
+        return math.nan, 0.0
+    ordered = sorted(sample) if side == "most" else sorted(sample, reverse=True)
+    k = min(math.ceil((n + 1) * coverage - 1e-9), n)
+    return ordered[k - 1], k / (n + 1)
+
+
+def calibrate(
+    labels: Sequence[Label],
+    marks: Sequence[Mark],
+    answers: Sequence[Mapping[str, Any]],
+    limits: Thresholds = DEFAULTS,
+    coverage: float = COVERAGE,
+) -> dict[str, Any]:
+    """Quantiles by which thresholds can be set, and what each of them would do to the effects of the ensemble.
+
+    Parameters
+    ----------
+    labels : sequence of Label
+    marks : sequence of Mark
+        Of the same cases.
+    answers : sequence of mapping
+        `result` of each, with its `statistics`, and those with open thresholds (`open`) where no gap was seen.
+    limits : Thresholds
+        By which they were given.
+    coverage : float
+
+    Returns
+    -------
+    dict
+        `yid-calibration/1`.
+    """
+    cases = [
+        (label, mark, said, _opened(entry))
+        for label, mark, entry in zip(labels, marks, answers, strict=True)
+        if (said := entry["result"].get("statistics")) is not None
+    ]
+    found = {}
+    for name, rule in RULES.items():
+        clean = [rule.statistic(wide or said, limits) for label, _, said, wide in cases if label.category == "null"]
+        true = [
+            (mark.multiple, rule.statistic(said, limits))
+            for label, mark, said, _ in cases
+            if label.category == "single" and mark.right
+        ]
+        strange = [
+            rule.statistic(said, limits) for label, _, said, _ in cases if label.category in ("outside", "left_out")
+        ]
+        sample = clean if rule.of == "clean" else [value for _, value in true if value > -math.inf]
+        value, attained = conformal(sample, rule.side, coverage)
+        sizes = sorted({size for size, _ in true})
+        found[name] = {
+            "statistic": rule.words,
+            "of": rule.of,
+            "side": rule.side,
+            "cases": len(sample),
+            "coverage": attained,
+            "quantile": _number(value),
+            "setting": getattr(limits, name),
+            "sample": [_number(entry) for entry in sorted(sample)],
+            "effects_beyond": {f"{size:.3g}": proportion([x > value for s, x in true if s == size]) for size in sizes},
+            "strange_beyond": proportion([entry > value for entry in strange]),
+        }
+    return {"format": FORMAT, "asked": coverage, "thresholds": found}
+
+
+def _opened(answer: Mapping[str, Any]) -> Statistics | None:
+    """Statistics with open thresholds, where there are any."""
+    wide = answer.get("open")
+    return wide if wide is not None and "p_value" in wide else None
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -16,6 +16,8 @@ from yid_ocp.effects import EFFECTS
 
 FORMAT = "yid-blind/1"
 SORTS = tuple(SHARES)
+STRANGE = ("outside", "left_out")
+"""Sorts whose effect no candidate is."""
 VERDICTS = ("no_gap", "unknown", "insufficient_data", "effect", "confusable")
 
 
@@ -45,7 +47,7 @@ class Mark:
     z : mapping of str to float
         (estimate - truth)/std of the same parameters.
     p_value : float
-        Of the null test on the recordings that were estimated on.
+        Of the null test on the held-out recordings.
     """
 
     case: str
@@ -67,6 +69,11 @@ class Mark:
     experiment: str = ""
     z: Mapping[str, float] = field(default_factory=dict)
     p_value: float = math.nan
+
+    @property
+    def named(self) -> tuple[str, ...]:
+        """What the effect may be by the answer: the set that is not separable, or what was added first alone."""
+        return self.confusable or tuple(self.answer.split(" + ")[:1])
 
     @property
     def sort(self) -> str:
@@ -169,8 +176,8 @@ def score(marks: Sequence[Mark]) -> dict[str, Any]:
 
     singles = [m for m in marks if m.category == "single"]
     seen = [m for m in singles if m.gap]
-    named = [m for m in seen if m.confusable]
-    strange = [m for m in marks if m.category in ("outside", "left_out")]
+    named = [m for m in seen if m.answer != "-"]
+    strange = [m for m in marks if m.category in STRANGE]
     errors = [entry for m in singles for entry in m.errors.values()]
     relative = [m.closure / m.best for m in singles if m.best > 0 and math.isfinite(m.closure)]
     sizes = sorted({m.multiple for m in singles if math.isfinite(m.multiple)})
@@ -179,8 +186,9 @@ def score(marks: Sequence[Mark]) -> dict[str, Any]:
         "kind_first": [m.kind_first for m in seen],
         "kind_in_two": [m.kind_second for m in seen],
         "location_first": [m.location_first for m in seen],
-        "confusable_covers": [m.truth in m.confusable for m in named],
+        "sets_cover": [m.truth in m.named for m in named],
         "unknown_recall": [m.verdict == "unknown" for m in strange],
+        **{f"unknown_{sort}": [m.verdict == "unknown" for m in strange if m.category == sort] for sort in STRANGE},
         "unknown_location": [m.location_first for m in strange if m.gap],
         "pairs_right": [m.right for m in marks if m.category == "pair"],
         "interval_coverage": [inside for _, inside in errors],
@@ -189,18 +197,20 @@ def score(marks: Sequence[Mark]) -> dict[str, Any]:
     detected = {}
     for size in sizes:
         own = [m for m in singles if m.multiple == size]
-        detected[f"{size:.3g}"] = {"gap": proportion([m.gap for m in own]), "right": proportion([m.right for m in own])}
+        hits = {"gap": [m.gap for m in own], "first": [m.gap and m.kind_first for m in own]}
+        hits["right"] = [m.right for m in own]
+        detected[f"{size:.3g}"] = {name: proportion(said) for name, said in hits.items()}
     return {
         "format": FORMAT,
         "cases": len(marks),
         **{name: entry["rate"] for name, entry in intervals.items()},
         "intervals": intervals,
         "detection": {
-            size: {"cases": own["gap"]["of"], "gap": own["gap"]["rate"], "right": own["right"]["rate"]}
+            size: {"cases": own["gap"]["of"], **{name: entry["rate"] for name, entry in own.items()}}
             for size, own in detected.items()
         },
         "detection_intervals": detected,
-        "confusable_size": mean([len(m.confusable) for m in named]),
+        "set_size": mean([len(m.named) for m in named]),
         "closure_of_best": mean(relative),
         "parameter_error": None if not errors else float(np.median([e for e, _ in errors])),
         "seconds": mean([m.seconds for m in marks if math.isfinite(m.seconds)]),

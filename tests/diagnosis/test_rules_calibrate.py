@@ -1,0 +1,122 @@
+"""Thresholds as quantiles: conformal coverage, which cases count, what a threshold would do to the others."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from yid_ocp.diagnosis import Thresholds
+from yid_ocp.diagnosis.blind import Label, calibrate, mark, opened_wide
+from yid_ocp.diagnosis.blind.calibrate import RULES, conformal
+from yid_ocp.virtual.injected import InjectedEffect
+
+DAMPER = InjectedEffect("kelvin_voigt", "T1", {"tau": 0.05})
+
+
+@pytest.mark.parametrize(("n", "coverage"), [(19, 0.95), (39, 0.95), (59, 0.95), (9, 0.8)])
+def test_a_further_case_stays_below_the_quantile_as_often_as_is_said(n: int, coverage: float) -> None:
+    rng = np.random.default_rng(n)
+    kept = said = 0.0
+    for _ in range(3000):
+        *sample, another = rng.standard_exponential(n + 1)
+        value, said = conformal(sample, "most", coverage)
+        kept += another <= value
+    assert said >= coverage
+    assert kept / 3000 == pytest.approx(said, abs=0.015)
+
+
+def test_too_few_cases_promise_less() -> None:
+    assert conformal([3.0, 1.0, 2.0], "most") == (3.0, 0.75)
+    assert conformal([3.0, 1.0, 2.0], "least") == (1.0, 0.75)
+    value, coverage = conformal([], "most")
+    assert (math.isnan(value), coverage) == (True, 0.0)
+    # of forty the second largest is enough, of nineteen the largest
+    assert conformal(list(range(40)), "most") == (38, 39 / 41)
+    assert conformal(list(range(40)), "least") == (1, 39 / 41)
+
+
+STATISTICS = {
+    "p_value": 1.0,
+    "chi2_per_dof": 1.0,
+    "largest_channel": 1.0,
+    "candidate": 1.0,
+    "evidence": None,
+    "closure_low": None,
+    "fall": None,
+    "explained": None,
+    "carried": None,
+}
+
+
+def case(category: str, verdict: str, *effects: InjectedEffect, multiple: float | None = None, **said: Any) -> Any:
+    label = Label("case_000", category, effects, multiple, {})
+    named = [{"kind": effect.kind, "location": effect.location} for effect in effects] if verdict == "effect" else []
+    result = {
+        "verdict": verdict,
+        "effects": named,
+        "which": [{**entry, "parameters": {}} for entry in named],
+        "where": [],
+        "confusable": [],
+        "gap": {"closure": None},
+        "statistics": STATISTICS | said.pop("statistics", {}),
+    }
+    return label, mark(label, result), {"result": result, **said}
+
+
+def calibrated(*cases: Any) -> dict[str, Any]:
+    labels, marks, answers = zip(*cases, strict=True)
+    return json.loads(json.dumps(calibrate(labels, marks, answers)))["thresholds"]
+
+
+def test_clean_recordings_set_what_chance_may_reach() -> None:
+    clean = [
+        case("null", "no_gap", open=STATISTICS | {"p_value": 1e-3, "chi2_per_dof": 1.04, "evidence": 2.0}),
+        case("null", "no_gap", statistics={"p_value": 0.2, "chi2_per_dof": 1.3}, open={"message": "it did not run"}),
+        # a false alarm counts with what it was decided by
+        case("null", "unknown", statistics={"p_value": 1e-9, "chi2_per_dof": 1.2, "evidence": 7.0}),
+        case("null", "no_gap", open=STATISTICS | {"candidate": 1e-3, "largest_channel": 1.15, "closure_low": -0.1}),
+    ]
+    effects = [
+        case("single", "effect", DAMPER, multiple=size, statistics={"evidence": 10.0 * size, "explained": 0.9})
+        for size in (0.1, 1.0)
+    ]
+    strange = [case("left_out", "unknown", DAMPER, statistics={"evidence": 6.0})]
+    found = calibrated(*clean, *effects, *strange)
+    evidence = found["worth"]
+    assert (evidence["quantile"], evidence["coverage"], evidence["cases"]) == (7.0, 0.8, 4)
+    assert evidence["sample"] == [None, None, 2.0, 7.0]
+    assert {size: entry["count"] for size, entry in evidence["effects_beyond"].items()} == {"0.1": 0, "1": 1}
+    assert (evidence["strange_beyond"]["count"], evidence["strange_beyond"]["of"]) == (0, 1)
+    assert evidence["setting"] == Thresholds().worth
+    # a residual that is not significant is none, however large; along a candidate the worst channel counts
+    assert found["smallest_gap"]["sample"][-3:] == [pytest.approx(0.04), pytest.approx(0.15), pytest.approx(0.2)]
+    assert found["closure"]["quantile"] == -0.1
+
+
+def test_effects_that_were_named_right_set_what_must_be_explained() -> None:
+    named = [case("single", "effect", DAMPER, multiple=3.0, statistics={"explained": x}) for x in (0.8, 0.97, 1.0)]
+    missed = [case("single", "unknown", DAMPER, multiple=3.0, statistics={"explained": 0.1})]
+    strange = [case("outside", "effect", DAMPER, statistics={"explained": x}) for x in (0.3, 0.99)]
+    found = calibrated(*named, *missed, *strange)["explained"]
+    assert (found["quantile"], found["cases"], found["side"]) == (0.8, 3, "least")
+    assert found["strange_beyond"]["count"] == 1
+
+
+def test_cases_that_could_not_be_fitted_do_not_count() -> None:
+    label, told, answer = case("null", "insufficient_data")
+    del answer["result"]["statistics"]
+    found = calibrated((label, told, answer))
+    assert {entry["cases"] for entry in found.values()} == {0}
+    assert {entry["quantile"] for entry in found.values()} == {None}
+
+
+def test_every_rule_is_of_a_threshold() -> None:
+    for name in RULES:
+        assert hasattr(Thresholds(), name)
+    wide = opened_wide(Thresholds(refits=3))
+    assert wide.refits == 3
+    assert wide.level > 1 > Thresholds().level
