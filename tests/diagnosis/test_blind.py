@@ -93,8 +93,8 @@ def test_rates_count_what_they_say():
     ]
     found = score(marks)
     assert found["false_alarms"] == 0.5
-    assert found["detection"]["10"] == {"cases": 1, "gap": 1.0, "right": 1.0}
-    assert found["detection"]["1"] == {"cases": 1, "gap": 0.0, "right": 0.0}
+    assert found["detection"]["10"] == {"cases": 1, "gap": 1.0, "first": 1.0, "right": 1.0}
+    assert found["detection"]["1"] == {"cases": 1, "gap": 0.0, "first": 0.0, "right": 0.0}
     assert found["unknown_recall"] == 1.0
     assert found["unknown_location"] == 0.0
     assert found["closure_of_best"] == pytest.approx(0.8)

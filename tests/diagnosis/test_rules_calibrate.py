@@ -92,8 +92,9 @@ def test_clean_recordings_set_what_chance_may_reach() -> None:
     assert {size: entry["count"] for size, entry in evidence["effects_beyond"].items()} == {"0.1": 0, "1": 1}
     assert (evidence["strange_beyond"]["count"], evidence["strange_beyond"]["of"]) == (0, 1)
     assert evidence["setting"] == Thresholds().worth
-    # a residual that is not significant is none, however large; along a candidate the worst channel counts
-    assert found["smallest_gap"]["sample"][-3:] == [pytest.approx(0.04), pytest.approx(0.15), pytest.approx(0.2)]
+    # a residual that is not significant is none, however large
+    assert found["smallest_gap"]["sample"][-2:] == [pytest.approx(0.04), pytest.approx(0.2)]
+    assert found["smallest_channel"]["sample"] == [None, None, None, pytest.approx(0.15)]
     assert found["closure"]["quantile"] == -0.1
 
 

@@ -14,6 +14,7 @@ from yid_ocp.diagnosis import select
 from yid_ocp.diagnosis.refit import Loss, Search
 from yid_ocp.diagnosis.screening import Screened
 from yid_ocp.diagnosis.select import (
+    behind,
     closure,
     compose,
     far_likelier,
@@ -539,6 +540,20 @@ def test_an_effect_far_less_likely_than_the_best_is_not_within_reach():
     assert within_reach([one, other]) == [one]
     near = fit([effect("other@elbow")], loss(0.98, 1.0))
     assert within_reach([one, near]) == [one, near]
+
+
+def test_all_recordings_tell_which_effects_are_within_reach():
+    one = fit([effect("one@elbow")], loss(0.99, 1.0), cost=100.0)
+    # 2 more in held-out squares, and twice the cost: 12 in all, where 10 are worth a word
+    assert within_reach([one, fit([effect("other@elbow")], loss(1.01, 1.0), cost=105.0)]) == [one]
+    assert len(within_reach([one, fit([effect("other@elbow")], loss(1.01, 1.0), cost=103.9)])) == 2
+    # a parameter more is worth one by chance
+    two = fit([effect("two@elbow", amplitude("a"), amplitude("b"))], loss(0.99, 1.0), cost=100.0)
+    assert len(within_reach([two, fit([effect("other@elbow")], loss(1.01, 1.0), cost=104.4)])) == 2
+    assert behind(fit([effect("other@elbow")], loss(1.01, 1.0), cost=104.4), two) == pytest.approx(9.8)
+    # where more than noise is left, squares are errors of the model
+    rough = fit([effect("one@elbow")], loss(1.19, 1.2), cost=100.0)
+    assert len(within_reach([rough, fit([effect("other@elbow")], loss(1.2, 1.2), cost=130.0)])) == 2
 
 
 def test_nothing_is_added_where_no_refit_succeeds(monkeypatch):

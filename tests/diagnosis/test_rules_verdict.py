@@ -65,8 +65,8 @@ def test_a_gap_is_sure_and_worth_a_name(before, held_out, gap):
         ((0.9, 0.001, 0.9, 0.9), {"a": 1.2}, {"a": 1.0}, True),
         ((0.9, 0.003, 0.9, 0.9), {"a": 1.2}, {"a": 1.0}, False),
         ((0.01,), {"a": 1.2}, {"a": 1.2}, False),
-        ((0.001,), {"a": 1.09}, {"a": 1.05}, False),
-        ((0.001,), {"a": 1.1}, {"a": 1.1}, False),
+        ((0.001,), {"a": 1.02}, {"a": 1.01}, False),
+        ((0.001,), {"a": 1.03}, {"a": 0.9}, False),
         ((0.001,), {}, {}, False),
         ((), {"a": 1.2}, {"a": 1.2}, False),
     ],
@@ -78,14 +78,14 @@ def test_a_gap_is_sure_and_worth_a_name(before, held_out, gap):
         "not the best of four tries",
         "at the level",
         "no channel above noise",
-        "channels at the smallest gap",
+        "channels at the smallest excess",
         "no channel",
         "no candidate",
     ],
 )
 def test_a_gap_along_a_candidate_needs_a_channel_above_noise(p_values, before, held_out, gap):
     tests = [outcome(channels=channels) for channels in (before, held_out)]
-    assert has_gap(*tests, LIMITS, scored(*p_values)) is gap
+    assert has_gap(*tests, Thresholds(smallest_channel=0.03), scored(*p_values)) is gap
 
 
 @pytest.mark.parametrize(
@@ -108,7 +108,7 @@ def test_the_level_and_the_smallest_gap_are_thresholds():
     assert has_gap(*tests, Thresholds(level=0.05))
     assert not has_gap(*tests, Thresholds(level=0.05, smallest_gap=0.3))
     assert has_gap(outcome(), outcome(chi2=1.2), Thresholds(level=0.05), scored(0.03))
-    assert not has_gap(outcome(), outcome(chi2=1.2), Thresholds(level=0.05, smallest_gap=0.3), scored(0.03))
+    assert not has_gap(outcome(), outcome(chi2=1.2), Thresholds(level=0.05, smallest_channel=0.3), scored(0.03))
 
 
 # -- is it chance -----------------------------------------------------------------------------------------------------

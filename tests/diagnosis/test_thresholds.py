@@ -69,7 +69,11 @@ def test_too_few_samples_by_another_measure(bench):
 
 @pytest.mark.parametrize(
     ("limits", "verdict"),
-    [({"closure": 0.999}, "unknown"), ({"smallest_gap": 1e3}, "no_gap"), ({"effects": 1}, "effect")],
+    [
+        ({"closure": 0.999}, "unknown"),
+        ({"smallest_gap": 1e3, "smallest_channel": 1e3}, "no_gap"),
+        ({"effects": 1}, "effect"),
+    ],
 )
 def test_a_verdict_goes_by_its_thresholds(bench, limits, verdict):
     assert found(bench, **limits).verdict == verdict

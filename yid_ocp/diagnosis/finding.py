@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +15,7 @@ from yid_ocp.diagnosis.hypotheses import Cut
 from yid_ocp.diagnosis.localise import Place
 from yid_ocp.diagnosis.refit import Fit
 from yid_ocp.diagnosis.screening import Confusability, Score, Visibility
-from yid_ocp.diagnosis.select import Added, Closure, closure, fall
+from yid_ocp.diagnosis.select import Added, Closure, behind, closure, fall, gain
 from yid_ocp.diagnosis.smoother import Smoothed
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import Reason, assumptions, best_of
@@ -243,7 +243,8 @@ def statistics(finding: Finding) -> dict[str, Any]:
         offsets and biases raise the log evidence by), `closure` and `closure_low` (held out, of all that was added,
         accepted or not), `fall` (part of the held-out error that they take away), `explained` (over what the smoother
         explains), `assumptions`, `carried` (standard deviations between the values found and those on the held-out
-        recordings, at most).
+        recordings, at most), `behind` (of every effect that was refitted alone, how far it is behind the first: in
+        held-out chi2/n with its standard error, and in r'r of all recordings).
     """
     tests = (finding.before, finding.held_out_before)
     apart = [
@@ -265,7 +266,18 @@ def statistics(finding: Finding) -> dict[str, Any]:
         "assumptions": assumptions(added),
         "carried": max(apart, default=None),
     }
-    return {name: None if value is None or not math.isfinite(value) else value for name, value in found.items()}
+    said: dict[str, Any] = {name: None if value is None else _number(value) for name, value in found.items()}
+    return said | {"behind": _behind(finding.fits)}
+
+
+def _behind(fits: Sequence[Fit]) -> dict[str, Any]:
+    """How far each of several fits is behind the first."""
+    found = {}
+    for fit in fits:
+        lost, error = gain(fit.loss, fits[0].loss)
+        figures = {"chi2_per_dof": lost, "error": error, "squares": behind(fit, fits[0])}
+        found[fit.effects[-1].label] = {name: _number(value) for name, value in figures.items()}
+    return found
 
 
 def model_result(finding: Finding) -> dict[str, Any]:

@@ -112,7 +112,7 @@ def within_reach(fits: Sequence[Fit], limits: Thresholds = DEFAULTS) -> list[Fit
     near = []
     for fit in fits:
         lost, error = gain(fit.loss, best.loss)
-        apart = far_likelier(fit.loss, best.loss, limits)
+        apart = less_likely(fit, best, limits)
         if (
             fit is best
             or (lost <= max(error, limits.tie * best.loss.mean) and not apart)
@@ -124,6 +124,24 @@ def within_reach(fits: Sequence[Fit], limits: Thresholds = DEFAULTS) -> list[Fit
         return bool(fit.effects) and oversized(fit.effects[-1], fit.values, limits), fit.size, fit.loss.mean
 
     return sorted(near, key=order)
+
+
+def less_likely(fit: Fit, best: Fit, limits: Thresholds = DEFAULTS) -> bool:
+    """Whether all recordings are less likely with a fit than with the best by the odds of `worth`; see `behind`.
+
+    Where more than noise is left, squares count errors of the model, and their differences say little.
+    """
+    noise = max(fit.loss.mean, best.loss.mean) < 1 + limits.smallest_gap
+    return noise and behind(fit, best) > 2 * limits.worth
+
+
+def behind(fit: Fit, best: Fit) -> float:
+    """By how much r'r of all recordings, fitted and held out, exceeds that of another fit.
+
+    Parameters that the other has more than this one count with what chance gives each of them.
+    """
+    held = np.sum(fit.loss.squares) + fit.loss.known - np.sum(best.loss.squares) - best.loss.known
+    return float(held) + 2 * (fit.cost - best.cost) - max(best.size - fit.size, 0)
 
 
 def _likely(fit: Fit, limits: Thresholds) -> bool:

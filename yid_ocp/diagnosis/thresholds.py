@@ -21,6 +21,8 @@ class Thresholds:
         Significance below which a residual is more than noise.
     smallest_gap : float
         chi2/n - 1 below which a gap is not worth a name, however sure.
+    smallest_channel : float
+        chi2/n - 1 of the worst channel below which what a candidate would surely mend is not worth a name.
     shapeless : float
         Part of the significance level that an excess without any shape has to reach.
     samples_per_unknown : float
@@ -102,6 +104,7 @@ class Thresholds:
     smallest_gap: Annotated[float, Ge(0), About("chi2/n - 1 below which a gap is not worth a name")] = (
         USUAL.smallest_gap
     )
+    smallest_channel: Annotated[float, Ge(0), About("the same of the worst channel, where a candidate mends it")] = 0.02
     shapeless: Annotated[float, Gt(0), Le(1), About("part of the level that an excess without shape must reach")] = 0.01
     samples_per_unknown: Annotated[float, Gt(0), About("effective samples needed for every unknown")] = 3.0
     window: Annotated[float, Gt(0), About("length of the windows of the residual", "s")] = WINDOW

@@ -41,7 +41,7 @@ def has_gap(
         return True
     best = best_of(ranked)
     largest = max((*before.channels.values(), *held_out.channels.values()), default=1.0)
-    return best < limits.level and largest > 1 + limits.smallest_gap
+    return best < limits.level and largest > 1 + limits.smallest_channel
 
 
 def shapeless(

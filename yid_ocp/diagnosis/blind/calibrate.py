@@ -27,7 +27,7 @@ def opened_wide(limits: Thresholds) -> Thresholds:
 
     A diagnosis of clean recordings with these shows how far chance alone goes.
     """
-    limits = replace(limits, level=1.0 + 1e-9, smallest_gap=-1.0, shapeless=1.0)
+    limits = replace(limits, level=1.0 + 1e-9, smallest_gap=-1.0, smallest_channel=-1.0, shapeless=1.0)
     return replace(limits, worth=1e-9, places=1, closure=-math.inf, relevance=-math.inf, effects=1)
 
 
@@ -55,9 +55,12 @@ class Rule:
 
 def _excess(said: Statistics, limits: Thresholds) -> float:
     """chi2/n - 1 by which a residual counts as a gap, if it is significant at all."""
-    whole = said["chi2_per_dof"] - 1 if said["p_value"] < limits.level else -math.inf
-    along = (said["largest_channel"] or 1.0) - 1 if said["candidate"] < limits.level else -math.inf
-    return max(whole, along)
+    return float(said["chi2_per_dof"]) - 1 if said["p_value"] < limits.level else -math.inf
+
+
+def _along(said: Statistics, limits: Thresholds) -> float:
+    """That of the worst channel, if any candidate is significant."""
+    return (said["largest_channel"] or 1.0) - 1 if said["candidate"] < limits.level else -math.inf
 
 
 def _of(name: str) -> Callable[[Statistics, Thresholds], float]:
@@ -66,6 +69,7 @@ def _of(name: str) -> Callable[[Statistics, Thresholds], float]:
 
 RULES: Mapping[str, Rule] = {
     "smallest_gap": Rule(_excess, "chi2/n - 1 of a significant residual", "clean", "most"),
+    "smallest_channel": Rule(_along, "that of the worst channel, along a significant candidate", "clean", "most"),
     "worth": Rule(_of("evidence"), "rise of the log evidence by the best place", "clean", "most"),
     "closure": Rule(_of("closure_low"), "lower end of the closure by the best candidate", "clean", "most"),
     "relevance": Rule(_of("fall"), "part of a held-out error that the best candidate takes away", "clean", "most"),

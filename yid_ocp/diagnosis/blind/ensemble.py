@@ -276,6 +276,8 @@ class Ensemble:
         effects = chosen_effects(problem.system, clean, self._candidates)
         composed = CandidateProblem.of(problem, effects, [self.record(self.truth(rng), (), rng, "other")])
         nominal = nominal_fit(problem, composed, limits=self._limits)
+        # weighted by all noise, that of torques too
+        composed = replace(composed, problem=nominal.problem)
         return linearise(composed, (), nominal.values, self._limits.shape_values)
 
     @property
