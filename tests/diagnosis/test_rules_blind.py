@@ -15,6 +15,7 @@ from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.diagnosis.blind import Conditions, Ensemble, Label, Planned, finer_values, planned
 from yid_ocp.diagnosis.blind import ensemble as module
 from yid_ocp.diagnosis.blind.ensemble import OUTSIDE_SIZES, Detectable
+from yid_ocp.diagnosis.hypotheses import CandidateProblem
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.virtual.engine import Simulation
@@ -116,6 +117,17 @@ def test_what_cannot_be_simulated_is_refused(drawn, given, words):
     with pytest.raises(ConfigError, match=words):
         drawn(**given)
     drawn(seed=0)
+
+
+def test_what_is_detectable_counts_the_noise_of_torques(drawn, monkeypatch):
+    ensemble = drawn()
+    composed = CandidateProblem("by the sensors", (DAMPER,), False)
+    monkeypatch.setattr(ensemble, "of", lambda recordings: SimpleNamespace(system="system"))
+    monkeypatch.setattr(module, "CandidateProblem", SimpleNamespace(of=lambda *_: composed))
+    weighted = SimpleNamespace(problem="by all noise", values={"k": 1.0})
+    monkeypatch.setattr(module, "nominal_fit", lambda *_, limits: weighted)
+    monkeypatch.setattr(module, "linearise", lambda of, base, values, grid: of)
+    assert ensemble.point() == replace(composed, problem="by all noise")
 
 
 def test_the_truth_is_spread_about_the_start(drawn):

@@ -49,6 +49,7 @@ STATISTICS = {
     "fall": None,
     "explained": None,
     "carried": None,
+    "behind": {},
 }
 
 
@@ -105,6 +106,21 @@ def test_effects_that_were_named_right_set_what_must_be_explained() -> None:
     found = calibrated(*named, *missed, *strange)["explained"]
     assert (found["quantile"], found["cases"], found["side"]) == (0.8, 3, "least")
     assert found["strange_beyond"]["count"] == 1
+
+
+def test_a_tie_is_what_the_truth_may_be_behind() -> None:
+    def behind(**lost: float | None) -> Any:
+        said = {label.replace("_at_", "@"): {"chi2_per_dof": value} for label, value in lost.items()}
+        return case("single", "unknown", DAMPER, multiple=3.0, statistics={"behind": said})
+
+    cases = [
+        behind(a_at_b=0.0, kelvin_voigt_at_T1=0.02, c_at_d=-0.01),
+        behind(kelvin_voigt_at_T1=0.0, c_at_d=0.5),
+        behind(a_at_b=0.0),
+        behind(a_at_b=0.0, kelvin_voigt_at_T1=None),
+    ]
+    found = calibrated(*cases)["tie"]
+    assert found["sample"] == [0.0, pytest.approx(0.03)], "also where it was not named"
 
 
 def test_cases_that_could_not_be_fitted_do_not_count() -> None:

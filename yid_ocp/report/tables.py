@@ -246,7 +246,7 @@ def _threshold_rows(calibration: Mapping[str, Any], rate: Callable[[Mapping[str,
     rows: Rows = [("diagnosis.", "is", "quantile", "coverage", "of", "effects beyond it, by size", "strange ones")]
     for name, own in calibration["thresholds"].items():
         value = "-" if own["quantile"] is None else f"{own['quantile']:.3g}"
-        kind = {"clean": "clean recordings", "effect": "effects named right"}[own["of"]]
+        kind = {"clean": "clean recordings", "named": "effects named right", "refitted": "effects refitted"}[own["of"]]
         sizes = ", ".join(f"{size}: {rate(found)}" for size, found in own["effects_beyond"].items())
         cells = (f"{own['setting']:.3g}", value, f"{100 * own['coverage']:.0f} %", f"{own['cases']} {kind}")
         rows.append((name, *cells, sizes or "-", rate(own["strange_beyond"])))

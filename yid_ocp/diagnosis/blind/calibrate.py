@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from yid_ocp.diagnosis.blind.ensemble import Label
-from yid_ocp.diagnosis.blind.score import Mark, proportion
+from yid_ocp.diagnosis.blind.score import STRANGE, Mark, proportion
 from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
 
 FORMAT = "yid-calibration/1"
@@ -38,33 +38,41 @@ class Rule:
     Attributes
     ----------
     statistic : callable
-        Of `finding.statistics` and the thresholds of the diagnosis; -inf where the case did not come to it.
+        Of `finding.statistics`, the thresholds of the diagnosis and the true effect's label; -inf where the case did not
+        come to it.
     words : str
         What it is.
-    of : {'clean', 'effect'}
-        Cases whose quantile it is: clean recordings, or effects that were named right.
+    of : {'clean', 'named', 'refitted'}
+        Cases whose quantile it is: clean recordings, single effects that were named right, or those that were refitted.
     side : {'most', 'least'}
         Whether these cases are to stay below the threshold or above it.
     """
 
-    statistic: Callable[[Statistics, Thresholds], float]
+    statistic: Callable[[Statistics, Thresholds, str], float]
     words: str
-    of: Literal["clean", "effect"]
+    of: Literal["clean", "named", "refitted"]
     side: Literal["most", "least"]
 
 
-def _excess(said: Statistics, limits: Thresholds) -> float:
+def _excess(said: Statistics, limits: Thresholds, _: str) -> float:
     """chi2/n - 1 by which a residual counts as a gap, if it is significant at all."""
     return float(said["chi2_per_dof"]) - 1 if said["p_value"] < limits.level else -math.inf
 
 
-def _along(said: Statistics, limits: Thresholds) -> float:
+def _along(said: Statistics, limits: Thresholds, _: str) -> float:
     """That of the worst channel, if any candidate is significant."""
     return (said["largest_channel"] or 1.0) - 1 if said["candidate"] < limits.level else -math.inf
 
 
-def _of(name: str) -> Callable[[Statistics, Thresholds], float]:
-    return lambda said, limits: -math.inf if said.get(name) is None else float(said[name])
+def _of(name: str) -> Callable[[Statistics, Thresholds, str], float]:
+    return lambda said, limits, truth: -math.inf if said.get(name) is None else float(said[name])
+
+
+def _lost(said: Statistics, _: Thresholds, truth: str) -> float:
+    """Held-out chi2/n by which the true effect alone is behind the best one alone."""
+    lost = {label: entry["chi2_per_dof"] for label, entry in said["behind"].items()}
+    known = [value for value in lost.values() if value is not None]
+    return -math.inf if lost.get(truth) is None else max(lost[truth] - min(known), 0.0)
 
 
 RULES: Mapping[str, Rule] = {
@@ -73,8 +81,9 @@ RULES: Mapping[str, Rule] = {
     "worth": Rule(_of("evidence"), "rise of the log evidence by the best place", "clean", "most"),
     "closure": Rule(_of("closure_low"), "lower end of the closure by the best candidate", "clean", "most"),
     "relevance": Rule(_of("fall"), "part of a held-out error that the best candidate takes away", "clean", "most"),
-    "explained": Rule(_of("explained"), "part of the smoother's explanation", "effect", "least"),
-    "carried_stds": Rule(_of("carried"), "standard deviations between recordings", "effect", "most"),
+    "explained": Rule(_of("explained"), "part of the smoother's explanation", "named", "least"),
+    "carried_stds": Rule(_of("carried"), "standard deviations between recordings", "named", "most"),
+    "tie": Rule(_lost, "held-out chi2/n by which the truth is behind the best effect", "refitted", "most"),
 }
 """By the setting of `diagnosis` that they calibrate."""
 
@@ -136,15 +145,13 @@ def calibrate(
     ]
     found = {}
     for name, rule in RULES.items():
-        clean = [rule.statistic(wide or said, limits) for label, _, said, wide in cases if label.category == "null"]
+        clean = [rule.statistic(wide or said, limits, "") for label, _, said, wide in cases if label.category == "null"]
         true = [
-            (mark.multiple, rule.statistic(said, limits))
+            (mark.multiple, rule.statistic(said, limits, mark.truth))
             for label, mark, said, _ in cases
-            if label.category == "single" and mark.right
+            if label.category == "single" and (mark.right or rule.of != "named")
         ]
-        strange = [
-            rule.statistic(said, limits) for label, _, said, _ in cases if label.category in ("outside", "left_out")
-        ]
+        strange = [rule.statistic(said, limits, "") for label, _, said, _ in cases if label.category in STRANGE]
         sample = clean if rule.of == "clean" else [value for _, value in true if value > -math.inf]
         value, attained = conformal(sample, rule.side, coverage)
         sizes = sorted({size for size, _ in true})
