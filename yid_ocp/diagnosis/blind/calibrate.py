@@ -38,8 +38,8 @@ class Rule:
     Attributes
     ----------
     statistic : callable
-        Of `finding.statistics`, the thresholds of the diagnosis and the true effect's label; -inf where the case did not
-        come to it.
+        Of `finding.statistics`, the thresholds of the diagnosis and the true effect's label; -inf where the case did
+        not come to it.
     words : str
         What it is.
     of : {'clean', 'named', 'refitted'}
