@@ -70,7 +70,7 @@ def case(category: str, verdict: str, *effects: InjectedEffect, multiple: float 
 
 def calibrated(*cases: Any) -> dict[str, Any]:
     labels, marks, answers = zip(*cases, strict=True)
-    return json.loads(json.dumps(calibrate(labels, marks, answers)))["thresholds"]
+    return json.loads(json.dumps(calibrate(labels, marks, answers)))["rules"]
 
 
 def test_clean_recordings_set_what_chance_may_reach() -> None:
@@ -87,15 +87,15 @@ def test_clean_recordings_set_what_chance_may_reach() -> None:
     ]
     strange = [case("left_out", "unknown", DAMPER, statistics={"evidence": 6.0})]
     found = calibrated(*clean, *effects, *strange)
-    evidence = found["worth"]
+    evidence = found["evidence"]
     assert (evidence["quantile"], evidence["coverage"], evidence["cases"]) == (7.0, 0.8, 4)
     assert evidence["sample"] == [None, None, 2.0, 7.0]
     assert {size: entry["count"] for size, entry in evidence["effects_beyond"].items()} == {"0.1": 0, "1": 1}
     assert (evidence["strange_beyond"]["count"], evidence["strange_beyond"]["of"]) == (0, 1)
-    assert evidence["setting"] == Thresholds().worth
+    assert evidence["is"] == Thresholds().worth
     # a residual that is not significant is none, however large
-    assert found["smallest_gap"]["sample"][-2:] == [pytest.approx(0.04), pytest.approx(0.2)]
-    assert found["smallest_channel"]["sample"] == [None, None, None, pytest.approx(0.15)]
+    assert found["gap"]["sample"][-2:] == [pytest.approx(0.04), pytest.approx(0.2)]
+    assert found["channel"]["sample"] == [None, None, None, pytest.approx(0.15)]
     assert found["closure"]["quantile"] == -0.1
 
 
@@ -110,7 +110,7 @@ def test_effects_that_were_named_right_set_what_must_be_explained() -> None:
 
 def test_a_tie_is_what_the_truth_may_be_behind() -> None:
     def behind(**lost: float | None) -> Any:
-        said = {label.replace("_at_", "@"): {"chi2_per_dof": value} for label, value in lost.items()}
+        said = {label.replace("_at_", "@"): {"chi2_per_dof": x, "squares": x} for label, x in lost.items()}
         return case("single", "unknown", DAMPER, multiple=3.0, statistics={"behind": said})
 
     cases = [
@@ -123,6 +123,34 @@ def test_a_tie_is_what_the_truth_may_be_behind() -> None:
     assert found["sample"] == [0.0, pytest.approx(0.03)], "also where it was not named"
 
 
+@pytest.mark.parametrize(
+    ("evidence", "explained", "worth", "asked"),
+    [
+        # what chance reaches, and what effects reach, outwards to two digits
+        (7.123, 0.7089, 7.2, 0.7),
+        # but no less than what is worth a name, nor more than anybody asks
+        (1.0, 0.99, 5.0, 0.75),
+        (None, None, 5.0, 0.75),
+    ],
+)
+def test_settings_are_quantiles_within_what_is_of_use(
+    evidence: float | None, explained: float | None, worth: float, asked: float
+) -> None:
+    clean = case("null", "no_gap", open=STATISTICS | {"evidence": evidence})
+    named = case("single", "effect", DAMPER, multiple=3.0, statistics={"explained": explained})
+    labels, marks, answers = zip(clean, named, strict=True)
+    settings = calibrate(labels, marks, answers)["settings"]
+    assert (settings["worth"], settings["explained"]) == (worth, asked)
+
+
+def test_of_two_rules_for_one_setting_the_wider_counts() -> None:
+    clean = case("null", "no_gap", open=STATISTICS | {"evidence": 6.0})
+    behind = {"a@b": {"chi2_per_dof": 0.0, "squares": -4.0}, "kelvin_voigt@T1": {"chi2_per_dof": 0.0, "squares": 14.0}}
+    true = case("single", "effect", DAMPER, multiple=3.0, statistics={"behind": behind})
+    labels, marks, answers = zip(clean, true, strict=True)
+    assert calibrate(labels, marks, answers)["settings"]["worth"] == 9.0
+
+
 def test_cases_that_could_not_be_fitted_do_not_count() -> None:
     label, told, answer = case("null", "insufficient_data")
     del answer["result"]["statistics"]
@@ -132,8 +160,8 @@ def test_cases_that_could_not_be_fitted_do_not_count() -> None:
 
 
 def test_every_rule_is_of_a_threshold() -> None:
-    for name in RULES:
-        assert hasattr(Thresholds(), name)
+    for rule in RULES.values():
+        assert hasattr(Thresholds(), rule.setting)
     wide = opened_wide(Thresholds(refits=3))
     assert wide.refits == 3
     assert wide.level > 1 > Thresholds().level

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -551,6 +552,11 @@ def test_all_recordings_tell_which_effects_are_within_reach():
     two = fit([effect("two@elbow", amplitude("a"), amplitude("b"))], loss(0.99, 1.0), cost=100.0)
     assert len(within_reach([two, fit([effect("other@elbow")], loss(1.01, 1.0), cost=104.4)])) == 2
     assert behind(fit([effect("other@elbow")], loss(1.01, 1.0), cost=104.4), two) == pytest.approx(9.8)
+    # chance lets another be the best on what is held out, by less than a standard error
+    ahead, true = fit([effect("ahead@elbow")], loss(0.9, 1.0), cost=130.0), fit([effect("true@elbow")], loss(1.0, 0.95))
+    assert within_reach([ahead, replace(true, cost=100.0)]) == [replace(true, cost=100.0)]
+    both = within_reach([ahead, replace(true, cost=127.0)])
+    assert [entry.effects[0].kind for entry in both] == ["true", "ahead"], "the likelier first"
     # where more than noise is left, squares are errors of the model
     rough = fit([effect("one@elbow")], loss(1.19, 1.2), cost=100.0)
     assert len(within_reach([rough, fit([effect("other@elbow")], loss(1.2, 1.2), cost=130.0)])) == 2

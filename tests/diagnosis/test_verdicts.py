@@ -117,6 +117,14 @@ def test_a_withheld_effect_is_named_placed_and_measured(bench):
     low, high = result["gap"]["closure_ci"]
     assert 0.9 < low <= result["gap"]["closure"] <= high + 1e-12
     assert result["gap"]["after"]["chi2_per_dof"] < 1.1 < result["gap"]["before"]["chi2_per_dof"]
+    told = result["statistics"]
+    assert (told["closure_low"], told["assumptions"]) == (low, 1)
+    assert told["explained"] == finding.explained > 0.9
+    assert told["candidate"] <= len(FRICTION) * result["which"][0]["p_value"]
+    assert told["behind"]["joint_coulomb@elbow"] == {"chi2_per_dof": 0.0, "error": 0.0, "squares": 0.0}
+    assert min(entry["squares"] for entry in told["behind"].values()) == 0.0, "no other is as likely"
+    [apart] = finding.carried
+    assert told["carried"] == pytest.approx(abs(apart.value - apart.again) / np.hypot(apart.std, apart.again_std))
     damping = next(entry for entry in finding.absorbed if entry.name == "elbow.damping")
     assert damping.before > damping.after, "friction hides in the damping until it is named"
     assert "joint_coulomb@elbow with tau_c" in result["summary"]
@@ -128,6 +136,9 @@ def test_a_model_that_is_right_has_no_gap(bench):
     assert result["effects"] == []
     assert result["gap"]["closure"] is None
     assert result["gap"]["before"] == result["gap"]["after"]
+    told = result["statistics"]
+    assert told["p_value"] > 0.01
+    assert {told[name] for name in ("closure", "fall", "explained", "carried", "evidence")} == {None}
 
 
 def test_one_recording_is_split_in_blocks_and_the_report_says_so(bench):

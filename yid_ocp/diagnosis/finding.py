@@ -240,11 +240,12 @@ def statistics(finding: Finding) -> dict[str, Any]:
     dict
         `p_value` and `chi2_per_dof` of the null test (of both residuals together), `largest_channel` (chi2/n of the
         worst channel), `candidate` (p-value of the best, as the best of so many), `evidence` (what unknown forces,
-        offsets and biases raise the log evidence by), `closure` and `closure_low` (held out, of all that was added,
-        accepted or not), `fall` (part of the held-out error that they take away), `explained` (over what the smoother
-        explains), `assumptions`, `carried` (standard deviations between the values found and those on the held-out
-        recordings, at most), `behind` (of every effect that was refitted alone, how far it is behind the first: in
-        held-out chi2/n with its standard error, and in r'r of all recordings).
+        offsets and biases raise the log evidence by; not where noise that drives the motion is among them), `closure`
+        and `closure_low` (held out, of all that was added, accepted or not), `fall` (part of the held-out error that
+        they take away), `explained` (over what the smoother explains), `assumptions`, `carried` (standard deviations
+        between the values found and those on the held-out recordings, at most), `behind` (of every effect that was
+        refitted alone, how far it is behind the first: in held-out chi2/n with its standard error, and in r'r of all
+        recordings).
     """
     tests = (finding.before, finding.held_out_before)
     apart = [
@@ -252,13 +253,13 @@ def statistics(finding: Finding) -> dict[str, Any]:
         for entry in finding.carried
         if math.hypot(entry.std, entry.again_std) > 0
     ]
-    added = finding.added
+    added, seen = finding.added, finding.smoothed
     found = {
         "p_value": min(1.0, len(tests) * min(test.p_value for test in tests)),
         "chi2_per_dof": max(test.chi2_per_dof for test in tests),
         "largest_channel": max((value for test in tests for value in test.channels.values()), default=None),
         "candidate": min(1.0, best_of(finding.scores)),
-        "evidence": None if finding.smoothed is None else max(finding.smoothed.evidence.values()),
+        "evidence": None if seen is None or finding.nominal.problem.disturbed else max(seen.evidence.values()),
         "closure": finding.closure.value if added else None,
         "closure_low": finding.closure.low if added else None,
         "fall": fall(finding.nominal.loss, added[-1].fit.loss) if added else None,

@@ -99,10 +99,11 @@ def gain(before: Loss, after: Loss) -> tuple[float, float]:
 def within_reach(fits: Sequence[Fit], limits: Thresholds = DEFAULTS) -> list[Fit]:
     """Fits whose held-out loss is within one standard error of the best one's (or `tie` of it), the simplest first.
 
-    Where the model errs everywhere, simpler ones are near by the evidence as well; see `outweighs`. An effect whose
-    shape is far from what an engineer would expect (`out_of_shape`) counts only where no other comes near it: a solid
-    that relaxes in a tenth of the shortest time expected is a damper. So does one that is not sure to be there. One
-    whose amplitude is out of its range (`oversized`) comes last.
+    Of these only what is as likely as the likeliest on all recordings together stays (`less_likely`). Where the model
+    errs everywhere, simpler ones are near by the evidence as well; see `outweighs`. An effect whose shape is far from
+    what an engineer would expect (`out_of_shape`) counts only where no other comes near it: a solid that relaxes in a
+    tenth of the shortest time expected is a damper. So does one that is not sure to be there. One whose amplitude is
+    out of its range (`oversized`) comes last.
     """
     best = min(fits, key=lambda fit: fit.loss.mean)
     likely = [fit for fit in fits if not fit.effects or _likely(fit, limits)]
@@ -112,36 +113,33 @@ def within_reach(fits: Sequence[Fit], limits: Thresholds = DEFAULTS) -> list[Fit
     near = []
     for fit in fits:
         lost, error = gain(fit.loss, best.loss)
-        apart = less_likely(fit, best, limits)
-        if (
-            fit is best
-            or (lost <= max(error, limits.tie * best.loss.mean) and not apart)
-            or outweighs(fit, best, limits)
-        ):
+        if fit is best or lost <= max(error, limits.tie * best.loss.mean) or outweighs(fit, best, limits):
             near.append(fit)
+    likeliest = min(near, key=lambda fit: behind(fit, best))
+    near = [fit for fit in near if not less_likely(fit, likeliest, limits)]
 
     def order(fit: Fit) -> tuple[bool, int, float]:
-        return bool(fit.effects) and oversized(fit.effects[-1], fit.values, limits), fit.size, fit.loss.mean
+        return bool(fit.effects) and oversized(fit.effects[-1], fit.values, limits), fit.size, behind(fit, likeliest)
 
     return sorted(near, key=order)
 
 
-def less_likely(fit: Fit, best: Fit, limits: Thresholds = DEFAULTS) -> bool:
-    """Whether all recordings are less likely with a fit than with the best by the odds of `worth`; see `behind`.
+def less_likely(fit: Fit, other: Fit, limits: Thresholds = DEFAULTS) -> bool:
+    """Whether all recordings are less likely with a fit than with another by the odds of `worth`; see `behind`.
 
     Where more than noise is left, squares count errors of the model, and their differences say little.
     """
-    noise = max(fit.loss.mean, best.loss.mean) < 1 + limits.smallest_gap
-    return noise and behind(fit, best) > 2 * limits.worth
+    noise = max(fit.loss.mean, other.loss.mean) < 1 + limits.smallest_gap
+    return noise and behind(fit, other) > 2 * limits.worth
 
 
-def behind(fit: Fit, best: Fit) -> float:
+def behind(fit: Fit, other: Fit) -> float:
     """By how much r'r of all recordings, fitted and held out, exceeds that of another fit.
 
-    Parameters that the other has more than this one count with what chance gives each of them.
+    Every parameter counts as the one by which chance alone lowers r'r.
     """
-    held = np.sum(fit.loss.squares) + fit.loss.known - np.sum(best.loss.squares) - best.loss.known
-    return float(held) + 2 * (fit.cost - best.cost) - max(best.size - fit.size, 0)
+    held = np.sum(fit.loss.squares) + fit.loss.known - np.sum(other.loss.squares) - other.loss.known
+    return float(held) + 2 * (fit.cost - other.cost) + fit.size - other.size
 
 
 def _likely(fit: Fit, limits: Thresholds) -> bool:

@@ -235,21 +235,23 @@ def blind_tables(result: Mapping[str, Any]) -> dict[str, Rows]:
             "-" if entry["seconds"] is None else f"{entry['seconds']:.0f} s",
         ))  # fmt: skip
     tables = {"Score": marks, "Detection by size": sizes, "Experiments": experiments, "Cases": cases}
-    known: Mapping[str, Any] = result.get("calibration_of_thresholds") or {"thresholds": {}}
-    if known["thresholds"]:
+    known: Mapping[str, Any] | None = result.get("calibration_of_thresholds")
+    if known is not None:
         tables["Thresholds"] = _threshold_rows(known, rate)
     return tables
 
 
 def _threshold_rows(calibration: Mapping[str, Any], rate: Callable[[Mapping[str, Any]], str]) -> Rows:
     """Quantiles of a `yid-calibration/1` beside what is set."""
-    rows: Rows = [("diagnosis.", "is", "quantile", "coverage", "of", "effects beyond it, by size", "strange ones")]
-    for name, own in calibration["thresholds"].items():
-        value = "-" if own["quantile"] is None else f"{own['quantile']:.3g}"
-        kind = {"clean": "clean recordings", "named": "effects named right", "refitted": "effects refitted"}[own["of"]]
+    kinds = {"clean": "clean recordings", "named": "effects named right", "refitted": "effects refitted"}
+    head = ("diagnosis.", "is", "advised", "what", "quantile", "coverage", "of", "effects beyond it, by size")
+    rows: Rows = [(*head, "strange ones beyond it")]
+    for own in calibration["rules"].values():
+        name, value = own["setting"], "-" if own["quantile"] is None else f"{own['quantile']:.3g}"
         sizes = ", ".join(f"{size}: {rate(found)}" for size, found in own["effects_beyond"].items())
-        cells = (f"{own['setting']:.3g}", value, f"{100 * own['coverage']:.0f} %", f"{own['cases']} {kind}")
-        rows.append((name, *cells, sizes or "-", rate(own["strange_beyond"])))
+        cells = (f"{own['is']:.3g}", f"{calibration['settings'][name]:.3g}", own["statistic"], value)
+        cases = (f"{100 * own['coverage']:.0f} %", f"{own['cases']} {kinds[own['of']]}", sizes or "-")
+        rows.append((name, *cells, *cases, rate(own["strange_beyond"])))
     return rows
 
 

@@ -48,6 +48,7 @@ from yid_ocp.workflow.experiments import VARIATIONS, Experiment, experiments_of,
 from yid_ocp.workflow.folder import now
 
 COMMITMENT, LABELS, RESULT, TABLE = "commitment.json", "sealed/labels.json", "result.json", "table.md"
+THRESHOLDS = "thresholds.json"
 CONFIGS, PREPARED, DRAWN, CASES, ANSWERS, BEST = "configs", "prepared", "sealed/drawn", "cases", "answers", "best"
 log = logging.getLogger(__name__)
 
@@ -101,7 +102,8 @@ def run_blind(
         Folder: `configs/`, `prepared/` (what is detectable in every experiment), `cases/` (recordings),
         `sealed/labels.json`, `commitment.json` (hash of the labels, written before the first diagnosis, and of the
         sources that made the cases), `answers/` and `best/` (results of tasks, see `yid_ocp.parallel`), then
-        `result.json` (`yid-blind/1`), `table.md` and pictures.
+        `result.json` (`yid-blind/1`), `table.md` and pictures; of an ensemble to calibrate by `thresholds.json`
+        (`yid-calibration/1`).
     count : int
         Number of cases.
     seed : int
@@ -157,7 +159,10 @@ def run_blind(
         "variations": {name: varied.words for name, varied in VARIATIONS.items()},
     }
     if purpose == PURPOSES[1]:
-        result["calibration_of_thresholds"] = calibrate(labels, marks, answers, runs[0].diagnosis)
+        found = calibrate(labels, marks, answers, runs[0].diagnosis)
+        result["calibration_of_thresholds"] = found
+        made = {key: result[key] for key in ("cases", "seed", "code", "code_of_cases", "command", "date", "versions")}
+        write_json(folder / THRESHOLDS, jsonable(found | made))
     written = jsonable(result)
     write_json(folder / RESULT, written)
     write_text(folder / TABLE, "\n".join(blind_markdown(written)) + "\n")

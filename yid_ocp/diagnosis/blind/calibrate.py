@@ -37,6 +37,8 @@ class Rule:
 
     Attributes
     ----------
+    setting : str
+        Of `diagnosis`.
     statistic : callable
         Of `finding.statistics`, the thresholds of the diagnosis and the true effect's label; -inf where the case did
         not come to it.
@@ -46,12 +48,17 @@ class Rule:
         Cases whose quantile it is: clean recordings, single effects that were named right, or those that were refitted.
     side : {'most', 'least'}
         Whether these cases are to stay below the threshold or above it.
+    limit : float
+        Of use, whatever the cases show: less is not worth a name, or odds that convince nobody; where `side` is
+        'least', more than anybody asks.
     """
 
+    setting: str
     statistic: Callable[[Statistics, Thresholds, str], float]
     words: str
     of: Literal["clean", "named", "refitted"]
     side: Literal["most", "least"]
+    limit: float
 
 
 def _excess(said: Statistics, limits: Thresholds, _: str) -> float:
@@ -75,17 +82,31 @@ def _lost(said: Statistics, _: Thresholds, truth: str) -> float:
     return -math.inf if lost.get(truth) is None else max(lost[truth] - min(known), 0.0)
 
 
+def _less_likely(said: Statistics, _: Thresholds, truth: str) -> float:
+    """Half the r'r of all recordings by which the true effect alone is behind the likeliest one alone."""
+    squares = {label: entry["squares"] for label, entry in said["behind"].items()}
+    known = [value for value in squares.values() if value is not None]
+    return -math.inf if squares.get(truth) is None else 0.5 * (squares[truth] - min(known))
+
+
 RULES: Mapping[str, Rule] = {
-    "smallest_gap": Rule(_excess, "chi2/n - 1 of a significant residual", "clean", "most"),
-    "smallest_channel": Rule(_along, "that of the worst channel, along a significant candidate", "clean", "most"),
-    "worth": Rule(_of("evidence"), "rise of the log evidence by the best place", "clean", "most"),
-    "closure": Rule(_of("closure_low"), "lower end of the closure by the best candidate", "clean", "most"),
-    "relevance": Rule(_of("fall"), "part of a held-out error that the best candidate takes away", "clean", "most"),
-    "explained": Rule(_of("explained"), "part of the smoother's explanation", "named", "least"),
-    "carried_stds": Rule(_of("carried"), "standard deviations between recordings", "named", "most"),
-    "tie": Rule(_lost, "held-out chi2/n by which the truth is behind the best effect", "refitted", "most"),
+    "gap": Rule("smallest_gap", _excess, "chi2/n - 1 of a significant residual", "clean", "most", 0.1),
+    "channel": Rule(
+        "smallest_channel", _along, "the same of the worst channel, along a candidate", "clean", "most", 0.02
+    ),
+    "evidence": Rule("worth", _of("evidence"), "rise of the log evidence by the best place", "clean", "most", 5.0),
+    "rival": Rule("worth", _less_likely, "log odds of the likeliest effect against the truth", "refitted", "most", 5.0),
+    "closure": Rule(
+        "closure", _of("closure_low"), "lower end of the closure by the best effect", "clean", "most", 0.05
+    ),
+    "relevance": Rule("relevance", _of("fall"), "part of a held-out error taken away by it", "clean", "most", 0.01),
+    "explained": Rule("explained", _of("explained"), "part of the smoother's explanation", "named", "least", 0.75),
+    "carried": Rule("carried_stds", _of("carried"), "standard deviations between recordings", "named", "most", 2.0),
+    "tie": Rule(
+        "tie", _lost, "held-out chi2/n by which the truth is behind the best effect", "refitted", "most", 0.001
+    ),
 }
-"""By the setting of `diagnosis` that they calibrate."""
+"""All rules, by what they look at."""
 
 
 def conformal(
@@ -156,18 +177,42 @@ def calibrate(
         value, attained = conformal(sample, rule.side, coverage)
         sizes = sorted({size for size, _ in true})
         found[name] = {
+            "setting": rule.setting,
             "statistic": rule.words,
             "of": rule.of,
             "side": rule.side,
             "cases": len(sample),
             "coverage": attained,
             "quantile": _number(value),
-            "setting": getattr(limits, name),
+            "limit": rule.limit,
+            "is": getattr(limits, rule.setting),
             "sample": [_number(entry) for entry in sorted(sample)],
             "effects_beyond": {f"{size:.3g}": proportion([x > value for s, x in true if s == size]) for size in sizes},
             "strange_beyond": proportion([entry > value for entry in strange]),
         }
-    return {"format": FORMAT, "asked": coverage, "thresholds": found}
+    return {"format": FORMAT, "asked": coverage, "rules": found, "settings": _settings(found)}
+
+
+def _settings(rules: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
+    """Thresholds that follow: the quantile, outwards to two digits, within what is of use; of two rules the wider."""
+    advised: dict[str, float] = {}
+    for own in rules.values():
+        most, value, limit = own["side"] == "most", own["quantile"], float(own["limit"])
+        if value is not None:
+            outwards = _rounded(value, up=most)
+            limit = max(limit, outwards) if most else min(limit, outwards)
+        advised[own["setting"]] = max(limit, advised.get(own["setting"], limit))
+    return advised
+
+
+def _rounded(value: float, up: bool) -> float:
+    """To two digits, up or down."""
+    if value == 0:
+        return 0.0
+    digits = 1 - math.floor(math.log10(abs(value)))
+    scaled = value * 10.0**digits
+    whole = math.ceil(scaled - 1e-9) if up else math.floor(scaled + 1e-9)
+    return round(whole / 10.0**digits, max(digits, 0))
 
 
 def _opened(answer: Mapping[str, Any]) -> Statistics | None:
