@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -161,15 +162,22 @@ def test_the_constraint_solver_converges_on_a_fine_chain() -> None:
     assert scene.data.solver_niter[0] < 10
 
 
-def test_settling_ends_where_the_state_is_lost() -> None:
+@pytest.mark.parametrize(("later", "said"), [(False, "before the motion began"), (True, "the simulation diverged")])
+def test_a_state_that_is_lost_is_told(later: bool, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)  # MuJoCo leaves a log where it is
+
     class Thrown:
+        begun = False
+
         def prepare(self, model: Any) -> None: ...
-        def begin(self, data: Any) -> None: ...
+        def begin(self, data: Any) -> None:
+            self.begun = True
 
         def force(self, model: Any, data: Any) -> None:
-            data.qfrc_passive[:] += 1e14
+            if self.begun or not later:
+                data.qfrc_passive[:] += 1e14
 
     system = SYSTEMS[1]
     motion = multisine(system, TRUTH, seed=1)
-    with pytest.raises(ModelError, match="diverged before the motion began"):
+    with pytest.raises(ModelError, match=said):
         simulate_in_mujoco(system, TRUTH, motion, Simulation(0.1), injected=Thrown())
