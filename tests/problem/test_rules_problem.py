@@ -14,7 +14,7 @@ from small_problems import PENDULUM, H, pendulum_step, recording, seen, taken
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.episodes import apparent_inertia, beginning
+from yid_ocp.problem.episodes import apparent_inertia, beginning, coupled_inertia
 from yid_ocp.problem.evaluation import ResidualRows
 from yid_ocp.problem.unknowns import Unknowns, check_bounds, replaced, soft_logarithm
 
@@ -102,6 +102,18 @@ def test_start_bounds_and_values_by_name(make):
         **dict.fromkeys(problem.names[3:], 0.0),
         "start.q.elbow[run_1]": 0.5,
     }
+
+
+def test_joints_are_coupled_by_the_inertia_along_a_recording(momentum, free_step):
+    theta = free_step.system.parameters.vector()
+    angles = np.array([[0.4, 0.2], [-1.1, 0.7], [2.0, -0.3]])
+    matrices = [
+        np.column_stack([momentum(free_step, q[::-1], velocity, theta)[::-1] for velocity in np.eye(2)[::-1]])
+        for q in angles
+    ]
+    found = coupled_inertia(free_step, theta, ("elbow", "shoulder"), angles)
+    np.testing.assert_allclose(found, np.sqrt(np.mean(np.square(matrices), axis=0)), rtol=1e-9)
+    assert found[0, 1] == pytest.approx(found[1, 0]) != 0
 
 
 # -- priors and scales ------------------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.lqr import lqr_filter, proportional_filter
+from yid_ocp.integrator.rollout import momentum_of
 from yid_ocp.integrator.step import Feedback, Step, check_shape
 from yid_ocp.problem.functions import ModelFunctions
 from yid_ocp.problem.grid import Grid, make_grid
@@ -193,6 +195,28 @@ def apparent_inertia(step: Step, theta: Array, names: tuple[str, ...]) -> Array:
     return np.asarray(mass[[step.system.mechanism.joint_index(name) for name in names]])
 
 
+def coupled_inertia(step: Step, theta: Array, names: tuple[str, ...], angles: Array) -> Array:
+    """The named joints' part of the mass matrix, shape (k, k), as its root mean square over configurations.
+
+    Parameters
+    ----------
+    step : Step
+    theta : ndarray, shape (ntheta,)
+    names : tuple of str
+    angles : ndarray, shape (K, k)
+        Of these joints [rad or m]; all others are at zero.
+    """
+    places = [step.system.mechanism.joint_index(name) for name in names]
+    q = np.zeros((len(angles), step.sizes["n"]))
+    q[:, places] = angles
+    # every joint's unit velocity in every configuration, in one go
+    velocity = np.zeros((len(places), *q.shape))
+    velocity[range(len(places)), :, places] = 1.0
+    still = np.broadcast_to(q, velocity.shape).reshape(-1, q.shape[1])
+    momentum = momentum_of(step, still, velocity.reshape(still.shape), theta).reshape(velocity.shape)
+    return np.asarray(np.sqrt(np.mean(momentum[:, :, places] ** 2, axis=1)))
+
+
 def _samples(
     step: Step, recording: Recording, options: ProblemOptions, theta: Array, grid: Grid
 ) -> tuple[Measurements, ...]:
@@ -203,7 +227,7 @@ def _samples(
         grid.times,
         grid.time_step,
         LowPass(options.path_cutoff),
-        lambda names: apparent_inertia(step, theta, names),
+        partial(coupled_inertia, step, theta),
     )
     found = [data for kind in SENSORS for data in SENSORS[kind](around)]
     if options.weighting == "paper":

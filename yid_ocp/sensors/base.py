@@ -218,7 +218,8 @@ class Surroundings:
     low_pass : Smoothing
         That of prescribed paths and efforts.
     inertia : callable
-        From joint names to the diagonal of the mass matrix [kg m^2 or kg].
+        From joint names and some of their configurations, shape (K, k), to their part of the mass matrix, shape (k, k),
+        as its root mean square over these [kg m^2 or kg].
     """
 
     system: System
@@ -227,7 +228,7 @@ class Surroundings:
     times: Array
     time_step: float
     low_pass: Smoothing
-    inertia: Callable[[tuple[str, ...]], Array]
+    inertia: Callable[[tuple[str, ...], Array], Array]
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,8 @@ from yid_ocp.sensors.base import SENSORS, Array, Choice, JointData, PointData, S
 
 EFFORT = "joints.effort"
 POSITION = "joints.position"
+CONFIGURATIONS = 8
+"""Along a recording at which joints' inertias are worked out."""
 DIFFERENCES = 6
 """Order of the differences from which a noise level is read: they leave nothing of a motion that is slow beside the
 sampling."""
@@ -256,14 +258,17 @@ def by_joint(
 
 
 def _smoothed_effort_std(around: Surroundings, names: tuple[str, ...], choice: Choice, period: float) -> Array:
-    """Standard deviation of smoothed efforts: the sensor's noise and that of accelerations from noisy encoders."""
-    joints = around.recording.joints
+    """Standard deviation of smoothed efforts: the sensor's noise and that of all accelerations from noisy encoders.
+
+    An acceleration that is wrong at one joint asks for a torque at every joint whose inertia is coupled with it.
+    """
+    joints, where = around.recording.joints, around.recording.name
     assert joints is not None
     given = choice.std if choice.std is not None else joints.effort_std
     if given is None:
         raise DataError(
             "the noise level of the joint efforts is neither recorded nor given",
-            where=around.recording.name,
+            where=where,
             hint="set sensors.joints.effort.std [N m], from a stretch at rest or the data sheet",
         )
     std = by_joint(given, joints.names, names, "sensors.joints.effort.std")
@@ -271,4 +276,9 @@ def _smoothed_effort_std(around: Surroundings, names: tuple[str, ...], choice: C
     encoders = around.choice(POSITION)
     known = encoders.std if encoders.std is not None else joints.position_std
     angle = by_joint(0.0 if known is None else known, joints.names, names, "sensors.joints.position.std")
-    return np.asarray(np.sqrt((std * value_gain) ** 2 + (around.inertia(names) * angle * second_gain) ** 2))
+    variance = (std * value_gain) ** 2
+    if np.any(angle > 0):
+        chosen = np.linspace(0, len(joints.t) - 1, min(CONFIGURATIONS, len(joints.t))).astype(int)
+        inertia = around.inertia(names, joints.position[chosen][:, joint_columns(joints, names, where)])
+        variance = variance + inertia**2 @ (angle * second_gain) ** 2
+    return np.asarray(np.sqrt(variance))
