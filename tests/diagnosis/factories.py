@@ -217,7 +217,7 @@ def finding(verdict="effect", **changed) -> Finding:
         "scores": (score(of, p=1e-9, decrease=100.0, statistic=40.0),),
         "smoothed": None,
         "where": (place(),),
-        "nominal": fit(lost=loss(2.0, 2.2)),
+        "nominal": fit(lost=loss(2.0, 2.2), problem=SimpleNamespace(disturbed=False)),
         "fits": (fit([of], loss(1.0, 1.1), values={f"{of.label}.a": 0.5}),),
         "added": (added(of, fitted=fit([of], loss(1.0, 1.1), values={f"{of.label}.a": 0.5})),),
         "closure": closed(),

@@ -19,7 +19,8 @@ OFFSETS = {f"effort_offset@{joint}.offset": std for joint, std in BIAS.items()}
 
 
 def options(bias=None, **more):
-    sensors = {"joints.effort": SensorOptions(bias_std=bias)}
+    # accelerations of an unsmoothed path would drown the constants, were the encoders any worse
+    sensors = {"joints.effort": SensorOptions(bias_std=bias), "joints.position": SensorOptions(std=1e-4)}
     return ProblemOptions(path_cutoff=math.inf, weak_prior_factor=0.0, sensors=sensors, **more)
 
 

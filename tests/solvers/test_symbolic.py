@@ -211,7 +211,7 @@ def test_internal_coordinates_are_among_the_states(paper_systems, recording, one
 def test_several_recordings_with_efforts_as_gauss_newton_has_them(urdf_folder):
     """Efforts of prescribed joints, which depend on whole steps, need no elimination here."""
     problem = problem_of(urdf_folder, "all prescribed")
-    single = solve(problem, GaussNewton(cost_tolerance=1e-12))
+    single = solve(problem, GaussNewton(cost_tolerance=1e-15, step_tolerance=1e-10))
     solution = solve(problem, MultipleShooting(tolerance=1e-10, ipopt={"acceptable_iter": 0}))
     assert solution.status == Status.CONVERGED, solution.message
     np.testing.assert_allclose(solution.x, single.x, rtol=1e-5)
