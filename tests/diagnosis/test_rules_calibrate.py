@@ -86,6 +86,8 @@ def test_clean_recordings_set_what_chance_may_reach() -> None:
         for size in (0.1, 1.0)
     ]
     strange = [case("left_out", "unknown", DAMPER, statistics={"evidence": 6.0})]
+    lost = case("null", "unknown", statistics={"chi2_per_dof": None, "p_value": 0.0})
+    assert calibrated(*clean, lost)["gap"]["sample"].count(None) == 3, "beyond any number, or not significant"
     found = calibrated(*clean, *effects, *strange)
     evidence = found["evidence"]
     assert (evidence["quantile"], evidence["coverage"], evidence["cases"]) == (7.0, 0.8, 4)

@@ -372,7 +372,7 @@ def _composed(
             hint="set problem.weighting: whitened and the noise levels under `sensors`",
         )
     effects = chosen_effects(problem.system, [episode.recording for episode in problem.episodes], candidates)
-    left_out(effects, leave_out)
+    left_out(effects, leave_out)  # refused before anything is compiled
     progress.stage(f"composing {len(effects)} candidates into one step")
     composed = CandidateProblem.of(problem, effects, held_out)
     return replace(composed, effects=tuple(left_out(composed.effects, leave_out)))

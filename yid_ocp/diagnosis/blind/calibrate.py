@@ -63,6 +63,8 @@ class Rule:
 
 def _excess(said: Statistics, limits: Thresholds, _: str) -> float:
     """chi2/n - 1 by which a residual counts as a gap, if it is significant at all."""
+    if said["chi2_per_dof"] is None:
+        return math.inf  # it could not be followed at all
     return float(said["chi2_per_dof"]) - 1 if said["p_value"] < limits.level else -math.inf
 
 
