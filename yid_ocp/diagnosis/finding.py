@@ -20,7 +20,7 @@ from yid_ocp.diagnosis.smoother import Smoothed
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import Reason, assumptions, best_of
 from yid_ocp.effects import EffectBase
-from yid_ocp.problem.null_test import Floor, NullTest
+from yid_ocp.problem.null_test import Floor, NullTest, smallest_p_value
 from yid_ocp.shown import Shown, Summary
 from yid_ocp.solvers.judgement import known_covariance, uncertainty
 
@@ -255,7 +255,7 @@ def statistics(finding: Finding) -> dict[str, Any]:
     ]
     added, seen = finding.added, finding.smoothed
     found = {
-        "p_value": min(1.0, len(tests) * min(test.p_value for test in tests)),
+        "p_value": smallest_p_value(tests),
         "chi2_per_dof": max(test.chi2_per_dof for test in tests),
         "largest_channel": max((value for test in tests for value in test.channels.values()), default=None),
         "candidate": min(1.0, best_of(finding.scores)),

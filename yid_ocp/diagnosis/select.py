@@ -79,10 +79,16 @@ def far_likelier(before: Loss, after: Loss, limits: Thresholds = DEFAULTS) -> bo
     in a few of them only, as a constant error of a torque does at the start, differs too much from block to block for
     `gain` to be sure, and hardly moves chi2/n.
     """
-    if not max(before.mean, after.mean) < 1 + limits.smallest_gap:
-        return False
-    fall = np.sum(before.squares) + before.known - np.sum(after.squares) - after.known
-    return float(fall) > 2 * limits.worth
+    return _noise_is_left(before, after, limits) and _squares(before) - _squares(after) > 2 * limits.worth
+
+
+def _noise_is_left(one: Loss, other: Loss, limits: Thresholds) -> bool:
+    """Whether both of two models leave little but noise."""
+    return max(one.mean, other.mean) < 1 + limits.smallest_gap
+
+
+def _squares(loss: Loss) -> float:
+    return float(np.sum(loss.squares)) + loss.known
 
 
 def gain(before: Loss, after: Loss) -> tuple[float, float]:
@@ -129,8 +135,7 @@ def less_likely(fit: Fit, other: Fit, limits: Thresholds = DEFAULTS) -> bool:
 
     Where more than noise is left, squares count errors of the model, and their differences say little.
     """
-    noise = max(fit.loss.mean, other.loss.mean) < 1 + limits.smallest_gap
-    return noise and behind(fit, other) > 2 * limits.worth
+    return _noise_is_left(fit.loss, other.loss, limits) and behind(fit, other) > 2 * limits.worth
 
 
 def behind(fit: Fit, other: Fit) -> float:
@@ -138,8 +143,8 @@ def behind(fit: Fit, other: Fit) -> float:
 
     Every parameter counts as the one by which chance alone lowers r'r.
     """
-    held = np.sum(fit.loss.squares) + fit.loss.known - np.sum(other.loss.squares) - other.loss.known
-    return float(held) + 2 * (fit.cost - other.cost) + fit.size - other.size
+    held = _squares(fit.loss) - _squares(other.loss)
+    return held + 2 * (fit.cost - other.cost) + fit.size - other.size
 
 
 def _likely(fit: Fit, limits: Thresholds) -> bool:

@@ -195,16 +195,18 @@ def null_test(
 def more_than_noise(tests: Sequence[NullTest], limits: GapLimits = USUAL) -> bool:
     """Whether residuals of one model are more than noise, by enough to be worth a word.
 
-    The smallest p-value counts as the best of so many tests (Bonferroni).
-
     Parameters
     ----------
     tests : sequence of NullTest
         Of the recordings that were fitted, of those held out, or of both.
     limits : GapLimits
     """
-    p = min(1.0, len(tests) * min(test.p_value for test in tests))
-    return p < limits.level and max(test.chi2_per_dof for test in tests) > 1 + limits.smallest_gap
+    return smallest_p_value(tests) < limits.level and max(test.chi2_per_dof for test in tests) > 1 + limits.smallest_gap
+
+
+def smallest_p_value(tests: Sequence[NullTest]) -> float:
+    """The smallest p-value as the best of so many tests (Bonferroni)."""
+    return min(1.0, len(tests) * min(test.p_value for test in tests))
 
 
 def _whiteness(parts: Sequence[Array], lags: int = 10) -> float:

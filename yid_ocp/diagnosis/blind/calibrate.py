@@ -77,18 +77,14 @@ def _of(name: str) -> Callable[[Statistics, Thresholds, str], float]:
     return lambda said, limits, truth: -math.inf if said.get(name) is None else float(said[name])
 
 
-def _lost(said: Statistics, _: Thresholds, truth: str) -> float:
-    """Held-out chi2/n by which the true effect alone is behind the best one alone."""
-    lost = {label: entry["chi2_per_dof"] for label, entry in said["behind"].items()}
-    known = [value for value in lost.values() if value is not None]
-    return -math.inf if lost.get(truth) is None else max(lost[truth] - min(known), 0.0)
+def _behind(figure: str, scale: float) -> Callable[[Statistics, Thresholds, str], float]:
+    """By how much the true effect alone is behind the best one alone."""
 
+    def lost(said: Statistics, _: Thresholds, truth: str) -> float:
+        known = {label: own[figure] for label, own in said["behind"].items() if own[figure] is not None}
+        return scale * (known[truth] - min(known.values())) if truth in known else -math.inf
 
-def _less_likely(said: Statistics, _: Thresholds, truth: str) -> float:
-    """Half the r'r of all recordings by which the true effect alone is behind the likeliest one alone."""
-    squares = {label: entry["squares"] for label, entry in said["behind"].items()}
-    known = [value for value in squares.values() if value is not None]
-    return -math.inf if squares.get(truth) is None else 0.5 * (squares[truth] - min(known))
+    return lost
 
 
 RULES: Mapping[str, Rule] = {
@@ -97,7 +93,9 @@ RULES: Mapping[str, Rule] = {
         "smallest_channel", _along, "the same of the worst channel, along a candidate", "clean", "most", 0.02
     ),
     "evidence": Rule("worth", _of("evidence"), "rise of the log evidence by the best place", "clean", "most", 5.0),
-    "rival": Rule("worth", _less_likely, "log odds of the likeliest effect against the truth", "refitted", "most", 5.0),
+    "rival": Rule(
+        "worth", _behind("squares", 0.5), "log odds of the likeliest effect against the truth", "refitted", "most", 5.0
+    ),
     "closure": Rule(
         "closure", _of("closure_low"), "lower end of the closure by the best effect", "clean", "most", 0.05
     ),
@@ -105,7 +103,12 @@ RULES: Mapping[str, Rule] = {
     "explained": Rule("explained", _of("explained"), "part of the smoother's explanation", "named", "least", 0.75),
     "carried": Rule("carried_stds", _of("carried"), "standard deviations between recordings", "named", "most", 2.0),
     "tie": Rule(
-        "tie", _lost, "held-out chi2/n by which the truth is behind the best effect", "refitted", "most", 0.001
+        "tie",
+        _behind("chi2_per_dof", 1.0),
+        "held-out chi2/n by which the truth is behind the best effect",
+        "refitted",
+        "most",
+        0.001,
     ),
 }
 """All rules, by what they look at."""
