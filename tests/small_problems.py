@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 
@@ -36,6 +38,18 @@ def measured(sensor, node, fraction, value, weight=None, std=None, span=(0, 100)
     std = np.where(seen, 1.0, np.nan) if std is None else np.asarray(std, float)
     bias = np.zeros(value.shape[1])
     return Measurements(sensor, np.asarray(node), np.asarray(fraction, float), value, weight, std, span, bias)
+
+
+def correlated(episode):
+    """The episode with noise that is correlated among the outputs of every sample, each time another way."""
+    rng, made = np.random.default_rng(8), []
+    for samples in episode.samples:
+        size = samples.value.shape[1]
+        factor = rng.standard_normal((len(samples.value), size, size)) + 1.5 * np.eye(size)
+        covariance = factor @ factor.transpose(0, 2, 1)
+        std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+        made.append(replace(samples, correlation=covariance / (std[:, :, None] * std[:, None, :])))
+    return replace(episode, samples=tuple(made))
 
 
 def joints(names, t, position, **more) -> JointGroup:

@@ -118,6 +118,6 @@ def test_held_out_rows_count_it_and_rows_without_a_constant_stay(urdf_folder):
     plain = np.concatenate([s.rows(y).residual for s, y in zip(episode.samples, result.predicted, strict=True)])
     slopes = slopes_by_constants(episode.samples)
     rows = np.any(slopes != 0, axis=1)
-    np.testing.assert_array_equal(counted[~rows], plain[~rows])
+    np.testing.assert_allclose(counted[~rows], plain[~rows], rtol=1e-14)
     covariance = np.eye(len(plain)) + slopes @ slopes.T
     assert counted @ counted == pytest.approx(plain @ np.linalg.solve(covariance, plain), rel=1e-9)

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_problems import H, pendulum_step, taken
+from small_problems import H, correlated, pendulum_step, taken
 
 from yid_ocp.errors import ConfigError
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
@@ -91,8 +91,11 @@ def point(urdf_folder):
     ],
     ids=["tracked", "open_loop", "late_camera", "two_steps_a_sample"],
 )
-def test_innovations_weigh_by_the_covariance_of_all_residuals(urdf_folder, how, effects):
+@pytest.mark.parametrize("together", [False, True], ids=["independent", "correlated"])
+def test_innovations_weigh_by_the_covariance_of_all_residuals(urdf_folder, how, effects, together):
     problem = problem_of(urdf_folder, encoders=False, effects=effects, **how)
+    if together:
+        problem = problem.on([correlated(episode) for episode in problem.episodes], ())
     x = problem.start * 1.1
     plain, weighted = problem.evaluate(x), problem.weighted_at(x).evaluate(x)
     rows = problem.rows.data

@@ -108,7 +108,7 @@ def test_rows_are_whitened_differences_where_something_was_measured():
     np.testing.assert_array_equal(TWO.whitened(predicted), [[2.0, 0.0], [-1.0, 10.0]])
     found = TWO.rows(predicted)
     np.testing.assert_array_equal(found.residual, [2.0, -1.0, 10.0])
-    np.testing.assert_array_equal(found.weight, [2.0, 0.5, 10.0])
+    np.testing.assert_array_equal(found.factor, [1.0, 1.0, 1.0])
     assert found.cost == pytest.approx(0.5 * (4 + 1 + 100))
     assert found.jacobian is None
     assert TWO.count == 3
@@ -119,7 +119,7 @@ def test_rows_have_the_slopes_of_their_predictions_and_a_robust_weight():
     slopes = np.arange(12.0).reshape(2, 2, 3)
     found = TWO.rows(np.array([[2.0, 9.0], [1.0, 5.0]]), slopes, threshold=2.5)
     np.testing.assert_allclose(found.residual, [2.0, -1.0, 5.0])
-    np.testing.assert_allclose(found.weight, [2.0, 0.5, 5.0])
+    np.testing.assert_allclose(found.factor, [1.0, 1.0, 0.5])
     np.testing.assert_allclose(found.jacobian, [[0, 2, 4], [3, 3.5, 4], [45, 50, 55]])
     assert found.cost == pytest.approx(2.0 + 0.5 + 2.5 * (10 - 1.25))
 

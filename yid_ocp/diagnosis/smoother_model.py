@@ -21,6 +21,7 @@ from typing import Literal
 import casadi as ca
 import numpy as np
 import scipy.linalg
+import scipy.sparse
 from numpy.typing import NDArray
 
 from yid_ocp.diagnosis.pushes import forces_of_pushes, weights_of_segments
@@ -485,8 +486,10 @@ class _Reading:
         First nodes of the intervals and the last node.
     interval, group, column, node : ndarray of int, shape (nr,)
         Interval, group of samples, column in it and node before every row of the residual.
-    fraction, weight : ndarray, shape (nr,)
-        Place between that node and the next, and weight with the robust loss's factor.
+    fraction, weight, factor : ndarray, shape (nr,)
+        Place between that node and the next, weight, and factor of the robust loss.
+    mixing : sparse array, shape (nr, nr), or None
+        What makes correlated noise independent, between weight and factor.
     slope : tuple of ndarray, shape (N + 1, k, ns)
         Of every group's sensor by the states of a node.
     load : tuple of ndarray, shape (N + 1, k, nc)
@@ -500,6 +503,8 @@ class _Reading:
     node: NDArray[np.int64]
     fraction: Array
     weight: Array
+    factor: Array
+    mixing: scipy.sparse.csr_array | None
     slope: tuple[Array, ...]
     load: tuple[Array, ...]
 
@@ -528,15 +533,21 @@ class _Reading:
                 if effort.shape[1]:
                     value += np.einsum("rx,rxd->rd", load[place, column[used]], effort[local])
                 found[own[used]] += part[used, None] * value
-        return rows, found * self.weight[rows, None]
+        return rows, self._whitened(rows, found)
 
     def bias(self, rows: NDArray[np.int64], biased: Sequence[tuple[int, int]], reference: Array) -> Array:
         """Slopes of rows by the biases, in units of their reference."""
         found = np.zeros((len(rows), len(biased)))
         for i, (k, column) in enumerate(biased):
             own = (self.group[rows] == k) & (self.column[rows] == column)
-            found[own, i] = self.weight[rows[own]] * reference[i]
-        return found
+            found[own, i] = reference[i]
+        return self._whitened(rows, found)
+
+    def _whitened(self, rows: NDArray[np.int64], slopes: Array) -> Array:
+        found = slopes * self.weight[rows, None]
+        if self.mixing is not None:
+            found = self.mixing[rows][:, rows] @ found
+        return np.asarray(found * self.factor[rows, None])
 
 
 def _reading(course: _Course, moving: NDArray[np.int64], edges: NDArray[np.int64]) -> _Reading:
@@ -544,7 +555,7 @@ def _reading(course: _Course, moving: NDArray[np.int64], edges: NDArray[np.int64
     predictor, threshold = problem.predictor, problem.options.huber_threshold
     state, efforts = course.rollout.state, predictor.efforts(course.rollout)
     group: list[NDArray[np.int64]] = []
-    column, node, fraction, weight, slope, load = [], [], [], [], [], []
+    column, node, fraction, weight, factor, slope, load = [], [], [], [], [], [], []
     for samples, predicted in zip(course.episode.samples, course.result.predicted, strict=True):
         late = predictor.lateness(samples, theta, ())
         placed = samples if late is None else samples.late(late[0])
@@ -557,11 +568,16 @@ def _reading(course: _Course, moving: NDArray[np.int64], edges: NDArray[np.int64
         column.append(np.broadcast_to(np.arange(shape[1]), shape)[keep])
         node.append(where[keep])
         fraction.append(beyond[keep])
-        weight.append(samples.rows(predicted, threshold=threshold).weight)
+        weight.append(samples.weight[keep])
+        factor.append(samples.rows(predicted, threshold=threshold).factor)
         slope.append(np.concatenate([by_q, np.zeros((*by_q.shape[:2], n)), by_z], axis=2)[:, :, moving])
         load.append(by_e[:, :, course.fixed])
     nodes = np.concatenate(node)
     interval = np.clip(np.searchsorted(edges, nodes, side="right") - 1, 0, len(edges) - 2)
+    mixing = None
+    if any(samples.mixing is not None for samples in course.episode.samples):
+        own = [s.independent(scipy.sparse.eye_array(s.count, format="csr")) for s in course.episode.samples]
+        mixing = scipy.sparse.csr_array(scipy.sparse.block_diag(own))
     return _Reading(
         edges,
         interval,
@@ -570,6 +586,8 @@ def _reading(course: _Course, moving: NDArray[np.int64], edges: NDArray[np.int64
         nodes,
         np.concatenate(fraction),
         np.concatenate(weight),
+        np.concatenate(factor),
+        mixing,
         tuple(slope),
         tuple(load),
     )

@@ -288,7 +288,7 @@ class Experiment:
             joint = np.broadcast_to(np.arange(samples.value.shape[1]), samples.value.shape)[samples.seen]
             for i, (name, size) in enumerate(std.items()):
                 own = joint == samples.sensor.efforts.index(name)
-                found[rows, i] = np.where(own, size * samples.weight[samples.seen], 0.0)
+                found[rows, i] = samples.independent(np.where(own, size * samples.weight[samples.seen], 0.0))
         return np.vstack([found, np.eye(len(std))])
 
     def rows(self, w: Array) -> Array | None:

@@ -64,7 +64,7 @@ def slopes_by_constants(samples: Sequence[Measurements]) -> Array:
     found = np.zeros((sum(s.count for s in samples), count))
     rows = 0
     for s, part in zip(samples, parts, strict=True):
-        own = part[s.seen]
+        own = s.independent(part[s.seen])
         found[rows : rows + s.count, before : before + own.shape[1]] = own
         rows, before = rows + s.count, before + own.shape[1]
     return found

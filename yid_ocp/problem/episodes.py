@@ -168,6 +168,8 @@ def beginning(episode: Episode, steps: int) -> Episode:
         last = min(entry.span[1], steps - (episode.grid.steps - entry.span[1]))
         early = entry.node + entry.fraction <= last + 1e-9
         parts = {name: getattr(entry, name)[early] for name in ("node", "fraction", "value", "weight", "std")}
+        if entry.correlation is not None:
+            parts["correlation"] = entry.correlation[early]
         samples.append(replace(entry, **parts, span=(entry.span[0], last)))
     whole, errors = episode.feedback, episode.errors
     return replace(
@@ -196,7 +198,7 @@ def apparent_inertia(step: Step, theta: Array, names: tuple[str, ...]) -> Array:
 
 
 def coupled_inertia(step: Step, theta: Array, names: tuple[str, ...], angles: Array) -> Array:
-    """The named joints' part of the mass matrix, shape (k, k), as its root mean square over configurations.
+    """The named joints' part of the mass matrix in several configurations, shape (K, k, k).
 
     Parameters
     ----------
@@ -214,7 +216,7 @@ def coupled_inertia(step: Step, theta: Array, names: tuple[str, ...], angles: Ar
     velocity[range(len(places)), :, places] = 1.0
     still = np.broadcast_to(q, velocity.shape).reshape(-1, q.shape[1])
     momentum = momentum_of(step, still, velocity.reshape(still.shape), theta).reshape(velocity.shape)
-    return np.asarray(np.sqrt(np.mean(momentum[:, :, places] ** 2, axis=1)))
+    return momentum[:, :, places].transpose(1, 2, 0)
 
 
 def _samples(

@@ -102,7 +102,7 @@ def joined(measurements: Sequence[Measurements], result: EpisodeResult, threshol
         sum(part.cost for part in parts),
         np.concatenate([part.residual for part in parts]),
         np.vstack(jacobians) if jacobians else None,
-        np.concatenate([part.weight for part in parts]),
+        np.concatenate([part.factor for part in parts]),
     )
 
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal
+from functools import cached_property
+from typing import Any, Literal
 
 import numpy as np
+import scipy.sparse
 from numpy.typing import NDArray
 
 from yid_ocp.errors import DataError
@@ -27,14 +29,14 @@ class Rows:
         Loss: half the sum of squares, or Huber's.
     residual : ndarray, shape (nr,)
     jacobian : ndarray, shape (nr, d), or None
-    weight : ndarray, shape (nr,)
-        Factor from a change of the prediction to that of the residual.
+    factor : ndarray, shape (nr,)
+        That of the robust loss, which the residual and the Jacobian hold.
     """
 
     cost: float
     residual: Array
     jacobian: Array | None
-    weight: Array
+    factor: Array
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,8 @@ class Measurements:
         First and last node at which the sensor can be predicted.
     bias_std : ndarray, shape (k,)
         Standard deviation of a constant error of every output, in the sensor's unit; zero where there is none.
+    correlation : ndarray, shape (M, k, k), or None
+        Of the noise of the outputs of one sample; None where they are independent.
     """
 
     sensor: Sensor
@@ -68,6 +72,7 @@ class Measurements:
     std: Array
     span: tuple[int, int]
     bias_std: Array
+    correlation: Array | None = None
 
     @property
     def channel_of_column(self) -> tuple[str, ...]:
@@ -94,9 +99,40 @@ class Measurements:
         """How many rows of a residual they make."""
         return int(np.count_nonzero(self.weight > 0))
 
+    @cached_property
+    def mixing(self) -> scipy.sparse.csr_array | None:
+        """What makes differences over their standard deviations independent, shape (nr, nr); None where they are.
+
+        With R the correlation of what is seen of a sample, R^(-1/2): of all that whiten, the one whose rows stay
+        closest to the outputs (Kessy, Lewin and Strimmer 2018, doi:10.1080/00031305.2016.1277159).
+        """
+        if self.correlation is None:
+            return None
+        seen = self.seen
+        together = seen[:, :, None] & seen[:, None, :]
+        size, turn = np.linalg.eigh(np.where(together, self.correlation, np.eye(seen.shape[1])))
+        blocks = (turn / np.sqrt(size)[:, None, :]) @ turn.transpose(0, 2, 1)
+        place = np.cumsum(seen).reshape(seen.shape) - 1
+        row, column = (np.broadcast_to(p, blocks.shape)[together] for p in (place[:, :, None], place[:, None, :]))
+        return scipy.sparse.csr_array((blocks[together], (row, column)), shape=(self.count, self.count))
+
+    def independent(self, rows: Any) -> Any:
+        """Rows of differences over their standard deviations, shape (nr,) or (nr, d), dense or sparse, made so."""
+        return rows if self.mixing is None else self.mixing @ rows
+
     def whitened(self, predicted: Array) -> Array:
         """Prediction less measurement in units of the noise, zero where there is none, shape (M, k)."""
-        return np.asarray(self.weight * np.where(self.weight > 0, predicted - self.value, 0.0))
+        plain = np.asarray(self.weight * np.where(self.weight > 0, predicted - self.value, 0.0))
+        if self.mixing is not None:
+            plain[self.seen] = self.mixing @ plain[self.seen]
+        return plain
+
+    def pulled(self, pull: Array) -> Array:
+        """Derivative of a cost by the prediction from that by `whitened`, both of shape (M, k)."""
+        if self.mixing is not None:
+            pull = pull.copy()
+            pull[self.seen] = self.mixing.T @ pull[self.seen]
+        return np.asarray(pull * self.weight)
 
     def rows(self, predicted: Array, slopes: Array | None = None, threshold: float = math.inf) -> Rows:
         """Their part of a residual.
@@ -111,12 +147,11 @@ class Measurements:
         """
         raw = self.whitened(predicted)
         cost, factor = huber(raw, threshold)
-        keep = self.seen.ravel()
-        weight = factor * self.weight
-        jacobian = None
+        seen, jacobian = self.seen, None
+        robust = factor[seen]
         if slopes is not None:
-            jacobian = (weight[:, :, None] * slopes).reshape(raw.size, slopes.shape[2])[keep]
-        return Rows(cost, (factor * raw).ravel()[keep], jacobian, weight.ravel()[keep])
+            jacobian = robust[:, None] * self.independent(self.weight[seen][:, None] * slopes[seen])
+        return Rows(cost, robust * raw[seen], jacobian, robust)
 
     def late(self, steps: Array) -> Measurements:
         """The same samples, each output that of so many steps before, within the span.
@@ -195,7 +230,9 @@ def placed(data: SensorData, grid: Grid, where: str) -> Measurements:
     node, fraction = grid.locate(data.t)
     std = np.where(seen, data.std, np.nan)
     bias = np.zeros(data.value.shape[1]) if data.bias_std is None else data.bias_std
-    return Measurements(data.sensor, node, fraction, data.value, weight, std, data.span or (0, grid.steps), bias)
+    return Measurements(
+        data.sensor, node, fraction, data.value, weight, std, data.span or (0, grid.steps), bias, data.correlation
+    )
 
 
 def paper_weighting(samples: Measurements, grid: Grid) -> Measurements:
@@ -207,8 +244,8 @@ def paper_weighting(samples: Measurements, grid: Grid) -> Measurements:
     weight = np.where(np.isfinite(samples.value), 1.0, 0.0)
     weight[nearest_node == 0] = 0.0
     weight[nearest_node == grid.steps] *= np.sqrt(2.0)
-    none = np.zeros(len(samples.bias_std))
-    return replace(samples, node=nearest_node, fraction=np.zeros(len(nearest_node)), weight=weight, bias_std=none)
+    none, exact = np.zeros(len(samples.bias_std)), np.zeros(len(nearest_node))
+    return replace(samples, node=nearest_node, fraction=exact, weight=weight, bias_std=none, correlation=None)
 
 
 def huber(residual: Array, scale: float) -> tuple[float, Array]:

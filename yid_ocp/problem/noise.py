@@ -519,11 +519,11 @@ class _Readings:
             weight = samples.weight[sample, column]
             place = np.searchsorted(used, node)
             later = np.minimum(place + 1, len(used) - 1)
-            before.append((weight * (1 - fraction))[:, None] * slopes[place, column])
-            after.append(
-                (weight * fraction)[:, None] * np.where(fraction > 0, 1.0, 0.0)[:, None] * slopes[later, column]
-            )
-            effort.append(weight[:, None] * by_load[place, column][:, fixed])
+            early = (weight * (1 - fraction))[:, None] * slopes[place, column]
+            late = (weight * fraction)[:, None] * np.where(fraction > 0, 1.0, 0.0)[:, None] * slopes[later, column]
+            before.append(samples.independent(early))
+            after.append(samples.independent(late))
+            effort.append(samples.independent(weight[:, None] * by_load[place, column][:, fixed]))
             nodes.append(np.minimum(node, last))
         at = np.concatenate(nodes)
         order = np.argsort(at, kind="stable")

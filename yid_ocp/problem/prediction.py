@@ -20,6 +20,7 @@ from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.functions import ModelFunctions
 from yid_ocp.problem.inputs import held_inputs, held_inputs_slope
 from yid_ocp.problem.lag import Lag
+from yid_ocp.problem.low_pass import LowPass
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.noise import Course, Innovations, InputErrors, innovations
 from yid_ocp.problem.options import ProblemOptions
@@ -29,6 +30,9 @@ from yid_ocp.problem.unknowns import Unknowns
 Array = NDArray[np.float64]
 MOST_AT_ONCE, MOST_MEMORY = 16, 2.0**28
 """Episodes that are rolled out at once, and memory of their states and derivatives [bytes]."""
+
+SLOW = 0.1
+"""Part of the filter's cutoff below which measured loads count on gears whose efforts are compared."""
 
 LEAST_GAIN = 0.1
 """Least factor between a recorded torque and the one that acts at which an error of the latter is one of the former."""
@@ -97,6 +101,28 @@ class Predictor:
         return replace(
             episode, start=self.functions.start_fit.solve(episode.posture, samples, own, window, episode.path)
         )
+
+    def loaded(self, episode: Episode, theta: Array) -> Episode:
+        """The episode with the model's own loads on the gears of joints whose efforts are compared.
+
+        A gear that gave way under the measured effort would bring its noise into the prediction of the same effort, and
+        so explain noise. What the model does not know of a load is slow: that alone is taken from the measurement.
+        """
+        compared = [samples for samples in episode.samples if samples.sensor.efforts]
+        if not compared or not self.functions.corrections.angles_need_effort:
+            return episode
+        result = self.run(episode, theta, np.zeros(len(self.unknowns.start)), False)
+        if isinstance(result, str):
+            return episode
+        load, own, slow = episode.load.copy(), self.efforts(result.rollout), LowPass(SLOW * self.options.path_cutoff)
+        for samples in compared:
+            # near both ends neither side is right
+            inner = np.clip(np.arange(len(load)), samples.node.min(), samples.node.max())
+            for joint in samples.sensor.efforts:
+                at = self.functions.corrections.joints.index(joint)
+                gap = (load[:, at] - own[:, self.system.mechanism.joint_index(joint)])[inner]
+                load[:, at] += slow(episode.grid.times, gap[:, None])[:, 0] - gap
+        return replace(episode, load=load)
 
     def own_theta(self, episode: Episode, theta: Array) -> Array:
         """theta with the values that belong to one recording: known ones, and those fitted along with its start."""

@@ -121,8 +121,9 @@ class EstimationProblem(Shown):
             for group in (recordings, held_out)
         )
         self._set(functions, options, tuple(free), theta, episodes, others)
-        fitted = tuple(self.predictor.fitted(episode, theta) for episode in episodes)
-        self._set(functions, options, tuple(free), theta, fitted, others)
+        fitted = (self.predictor.fitted(episode, theta) for episode in episodes)
+        ready, other = (tuple(self.predictor.loaded(e, theta) for e in group) for group in (fitted, others))
+        self._set(functions, options, tuple(free), theta, ready, other)
 
     def _set(
         self,
@@ -355,7 +356,7 @@ class EstimationProblem(Shown):
             for k, samples in enumerate(self.episodes[i].samples):
                 raw = samples.whitened(result.predicted[k])
                 _, factor = huber(raw, self.options.huber_threshold)
-                pulls.append(factor**2 * raw * samples.weight)
+                pulls.append(samples.pulled(factor**2 * raw))
             own = self.predictor.pulled(self.episodes[i], result, *self.split(x, i), pulls)
             gradient += self.unknowns.placed(own[None, :], i)[0]
         prior_residual, prior_jacobian = self.prior(x)

@@ -218,8 +218,8 @@ class Surroundings:
     low_pass : Smoothing
         That of prescribed paths and efforts.
     inertia : callable
-        From joint names and some of their configurations, shape (K, k), to their part of the mass matrix, shape (k, k),
-        as its root mean square over these [kg m^2 or kg].
+        From joint names and some of their configurations, shape (K, k), to their part of the mass matrix in each of
+        them, shape (K, k, k) [kg m^2 or kg].
     """
 
     system: System
@@ -246,6 +246,8 @@ class SensorData:
         First and last node at which the sensor can be predicted; all of them when absent.
     bias_std : ndarray, optional, shape (k,)
         Standard deviations of an error of every output that is constant in one recording; none when absent.
+    correlation : ndarray, optional, shape (M, k, k)
+        Of the noise of the outputs of one sample; none when absent.
     """
 
     sensor: Sensor
@@ -254,6 +256,7 @@ class SensorData:
     std: Array
     span: tuple[int, int] | None = None
     bias_std: Array | None = None
+    correlation: Array | None = None
 
 
 SENSORS: Registry[Callable[[Surroundings], list[SensorData]]] = Registry("kind of sensor")

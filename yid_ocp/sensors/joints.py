@@ -18,8 +18,6 @@ from yid_ocp.sensors.base import SENSORS, Array, Choice, JointData, PointData, S
 
 EFFORT = "joints.effort"
 POSITION = "joints.position"
-CONFIGURATIONS = 8
-"""Along a recording at which joints' inertias are worked out."""
 DIFFERENCES = 6
 """Order of the differences from which a noise level is read: they leave nothing of a motion that is slow beside the
 sampling."""
@@ -165,7 +163,6 @@ def measured_efforts(around: Surroundings) -> list[SensorData]:
     period = float(np.median(np.diff(joints.t)))
     late = 0.0 if joints.effort_taken_as == "sample" else 0.5 * period
     measured = np.stack([np.interp(times, joints.t + late, column) for column in effort.T], axis=1)
-    std = _smoothed_effort_std(around, names, choice, period)
     # Smoothed values repeat their neighbours: only as many are kept as count as independent. Both ends are left out:
     # the filter sees one side alone there, the impulse at node 0 depends on the motion before the recording and that at
     # the last node on the motion after it.
@@ -181,9 +178,9 @@ def measured_efforts(around: Surroundings) -> list[SensorData]:
             allowed=f"more than {2 * ends * step:.3g} s",
             hint="use a longer recording, or raise problem.path_cutoff",
         )
-    spread = np.broadcast_to(std, measured.shape)[kept]
+    std, correlation = _smoothed_effort_noise(around, names, choice, period, times[kept])
     bias = torque_bias_std(joints, names, choice)
-    return [SensorData(EffortSensor(names), times[kept], measured[kept], spread, (1, steps - 1), bias)]
+    return [SensorData(EffortSensor(names), times[kept], measured[kept], std, (1, steps - 1), bias, correlation)]
 
 
 # -- noise levels -----------------------------------------------------------------------------------------------------
@@ -257,10 +254,19 @@ def by_joint(
     return wide[[list(recorded).index(name) for name in names]]
 
 
-def _smoothed_effort_std(around: Surroundings, names: tuple[str, ...], choice: Choice, period: float) -> Array:
-    """Standard deviation of smoothed efforts: the sensor's noise and that of all accelerations from noisy encoders.
+def _smoothed_effort_noise(
+    around: Surroundings, names: tuple[str, ...], choice: Choice, period: float, times: Array
+) -> tuple[Array, Array | None]:
+    """Noise of smoothed efforts at some times: the sensor's own and that of all accelerations from noisy encoders.
 
-    An acceleration that is wrong at one joint asks for a torque at every joint whose inertia is coupled with it.
+    An acceleration that is wrong at one joint asks for a torque at every joint whose inertia is coupled with it, so
+    that their errors are correlated: with M the mass matrix, the covariance is diag(s^2) + M diag(a^2) M.
+
+    Returns
+    -------
+    std : ndarray, shape (M, k)
+    correlation : ndarray, shape (M, k, k), or None
+        None where the encoders' noise is not stated.
     """
     joints, where = around.recording.joints, around.recording.name
     assert joints is not None
@@ -276,9 +282,12 @@ def _smoothed_effort_std(around: Surroundings, names: tuple[str, ...], choice: C
     encoders = around.choice(POSITION)
     known = encoders.std if encoders.std is not None else joints.position_std
     angle = by_joint(0.0 if known is None else known, joints.names, names, "sensors.joints.position.std")
-    variance = (std * value_gain) ** 2
-    if np.any(angle > 0):
-        chosen = np.linspace(0, len(joints.t) - 1, min(CONFIGURATIONS, len(joints.t))).astype(int)
-        inertia = around.inertia(names, joints.position[chosen][:, joint_columns(joints, names, where)])
-        variance = variance + inertia**2 @ (angle * second_gain) ** 2
-    return np.asarray(np.sqrt(variance))
+    own = (std * value_gain) ** 2
+    if not np.any(angle > 0):
+        return np.broadcast_to(np.sqrt(own), (len(times), len(names))), None
+    measured = joints.position[:, joint_columns(joints, names, where)]
+    angles = np.stack([np.interp(times, joints.t, column) for column in measured.T], axis=1)
+    by_acceleration = around.inertia(names, angles) * (angle * second_gain)
+    covariance = by_acceleration @ by_acceleration.transpose(0, 2, 1) + np.diag(own)
+    total = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    return total, covariance / (total[:, :, None] * total[:, None, :])

@@ -418,11 +418,17 @@ class _Maker:
         parts = [f".{axis}" for axis in "xyz"] if sensor.width == 3 else [""] * sensor.width
         rows = tuple(f"{channel}{part}" for channel in sensor.channels for part in parts)
         term = Term(f"{sensor.group}[{episode.name}]", rows, read, at, data, places.theta)
-        seen = samples.seen
+        seen, between = samples.seen, _between(samples)
+        threshold = self._problem.options.huber_threshold
+        if samples.correlation is not None:
+            mixed = np.zeros(seen.shape)
+            mixed[seen] = samples.independent(samples.weight[seen] * samples.value[seen])
+            target = self._p.add(f"value.{term.name}", mixed.T, rows, "")
+            combination = samples.independent(scipy.sparse.diags_array(samples.weight[seen]) @ between)
+            return Residual(term, ca.DM(scipy.sparse.csc_matrix(combination)), None, target.T[seen], threshold)
         value = self._p.add(f"value.{term.name}", np.where(seen, samples.value, 0.0).T, rows, sensor.unit)
         weight = self._p.add(f"weight.{term.name}", samples.weight.T, rows)
-        threshold = self._problem.options.huber_threshold
-        return Residual(term, _between(samples), weight.T[seen], value.T[seen], threshold)
+        return Residual(term, ca.DM(between), weight.T[seen], value.T[seen], threshold)
 
     def _reading(self, sensor: Sensor, episode: Episode) -> tuple[Local, bool]:
         """What a sensor reads at a node, and whether it depends on efforts, that is, on the step from there."""
@@ -501,7 +507,7 @@ def _itself(size: int) -> Local:
     return Local("itself", [v, ca.SX(0, 1), ca.SX(0, 1)], v)
 
 
-def _between(samples: Measurements) -> ca.DM:
+def _between(samples: Measurements) -> scipy.sparse.csc_matrix:
     """What makes predictions of samples, those that count, from readings at nodes, node by node."""
     width, nodes = samples.value.shape[1], samples.nodes
     sample, column = np.nonzero(samples.seen)
@@ -512,4 +518,4 @@ def _between(samples: Measurements) -> ca.DM:
     at = np.concatenate([before * width + column, after * width + column])
     matrix = scipy.sparse.csc_matrix((entries, (np.tile(row, 2), at)), shape=(len(sample), width * len(nodes)))
     matrix.eliminate_zeros()
-    return ca.DM(matrix)
+    return matrix

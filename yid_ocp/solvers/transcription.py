@@ -453,7 +453,9 @@ class Transcription:
             part = samples.rows(predicted, threshold=problem.options.huber_threshold)
             placed: Sparse | None = None
             if jacobian is not None:
-                placed = scipy.sparse.diags(part.weight) @ jacobian.tocsr()[samples.seen.ravel()]
+                seen = samples.seen
+                plain = scipy.sparse.diags_array(samples.weight[seen]) @ jacobian.tocsr()[seen.ravel()]
+                placed = scipy.sparse.diags_array(part.factor) @ samples.independent(plain)
             result.append((part.residual, placed, part.cost))
         return result
 
