@@ -15,6 +15,7 @@ from yid_ocp.diagnosis.screening import Linearisation, Signature, robust, shape_
 from yid_ocp.diagnosis.select import gain, out_of_shape, oversized, within_reach
 from yid_ocp.effects import make_effect
 from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.low_pass import LowPass
 from yid_ocp.problem.null_test import Series, null_test, residual_series, smoothed_colour
 
 
@@ -64,7 +65,7 @@ def test_p_values_of_matching_noise_are_uniform():
 
 def test_p_values_of_coloured_noise_are_uniform_when_its_colour_is_known():
     rng = np.random.default_rng(6)
-    colour = smoothed_colour(5.0, 0.01)
+    colour = smoothed_colour(LowPass(5.0), 0.01)
     lags = np.abs(np.subtract.outer(np.arange(400), np.arange(400)))
     covariance = np.where(lags < len(colour), colour[np.minimum(lags, len(colour) - 1)], 0.0)
     values, vectors = np.linalg.eigh(covariance)

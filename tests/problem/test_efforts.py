@@ -13,7 +13,7 @@ from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.problem.low_pass import LowPass
+from yid_ocp.problem.low_pass import LowPass, effort_filter
 from yid_ocp.solvers import GaussNewton, solve
 
 JOINTS = ("shoulder", "elbow")
@@ -57,16 +57,17 @@ def test_deviations_are_those_of_repeats(arm):
 
 
 def test_a_record_shorter_than_the_filter_is_refused(arm):
-    with pytest.raises(DataError, match=r"(?s)6 s of efforts are too short.*more than 11\.5 s"):
+    with pytest.raises(DataError, match=r"(?s)6 s of efforts are too short.*more than 15\.4 s"):
         arm(np.zeros((601, 2)), 0.5)
 
 
 def test_neighbours_that_repeat_each_other_are_left_out(arm):
     plain, smooth = (arm(np.zeros((601, 2)), cutoff).episodes[0].samples[0] for cutoff in (math.inf, CUTOFF))
     np.testing.assert_array_equal(plain.node, np.arange(1, 600))
-    np.testing.assert_array_equal(smooth.node + np.rint(smooth.fraction), np.arange(58, 543, 10))
+    np.testing.assert_array_equal(smooth.node + np.rint(smooth.fraction), np.arange(77, 524, 10))
     assert LowPass(CUTOFF).stride(0.01) == 10
     assert LowPass(CUTOFF).settling == pytest.approx(0.574, abs=1e-3)
+    assert effort_filter(CUTOFF).settling == pytest.approx(0.768, abs=1e-3)
     assert LowPass(30.0).stride(0.05) == 1
 
 

@@ -23,7 +23,7 @@ from yid_ocp.problem.inputs import (
     prescribed_path,
     sensors_present,
 )
-from yid_ocp.problem.low_pass import LowPass
+from yid_ocp.problem.low_pass import LowPass, effort_filter
 
 PLAIN = LowPass(math.inf)
 
@@ -325,6 +325,25 @@ def test_what_lies_beyond_an_end_is_forgotten_after_settling(cutoff):
     assert 1e-4 < late / response.max() < 1e-2
     poles = np.log(scipy.signal.butter(4, cutoff * 2 * step, output="zpk")[1]) / step
     assert settling == pytest.approx(math.log(1e3) / np.abs(poles.real).min(), rel=1e-2)
+
+
+@pytest.mark.parametrize("low_pass", [LowPass(4.0), LowPass(4.0, 2), LowPass(9.0), LowPass(math.inf)])
+def test_as_a_matrix_it_is_the_same_filter(low_pass):
+    t = 0.01 * np.arange(301)
+    values = np.random.default_rng(1).standard_normal((301, 2))
+    matrix = low_pass.matrix(301, 0.01)
+    np.testing.assert_allclose((matrix @ values)[150], low_pass(t, values)[150], atol=2e-3)
+    np.testing.assert_allclose(matrix.sum(axis=1), 1.0, rtol=1e-12)
+    # what comes before a motion sets in does not count
+    assert matrix[:, [0]].nnz == (1 if math.isinf(low_pass.cutoff) else 0)
+
+
+def test_two_passes_are_one_after_the_other():
+    t, values = 0.01 * np.arange(301), np.random.default_rng(1).standard_normal((301, 2))
+    once, twice = LowPass(5.0), effort_filter(5.0)
+    np.testing.assert_allclose(twice(t, values)[80:-80], once(t, once(t, values))[80:-80], atol=1e-3)
+    assert twice.settling > once.settling
+    assert (twice.cutoff, twice.passes) == (5.0, 2)
 
 
 @pytest.mark.parametrize("cutoff", [1.0, 4.0, 8.0, 40.0, math.inf])

@@ -31,7 +31,7 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.constant_errors import without_constants
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.problem.low_pass import LowPass
+from yid_ocp.problem.low_pass import LowPass, effort_filter
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.null_test import discoveries, sample_times
 from yid_ocp.problem.options import SensorOptions
@@ -270,7 +270,7 @@ def _falls(problem: EstimationProblem, run: Run, limits: Thresholds) -> Iterator
 def _before_fall(history: History, falls: Sequence[Fall], limits: Thresholds) -> History | None:
     """A history up to where its recording's motion gets too fast, less what a filter smears; None where too short."""
     until = min((fall.time for fall in falls if fall.recording == history.recording), default=math.inf)
-    smear = LowPass(history.cutoff).settling if math.isfinite(history.cutoff) else 0.0
+    smear = effort_filter(history.cutoff).settling if math.isfinite(history.cutoff) else 0.0
     keep = np.flatnonzero(history.t <= until - (smear if math.isfinite(until) else 0.0))
     if len(keep) < 10:
         return None

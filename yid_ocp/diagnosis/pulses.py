@@ -29,7 +29,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
-from yid_ocp.problem.low_pass import LowPass
+from yid_ocp.problem.low_pass import effort_filter
 
 Array = NDArray[np.float64]
 Sparse = Any  # scipy.sparse.csc_array or, of few profiles, ndarray; the former has no types
@@ -181,11 +181,11 @@ class _Filter:
         if not math.isfinite(cutoff):
             return _Filter(np.zeros(1), np.ones(1))
         step = 0.1 / cutoff
-        length = 20
+        length = 30
         delay = np.asarray(step * np.arange(-length, length + 1), float)
         impulse = np.zeros((len(delay), 1))
         impulse[length] = 1.0
-        weight = LowPass(cutoff)(delay, impulse)[:, 0]
+        weight = effort_filter(cutoff)(delay, impulse)[:, 0]
         return _Filter(delay, weight / weight.sum())
 
     def __call__(self, windows: _Windows, t: Array) -> Array:

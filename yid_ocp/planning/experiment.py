@@ -33,7 +33,7 @@ from yid_ocp.planning.path import SplinePath
 from yid_ocp.planning.points import Points
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.problem.low_pass import LowPass
+from yid_ocp.problem.low_pass import effort_filter
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.sensors.joints import EFFORT, POSITION
 
@@ -363,7 +363,7 @@ class Experiment:
 
 def _check_long_enough(problem: EstimationProblem, duration: float) -> None:
     """Refuse a motion of whose efforts the low-pass filter leaves nothing."""
-    joints, low_pass = problem.episodes[0].recording.joints, LowPass(problem.options.path_cutoff)
+    joints, low_pass = problem.episodes[0].recording.joints, effort_filter(problem.options.path_cutoff)
     least = 2.0 * low_pass.settling + low_pass.stride(problem.step.time_step) * problem.step.time_step
     if joints is not None and joints.effort is not None and duration <= least:
         raise ConfigError(

@@ -18,7 +18,7 @@ from yid_ocp.integrator.step import Feedback, Step, check_shape
 from yid_ocp.problem.functions import ModelFunctions
 from yid_ocp.problem.grid import Grid, make_grid
 from yid_ocp.problem.inputs import held_inputs, joint_loads, measured_angles, prescribed_path
-from yid_ocp.problem.low_pass import LowPass
+from yid_ocp.problem.low_pass import LowPass, effort_filter
 from yid_ocp.problem.measurements import Measurements, paper_weighting, placed
 from yid_ocp.problem.noise import InputErrors, input_errors
 from yid_ocp.problem.options import ProblemOptions, SensorOptions
@@ -228,7 +228,7 @@ def _samples(
         lambda group: options.sensors.get(group, SensorOptions()),
         grid.times,
         grid.time_step,
-        LowPass(options.path_cutoff),
+        effort_filter(options.path_cutoff),
         partial(coupled_inertia, step, theta),
     )
     found = [data for kind in SENSORS for data in SENSORS[kind](around)]

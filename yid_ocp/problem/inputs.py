@@ -19,6 +19,8 @@ from yid_ocp.problem.low_pass import LowPass
 from yid_ocp.sensors import camera_pose, joint_columns
 
 Array = NDArray[np.float64]
+SLOW = 0.1
+"""Part of the filter's cutoff below which measured loads count on gears whose efforts are compared."""
 
 
 def held_inputs(
@@ -149,6 +151,26 @@ def joint_loads(recording: Recording, names: tuple[str, ...], grid: Grid, low_pa
         )
     effort = low_pass(joints.t, joints.effort[:, joint_columns(joints, names, recording.name)])
     return np.stack([np.interp(grid.times, joints.t, column) for column in effort.T], axis=1)
+
+
+def own_loads(measured: Array, own: Array, nodes: NDArray[np.int64], times: Array, cutoff: float) -> Array:
+    """Loads of gears whose efforts are compared: the model's own, and the slow part of what measured ones are more.
+
+    A gear that gave way under the measured effort would bring its noise into the prediction of the same effort, and so
+    explain noise. What the model does not know of a load is slow.
+
+    Parameters
+    ----------
+    measured, own : ndarray, shape (N + 1, k)
+        Smoothed.
+    nodes : ndarray of int, shape (M,)
+        At which they are compared; beyond the first and the last neither side is right.
+    times : ndarray, shape (N + 1,)
+    cutoff : float
+        Of the filter of paths and efforts [Hz].
+    """
+    gap = (measured - own)[np.clip(np.arange(len(own)), nodes.min(), nodes.max())]
+    return measured - gap + LowPass(SLOW * cutoff)(times, gap)
 
 
 def sensors_present(recordings: Sequence[Recording]) -> frozenset[str]:

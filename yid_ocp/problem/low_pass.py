@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import scipy.interpolate
 import scipy.signal
+import scipy.sparse
+import scipy.special
 from numpy.typing import NDArray
 
 from yid_ocp.errors import DataError
@@ -16,6 +19,8 @@ Array = NDArray[np.float64]
 
 LEAST = 1e-4  # of half the sampling rate; below it the filter's sections are singular to rounding
 FILTER_ORDER = 4
+TAIL = 1e-4
+"""Part of the largest weight below which a filter's weights are left out where it is a matrix."""
 
 
 @dataclass(frozen=True)
@@ -26,9 +31,12 @@ class LowPass:
     ----------
     cutoff : float
         Frequency at which the amplitude is halved in power twice over [Hz]; infinite for no filter.
+    passes : int
+        How many times values pass it.
     """
 
     cutoff: float
+    passes: int = 1
 
     def __call__(self, t: Array, values: Array) -> Array:
         """Smoothed values at the same times; an uneven clock is resampled to its median step in between.
@@ -45,7 +53,9 @@ class LowPass:
         sections = self._sections(step)
         resampled = scipy.interpolate.interp1d(t, values, axis=0, bounds_error=False, fill_value="extrapolate")(even)
         pad = min(len(even) - 1, max(15, int(3 / (self.cutoff * step))))
-        smooth = scipy.signal.sosfiltfilt(sections, resampled, axis=0, padlen=pad)
+        smooth = resampled
+        for _ in range(self.passes):
+            smooth = scipy.signal.sosfiltfilt(sections, smooth, axis=0, padlen=pad)
         return np.asarray(scipy.interpolate.CubicSpline(even, smooth, axis=0)(np.clip(t, even[0], even[-1])))
 
     def stride(self, step: float) -> int:
@@ -59,23 +69,42 @@ class LowPass:
     def settling(self) -> float:
         """How far from either end of a record the filter still sees what it does not hold [s].
 
-        The slowest pair of its poles has then decayed to a thousandth.
+        The slowest pair of its poles has then decayed to a thousandth, pass after pass.
         """
         decay = 2 * math.pi * self.cutoff * math.sin(math.pi / (2 * FILTER_ORDER))
-        return math.log(1e3) / decay
+        return float(scipy.special.gammainccinv(self.passes, 1e-3)) / decay
 
     def gains(self, step: float) -> tuple[float, float, float]:
         """Factors from white noise's std to that of the value, its rate [1/s] and its second rate [1/s^2]."""
         if not math.isfinite(self.cutoff):
             return 1.0, math.sqrt(0.5) / step, math.sqrt(6.0) / step**2
-        length = 2 * int(5 / (self.cutoff * step)) + 101
-        impulse = np.zeros(length)
-        impulse[length // 2] = 1.0
-        response = scipy.signal.sosfiltfilt(self._sections(step), impulse)
+        response = self._response(step)
         rate = np.gradient(response, step)
         second = np.zeros_like(response)
         second[1:-1] = (response[2:] - 2 * response[1:-1] + response[:-2]) / step**2
         return float(np.linalg.norm(response)), float(np.linalg.norm(rate)), float(np.linalg.norm(second))
+
+    def matrix(self, count: int, step: float) -> scipy.sparse.csr_array:
+        """The filter as a matrix over some nodes, shape (count, count), for what sets in with a motion at node 1.
+
+        Beyond node 1 and the last one values count as they are there.
+
+        Parameters
+        ----------
+        count : int
+        step : float
+            From node to node [s].
+        """
+        return _matrix(self, count, step)
+
+    def _response(self, step: float) -> Array:
+        """To an impulse in the middle, at an odd number of samples."""
+        length = 2 * int(5 * self.passes / (self.cutoff * step)) + 101
+        response = np.zeros(length)
+        response[length // 2] = 1.0
+        for _ in range(self.passes):
+            response = scipy.signal.sosfiltfilt(self._sections(step), response)
+        return np.asarray(response)
 
     def _sections(self, step: float) -> Array:
         nyquist = 0.5 / step
@@ -86,3 +115,26 @@ class LowPass:
                 allowed=f"above {least:.2g} and below {nyquist:g} Hz for this recording",
             )
         return np.asarray(scipy.signal.butter(FILTER_ORDER, self.cutoff / nyquist, output="sos"))
+
+
+@lru_cache(maxsize=16)
+def _matrix(low_pass: LowPass, count: int, step: float) -> scipy.sparse.csr_array:
+    if not math.isfinite(low_pass.cutoff):
+        return scipy.sparse.eye_array(count, format="csr")
+    response = low_pass._response(step)
+    middle = len(response) // 2
+    reach = int(np.abs(np.flatnonzero(np.abs(response) > TAIL * response[middle]) - middle).max())
+    weight, delay = response[middle - reach : middle + reach + 1], np.arange(-reach, reach + 1)
+    row = np.repeat(np.arange(count), len(delay))
+    column = np.clip(row + np.tile(delay, count), 1, count - 1)
+    values = np.tile(weight / weight.sum(), count)
+    return scipy.sparse.coo_array((values, (row, column)), shape=(count, count)).tocsr()
+
+
+def effort_filter(cutoff: float) -> LowPass:
+    """What measured efforts pass where paths pass `LowPass(cutoff)` once.
+
+    Their prediction from a smoothed path is smoothed as well, as friction makes steps of a smooth motion: so both sides
+    have passed it twice, and steps once at least.
+    """
+    return LowPass(cutoff, 2)

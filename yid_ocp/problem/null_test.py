@@ -15,7 +15,7 @@ import scipy.stats
 from numpy.typing import NDArray
 
 from yid_ocp.problem.episodes import Episode
-from yid_ocp.problem.low_pass import LowPass
+from yid_ocp.problem.low_pass import LowPass, effort_filter
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.problem import EstimationProblem
 
@@ -295,18 +295,18 @@ def noise_colour(problem: EstimationProblem, episode: Episode, samples: Measurem
     """Autocorrelation of a sensor's noise at lags 0, 1, ... samples: white, but for efforts, which are smoothed."""
     if not samples.sensor.efforts:
         return np.ones(1)
-    stride = LowPass(problem.options.path_cutoff).stride(episode.grid.time_step)
-    return smoothed_colour(problem.options.path_cutoff, episode.grid.time_step)[::stride]
+    low_pass, step = effort_filter(problem.options.path_cutoff), episode.grid.time_step
+    return smoothed_colour(low_pass, step)[:: low_pass.stride(step)]
 
 
-def smoothed_colour(cutoff: float, step: float) -> Array:
-    """Autocorrelation of white noise after the zero-phase filter of paths and efforts."""
-    if not np.isfinite(cutoff):
+def smoothed_colour(low_pass: LowPass, step: float) -> Array:
+    """Autocorrelation of white noise behind a filter, at lags of so many seconds."""
+    if not np.isfinite(low_pass.cutoff):
         return np.ones(1)
-    half = int(2 / (cutoff * step)) + 10
+    half = int(2 * low_pass.passes / (low_pass.cutoff * step)) + 10
     impulse = np.zeros((2 * half + 1, 1))
     impulse[half] = 1.0
     times = step * np.arange(2 * half + 1, dtype=float)
-    response = LowPass(cutoff)(times, impulse)[:, 0]
+    response = low_pass(times, impulse)[:, 0]
     full = np.correlate(response, response, "full")[2 * half :]
     return np.asarray(full[:half] / full[0])

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.sparse
 from numpy.typing import NDArray
 
 from yid_ocp.integrator.rollout import adjoint_gradient, rollout_member, simulate_all
@@ -18,7 +20,7 @@ from yid_ocp.problem.constant_errors import without_constants
 from yid_ocp.problem.corrections import Inputs
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.functions import ModelFunctions
-from yid_ocp.problem.inputs import held_inputs, held_inputs_slope
+from yid_ocp.problem.inputs import held_inputs, held_inputs_slope, own_loads
 from yid_ocp.problem.lag import Lag
 from yid_ocp.problem.low_pass import LowPass
 from yid_ocp.problem.measurements import Measurements
@@ -30,9 +32,6 @@ from yid_ocp.problem.unknowns import Unknowns
 Array = NDArray[np.float64]
 MOST_AT_ONCE, MOST_MEMORY = 16, 2.0**28
 """Episodes that are rolled out at once, and memory of their states and derivatives [bytes]."""
-
-SLOW = 0.1
-"""Part of the filter's cutoff below which measured loads count on gears whose efforts are compared."""
 
 LEAST_GAIN = 0.1
 """Least factor between a recorded torque and the one that acts at which an error of the latter is one of the former."""
@@ -96,32 +95,25 @@ class Predictor:
         if self.options.start_std is not None:
             weight = 1.0 / self.options.start_std
             samples = tuple(replace(s, weight=np.where(s.seen, weight, 0.0)) for s in samples)
-        own = self._with(theta, episode.values)
-        window = self.options.start_window
-        return replace(
-            episode, start=self.functions.start_fit.solve(episode.posture, samples, own, window, episode.path)
-        )
+        own, window = self._with(theta, episode.values), self.options.start_window
+        start = self.functions.start_fit.solve(episode.posture, samples, own, window, episode.path)
+        return replace(episode, start=start)
 
     def loaded(self, episode: Episode, theta: Array) -> Episode:
-        """The episode with the model's own loads on the gears of joints whose efforts are compared.
-
-        A gear that gave way under the measured effort would bring its noise into the prediction of the same effort, and
-        so explain noise. What the model does not know of a load is slow: that alone is taken from the measurement.
-        """
+        """The episode with the model's own loads on the gears of joints whose efforts are compared; see `own_loads`."""
         compared = [samples for samples in episode.samples if samples.sensor.efforts]
         if not compared or not self.functions.corrections.angles_need_effort:
             return episode
         result = self.run(episode, theta, np.zeros(len(self.unknowns.start)), False)
         if isinstance(result, str):
             return episode
-        load, own, slow = episode.load.copy(), self.efforts(result.rollout), LowPass(SLOW * self.options.path_cutoff)
+        load, own = episode.load.copy(), self.efforts(result.rollout)
         for samples in compared:
-            # near both ends neither side is right
-            inner = np.clip(np.arange(len(load)), samples.node.min(), samples.node.max())
-            for joint in samples.sensor.efforts:
-                at = self.functions.corrections.joints.index(joint)
-                gap = (load[:, at] - own[:, self.system.mechanism.joint_index(joint)])[inner]
-                load[:, at] += slow(episode.grid.times, gap[:, None])[:, 0] - gap
+            at = [self.functions.corrections.joints.index(joint) for joint in samples.sensor.efforts]
+            column = [self.system.mechanism.joint_index(joint) for joint in samples.sensor.efforts]
+            load[:, at] = own_loads(
+                load[:, at], own[:, column], samples.node, episode.grid.times, self.options.path_cutoff
+            )
         return replace(episode, load=load)
 
     def own_theta(self, episode: Episode, theta: Array) -> Array:
@@ -307,7 +299,7 @@ class Predictor:
                 by_applied += directions.torque
             if feedback is not None:
                 by_applied -= feedback.gain @ rollout.by_state[:-1, feedback.index]
-        predicted, sensitivities, read = [], [], self._with_lag(rollout, theta, wanted)
+        predicted, sensitivities, read = [], [], self._recorded(episode, rollout, theta, wanted)
         for samples in episode.samples:
             values, by_all = self._predict(samples, read, by_applied, theta, wanted)
             predicted.append(values)
@@ -467,13 +459,21 @@ class Predictor:
         found = self.functions.corrections.sensor_delay(samples.sensor, theta, wanted)
         return None if found is None else (found[0] / self.step.time_step, found[1] / self.step.time_step)
 
-    def _with_lag(self, rollout: Rollout, theta: Array, wanted: tuple[str, ...]) -> Rollout:
-        """The rollout with efforts of prescribed joints as sensors follow them."""
-        lag = self.functions.corrections.effort_lag(theta, wanted)
-        if lag is None:
-            return rollout
-        effort, by_effort = Lag(*lag, self.step.time_step).of_nodes(rollout.effort, rollout.by_effort)
-        return replace(rollout, effort=effort, by_effort=by_effort)
+    def _recorded(self, episode: Episode, rollout: Rollout, theta: Array, wanted: tuple[str, ...]) -> Rollout:
+        """The rollout with efforts of prescribed joints as they are compared: as sensors follow them, and smoothed."""
+        effort, slope = rollout.effort, rollout.by_effort
+        if (lag := self.functions.corrections.effort_lag(theta, wanted)) is not None:
+            effort, slope = Lag(*lag, self.step.time_step).of_nodes(effort, slope)
+        if (smooth := self.smoothing(episode)) is not None:
+            effort = smooth @ effort
+            slope = None if slope is None else (smooth @ slope.reshape(len(slope), -1)).reshape(slope.shape)
+        return replace(rollout, effort=effort, by_effort=slope)
+
+    def smoothing(self, episode: Episode) -> scipy.sparse.csr_array | None:
+        """What smooths predicted efforts of prescribed joints, (N, N), as measured ones are; None where none are."""
+        if not math.isfinite(self.options.path_cutoff) or not any(s.sensor.efforts for s in episode.samples):
+            return None
+        return LowPass(self.options.path_cutoff).matrix(episode.grid.steps, self.step.time_step)
 
     def _predict(
         self, samples: Measurements, rollout: Rollout, by_applied: Array | None, theta: Array, wanted: tuple[str, ...]
@@ -528,11 +528,12 @@ class Predictor:
         theta = self.own_theta(episode, theta)
         by_state = np.zeros((episode.grid.steps + 1, self.step.sizes["nx"]))
         by_effort, by_applied = np.zeros_like(rollout.effort), np.zeros_like(rollout.torque)
-        total, read = np.zeros(len(wanted)), self._with_lag(rollout, theta, ())
+        total, read = np.zeros(len(wanted)), self._recorded(episode, rollout, theta, ())
         for samples, pull in zip(episode.samples, pulls, strict=True):
             total += self._pull(samples, pull, read, theta, _Pulls(by_state, by_effort, by_applied))
-        lag = self.functions.corrections.effort_lag(theta, wanted)
-        if lag is not None:
+        if (smooth := self.smoothing(episode)) is not None:
+            by_effort = smooth.T @ by_effort
+        if (lag := self.functions.corrections.effort_lag(theta, wanted)) is not None:
             by_effort, by_lag = Lag(*lag, self.step.time_step).pulled(rollout.effort, by_effort)
             total += by_lag
         feedback = episode.feedback
@@ -596,5 +597,4 @@ class _Pulls:
 def _plain(episode: Episode, result: EpisodeResult) -> Array:
     """Residual of an episode in units of the sensors' noise, their constant errors taken off."""
     samples = without_constants(episode.samples, result.predicted)
-    rows = [s.rows(y).residual for s, y in zip(samples, result.predicted, strict=True)]
-    return np.concatenate(rows)
+    return np.concatenate([s.rows(y).residual for s, y in zip(samples, result.predicted, strict=True)])

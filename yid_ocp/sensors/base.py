@@ -216,7 +216,7 @@ class Surroundings:
     time_step : float
         Between them [s].
     low_pass : Smoothing
-        That of prescribed paths and efforts.
+        That of efforts of prescribed joints.
     inertia : callable
         From joint names and some of their configurations, shape (K, k), to their part of the mass matrix in each of
         them, shape (K, k, k) [kg m^2 or kg].

@@ -406,6 +406,9 @@ class _Maker:
         """Samples of one sensor, predicted linearly between the two nodes beside them."""
         sensor, nodes, n = samples.sensor, samples.nodes, self._sizes["n"]
         read, loaded = self._reading(sensor, episode)
+        smooth = self._problem.predictor.smoothing(episode) if sensor.efforts else None
+        if smooth is not None:
+            nodes = np.arange(episode.grid.steps)
         if loaded:
             # after the last step the effort is that of this step
             step = np.minimum(nodes, len(places.multipliers) - 1)
@@ -418,17 +421,19 @@ class _Maker:
         parts = [f".{axis}" for axis in "xyz"] if sensor.width == 3 else [""] * sensor.width
         rows = tuple(f"{channel}{part}" for channel in sensor.channels for part in parts)
         term = Term(f"{sensor.group}[{episode.name}]", rows, read, at, data, places.theta)
-        seen, between = samples.seen, _between(samples)
+        seen, between = samples.seen, _between(samples, nodes)
+        if smooth is not None:
+            between = between @ scipy.sparse.kron(smooth, scipy.sparse.eye_array(seen.shape[1]))
         threshold = self._problem.options.huber_threshold
         if samples.correlation is not None:
             mixed = np.zeros(seen.shape)
             mixed[seen] = samples.independent(samples.weight[seen] * samples.value[seen])
             target = self._p.add(f"value.{term.name}", mixed.T, rows, "")
             combination = samples.independent(scipy.sparse.diags_array(samples.weight[seen]) @ between)
-            return Residual(term, ca.DM(scipy.sparse.csc_matrix(combination)), None, target.T[seen], threshold)
+            return Residual(term, _constant(combination), None, target.T[seen], threshold)
         value = self._p.add(f"value.{term.name}", np.where(seen, samples.value, 0.0).T, rows, sensor.unit)
         weight = self._p.add(f"weight.{term.name}", samples.weight.T, rows)
-        return Residual(term, ca.DM(between), weight.T[seen], value.T[seen], threshold)
+        return Residual(term, _constant(between), weight.T[seen], value.T[seen], threshold)
 
     def _reading(self, sensor: Sensor, episode: Episode) -> tuple[Local, bool]:
         """What a sensor reads at a node, and whether it depends on efforts, that is, on the step from there."""
@@ -507,9 +512,15 @@ def _itself(size: int) -> Local:
     return Local("itself", [v, ca.SX(0, 1), ca.SX(0, 1)], v)
 
 
-def _between(samples: Measurements) -> scipy.sparse.csc_matrix:
+def _constant(matrix: scipy.sparse.sparray | scipy.sparse.spmatrix) -> ca.DM:
+    columns = scipy.sparse.csc_matrix(matrix)
+    columns.sum_duplicates()  # which also sorts
+    return ca.DM(columns)
+
+
+def _between(samples: Measurements, nodes: NDArray[np.int64]) -> scipy.sparse.csc_matrix:
     """What makes predictions of samples, those that count, from readings at nodes, node by node."""
-    width, nodes = samples.value.shape[1], samples.nodes
+    width = samples.value.shape[1]
     sample, column = np.nonzero(samples.seen)
     row, before = np.arange(len(sample)), np.searchsorted(nodes, samples.node[sample])
     fraction = samples.fraction[sample]
