@@ -104,12 +104,14 @@ def test_derivatives_and_transcriptions_count_what_is_correlated(urdf_folder, ho
     ]
     np.testing.assert_allclose(evaluation.jacobian, np.stack(moved, axis=1), rtol=1e-5, atol=1e-5 * np.abs(moved).max())
     np.testing.assert_allclose(problem.gradient(x)[1], evaluation.jacobian.T @ evaluation.residual, rtol=1e-8)
-    solvers = [GaussNewton(), SingleShooting(), *([] if how else [MultipleShooting(), Lifted()])]
     program = transcribe(problem)
     arguments, theta = program.arguments, program.block("theta").index.ravel()
     arguments["lbx"][theta] = arguments["ubx"][theta] = x
     solver = program.solver("ipopt", "exact", ipopt={"print_level": 0, "sb": "yes", "tol": 1e-9})
     assert float(solver(**arguments)["f"]) == pytest.approx(evaluation.cost, rel=1e-8)
+    if "cutoff" in how:  # what is measured of the efforts says little beside points that are this wrong
+        return
+    solvers = [GaussNewton(), SingleShooting(), *([] if how else [MultipleShooting(), Lifted()])]
     found = [solve(problem, s, restarts=False) for s in solvers]
     for other in found[1:]:
         assert other.cost == pytest.approx(found[0].cost, rel=1e-6)
