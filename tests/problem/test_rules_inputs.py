@@ -327,15 +327,18 @@ def test_what_lies_beyond_an_end_is_forgotten_after_settling(cutoff):
     assert settling == pytest.approx(math.log(1e3) / np.abs(poles.real).min(), rel=1e-2)
 
 
-@pytest.mark.parametrize("low_pass", [LowPass(4.0), LowPass(4.0, 2), LowPass(9.0), LowPass(math.inf)])
-def test_as_a_matrix_it_is_the_same_filter(low_pass):
-    t = 0.01 * np.arange(301)
-    values = np.random.default_rng(1).standard_normal((301, 2))
-    matrix = low_pass.matrix(301, 0.01)
-    np.testing.assert_allclose((matrix @ values)[150], low_pass(t, values)[150], atol=2e-3)
-    np.testing.assert_allclose(matrix.sum(axis=1), 1.0, rtol=1e-12)
+@pytest.mark.parametrize("low_pass", [LowPass(4.0), LowPass(4.0, 2), LowPass(9.0)])
+def test_at_some_nodes_it_is_the_same_filter(low_pass):
+    t, rng = 0.01 * np.arange(301), np.random.default_rng(1)
+    values, nodes = rng.standard_normal((301, 2)), np.array([3, 120, 150, 299])
+    made = low_pass.at(nodes, 301, 0.01)
+    np.testing.assert_allclose(made.of(values)[nodes[1:3]], low_pass(t, values)[nodes[1:3]], atol=2e-3)
+    np.testing.assert_array_equal(np.delete(made.of(values), nodes, axis=0), np.delete(values, nodes, axis=0))
+    np.testing.assert_allclose(made.matrix.sum(axis=1), 1.0, rtol=1e-12)
     # what comes before a motion sets in does not count
-    assert matrix[:, [0]].nnz == (1 if math.isinf(low_pass.cutoff) else 0)
+    assert made.matrix[:, [0]].nnz == 0
+    pull = rng.standard_normal((301, 2))
+    assert np.sum(made.pulled(pull) * values) == pytest.approx(np.sum(pull * made.of(values)))
 
 
 def test_two_passes_are_one_after_the_other():

@@ -557,8 +557,7 @@ def _reading(course: _Course, moving: NDArray[np.int64], edges: NDArray[np.int64
     group: list[NDArray[np.int64]] = []
     column, node, fraction, weight, factor, slope, load = [], [], [], [], [], [], []
     for samples, predicted in zip(course.episode.samples, course.result.predicted, strict=True):
-        late = predictor.lateness(samples, theta, ())
-        placed = samples if late is None else samples.late(late[0])
+        placed = predictor.placed(samples, theta)
         shape, keep = samples.weight.shape, samples.seen
         where = placed.node if placed.node.ndim > 1 else np.broadcast_to(placed.node[:, None], shape)
         beyond = placed.fraction if placed.node.ndim > 1 else np.broadcast_to(placed.fraction[:, None], shape)

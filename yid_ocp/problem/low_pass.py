@@ -84,18 +84,19 @@ class LowPass:
         second[1:-1] = (response[2:] - 2 * response[1:-1] + response[:-2]) / step**2
         return float(np.linalg.norm(response)), float(np.linalg.norm(rate)), float(np.linalg.norm(second))
 
-    def matrix(self, count: int, step: float) -> scipy.sparse.csr_array:
-        """The filter as a matrix over some nodes, shape (count, count), for what sets in with a motion at node 1.
+    def at(self, nodes: NDArray[np.int64], count: int, step: float) -> SmoothedNodes:
+        """The filter for values at some of `count` nodes, `step` apart [s]; nodes beyond are left out.
 
-        Beyond node 1 and the last one values count as they are there.
-
-        Parameters
-        ----------
-        count : int
-        step : float
-            From node to node [s].
+        Beyond node 1, where a motion sets in, and the last one values count as they are there.
         """
-        return _matrix(self, count, step)
+        nodes = nodes[nodes < count]
+        weight = _weights(self, step)
+        reach = len(weight) // 2
+        column = np.clip(nodes[:, None] + np.arange(-reach, reach + 1), 1, count - 1)
+        row = np.broadcast_to(np.arange(len(nodes))[:, None], column.shape)
+        values = np.broadcast_to(weight, column.shape)
+        entries = scipy.sparse.coo_array((values.ravel(), (row.ravel(), column.ravel())), (len(nodes), count))
+        return SmoothedNodes(nodes, entries.tocsr())
 
     def _response(self, step: float) -> Array:
         """To an impulse in the middle, at an odd number of samples."""
@@ -117,18 +118,41 @@ class LowPass:
         return np.asarray(scipy.signal.butter(FILTER_ORDER, self.cutoff / nyquist, output="sos"))
 
 
+@dataclass(frozen=True)
+class SmoothedNodes:
+    """What smooths values at nodes, for some of them; the others stay.
+
+    Attributes
+    ----------
+    nodes : ndarray of int, shape (M,)
+    matrix : sparse array, shape (M, N)
+        From values at all nodes.
+    """
+
+    nodes: NDArray[np.int64]
+    matrix: scipy.sparse.csr_array
+
+    def of(self, values: Array) -> Array:
+        """Values, shape (N, ...), smoothed."""
+        smooth = values.copy()
+        smooth[self.nodes] = (self.matrix @ values.reshape(len(values), -1)).reshape(len(self.nodes), *values.shape[1:])
+        return smooth
+
+    def pulled(self, pull: Array) -> Array:
+        """The pull at smoothed values, shape (N, k), passed on to those that are smoothed."""
+        passed = pull.copy()
+        passed[self.nodes] = 0.0
+        return np.asarray(passed + self.matrix.T @ pull[self.nodes])
+
+
 @lru_cache(maxsize=16)
-def _matrix(low_pass: LowPass, count: int, step: float) -> scipy.sparse.csr_array:
-    if not math.isfinite(low_pass.cutoff):
-        return scipy.sparse.eye_array(count, format="csr")
+def _weights(low_pass: LowPass, step: float) -> Array:
+    """Of the samples about each, an odd number of them, which add up to one."""
     response = low_pass._response(step)
     middle = len(response) // 2
     reach = int(np.abs(np.flatnonzero(np.abs(response) > TAIL * response[middle]) - middle).max())
-    weight, delay = response[middle - reach : middle + reach + 1], np.arange(-reach, reach + 1)
-    row = np.repeat(np.arange(count), len(delay))
-    column = np.clip(row + np.tile(delay, count), 1, count - 1)
-    values = np.tile(weight / weight.sum(), count)
-    return scipy.sparse.coo_array((values, (row, column)), shape=(count, count)).tocsr()
+    weight = response[middle - reach : middle + reach + 1]
+    return np.asarray(weight / weight.sum())
 
 
 def effort_filter(cutoff: float) -> LowPass:

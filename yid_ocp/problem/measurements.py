@@ -111,7 +111,7 @@ class Measurements:
         seen = self.seen
         together = seen[:, :, None] & seen[:, None, :]
         size, turn = np.linalg.eigh(np.where(together, self.correlation, np.eye(seen.shape[1])))
-        blocks = (turn / np.sqrt(size)[:, None, :]) @ turn.transpose(0, 2, 1)
+        blocks = (turn / np.sqrt(np.maximum(size, 1e-12))[:, None, :]) @ turn.transpose(0, 2, 1)
         place = np.cumsum(seen).reshape(seen.shape) - 1
         row, column = (np.broadcast_to(p, blocks.shape)[together] for p in (place[:, :, None], place[:, None, :]))
         return scipy.sparse.csr_array((blocks[together], (row, column)), shape=(self.count, self.count))

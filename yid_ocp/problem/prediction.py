@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.sparse
 from numpy.typing import NDArray
 
 from yid_ocp.integrator.rollout import adjoint_gradient, rollout_member, simulate_all
@@ -22,7 +21,7 @@ from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.functions import ModelFunctions
 from yid_ocp.problem.inputs import held_inputs, held_inputs_slope, own_loads
 from yid_ocp.problem.lag import Lag
-from yid_ocp.problem.low_pass import LowPass
+from yid_ocp.problem.low_pass import LowPass, SmoothedNodes
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.noise import Course, Innovations, InputErrors, innovations
 from yid_ocp.problem.options import ProblemOptions
@@ -408,7 +407,6 @@ class Predictor:
     def course(self, episode: Episode, result: EpisodeResult, theta: Array) -> Course:
         """The rollout of an episode, about which errors of what drives it are small."""
         own, rollout = self.own_theta(episode, theta), result.rollout
-        late = (self.lateness(samples, own, ()) for samples in episode.samples)
         nx, nu = self.step.sizes["nx"], self.step.sizes["nu"]
         by_angles, by_torque = np.zeros((nx, nu)), np.zeros((nx, nu))
         if result.rest is not None:
@@ -417,7 +415,7 @@ class Predictor:
             self.functions,
             own,
             rollout,
-            [s if by is None else s.late(by[0]) for s, by in zip(episode.samples, late, strict=True)],
+            [self.placed(samples, own) for samples in episode.samples],
             episode.feedback,
             self.efforts(rollout),
             by_angles,
@@ -459,28 +457,32 @@ class Predictor:
         found = self.functions.corrections.sensor_delay(samples.sensor, theta, wanted)
         return None if found is None else (found[0] / self.step.time_step, found[1] / self.step.time_step)
 
+    def placed(self, samples: Measurements, theta: Array) -> Measurements:
+        """The samples where what they show took place."""
+        late = self.lateness(samples, theta, ())
+        return samples if late is None else samples.late(late[0])
+
     def _recorded(self, episode: Episode, rollout: Rollout, theta: Array, wanted: tuple[str, ...]) -> Rollout:
         """The rollout with efforts of prescribed joints as they are compared: as sensors follow them, and smoothed."""
         effort, slope = rollout.effort, rollout.by_effort
         if (lag := self.functions.corrections.effort_lag(theta, wanted)) is not None:
             effort, slope = Lag(*lag, self.step.time_step).of_nodes(effort, slope)
-        if (smooth := self.smoothing(episode)) is not None:
-            effort = smooth @ effort
-            slope = None if slope is None else (smooth @ slope.reshape(len(slope), -1)).reshape(slope.shape)
+        if (smooth := self.smoothing(episode, theta)) is not None:
+            effort, slope = smooth.of(effort), None if slope is None else smooth.of(slope)
         return replace(rollout, effort=effort, by_effort=slope)
 
-    def smoothing(self, episode: Episode) -> scipy.sparse.csr_array | None:
-        """What smooths predicted efforts of prescribed joints, (N, N), as measured ones are; None where none are."""
-        if not math.isfinite(self.options.path_cutoff) or not any(s.sensor.efforts for s in episode.samples):
+    def smoothing(self, episode: Episode, theta: Array) -> SmoothedNodes | None:
+        """What smooths predicted efforts of prescribed joints, where they are compared, as measured ones are."""
+        compared = [samples for samples in episode.samples if samples.sensor.efforts]
+        if not math.isfinite(self.options.path_cutoff) or not compared:
             return None
-        return LowPass(self.options.path_cutoff).matrix(episode.grid.steps, self.step.time_step)
+        nodes = np.unique(np.concatenate([self.placed(samples, theta).nodes for samples in compared]))
+        return LowPass(self.options.path_cutoff).at(nodes, episode.grid.steps, self.step.time_step)
 
     def _predict(
         self, samples: Measurements, rollout: Rollout, by_applied: Array | None, theta: Array, wanted: tuple[str, ...]
     ) -> tuple[Array, Array]:
-        unmoved, late = samples, self.lateness(samples, theta, wanted)
-        if late is not None:
-            samples = samples.late(late[0])
+        unmoved, late, samples = samples, self.lateness(samples, theta, wanted), self.placed(samples, theta)
         effort = self.efforts(rollout)[samples.nodes]
         along = _Trajectory(rollout.state, rollout.by_state, effort, rollout.by_effort, by_applied)
         y, total = self._read(samples, along, theta, wanted)
@@ -531,8 +533,8 @@ class Predictor:
         total, read = np.zeros(len(wanted)), self._recorded(episode, rollout, theta, ())
         for samples, pull in zip(episode.samples, pulls, strict=True):
             total += self._pull(samples, pull, read, theta, _Pulls(by_state, by_effort, by_applied))
-        if (smooth := self.smoothing(episode)) is not None:
-            by_effort = smooth.T @ by_effort
+        if (smooth := self.smoothing(episode, theta)) is not None:
+            by_effort = smooth.pulled(by_effort)
         if (lag := self.functions.corrections.effort_lag(theta, wanted)) is not None:
             by_effort, by_lag = Lag(*lag, self.step.time_step).pulled(rollout.effort, by_effort)
             total += by_lag
@@ -554,9 +556,7 @@ class Predictor:
     def _pull(self, samples: Measurements, pull: Array, rollout: Rollout, theta: Array, pulls: _Pulls) -> Array:
         """Spread the pull at one group's samples over states and efforts; the direct part by the parameters."""
         n, wanted = self.system.size, self.unknowns.parameters
-        unmoved, late = samples, self.lateness(samples, theta, wanted)
-        if late is not None:
-            samples = samples.late(late[0])
+        unmoved, late, samples = samples, self.lateness(samples, theta, wanted), self.placed(samples, theta)
         at_nodes, nodes = samples.distribute(pull), samples.nodes
         q, z = rollout.state[nodes, :n], rollout.state[nodes, 2 * n :]
         effort = self.efforts(rollout)[nodes]

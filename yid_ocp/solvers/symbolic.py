@@ -406,7 +406,7 @@ class _Maker:
         """Samples of one sensor, predicted linearly between the two nodes beside them."""
         sensor, nodes, n = samples.sensor, samples.nodes, self._sizes["n"]
         read, loaded = self._reading(sensor, episode)
-        smooth = self._problem.predictor.smoothing(episode) if sensor.efforts else None
+        smooth = self._problem.predictor.smoothing(episode, self._problem.theta) if sensor.efforts else None
         if smooth is not None:
             nodes = np.arange(episode.grid.steps)
         if loaded:
@@ -421,9 +421,9 @@ class _Maker:
         parts = [f".{axis}" for axis in "xyz"] if sensor.width == 3 else [""] * sensor.width
         rows = tuple(f"{channel}{part}" for channel in sensor.channels for part in parts)
         term = Term(f"{sensor.group}[{episode.name}]", rows, read, at, data, places.theta)
-        seen, between = samples.seen, _between(samples, nodes)
+        seen, between = samples.seen, _between(samples, nodes if smooth is None else smooth.nodes)
         if smooth is not None:
-            between = between @ scipy.sparse.kron(smooth, scipy.sparse.eye_array(seen.shape[1]))
+            between = between @ scipy.sparse.kron(smooth.matrix, scipy.sparse.eye_array(seen.shape[1]))
         threshold = self._problem.options.huber_threshold
         if samples.correlation is not None:
             mixed = np.zeros(seen.shape)
