@@ -130,6 +130,27 @@ def test_a_delay_at_a_sample_has_the_mean_slope_of_both_sides(driven, prescribed
         assert np.max(np.abs(exact - numeric)) <= 1e-3 * np.max(np.abs(exact))
 
 
+@pytest.mark.parametrize("time_constant", [0.02, -0.02])
+def test_what_acts_follows_the_recorded_effort_of_a_prescribed_joint(time_constant, prescribed) -> None:
+    """T dz/dt = c - z; with a negative T the recorded effort follows what acts."""
+    task = problem(prescribed, ("effort_lag",), neutral=True)
+    x = task.start.copy()
+    column = task.names.index("effort_lag@left_a.time_constant")
+    acting = task.evaluate(x, derivatives=False).episodes[0]
+    x[column] = time_constant
+    recorded = task.evaluate(x, derivatives=False).episodes[0]
+    at = next(i for i, samples in enumerate(task.episodes[0].samples) if samples.sensor.efforts)
+    joint = task.episodes[0].samples[at].sensor.efforts.index("left_a")
+    z, c = (found.predicted[at][:, joint] for found in (acting, recorded))
+    follower, other = (z, c) if time_constant > 0 else (c, z)
+    rate = np.gradient(follower, H)
+    error = 0.02 * rate - (other - follower)
+    # the ramp of the motion ends in a step of its acceleration, which no difference of rates resolves
+    assert np.median(np.abs(error)) < 0.05 * np.median(np.abs(other - follower))
+    others = [k for k in range(recorded.predicted[at].shape[1]) if k != joint]
+    np.testing.assert_array_equal(recorded.predicted[at][:, others], acting.predicted[at][:, others])
+
+
 def test_a_late_camera_sees_the_past(driven, sensors) -> None:
     task = problem(driven, ("camera_latency",), neutral=True)
     delay = 3 * H

@@ -65,8 +65,23 @@ def test_without_a_time_constant_all_is_followed_at_once() -> None:
     np.testing.assert_allclose(slope[2:, 0, 0], -np.diff(VALUE[1:, 0]) / H)
 
 
-@pytest.mark.parametrize("form", ["of_steps", "of_nodes"])
-@pytest.mark.parametrize("size", [0.02, 1e-3])
+def test_of_a_negative_time_constant_the_value_follows() -> None:
+    """What a smooth value is said to follow, followed again, is the value."""
+    t = 0.001 * np.arange(1200)
+    value = np.stack([np.sin(5 * t), np.cos(3 * t)], axis=1)
+    there = Lag(np.array([-0.03, 0.0]), BY, 0.001)
+    back = Lag(np.array([0.03, 0.0]), BY, 0.001)
+    ahead, _ = there.of_nodes(value, None)
+    again, _ = back.of_nodes(ahead, None)
+    np.testing.assert_allclose(again[300:], value[300:], atol=2e-5)
+    assert np.abs(ahead - value)[300:, 0].max() == pytest.approx(0.15, rel=0.02)
+    np.testing.assert_array_equal(ahead[:, 1], value[:, 1])
+
+
+@pytest.mark.parametrize(
+    ("form", "size"),
+    [("of_steps", 0.02), ("of_steps", 1e-3), ("of_nodes", 0.02), ("of_nodes", 1e-3), ("of_nodes", -0.02)],
+)
 def test_derivatives_agree_with_differences(form, size) -> None:
     """By the time constant directly, and through what is followed."""
     _, slope = getattr(lag(size), form)(VALUE, SLOPE)
@@ -80,9 +95,10 @@ def test_derivatives_agree_with_differences(form, size) -> None:
         np.testing.assert_allclose(slope[:, :, direction], (above - below) / 2e-7, rtol=1e-5, atol=1e-5)
 
 
-def test_a_pull_comes_back_by_the_transpose() -> None:
+@pytest.mark.parametrize("size", [0.02, -0.02])
+def test_a_pull_comes_back_by_the_transpose(size) -> None:
     pull = np.random.default_rng(5).normal(size=(N, 2))
-    _, slope = lag().of_nodes(VALUE, SLOPE)
-    back, direct = lag().pulled(VALUE, pull)
+    _, slope = lag(size).of_nodes(VALUE, SLOPE)
+    back, direct = lag(size).pulled(VALUE, pull)
     total = np.einsum("kn,knd->d", back, SLOPE) + direct
     np.testing.assert_allclose(total, np.einsum("kn,knd->d", pull, slope), rtol=1e-12)

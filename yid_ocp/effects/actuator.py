@@ -222,8 +222,9 @@ class EffortDelay(EffectBase):
 class EffortLag(EffectBase):
     """Torque follows its command: time_constant dz/dt = command - z, z the torque that acts.
 
-    A driven joint's recorded torque is the command; of a prescribed joint the measured effort follows the one that the
-    motion needs in the same way. Before a recording begins both are what they are at its start.
+    The recorded torque is the command, of a prescribed joint too: the effort that its motion needs follows the recorded
+    one. A negative time constant there means that the recorded effort follows the one that is needed, as one behind a
+    sensor's filter does. Before a recording begins both are what they are at its start.
     """
 
     equation = "time_constant dz/dt = command - z"
@@ -239,12 +240,15 @@ class EffortLag(EffectBase):
     def quantities_at(cls, location: str, system: System) -> tuple[Quantity, ...]:
         """time_constant [s]."""
         text = "with which torque follows its command"
-        return (Quantity("time_constant", "s", 0.0, 0.0, 0.5, (0.0, 0.05), text),)
+        least = -0.5 if location in system.prescribed else 0.0
+        return (Quantity("time_constant", "s", 0.0, least, 0.5, (0.0, 0.05), text),)
 
     def lag(self, channel: str) -> ca.SX:
         """See the class."""
-        ours = (f"torque.{self.location}", f"joints.effort.{self.location}")
-        return self["time_constant"] if channel in ours else ca.SX(0)
+        quantity, _, joint = channel.rpartition(".")
+        if joint != self.location:
+            return ca.SX(0)
+        return {"torque": self["time_constant"], "joints.effort": -self["time_constant"]}.get(quantity, ca.SX(0))
 
 
 def _recorded(system: System) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.signal
+import scipy.sparse
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -15,7 +16,8 @@ Array = NDArray[np.float64]
 class Lag:
     """First-order lags of some channels.
 
-    With E = exp(-h/T) and f = T/h (1 - E), both zero at T = 0, where a value is followed at once.
+    With E = exp(-h/T) and f = T/h (1 - E), both zero at T = 0, where a value is followed at once. At nodes T may be
+    negative: then the value follows z with the time constant -T, so that z = x - T dx/dt.
 
     Attributes
     ----------
@@ -66,14 +68,17 @@ class Lag:
         Returns
         -------
         followed : ndarray, shape (N, k)
-            z_{k+1} = E z_k + (f - E) x_k + (1 - f) x_{k+1}
+            z_{k+1} = E z_k + (f - E) x_k + (1 - f) x_{k+1}, or x - T dx/dt by central differences.
         slope : ndarray, shape (N, k, d), or None
         """
         decay, share, _, _ = self._factors()
-        followed = self._straight(value, decay, share)
+        lead, rates = np.minimum(self.time_constant, 0.0), self._rates(len(value))
+        followed = self._straight(value, decay, share) - lead * (rates @ value)
         if slope is None:
             return followed, None
         total = self._straight(slope, decay[:, None], share[:, None])
+        if np.any(lead):
+            total -= lead[:, None] * (rates @ slope.reshape(len(slope), -1)).reshape(slope.shape)
         width = self.by_parameters.shape[1]
         total[:, :, :width] += self._by_time(value, followed)[:, :, None] * self.by_parameters
         return followed, total
@@ -91,6 +96,7 @@ class Lag:
         by_parameters : ndarray, shape (d,)
         """
         decay, share, _, _ = self._factors()
+        lead, rates = np.minimum(self.time_constant, 0.0), self._rates(len(value))
         direct = np.sum(pull * self._by_time(value, self._straight(value, decay, share)), axis=0) @ self.by_parameters
         back = pull.copy()
         for k in range(len(back) - 2, 0, -1):
@@ -98,7 +104,7 @@ class Lag:
         passed = back.copy()
         passed[2:] *= 1 - share
         passed[1:-1] += (share - decay) * back[2:]
-        return passed, direct
+        return passed - rates.T @ (lead * pull), direct
 
     def _factors(self) -> tuple[Array, Array, Array, Array]:
         """E, f and their derivatives by T."""
@@ -113,7 +119,18 @@ class Lag:
         decay, _, decay_slope, share_slope = self._factors()
         driven = np.zeros_like(value)
         driven[2:] = decay_slope * (followed[1:-1] - value[1:-1]) - share_slope * (value[2:] - value[1:-1])
-        return _filtered(driven, decay)
+        return np.where(self.time_constant < 0, -(self._rates(len(value)) @ value), _filtered(driven, decay))
+
+    def _rates(self, count: int) -> scipy.sparse.csr_array:
+        """Central differences of values at nodes, from node 1 on, one-sided there and at the last one, (N, N)."""
+        before, after = np.arange(count) - 1, np.arange(count) + 1
+        before, after = np.clip(before, 1, count - 1), np.clip(after, 1, count - 1)
+        width = np.maximum(after - before, 1) * self.time_step
+        width[0] = np.inf
+        node = np.arange(count)
+        entries = np.concatenate([-1 / width, 1 / width])
+        at = (np.tile(node, 2), np.concatenate([before, after]))
+        return scipy.sparse.coo_array((entries, at), shape=(count, count)).tocsr()
 
     @staticmethod
     def _following(value: Array, extra: Array, decay: Array) -> Array:
