@@ -77,14 +77,21 @@ def _of(name: str) -> Callable[[Statistics, Thresholds, str], float]:
     return lambda said, limits, truth: -math.inf if said.get(name) is None else float(said[name])
 
 
-def _behind(figure: str, scale: float) -> Callable[[Statistics, Thresholds, str], float]:
-    """By how much the true effect alone is behind the best one alone."""
+def _odds(said: Statistics, _: Thresholds, truth: str) -> float:
+    """Log odds of the likeliest effect alone against the true one alone."""
+    known = {label: own["squares"] for label, own in said["behind"].items() if own["squares"] is not None}
+    return 0.5 * (known[truth] - min(known.values())) if truth in known else -math.inf
 
-    def lost(said: Statistics, _: Thresholds, truth: str) -> float:
-        known = {label: own[figure] for label, own in said["behind"].items() if own[figure] is not None}
-        return scale * (known[truth] - min(known.values())) if truth in known else -math.inf
 
-    return lost
+def _lost(said: Statistics, _: Thresholds, truth: str) -> float:
+    """Held-out chi2/n by which the true effect alone is behind the best one alone, where that is beyond chance."""
+    known = {label: own for label, own in said["behind"].items() if own["chi2_per_dof"] is not None}
+    if truth not in known:
+        return -math.inf
+    own, best = known[truth], min(known.values(), key=lambda entry: float(entry["chi2_per_dof"]))
+    lost = float(own["chi2_per_dof"] - best["chi2_per_dof"])
+    # both are said beside the first, one of which they are as a rule
+    return lost if lost > math.hypot(own["error"], best["error"]) else 0.0
 
 
 RULES: Mapping[str, Rule] = {
@@ -93,19 +100,17 @@ RULES: Mapping[str, Rule] = {
         "smallest_channel", _along, "the same of the worst channel, along a candidate", "clean", "most", 0.02
     ),
     "evidence": Rule("worth", _of("evidence"), "rise of the log evidence by the best place", "clean", "most", 5.0),
-    "rival": Rule(
-        "worth", _behind("squares", 0.5), "log odds of the likeliest effect against the truth", "refitted", "most", 5.0
-    ),
+    "rival": Rule("worth", _odds, "log odds of the likeliest effect against the truth", "refitted", "most", 5.0),
     "closure": Rule(
         "closure", _of("closure_low"), "lower end of the closure by the best effect", "clean", "most", 0.05
     ),
     "relevance": Rule("relevance", _of("fall"), "part of a held-out error taken away by it", "clean", "most", 0.01),
     "explained": Rule("explained", _of("explained"), "part of the smoother's explanation", "named", "least", 0.75),
-    "carried": Rule("carried_stds", _of("carried"), "standard deviations between recordings", "named", "most", 2.0),
+    "carried": Rule("carried_stds", _of("carried"), "standard deviations between recordings", "named", "most", 3.0),
     "tie": Rule(
         "tie",
-        _behind("chi2_per_dof", 1.0),
-        "held-out chi2/n by which the truth is behind the best effect",
+        _lost,
+        "held-out chi2/n by which the truth is behind the best effect, beyond a standard error",
         "refitted",
         "most",
         0.001,
