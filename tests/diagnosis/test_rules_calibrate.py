@@ -113,7 +113,12 @@ def test_effects_that_were_named_right_set_what_must_be_explained() -> None:
 def test_a_tie_is_what_the_truth_may_be_behind_beyond_chance() -> None:
     def behind(error: float, **lost: float | None) -> Any:
         said = {
-            label.replace("_at_", "@"): {"chi2_per_dof": x, "error": error if x else 0.0, "squares": x}
+            label.replace("_at_", "@"): {
+                "left": x if x is None else 1.0 + x,
+                "chi2_per_dof": x,
+                "error": error if x else 0.0,
+                "squares": x,
+            }
             for label, x in lost.items()
         }
         return case("single", "unknown", DAMPER, multiple=3.0, statistics={"behind": said})
@@ -126,6 +131,8 @@ def test_a_tie_is_what_the_truth_may_be_behind_beyond_chance() -> None:
         behind(0.1, kelvin_voigt_at_T1=0.0, c_at_d=0.5),
         behind(0.1, a_at_b=0.0),
         behind(0.1, a_at_b=0.0, kelvin_voigt_at_T1=None),
+        # a search that ended elsewhere says nothing of rivals
+        behind(0.1, a_at_b=0.0, kelvin_voigt_at_T1=55.0),
     ]
     found = calibrated(*cases)["tie"]
     assert found["sample"] == [0.0, 0.0, pytest.approx(0.02), pytest.approx(0.03)], "also where it was not named"
@@ -153,7 +160,7 @@ def test_settings_are_quantiles_within_what_is_of_use(
 
 def test_of_two_rules_for_one_setting_the_wider_counts() -> None:
     clean = case("null", "no_gap", open=STATISTICS | {"evidence": 6.0})
-    same = {"chi2_per_dof": 0.0, "error": 0.0}
+    same = {"left": 1.0, "chi2_per_dof": 0.0, "error": 0.0}
     behind = {"a@b": same | {"squares": -4.0}, "kelvin_voigt@T1": same | {"squares": 14.0}}
     true = case("single", "effect", DAMPER, multiple=3.0, statistics={"behind": behind})
     labels, marks, answers = zip(clean, true, strict=True)

@@ -121,7 +121,8 @@ def test_a_withheld_effect_is_named_placed_and_measured(bench):
     assert (told["closure_low"], told["assumptions"]) == (low, 1)
     assert told["explained"] == finding.explained > 0.9
     assert told["candidate"] <= len(FRICTION) * result["which"][0]["p_value"]
-    assert told["behind"]["joint_coulomb@elbow"] == {"chi2_per_dof": 0.0, "error": 0.0, "squares": 0.0}
+    left = finding.fits[0].loss.mean
+    assert told["behind"]["joint_coulomb@elbow"] == {"left": left, "chi2_per_dof": 0.0, "error": 0.0, "squares": 0.0}
     assert min(entry["squares"] for entry in told["behind"].values()) == 0.0, "no other is as likely"
     [apart] = finding.carried
     assert told["carried"] == pytest.approx(abs(apart.value - apart.again) / np.hypot(apart.std, apart.again_std))

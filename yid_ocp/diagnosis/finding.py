@@ -244,8 +244,8 @@ def statistics(finding: Finding) -> dict[str, Any]:
         and `closure_low` (held out, of all that was added, accepted or not), `fall` (part of the held-out error that
         they take away), `explained` (over what the smoother explains), `assumptions`, `carried` (standard deviations
         between the values found and those on the held-out recordings, at most), `behind` (of every effect that was
-        refitted alone, how far it is behind the first: in held-out chi2/n with its standard error, and in r'r of all
-        recordings).
+        refitted alone, the held-out chi2/n that it leaves and how far it is behind the first: in held-out chi2/n with
+        its standard error, and in r'r of all recordings).
     """
     tests = (finding.before, finding.held_out_before)
     apart = [
@@ -276,7 +276,12 @@ def _behind(fits: Sequence[Fit]) -> dict[str, Any]:
     found = {}
     for fit in fits:
         lost, error = gain(fit.loss, fits[0].loss)
-        figures = {"chi2_per_dof": lost, "error": error, "squares": behind(fit, fits[0])}
+        figures = {
+            "left": fit.loss.mean,
+            "chi2_per_dof": lost,
+            "error": error,
+            "squares": behind(fit, fits[0]),
+        }
         found[fit.effects[-1].label] = {name: _number(value) for name, value in figures.items()}
     return found
 

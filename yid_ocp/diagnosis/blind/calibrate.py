@@ -77,18 +77,28 @@ def _of(name: str) -> Callable[[Statistics, Thresholds, str], float]:
     return lambda said, limits, truth: -math.inf if said.get(name) is None else float(said[name])
 
 
-def _odds(said: Statistics, _: Thresholds, truth: str) -> float:
+def _rivals(said: Statistics, limits: Thresholds, truth: str) -> Mapping[str, Statistics]:
+    """Effects refitted alone that leave little but noise, if the true one does: likelihood tells only these apart."""
+    found = {
+        label: own
+        for label, own in said["behind"].items()
+        if own["left"] is not None and own["left"] < 1 + limits.smallest_gap
+    }
+    return found if truth in found else {}
+
+
+def _odds(said: Statistics, limits: Thresholds, truth: str) -> float:
     """Log odds of the likeliest effect alone against the true one alone."""
-    known = {label: own["squares"] for label, own in said["behind"].items() if own["squares"] is not None}
-    return 0.5 * (known[truth] - min(known.values())) if truth in known else -math.inf
+    known = {label: own["squares"] for label, own in _rivals(said, limits, truth).items()}
+    return 0.5 * (known[truth] - min(known.values())) if known else -math.inf
 
 
-def _lost(said: Statistics, _: Thresholds, truth: str) -> float:
+def _lost(said: Statistics, limits: Thresholds, truth: str) -> float:
     """Held-out chi2/n by which the true effect alone is behind the best one alone, where that is beyond chance."""
-    known = {label: own for label, own in said["behind"].items() if own["chi2_per_dof"] is not None}
-    if truth not in known:
+    known = _rivals(said, limits, truth)
+    if not known:
         return -math.inf
-    own, best = known[truth], min(known.values(), key=lambda entry: float(entry["chi2_per_dof"]))
+    own, best = known[truth], min(known.values(), key=lambda entry: float(entry["left"]))
     lost = float(own["chi2_per_dof"] - best["chi2_per_dof"])
     # both are said beside the first, one of which they are as a rule
     return lost if lost > math.hypot(own["error"], best["error"]) else 0.0
