@@ -59,6 +59,8 @@ class Episode:
         Where the rollout begins, if it is neither at rest nor fitted at the parameters that are asked about.
     shares_start_of : int, optional
         Place of the episode to estimate on whose start this held-out one shares: two parts of one recording.
+    near : ndarray, optional, shape (n,)
+        Configuration near the equilibrium at which it starts, where that is not the one of least energy.
     """
 
     recording: Recording
@@ -75,6 +77,7 @@ class Episode:
     errors: InputErrors | None = None
     start: FittedStart | None = None
     shares_start_of: int | None = None
+    near: Array | None = None
 
     @property
     def tracking(self) -> Feedback | None:

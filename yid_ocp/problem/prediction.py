@@ -19,7 +19,7 @@ from yid_ocp.problem.constant_errors import without_constants
 from yid_ocp.problem.corrections import Inputs
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.functions import ModelFunctions
-from yid_ocp.problem.inputs import held_inputs, held_inputs_slope, own_loads
+from yid_ocp.problem.inputs import held_inputs, held_inputs_slope
 from yid_ocp.problem.lag import Lag
 from yid_ocp.problem.low_pass import LowPass, SmoothedNodes
 from yid_ocp.problem.measurements import Measurements
@@ -98,23 +98,6 @@ class Predictor:
         start = self.functions.start_fit.solve(episode.posture, samples, own, window, episode.path)
         return replace(episode, start=start)
 
-    def loaded(self, episode: Episode, theta: Array) -> Episode:
-        """The episode with the model's own loads on the gears of joints whose efforts are compared; see `own_loads`."""
-        compared = [samples for samples in episode.samples if samples.sensor.efforts]
-        if not compared or not self.functions.corrections.angles_need_effort:
-            return episode
-        result = self.run(episode, theta, np.zeros(len(self.unknowns.start)), False)
-        if isinstance(result, str):
-            return episode
-        load, own = episode.load.copy(), self.efforts(result.rollout)
-        for samples in compared:
-            at = [self.functions.corrections.joints.index(joint) for joint in samples.sensor.efforts]
-            column = [self.system.mechanism.joint_index(joint) for joint in samples.sensor.efforts]
-            load[:, at] = own_loads(
-                load[:, at], own[:, column], samples.node, episode.grid.times, self.options.path_cutoff
-            )
-        return replace(episode, load=load)
-
     def own_theta(self, episode: Episode, theta: Array) -> Array:
         """theta with the values that belong to one recording: known ones, and those fitted along with its start."""
         fitted: Mapping[str, float] = {} if episode.start is None else episode.start.values
@@ -141,7 +124,7 @@ class Predictor:
         wanted : tuple of str
             Parameters by which to differentiate.
         guess : ndarray, optional, shape (n,)
-            Configuration near the equilibrium; without one several are tried and that of least energy is taken.
+            Configuration near the equilibrium; without one `Episode.near`, or several, of which least energy is taken.
         """
         nx, rows = self.step.sizes["nx"], list(self.start_rows)
         by_offset = np.zeros((nx, len(rows)))
@@ -152,7 +135,8 @@ class Predictor:
         else:
             inputs = self.inputs(episode, theta, wanted)
             first = inputs.first_torque if self.system.driven else None
-            rest = self.functions.rest(inputs.posture, theta, first, guess, wanted)
+            near = episode.near if guess is None else guess
+            rest = self.functions.rest(inputs.posture, theta, first, near, wanted)
             if not rest.converged:
                 none = np.zeros((nx, len(wanted) + len(rows)))
                 return Start(rest.state, none, rest, f"{episode.name}: {rest.message}")

@@ -24,6 +24,7 @@ from yid_ocp.problem.noise import Innovations, InputErrors
 from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.problem.outcome import EpisodeResult, Start
 from yid_ocp.problem.prediction import Predictor
+from yid_ocp.problem.preparation import prepared
 from yid_ocp.problem.simulated import simulated
 from yid_ocp.problem.unknowns import (
     Unknowns,
@@ -122,7 +123,7 @@ class EstimationProblem(Shown):
         )
         self._set(functions, options, tuple(free), theta, episodes, others)
         fitted = (self.predictor.fitted(episode, theta) for episode in episodes)
-        ready, other = (tuple(self.predictor.loaded(e, theta) for e in group) for group in (fitted, others))
+        ready, other = (tuple(prepared(self.predictor, e, theta) for e in group) for group in (fitted, others))
         self._set(functions, options, tuple(free), theta, ready, other)
 
     def _set(
