@@ -82,7 +82,7 @@ def _error(predictor: Predictor, seen: Sequence[Measurements], start: Start, the
     n, state = predictor.system.size, start.state[None]
     squares: list[Array] = []
     for samples in seen:
-        read = predictor.functions.sensor(samples.sensor, ())
+        read = predictor.functions.sensor(samples.sensor, predictor.unknowns.parameters)
         predicted = read(state[:, :n], state[:, 2 * n :], np.zeros((1, n)), theta)[0][:, :, 0]
         squares.append(samples.whitened(predicted)[samples.seen] ** 2)
     return float(np.sqrt(np.mean(np.concatenate(squares))))
