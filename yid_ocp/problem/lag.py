@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import scipy.signal
@@ -72,7 +73,7 @@ class Lag:
         slope : ndarray, shape (N, k, d), or None
         """
         decay, share, _, _ = self._factors()
-        lead, rates = np.minimum(self.time_constant, 0.0), self._rates(len(value))
+        lead, rates = np.minimum(self.time_constant, 0.0), _rates(len(value), self.time_step)
         followed = self._straight(value, decay, share) - lead * (rates @ value)
         if slope is None:
             return followed, None
@@ -96,7 +97,7 @@ class Lag:
         by_parameters : ndarray, shape (d,)
         """
         decay, share, _, _ = self._factors()
-        lead, rates = np.minimum(self.time_constant, 0.0), self._rates(len(value))
+        lead, rates = np.minimum(self.time_constant, 0.0), _rates(len(value), self.time_step)
         direct = np.sum(pull * self._by_time(value, self._straight(value, decay, share)), axis=0) @ self.by_parameters
         back = pull.copy()
         for k in range(len(back) - 2, 0, -1):
@@ -119,18 +120,7 @@ class Lag:
         decay, _, decay_slope, share_slope = self._factors()
         driven = np.zeros_like(value)
         driven[2:] = decay_slope * (followed[1:-1] - value[1:-1]) - share_slope * (value[2:] - value[1:-1])
-        return np.where(self.time_constant < 0, -(self._rates(len(value)) @ value), _filtered(driven, decay))
-
-    def _rates(self, count: int) -> scipy.sparse.csr_array:
-        """Central differences of values at nodes, from node 1 on, one-sided there and at the last one, (N, N)."""
-        before, after = np.arange(count) - 1, np.arange(count) + 1
-        before, after = np.clip(before, 1, count - 1), np.clip(after, 1, count - 1)
-        width = np.maximum(after - before, 1) * self.time_step
-        width[0] = np.inf
-        node = np.arange(count)
-        entries = np.concatenate([-1 / width, 1 / width])
-        at = (np.tile(node, 2), np.concatenate([before, after]))
-        return scipy.sparse.coo_array((entries, at), shape=(count, count)).tocsr()
+        return np.where(self.time_constant < 0, -(_rates(len(value), self.time_step) @ value), _filtered(driven, decay))
 
     @staticmethod
     def _following(value: Array, extra: Array, decay: Array) -> Array:
@@ -154,3 +144,16 @@ def _filtered(driven: Array, decay: Array) -> Array:
     for i, factor in enumerate(np.ravel(decay)):
         result[:, i] = scipy.signal.lfilter([1.0], [1.0, -factor], driven[:, i], axis=0)
     return result
+
+
+@lru_cache(maxsize=16)
+def _rates(count: int, time_step: float) -> scipy.sparse.csr_array:
+    """Central differences of values at nodes, from node 1 on, one-sided there and at the last one, (N, N)."""
+    before, after = np.arange(count) - 1, np.arange(count) + 1
+    before, after = np.clip(before, 1, count - 1), np.clip(after, 1, count - 1)
+    width = np.maximum(after - before, 1) * time_step
+    width[0] = np.inf
+    node = np.arange(count)
+    entries = np.concatenate([-1 / width, 1 / width])
+    at = (np.tile(node, 2), np.concatenate([before, after]))
+    return scipy.sparse.coo_array((entries, at), shape=(count, count)).tocsr()

@@ -466,7 +466,9 @@ class Predictor:
     def _predict(
         self, samples: Measurements, rollout: Rollout, by_applied: Array | None, theta: Array, wanted: tuple[str, ...]
     ) -> tuple[Array, Array]:
-        unmoved, late, samples = samples, self.lateness(samples, theta, wanted), self.placed(samples, theta)
+        unmoved, late = samples, self.lateness(samples, theta, wanted)
+        if late is not None:
+            samples = samples.late(late[0])
         effort = self.efforts(rollout)[samples.nodes]
         along = _Trajectory(rollout.state, rollout.by_state, effort, rollout.by_effort, by_applied)
         y, total = self._read(samples, along, theta, wanted)
@@ -540,7 +542,9 @@ class Predictor:
     def _pull(self, samples: Measurements, pull: Array, rollout: Rollout, theta: Array, pulls: _Pulls) -> Array:
         """Spread the pull at one group's samples over states and efforts; the direct part by the parameters."""
         n, wanted = self.system.size, self.unknowns.parameters
-        unmoved, late, samples = samples, self.lateness(samples, theta, wanted), self.placed(samples, theta)
+        unmoved, late = samples, self.lateness(samples, theta, wanted)
+        if late is not None:
+            samples = samples.late(late[0])
         at_nodes, nodes = samples.distribute(pull), samples.nodes
         q, z = rollout.state[nodes, :n], rollout.state[nodes, 2 * n :]
         effort = self.efforts(rollout)[nodes]
