@@ -31,7 +31,7 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.constant_errors import without_constants
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.problem.low_pass import LowPass, effort_filter
+from yid_ocp.problem.low_pass import effort_filter
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.null_test import discoveries, sample_times
 from yid_ocp.problem.options import SensorOptions
@@ -270,7 +270,7 @@ def _falls(problem: EstimationProblem, run: Run, limits: Thresholds) -> Iterator
 def _before_fall(history: History, falls: Sequence[Fall], limits: Thresholds) -> History | None:
     """A history up to where its recording's motion gets too fast, less what a filter smears; None where too short."""
     until = min((fall.time for fall in falls if fall.recording == history.recording), default=math.inf)
-    smear = effort_filter(history.cutoff).settling if math.isfinite(history.cutoff) else 0.0
+    smear = effort_filter(history.cutoff).settling
     keep = np.flatnonzero(history.t <= until - (smear if math.isfinite(until) else 0.0))
     if len(keep) < 10:
         return None
@@ -569,20 +569,22 @@ def without_events(problem: EstimationProblem, events: Events) -> EstimationProb
         for event in own:
             if event.pulse is not None and event.channel in set(problem.system.driven) - set(problem.system.servos):
                 torque[:, problem.system.driven.index(event.channel)] += event.pulse.values(times)
-        smear = 1 / problem.options.path_cutoff
-        parts = [_counting(episode, samples, own, fall, smear) for samples in episode.samples]
+        parts = [_counting(episode, s, own, fall, problem.options.path_cutoff) for s in episode.samples]
         return replace(episode, torque=torque, samples=tuple(parts))
 
     return problem.on([cleaned(e) for e in problem.episodes], [cleaned(e) for e in problem.held_out])
 
 
-def _counting(episode: Episode, samples: Measurements, own: Sequence[Event], fall: float, smear: float) -> Measurements:
+def _counting(
+    episode: Episode, samples: Measurements, own: Sequence[Event], fall: float, cutoff: float
+) -> Measurements:
     """Samples without those that an event spoils."""
+    smear = 1 / cutoff
     hidden = np.zeros(samples.value.shape, bool)
     t = sample_times(episode, samples)
     t = t if t.ndim > 1 else np.broadcast_to(t[:, None], hidden.shape)
     if math.isfinite(fall) and samples.sensor.efforts:
-        hidden |= t > fall - LowPass(1 / smear).settling if smear > 0 else t > fall
+        hidden |= t > fall - effort_filter(cutoff).settling
     for event in own:
         for column, channel in enumerate(samples.channel_of_column):
             if samples.sensor.efforts:
