@@ -575,16 +575,14 @@ def without_events(problem: EstimationProblem, events: Events) -> EstimationProb
     return problem.on([cleaned(e) for e in problem.episodes], [cleaned(e) for e in problem.held_out])
 
 
-def _counting(
-    episode: Episode, samples: Measurements, own: Sequence[Event], fall: float, cutoff: float
-) -> Measurements:
+def _counting(episode: Episode, samples: Measurements, own: Sequence[Event], end: float, cutoff: float) -> Measurements:
     """Samples without those that an event spoils."""
     smear = 1 / cutoff
     hidden = np.zeros(samples.value.shape, bool)
     t = sample_times(episode, samples)
     t = t if t.ndim > 1 else np.broadcast_to(t[:, None], hidden.shape)
-    if math.isfinite(fall) and samples.sensor.efforts:
-        hidden |= t > fall - effort_filter(cutoff).settling
+    if math.isfinite(end) and samples.sensor.efforts:
+        hidden |= t > end - effort_filter(cutoff).settling
     for event in own:
         for column, channel in enumerate(samples.channel_of_column):
             if samples.sensor.efforts:
