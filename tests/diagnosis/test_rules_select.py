@@ -633,6 +633,34 @@ def test_a_later_effect_shows_what_an_earlier_one_stood_in_for(monkeypatch):
     assert [of.kind for of in added[0].rivals] == ["c"]
 
 
+HIDDEN = GROWING | {"b": (9.0, 9.2), "c": (9.1, 9.3), "ab": (1.0, 5.0), "ac": (3.1, 3.3), "bc": (1.2, 1.3)}
+"""Beside a, which stands in for b and c, neither is sure to help."""
+
+
+def test_one_that_stands_in_for_two_gives_way_to_both(monkeypatch):
+    rounds = Rounds(monkeypatch, HIDDEN)
+    _, chosen, added = rounds.compose(effects=2)
+    assert chosen == ["c", "b"]
+    assert added[-1].fit.loss.mean == pytest.approx(1.25)
+    assert "trying b@x with others in the place of those before it" in rounds.heard.stages
+    asked = [entry[:2] for entry in rounds.refits[2:]]
+    assert len(asked) == len({str(entry) for entry in asked}), "nothing is looked for twice"
+
+
+@pytest.mark.parametrize("losses", [{"bc": (9.4, 9.6)}, {"bc": (0.9, 5.0)}], ids=["worse", "not sure either"])
+def test_what_is_no_better_with_others_in_its_place_stays_as_it_was(monkeypatch, losses):
+    rounds = Rounds(monkeypatch, HIDDEN | losses)
+    _, chosen, added = rounds.compose(effects=2)
+    assert chosen == ["a"]
+    assert added[0].fit.loss.mean == pytest.approx(3.1)
+
+
+def test_what_is_not_there_is_not_tried_with_others(monkeypatch):
+    rounds = Rounds(monkeypatch, HIDDEN, absent=("b", "c"))
+    assert rounds.compose(effects=2)[1] == ["a"]
+    assert not any(said.startswith("trying") for said in rounds.heard.stages)
+
+
 def test_what_does_as_well_beside_the_others_is_a_rival(monkeypatch):
     losses = GROWING | {"ab": (2.0, 2.2), "b": (3.4, 3.5), "bc": (2.001, 2.201)}
     _, chosen, added = Rounds(monkeypatch, losses).compose(effects=2)

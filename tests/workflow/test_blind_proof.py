@@ -65,7 +65,7 @@ def test_a_proof_is_sealed_answered_and_not_done_again(driven, tmp_path, monkeyp
         run_blind([driven], folder, 2, 3, workers=Here())
 
 
-def test_what_cannot_be_proved_is_refused(driven, pendulum, tmp_path, cli):
+def test_what_cannot_be_proved_is_refused(driven, pendulum, tmp_path, cli, monkeypatch):
     prescribed = load_config(pendulum)
     with pytest.raises(ConfigError, match=r"moves driven arms(.|\n)*model.arms.mode"):
         run_blind([prescribed], tmp_path / "proof", 2, 3, workers=Here())
@@ -74,6 +74,7 @@ def test_what_cannot_be_proved_is_refused(driven, pendulum, tmp_path, cli):
     with pytest.raises(ConfigError, match="seed = -1"):
         run_blind([driven], tmp_path / "proof", 2, -1, workers=Here())
     assert not (tmp_path / "proof").exists()
+    monkeypatch.setattr("yid_ocp.parallel.cluster.CONNECTING", 0.5)
     options = [part for setting in SETTINGS for part in ("--set", setting)]
     done = cli("blind", pendulum, *options, "--scheduler", "127.0.0.1:1", "--out", tmp_path / "proof")
     assert done.code == 2

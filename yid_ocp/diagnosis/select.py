@@ -288,7 +288,8 @@ def compose(
     limits = search.limits
     current = nominal
     first: tuple[Fit, ...] = ()
-    added: list[Added] = []
+    added: tuple[Added, ...] = ()
+    settled = True
     while len(added) < limits.effects:
         base = [entry.effect for entry in added]
         if added:
@@ -307,17 +308,41 @@ def compose(
         if not added:
             first = (near[0], *sorted((fit for fit in fits if fit is not near[0]), key=lambda fit: fit.loss.mean))
         chosen = next((fit for fit in near if _worth_adding(current, fit, limits)), None)
-        if chosen is None:
+        if chosen is not None:
+            added, settled = (*added, _added(search, nominal, chosen, near)), False
+            closed = added[-1].closure.value
+            said = "" if np.isnan(closed) else f": {100 * closed:.3g} % of the held-out gap closed"
+            search.progress.stage(f"added {chosen.effects[-1].label}{said}")
+        elif revised := _beside_another(search, nominal, added, near):
+            added, settled = revised, True
+        else:
             break
-        total = closure(nominal.loss, chosen.loss, limits=limits)
-        rivals = (chosen, *(fit for fit in near if fit is not chosen))
-        added.append(Added(chosen.effects[-1], chosen, total, tuple(fit.effects[-1] for fit in rivals)))
-        said = "" if np.isnan(total.value) else f": {100 * total.value:.3g} % of the held-out gap closed"
-        search.progress.stage(f"added {chosen.effects[-1].label}{said}")
-        current = chosen
+        current = added[-1].fit
         if current.loss.mean < 1 + limits.smallest_gap:
             break
-    return first, _reconsidered(search, nominal, added)
+    return first, added if settled else _reconsidered(search, nominal, added)
+
+
+def _added(search: Search, nominal: Fit, chosen: Fit, near: Sequence[Fit]) -> Added:
+    """The last effect of a fit, with those of the fits near it."""
+    rivals = (chosen, *(fit for fit in near if fit is not chosen))
+    total = closure(nominal.loss, chosen.loss, limits=search.limits)
+    return Added(chosen.effects[-1], chosen, total, tuple(fit.effects[-1] for fit in rivals))
+
+
+def _beside_another(search: Search, nominal: Fit, added: Sequence[Added], near: Sequence[Fit]) -> tuple[Added, ...]:
+    """What effects become beside one that is not worth adding to them as they are; none where that is no better.
+
+    An effect that stands in for two leaves errors of its own, beside which the second is not sure to help. It is tried
+    all the same, and others in the place of those before it; both together have to be worth it then.
+    """
+    limits = search.limits
+    if not added or not stands_out(near[0].effects[-1], near[0], limits):
+        return ()
+    search.progress.stage(f"trying {near[0].effects[-1].label} with others in the place of those before it")
+    revised = _reconsidered(search, nominal, [*added, _added(search, nominal, near[0], near)])
+    others = _labels(revised) - _labels(added)
+    return revised if others and _worth_adding(added[-1].fit, revised[-1].fit, limits) else ()
 
 
 def _of_a_size(fits: Sequence[Fit], limits: Thresholds) -> list[Fit]:
@@ -338,19 +363,20 @@ def _reconsidered(search: Search, nominal: Fit, added: Sequence[Added]) -> tuple
     """Every effect tried for its place again beside the others: without it, and others instead of it.
 
     What was added first was chosen while the others were missing, and may be there in their stead. The last one was
-    chosen beside all others and needs no second look unless one of these has changed.
+    chosen beside all others, as one that was put in another's place; they need no second look until these change.
     """
     kept = tuple(added)
-    seen = {_labels(kept)}
-    position, last = 0, len(kept) - 1
-    while position < last and len(kept) > 1:
+    seen, tried = {_labels(kept)}, {_labels(kept[:-1])}
+    while len(kept) > 1:
+        others = [_labels(kept) - {entry.effect.label} for entry in kept]
+        position = next((i for i, own in enumerate(others) if own not in tried), None)
+        if position is None:
+            break
+        tried.add(others[position])
         revised = _revised(search, nominal, kept, position)
-        if _labels(revised) in seen:
-            kept = revised if _labels(revised) == _labels(kept) else kept
-            position += 1
-        else:
-            seen.add(_labels(revised))
-            kept, position, last = revised, 0, len(revised)
+        if _labels(revised) == _labels(kept) or _labels(revised) not in seen:
+            kept = revised
+            seen.add(_labels(kept))
     return kept
 
 

@@ -210,19 +210,29 @@ def calibrate(
             "effects_beyond": {f"{size:.3g}": proportion([x > value for s, x in true if s == size]) for size in sizes},
             "strange_beyond": proportion([entry > value for entry in strange]),
         }
-    return {"format": FORMAT, "asked": coverage, "rules": found, "settings": _settings(found)}
+    return {"format": FORMAT, "asked": coverage, "rules": found, "settings": advised(found)}
 
 
-def _settings(rules: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
-    """Thresholds that follow: the quantile, outwards to two digits, within what is of use; of two rules the wider."""
-    advised: dict[str, float] = {}
+def advised(rules: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
+    """Thresholds that follow: the quantile, outwards to two digits, within what is of use; of two rules the wider.
+
+    Parameters
+    ----------
+    rules : mapping
+        Of `yid-calibration/1`.
+
+    Returns
+    -------
+    dict of setting to value
+    """
+    settings: dict[str, float] = {}
     for own in rules.values():
         most, value, limit = own["side"] == "most", own["quantile"], float(own["limit"])
         if value is not None:
             outwards = _rounded(value, up=most)
             limit = max(limit, outwards) if most else min(limit, outwards)
-        advised[own["setting"]] = max(limit, advised.get(own["setting"], limit))
-    return advised
+        settings[own["setting"]] = max(limit, settings.get(own["setting"], limit))
+    return settings
 
 
 def _rounded(value: float, up: bool) -> float:
