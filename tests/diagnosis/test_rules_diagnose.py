@@ -20,6 +20,7 @@ from factories import (
     loss,
     outcome,
     place,
+    point,
     score,
     smoothed,
     visible,
@@ -32,7 +33,7 @@ from yid_ocp.diagnosis.earlier import Earlier
 from yid_ocp.diagnosis.events import NOTHING, Event, Events
 from yid_ocp.diagnosis.hypotheses import CandidateProblem
 from yid_ocp.diagnosis.refit import Search
-from yid_ocp.diagnosis.screening import Screened
+from yid_ocp.diagnosis.screening import Screened, together
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import DataError, SolverError
 from yid_ocp.solvers import GaussNewton
@@ -240,7 +241,9 @@ class Steps:
         self.given = {
             "before": outcome(p=1e-9, chi2=2.0, degrees=100.0),
             "held": outcome(p=1e-9, chi2=2.0),
-            "screened": Screened((visible(FRICTION), visible(OFFSET, seen=False)), (score(FRICTION, p=1e-9),), TABLE),
+            "screened": Screened(
+                (visible(FRICTION), visible(OFFSET, seen=False)), (score(FRICTION, p=1e-9),), TABLE, ALONE
+            ),
             "smoothed": SEEN,
             "added": (added(FRICTION, fitted=fit([FRICTION], loss(1.0, 1.1), cost=50.0, values=VALUES)),),
             "blocks": False,
@@ -311,6 +314,7 @@ class Remembering:
 
 
 TABLE = alike([FRICTION.label], [[1.0]])
+ALONE = together(point([0.0]))
 VALUES = {"k": 1.0, "l": 1.0}
 UNIT = SimpleNamespace(unit="N m/rad")
 SYSTEM = SimpleNamespace(parameters={"k": UNIT, "l": UNIT})
@@ -344,7 +348,7 @@ NOISE = {"before": outcome(p=0.4, degrees=100.0), "held": outcome(p=0.5)}
 FAINT = {"before": outcome(p=0.003, chi2=1.2, degrees=100.0), "held": outcome(p=0.5)}
 SLIGHT = {"before": outcome(p=1e-9, chi2=1.09, degrees=100.0)}
 LARGE = smoothed({FORCE: 9.0}, chi2=(500.0, 100.0))
-HARMLESS = Screened((visible(FRICTION),), (score(FRICTION, p=0.6),), TABLE)
+HARMLESS = Screened((visible(FRICTION),), (score(FRICTION, p=0.6),), TABLE, ALONE)
 
 
 @pytest.mark.parametrize(
@@ -356,7 +360,7 @@ HARMLESS = Screened((visible(FRICTION),), (score(FRICTION, p=0.6),), TABLE)
         (FAINT | {"screened": HARMLESS}, ["nominal", "screen", "smooth", "compose"], "effect"),
         ({"before": outcome(p=1e-9, chi2=2.0, degrees=5.9)}, ["nominal", "screen"], "insufficient_data"),
         ({"before": outcome(p=1e-9, chi2=2.0, degrees=6.0)}, ["nominal", "screen", "smooth", "compose"], "effect"),
-        ({"screened": Screened((), (), TABLE)}, ["nominal", "screen", "smooth"], "insufficient_data"),
+        ({"screened": Screened((), (), TABLE, ALONE)}, ["nominal", "screen", "smooth"], "insufficient_data"),
         ({"added": ()}, ["nominal", "screen", "smooth", "compose"], "unknown"),
         # where noise drives the motion the smoother's word does not count
         (FAINT | {"screened": HARMLESS, "disturbed": True}, ["nominal", "screen", "smooth"], "no_gap"),

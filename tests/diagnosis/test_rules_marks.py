@@ -73,10 +73,23 @@ RIGHT, WRONG = "kelvin_voigt@T1", "density@T2"
         (label("pair", KV, DRY), said("effect", [RIGHT, "joint_coulomb@elbow"]), True),
         (label("pair", KV, DRY), said("effect", ["joint_coulomb@elbow", "a@b", RIGHT]), True),
         (label("pair", KV, DRY), said("effect", [RIGHT]), False),
+        # one set says one of the two, and two sets of which one has both do not say two
         (
             label("pair", KV, DRY),
             said("confusable", ["joint_coulomb@elbow"], confusable=[["joint_coulomb@elbow", RIGHT]]),
-            True,
+            False,
+        ),
+        (
+            label("pair", KV, DRY),
+            said("confusable", ["joint_coulomb@elbow", "a@b"], confusable=[["joint_coulomb@elbow", RIGHT]]),
+            False,
+        ),
+        (label("pair", KV, DRY), said("confusable", ["a@b", RIGHT], confusable=[["a@b", "joint_coulomb@elbow"]]), True),
+        (label("pair", KV, DRY), said("confusable", [RIGHT, "a@b"], confusable=[["a@b", "joint_coulomb@elbow"]]), True),
+        (
+            label("pair", KV, DRY),
+            said("confusable", [RIGHT, "a@b"], confusable=[["a@b", "c@d", "e@f", "joint_coulomb@elbow"]]),
+            False,
         ),
     ],
 )
@@ -207,11 +220,14 @@ def test_rates_are_over_the_cases_that_they_speak_of():
             marked("outside", verdict="unknown", location_first=False),
             marked("left_out", verdict="effect"),
             marked("left_out", verdict="no_gap", gap=False, location_first=False),
-            marked("pair", right=False),
+            marked("pair", truth=f"{RIGHT} + a@b", answer=f"a@b + c@d + {RIGHT}", right=True),
+            marked("pair", truth=f"{RIGHT} + a@b", answer=f"c@d + {RIGHT}", right=True),
+            marked("pair", truth=f"{RIGHT} + a@b", answer="-", right=False),
+            marked("pair", truth=f"{RIGHT} + a@b", answer=RIGHT, right=False),
             marked("finer_chain", right=False),
         ]
     )
-    assert found["cases"] == 15
+    assert found["cases"] == 18
     assert found["false_alarms"] == 0.25
     assert found["detection"] == {
         "1": {"cases": 1, "gap": 0.0, "first": 0.0, "right": 0.0},
@@ -225,12 +241,12 @@ def test_rates_are_over_the_cases_that_they_speak_of():
     assert found["unknown_recall"] == pytest.approx(1 / 3)
     assert (found["unknown_outside"], found["unknown_left_out"]) == (1.0, 0.0)
     assert found["unknown_location"] == 0.5
-    assert found["pairs_right"] == 0.0
+    assert (found["pairs_right"], found["pairs_named"]) == (0.5, 0.25)
     assert found["closure_of_best"] == pytest.approx((0.9 + 0.6) / 2)
     assert found["parameter_error"] == pytest.approx(0.2)
     assert found["interval_coverage"] == pytest.approx(2 / 3)
     assert found["seconds"] == 6.0
-    assert len(found["marks"]) == 15
+    assert len(found["marks"]) == 18
 
 
 def test_no_cases_of_a_sort_have_no_rate():

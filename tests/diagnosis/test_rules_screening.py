@@ -21,6 +21,7 @@ from yid_ocp.diagnosis.screening import (
     scores,
     screen,
     shape_grid,
+    together,
     visibility,
 )
 from yid_ocp.diagnosis.thresholds import Thresholds
@@ -325,7 +326,7 @@ def test_a_signature_explained_by_another():
     b = effect("b@x", amplitude(lower=-1.0, expected=(-1.0, 1.0)))
     angle = math.radians(30)
     at = point([0.0] * 2, signature(a, [2.0, 0.0]), signature(b, [math.cos(angle), math.sin(angle)]))
-    found = confusability(at)
+    found = confusability(together(at))
     assert found.labels == ("a@x", "b@x")
     np.testing.assert_allclose(found.matrix, [[1.0, 0.75], [0.75, 1.0]], atol=1e-12)
 
@@ -333,32 +334,32 @@ def test_a_signature_explained_by_another():
 def test_two_amplitudes_explain_more_than_one():
     one, two = effect("one@x", amplitude(expected=(0.0, 2.0))), PAIR
     at = point([0.0] * 2, signature(one, [1.0, 1.0]), signature(two, np.eye(2)))
-    np.testing.assert_allclose(confusability(at).matrix, [[1.0, 1.0], [0.5, 1.0]], atol=1e-12)
+    np.testing.assert_allclose(confusability(together(at)).matrix, [[1.0, 1.0], [0.5, 1.0]], atol=1e-12)
 
 
 def test_amplitudes_count_by_half_the_range_that_is_expected():
     wide = effect("pair@x", amplitude("x", expected=(0.0, 4.0)), amplitude("y", expected=(-1.0, 1.0)))
     one = effect("one@x", amplitude())
     at = point([0.0] * 2, signature(wide, np.eye(2)), signature(one, [1.0, 0.0]))
-    np.testing.assert_allclose(confusability(at).matrix, [[1.0, 4.0 / 5.0], [1.0, 1.0]], atol=1e-12)
+    np.testing.assert_allclose(confusability(together(at)).matrix, [[1.0, 4.0 / 5.0], [1.0, 1.0]], atol=1e-12)
 
 
 def test_nothing_is_like_what_moves_nothing():
     a, b = effect("a@x", amplitude()), effect("b@x", amplitude())
     at = point([0.0] * 2, signature(a, [0.0, 0.0]), signature(b, [1.0, 0.0]))
-    np.testing.assert_array_equal(confusability(at).matrix, [[0.0, 0.0], [0.0, 1.0]])
-    assert confusability(point([0.0])).labels == ()
+    np.testing.assert_array_equal(confusability(together(at)).matrix, [[0.0, 0.0], [0.0, 1.0]])
+    assert confusability(together(point([0.0]))).labels == ()
 
 
 def test_shapes_are_those_of_the_scores_or_the_middle_of_the_grid():
     one = effect("one@x", amplitude())
     axes = [signature(SHAPED, np.eye(4)[i], s=0.1 * (i + 1)) for i in range(4)]
     at = point([0.0] * 4, *axes, signature(one, [0.0, 1.0, 0.0, 0.0]))
-    assert confusability(at).matrix[1, 0] == 0.0
+    assert confusability(together(at)).matrix[1, 0] == 0.0
     chosen = score(SHAPED, step={"branch@T1.a": 1.0, "branch@T1.s": 0.2})
-    assert confusability(at, [chosen]).matrix[1, 0] == pytest.approx(1.0)
+    assert confusability(together(at, [chosen])).matrix[1, 0] == pytest.approx(1.0)
     middle = point([0.0] * 4, *axes, signature(one, [0.0, 0.0, 1.0, 0.0]))
-    assert confusability(middle).matrix[1, 0] == pytest.approx(1.0)
+    assert confusability(together(middle)).matrix[1, 0] == pytest.approx(1.0)
 
 
 def test_candidates_alike_explain_the_signature_from_the_limit_on():
@@ -368,9 +369,44 @@ def test_candidates_alike_explain_the_signature_from_the_limit_on():
     assert table.like("b", 0.9) == ()
 
 
+# -- two at once -------------------------------------------------------------------------------------------------------
+
+
+def test_two_that_hide_in_each_other_show_as_a_pair():
+    """The residual is the difference of two signatures that are nearly one: neither does anything alone."""
+    a, b, c = (effect(f"{name}@x", amplitude(lower=-9.0)) for name in "abc")
+    at = point(
+        [0.0, -1.0, 0.0], *(signature(of, x) for of, x in ((a, [1, 0.5, 0]), (b, [1, -0.5, 0]), (c, [0, 0.5, 2])))
+    )
+    pairs = together(at).pairs([a.label, b.label, c.label])
+    assert [tuple(of.kind for of in pair.effects) for pair in pairs] == [("a", "b"), ("a", "c"), ("b", "c")]
+    best = pairs[0]
+    assert best.decrease == pytest.approx(1.0)
+    assert best.worth == pytest.approx(-1.0)
+    assert best.step == pytest.approx({"a@x.a": 1.0, "b@x.a": -1.0})
+    assert [tuple(of.kind for of in p.effects) for p in together(at).pairs(["c@x", "b@x"])] == [("b", "c")]
+
+
+def test_pairs_promise_what_the_linear_model_of_both_does():
+    rng = np.random.default_rng(3)
+    effects = (PAIR, TWO_SIDED, SHAPED)
+    columns = [rng.standard_normal((9, len(of.amplitudes))) for of in effects]
+    residual = rng.standard_normal(9)
+    made = [signature(of, x, **({"s": 0.2} if of is SHAPED else {})) for of, x in zip(effects, columns, strict=True)]
+    for pair in together(point(residual, *made)).pairs([of.label for of in effects]):
+        x = np.hstack([columns[effects.index(of)] for of in pair.effects])
+        names = [name for of in pair.effects for name in of.amplitudes]
+        lower, upper = (np.concatenate([screening._room(of)[k] for of in pair.effects]) for k in (0, 1))
+        step = np.clip(-np.linalg.lstsq(x, residual)[0], lower, upper)
+        assert [pair.step[name] for name in names] == pytest.approx(step)
+        assert pair.decrease == pytest.approx(residual @ residual - np.sum((residual + x @ step) ** 2))
+        assert pair.worth == pytest.approx(pair.decrease - len(names))
+        assert pair.step.get("branch@T1.s", 0.2) == 0.2
+
+
 def test_what_was_not_seen_is_listed():
     table = alike([], np.zeros((0, 0)))
-    screened = Screened((visible(ONE_SIDED), visible(TWO_SIDED, seen=False)), (), table)
+    screened = Screened((visible(ONE_SIDED), visible(TWO_SIDED, seen=False)), (), table, together(point([0.0])))
     assert screened.unseen == ["offset@elbow"]
 
 
@@ -459,4 +495,4 @@ def test_screening_goes_by_its_thresholds(swept):
     assert [v.detectable for v in found.visible] == [v.detectable for v in visibility(at, 1.5)]
     assert found.scores == scores(at, swept.parts, visibility(at, 1.5))
     assert swept.warmed[:2] == [None, ()]
-    np.testing.assert_array_equal(found.alike.matrix, confusability(at, found.scores).matrix)
+    np.testing.assert_array_equal(found.alike.matrix, confusability(together(at, found.scores)).matrix)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from yid_ocp.diagnosis import closure, confusability, linearise, refit, scores, visibility
+from yid_ocp.diagnosis import closure, confusability, linearise, refit, scores, together, visibility
 from yid_ocp.diagnosis.hypotheses import CandidateProblem, chosen_effects
 from yid_ocp.diagnosis.refit import Loss
 from yid_ocp.diagnosis.screening import Linearisation, Signature, robust, shape_grid
@@ -120,7 +120,7 @@ def test_what_the_fit_has_explained_is_projected_off(screened):
 
 def test_a_candidate_explains_itself_and_nothing_explains_more(screened):
     _, _, point = screened
-    table = confusability(point)
+    table = confusability(together(point))
     assert np.diag(table.matrix) == pytest.approx(1.0)
     assert np.all((table.matrix >= 0) & (table.matrix <= 1))
     assert "joint_stribeck@elbow" in table.labels

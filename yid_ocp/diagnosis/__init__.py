@@ -10,6 +10,7 @@ from yid_ocp.diagnosis.refit import refit as refit
 from yid_ocp.diagnosis.screening import confusability as confusability
 from yid_ocp.diagnosis.screening import linearise as linearise
 from yid_ocp.diagnosis.screening import scores as scores
+from yid_ocp.diagnosis.screening import together as together
 from yid_ocp.diagnosis.screening import visibility as visibility
 from yid_ocp.diagnosis.select import closure as closure
 from yid_ocp.diagnosis.smoother import Smoothed as Smoothed

@@ -309,20 +309,42 @@ def refit_all(
         What is said of `values` in the store, if the same effects are refitted from elsewhere too.
     """
 
+    beside = f" beside {', '.join(effect.label for effect in base)}" if base else ""
+    entries = [_Tried((*base, effect), effect.label, step, where) for effect, step in tried]
+    return _each(search, entries, values, f"{len(tried)} effects{beside}")
+
+
+def refit_pairs(
+    search: Search,
+    tried: Sequence[tuple[tuple[EffectBase, EffectBase], Mapping[str, float]]],
+    values: Mapping[str, float],
+) -> list[Fit]:
+    """Refit the model with each of several pairs of effects; failures are left out. See `refit_all`."""
+    entries = [_Tried(pair, describe(pair), step, "together") for pair, step in tried]
+    return _each(search, entries, values, f"{len(tried)} pairs")
+
+
+@dataclass(frozen=True)
+class _Tried:
+    effects: tuple[EffectBase, ...]
+    label: str  # of those that are new
+    step: Mapping[str, float]
+    where: str
+
+
+def _each(search: Search, tried: Sequence[_Tried], values: Mapping[str, float], words: str) -> list[Fit]:
     if not tried:
         return []
-    beside = f" beside {', '.join(effect.label for effect in base)}" if base else ""
-    search.progress.stage(f"refitting with each of {len(tried)} effects{beside}")
-    parts = Parts(search.progress, len(tried), tried[0][0].label)
+    search.progress.stage(f"refitting with each of {words}")
+    parts = Parts(search.progress, len(tried), tried[0].label)
 
-    def one(entry: tuple[EffectBase, Mapping[str, float]]) -> Fit | None:
-        effect, step = entry
-        name = f"{describe((*base, effect))} {where}" if where else ""
-        fit = refit(search.problem, (*base, effect), {**values, **step}, search.store, name, search.limits)
-        text = f"no fit with {effect.label}"
+    def one(entry: _Tried) -> Fit | None:
+        name = f"{describe(entry.effects)} {entry.where}" if entry.where else ""
+        fit = refit(search.problem, entry.effects, {**values, **entry.step}, search.store, name, search.limits)
+        text = f"no fit with {entry.label}"
         if fit is not None:
             how = "resumed the refit" if fit.resumed else "refitted"
-            text = f"{how} with {effect.label}: held-out chi2/n {fit.loss.mean:.4g}"
+            text = f"{how} with {entry.label}: held-out chi2/n {fit.loss.mean:.4g}"
         parts.done(text)
         return fit
 

@@ -269,14 +269,19 @@ def scores(point: Linearisation, series: Sequence[Series], visible: Sequence[Vis
     return tuple(sorted(final, key=lambda s: -s.decrease))
 
 
+def _room(effect: EffectBase) -> tuple[Array, Array]:
+    """How far amplitudes may go from neutral, to either side."""
+    quantities = {f"{effect.label}.{q.name}": q for q in effect.quantities}
+    own = [quantities[name] for name in effect.amplitudes]
+    return np.array([q.lower - q.neutral for q in own]), np.array([q.upper - q.neutral for q in own])
+
+
 def _score(signature: Signature, residual: Array, series: Sequence[Series]) -> Score:
     effect, x = signature.effect, signature.columns
-    quantities = {f"{effect.label}.{q.name}": q for q in effect.quantities}
-    neutral = np.array([quantities[name].neutral for name in effect.amplitudes])
+    neutral = np.array([effect.neutral[name] for name in effect.amplitudes])
     information, slope = x.T @ x, -(x.T @ residual)
     plain = np.linalg.pinv(information, rcond=1e-10, hermitian=True) @ slope
-    lower = np.array([quantities[name].lower for name in effect.amplitudes]) - neutral
-    upper = np.array([quantities[name].upper for name in effect.amplitudes]) - neutral
+    lower, upper = _room(effect)
     step = np.clip(plain, lower, upper)
     decrease = float(2 * slope @ step - step @ information @ step)
     # the candidate's own share of the residual would hide it: what would be left is what its score scatters with
@@ -314,11 +319,91 @@ class Confusability:
         return tuple(n for n, f in zip(self.labels, row, strict=True) if f >= limit and n != label)
 
 
-def confusability(point: Linearisation, chosen: Sequence[Score] = ()) -> Confusability:
-    """Fractions of signatures explained by each other, at the scores' shape values or the middle of the grid.
+@dataclass(frozen=True)
+class Pair:
+    """Two candidates that explain the residual together, to first order.
 
-    Every amplitude counts in units of its prior range.
+    Attributes
+    ----------
+    effects : tuple of EffectBase
+    step : dict of str to float
+        Amplitudes to which the linear model would go, and the shape values.
+    decrease : float
+        Promised decrease of r'r.
     """
+
+    effects: tuple[EffectBase, EffectBase]
+    step: dict[str, float]
+    decrease: float
+
+    @property
+    def worth(self) -> float:
+        """The decrease beyond what chance alone brings by so many amplitudes."""
+        return self.decrease - sum(len(effect.amplitudes) for effect in self.effects)
+
+
+@dataclass(frozen=True)
+class Together:
+    """The residual as a linear function of the amplitudes of all candidates at once, each with one value of its shape.
+
+    Attributes
+    ----------
+    effects : tuple of EffectBase
+    shapes : tuple of dict of str to float
+    information : ndarray, shape (n, n)
+        X'X of all signatures side by side.
+    slope : ndarray, shape (n,)
+        -X'r.
+    """
+
+    effects: tuple[EffectBase, ...]
+    shapes: tuple[dict[str, float], ...]
+    information: Array
+    slope: Array
+
+    @property
+    def blocks(self) -> list[slice]:
+        """Columns of every candidate."""
+        edges = np.cumsum([0, *(len(effect.amplitudes) for effect in self.effects)])
+        return [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
+
+    def pairs(self, among: Sequence[str]) -> list[Pair]:
+        """All pairs of some candidates, by what they are worth, best first.
+
+        What two effects do together neither need do alone: one of them may hide in what the other leaves.
+
+        Parameters
+        ----------
+        among : sequence of str
+            Labels.
+        """
+        bounds = [_room(effect) for effect in self.effects]
+        lower, upper = (np.concatenate([np.zeros(0), *(entry[k] for entry in bounds)]) for k in (0, 1))
+        columns = [np.arange(block.start, block.stop) for block in self.blocks]
+        by_size: dict[tuple[int, int], list[tuple[int, int]]] = {}
+        for i, j in itertools.combinations([i for i, e in enumerate(self.effects) if e.label in set(among)], 2):
+            by_size.setdefault((len(columns[i]), len(columns[j])), []).append((i, j))
+        found = []
+        for members in by_size.values():
+            at = np.array([[*columns[i], *columns[j]] for i, j in members])
+            information, slope = self.information[at[:, :, None], at[:, None, :]], self.slope[at]
+            plain = np.einsum("kab,kb->ka", np.linalg.pinv(information, rcond=1e-10, hermitian=True), slope)
+            steps = np.clip(plain, lower[at], upper[at])
+            decrease = 2 * np.einsum("ka,ka->k", slope, steps) - np.einsum("ka,kab,kb->k", steps, information, steps)
+            for (i, j), step, value in zip(members, steps, decrease, strict=True):
+                found.append(self._pair(i, j, step, float(value)))
+        return sorted(found, key=lambda pair: -pair.worth)
+
+    def _pair(self, i: int, j: int, step: Array, decrease: float) -> Pair:
+        one, other = self.effects[i], self.effects[j]
+        neutral = one.neutral | other.neutral
+        names = (*one.amplitudes, *other.amplitudes)
+        values = {name: neutral[name] + float(moved) for name, moved in zip(names, step, strict=True)}
+        return Pair((one, other), values | self.shapes[i] | self.shapes[j], decrease)
+
+
+def together(point: Linearisation, chosen: Sequence[Score] = ()) -> Together:
+    """All candidates side by side, at the scores' shape values or the middle of the grid."""
     shape = {s.effect.label: {k: v for k, v in s.step.items() if k in s.effect.shapes} for s in chosen}
     groups: dict[str, list[Signature]] = {}
     for signature in point.signatures:
@@ -327,22 +412,25 @@ def confusability(point: Linearisation, chosen: Sequence[Score] = ()) -> Confusa
     for label, group in groups.items():
         wanted = shape.get(label)
         kept.append(next((s for s in group if s.shape == wanted), group[len(group) // 2]))
-    scale = [
-        np.array([(s.effect.prior_range[n][1] - s.effect.prior_range[n][0]) / 2 for n in s.effect.amplitudes])
-        for s in kept
-    ]
-    every = np.hstack([s.columns * f for s, f in zip(kept, scale, strict=True)]) if kept else np.zeros((0, 0))
-    gram = every.T @ every
-    edges = np.cumsum([0, *(s.columns.shape[1] for s in kept)])
-    blocks = [slice(a, b) for a, b in itertools.pairwise(edges)]
-    matrix = np.zeros((len(kept), len(kept)))
+    every = np.hstack([s.columns for s in kept]) if kept else np.zeros((len(point.residual), 0))
+    effects, shapes = tuple(s.effect for s in kept), tuple(s.shape for s in kept)
+    return Together(effects, shapes, every.T @ every, -(every.T @ point.residual))
+
+
+def confusability(everything: Together) -> Confusability:
+    """Fractions of signatures explained by each other; every amplitude counts in units of its prior range."""
+    ranges = [effect.prior_range[name] for effect in everything.effects for name in effect.amplitudes]
+    scale = np.array([(high - low) / 2 for low, high in ranges])
+    gram = everything.information * scale[:, None] * scale
+    blocks = everything.blocks
+    matrix = np.zeros((len(blocks), len(blocks)))
     inverses = [np.linalg.pinv(gram[b, b], rcond=1e-8, hermitian=True) for b in blocks]
     for j, row in enumerate(blocks):
         size = float(np.trace(gram[row, row]))
         for i, column in enumerate(blocks):
             cross = gram[row, column]
             matrix[j, i] = float(np.trace(cross @ inverses[i] @ cross.T)) / size if size > 0 else 0.0
-    return Confusability(tuple(s.effect.label for s in kept), np.clip(matrix, 0.0, 1.0))
+    return Confusability(tuple(effect.label for effect in everything.effects), np.clip(matrix, 0.0, 1.0))
 
 
 @dataclass(frozen=True)
@@ -355,11 +443,13 @@ class Screened:
     scores : tuple of Score
         Best first.
     alike : Confusability
+    together : Together
     """
 
     visible: tuple[Visibility, ...]
     scores: tuple[Score, ...]
     alike: Confusability
+    together: Together
 
     @property
     def unseen(self) -> list[str]:
@@ -374,4 +464,5 @@ def screen(
     point = linearise(problem, base, values, limits.shape_values)
     visible = visibility(point, limits.detection)
     ranked = scores(point, residual_series(problem.problem), visible)
-    return Screened(visible, ranked, confusability(point, ranked))
+    everything = together(point, ranked)
+    return Screened(visible, ranked, confusability(everything), everything)

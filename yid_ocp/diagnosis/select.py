@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from yid_ocp.diagnosis.hypotheses import describe
-from yid_ocp.diagnosis.refit import Fit, Loss, Search, refit, refit_all
-from yid_ocp.diagnosis.screening import Confusability, Score, Screened, screen
+from yid_ocp.diagnosis.refit import Fit, Loss, Search, refit, refit_all, refit_pairs
+from yid_ocp.diagnosis.screening import Confusability, Pair, Score, Screened, screen
 from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import SolverError
@@ -285,11 +285,11 @@ def compose(
         Of the first round, the chosen one first, then by held-out loss.
     added : tuple of Added
     """
-    limits = search.limits
+    limits, alone = search.limits, screened
     current = nominal
     first: tuple[Fit, ...] = ()
     added: tuple[Added, ...] = ()
-    settled = True
+    paired = False
     while len(added) < limits.effects:
         base = [entry.effect for entry in added]
         if added:
@@ -300,6 +300,9 @@ def compose(
         fits = refit_all(search, base, shortlist(scores, screened.alike, limits, places), current.values)
         if moved and not added:
             fits = _likelier(fits, _from_before(search))
+        if len(added) == 1:
+            pairs = likely_pairs(alone, limits, base[0])
+            fits += [fit for fit in refit_pairs(search, pairs, nominal.values) if _firmly(fit.effects[0], fit, limits)]
         if added:
             fits = _of_a_size(fits, limits)
         if not fits:
@@ -308,41 +311,55 @@ def compose(
         if not added:
             first = (near[0], *sorted((fit for fit in fits if fit is not near[0]), key=lambda fit: fit.loss.mean))
         chosen = next((fit for fit in near if _worth_adding(current, fit, limits)), None)
-        if chosen is not None:
-            added, settled = (*added, _added(search, nominal, chosen, near)), False
-            closed = added[-1].closure.value
-            said = "" if np.isnan(closed) else f": {100 * closed:.3g} % of the held-out gap closed"
-            search.progress.stage(f"added {chosen.effects[-1].label}{said}")
-        elif revised := _beside_another(search, nominal, added, near):
-            added, settled = revised, True
-        else:
+        if chosen is None:
             break
-        current = added[-1].fit
+        paired = [e.label for e in chosen.effects[:-1]] != [e.label for e in base]
+        total = closure(nominal.loss, chosen.loss, limits=limits)
+        said = "" if np.isnan(total.value) else f": {100 * total.value:.3g} % of the held-out gap closed"
+        if paired:
+            search.progress.stage(f"put {describe(chosen.effects)} in the place of {describe(base)}{said}")
+            both = [Added(effect, chosen, total, (effect,)) for effect in chosen.effects]
+            added = _rebuilt(search, nominal, both, chosen)
+        else:
+            search.progress.stage(f"added {chosen.effects[-1].label}{said}")
+            beside = [fit.effects[-1] for fit in near if fit is not chosen and fit.effects[:-1] == chosen.effects[:-1]]
+            added = (*added, Added(chosen.effects[-1], chosen, total, (chosen.effects[-1], *beside)))
+        current = chosen
         if current.loss.mean < 1 + limits.smallest_gap:
             break
-    return first, added if settled else _reconsidered(search, nominal, added)
+    return first, _reconsidered(search, nominal, added, paired)
 
 
-def _added(search: Search, nominal: Fit, chosen: Fit, near: Sequence[Fit]) -> Added:
-    """The last effect of a fit, with those of the fits near it."""
-    rivals = (chosen, *(fit for fit in near if fit is not chosen))
-    total = closure(nominal.loss, chosen.loss, limits=search.limits)
-    return Added(chosen.effects[-1], chosen, total, tuple(fit.effects[-1] for fit in rivals))
+def likely_pairs(
+    screened: Screened, limits: Thresholds, without: EffectBase
+) -> list[tuple[tuple[EffectBase, EffectBase], Mapping[str, float]]]:
+    """Which pairs of candidates are refitted: those worth most, none of which one before it can stand in for.
 
-
-def _beside_another(search: Search, nominal: Fit, added: Sequence[Added], near: Sequence[Fit]) -> tuple[Added, ...]:
-    """What effects become beside one that is not worth adding to them as they are; none where that is no better.
-
-    An effect that stands in for two leaves errors of its own, beside which the second is not sure to help. It is tried
-    all the same, and others in the place of those before it; both together have to be worth it then.
+    The best effect alone, with which others are tried anyway, is in none of them.
     """
-    limits = search.limits
-    if not added or not stands_out(near[0].effects[-1], near[0], limits):
-        return ()
-    search.progress.stage(f"trying {near[0].effects[-1].label} with others in the place of those before it")
-    revised = _reconsidered(search, nominal, [*added, _added(search, nominal, near[0], near)])
-    others = _labels(revised) - _labels(added)
-    return revised if others and _worth_adding(added[-1].fit, revised[-1].fit, limits) else ()
+    alike = screened.alike
+
+    def same(one: EffectBase, other: EffectBase) -> bool:
+        return one.label == other.label or other.label in alike.like(one.label, limits.alike)
+
+    def covered(pair: Pair, by: Pair) -> bool:
+        (a, b), (c, d) = pair.effects, by.effects
+        return (same(a, c) and same(b, d)) or (same(a, d) and same(b, c))
+
+    labels = [score.effect.label for score in screened.scores if score.effect.label != without.label]
+    chosen: list[Pair] = []
+    for pair in screened.together.pairs(labels):
+        if len(chosen) == limits.pairs:
+            break
+        if not any(covered(pair, before) for before in chosen):
+            chosen.append(pair)
+    return [(pair.effects, pair.step) for pair in chosen]
+
+
+def _firmly(effect: EffectBase, fit: Fit, limits: Thresholds) -> bool:
+    """Whether an effect of a fit is there, with a shape and an amplitude to be expected."""
+    there = stands_out(effect, fit, limits) and not out_of_shape(effect, fit.values, limits)
+    return there and not oversized(effect, fit.values, limits)
 
 
 def _of_a_size(fits: Sequence[Fit], limits: Thresholds) -> list[Fit]:
@@ -359,14 +376,16 @@ def _worth_adding(current: Fit, chosen: Fit, limits: Thresholds) -> bool:
     return stands_out(chosen.effects[-1], chosen, limits) and relevant(current.loss, chosen.loss, limits)
 
 
-def _reconsidered(search: Search, nominal: Fit, added: Sequence[Added]) -> tuple[Added, ...]:
+def _reconsidered(search: Search, nominal: Fit, added: Sequence[Added], paired: bool) -> tuple[Added, ...]:
     """Every effect tried for its place again beside the others: without it, and others instead of it.
 
-    What was added first was chosen while the others were missing, and may be there in their stead. The last one was
-    chosen beside all others, as one that was put in another's place; they need no second look until these change.
+    What was added first was chosen while the others were missing, and may be there in their stead. The last one, unless
+    it came as one of a pair, was chosen beside all others, as one that was put in another's place: they need no second
+    look until these change.
     """
     kept = tuple(added)
-    seen, tried = {_labels(kept)}, {_labels(kept[:-1])}
+    seen = {_labels(kept)}
+    tried = set() if paired else {_labels(kept[:-1])}
     while len(kept) > 1:
         others = [_labels(kept) - {entry.effect.label} for entry in kept]
         position = next((i for i, own in enumerate(others) if own not in tried), None)

@@ -37,6 +37,8 @@ class Thresholds:
         Candidates refitted in a round, and once more as many that are like them.
     surest : int
         Candidates of the smallest p-values that are refitted in any case.
+    pairs : int
+        Pairs of candidates refitted where one effect leaves a gap.
     alike : float
         Part of a signature explained by another candidate from which both are refitted.
     poor, promising : float
@@ -113,6 +115,7 @@ class Thresholds:
     shape_values: Annotated[int, Ge(1), About("values tried of every shape parameter")] = 4
     refits: Annotated[int, Ge(1), About("candidates refitted in a round")] = 6
     surest: Annotated[int, Ge(0), About("candidates of the smallest p-values refitted in any case")] = 2
+    pairs: Annotated[int, Ge(0), About("pairs of candidates refitted where one effect leaves a gap")] = 4
     alike: Annotated[float, Gt(0), Le(1), About("part of a signature from which two candidates are alike")] = 0.9
     poor: Annotated[float, Gt(0), About("chi2/n above which a refit may be tried again")] = 1.1
     promising: Annotated[float, Gt(0), Lt(1), About("part of the excess explained by a refit tried again")] = 0.2

@@ -18,6 +18,8 @@ FORMAT = "yid-blind/1"
 SORTS = tuple(SHARES)
 STRANGE = ("outside", "left_out")
 """Sorts whose effect no candidate is."""
+SET = 3
+"""How many a set may have to be right; more is no answer."""
 VERDICTS = ("no_gap", "unknown", "insufficient_data", "effect", "confusable")
 
 
@@ -36,8 +38,8 @@ class Mark:
     confusable : tuple of str
         Set that was named as not separable.
     right : bool
-        As the verdict asks: no_gap of a clean one, the true effect alone or in a set of at most three, unknown at the
-        right place outside the library.
+        As the verdict asks: no_gap of a clean one, the true effect alone or in a set of at most three, each of a pair
+        likewise, unknown at the right place outside the library.
     closure, best : float
         Held out, of what was added and of the true effects refitted.
     errors : dict of str to (float, bool)
@@ -111,9 +113,9 @@ def mark(label: Label, result: Mapping[str, Any], best: float = math.nan, second
     elif label.category in ("outside", "left_out"):
         right = verdict == "unknown" and located
     elif label.category == "pair":
-        right = set(true) <= {*named, *alike}
+        right = _found(true, named, groups)
     else:
-        right = bool(true) and (named[:1] == true or (true[0] in alike and len(alike) <= 3))
+        right = bool(true) and _found(true, named[:1], groups)
     errors: dict[str, tuple[float, bool]] = {}
     z: dict[str, float] = {}
     for effect in label.injected:
@@ -153,6 +155,19 @@ def mark(label: Label, result: Mapping[str, Any], best: float = math.nan, second
     )
 
 
+def _found(true: Sequence[str], named: Sequence[str], groups: Sequence[tuple[str, ...]]) -> bool:
+    """Whether every true effect has one of its own among those named: itself, or one in a set of at most `SET` with it.
+
+    A set that has two of them in it says one of the two.
+    """
+    if not true:
+        return True
+    sets = [
+        {name, *(label for group in groups if name in group and len(group) <= SET for label in group)} for name in named
+    ]
+    return any(true[0] in own and _found(true[1:], [*named[:i], *named[i + 1 :]], groups) for i, own in enumerate(sets))
+
+
 def proportion(hits: Sequence[bool]) -> dict[str, float | int | None]:
     """How many of how many, and the 95 % interval of the rate (Clopper and Pearson 1934, doi:10.1093/biomet/26.4.404).
 
@@ -178,6 +193,7 @@ def score(marks: Sequence[Mark]) -> dict[str, Any]:
     seen = [m for m in singles if m.gap]
     named = [m for m in seen if m.answer != "-"]
     strange = [m for m in marks if m.category in STRANGE]
+    pairs = [m for m in marks if m.category == "pair"]
     errors = [entry for m in singles for entry in m.errors.values()]
     relative = [m.closure / m.best for m in singles if m.best > 0 and math.isfinite(m.closure)]
     sizes = sorted({m.multiple for m in singles if math.isfinite(m.multiple)})
@@ -190,7 +206,8 @@ def score(marks: Sequence[Mark]) -> dict[str, Any]:
         "unknown_recall": [m.verdict == "unknown" for m in strange],
         **{f"unknown_{sort}": [m.verdict == "unknown" for m in strange if m.category == sort] for sort in STRANGE},
         "unknown_location": [m.location_first for m in strange if m.gap],
-        "pairs_right": [m.right for m in marks if m.category == "pair"],
+        "pairs_right": [m.right for m in pairs],
+        "pairs_named": [set(m.truth.split(" + ")) <= set(m.answer.split(" + ")) for m in pairs],
         "interval_coverage": [inside for _, inside in errors],
     }
     intervals = {name: proportion(hits) for name, hits in shares.items()}
