@@ -79,7 +79,7 @@ def test_clean_recordings_set_what_chance_may_reach() -> None:
         case("null", "no_gap", statistics={"p_value": 0.2, "chi2_per_dof": 1.3}, open={"message": "it did not run"}),
         # a false alarm counts with what it was decided by
         case("null", "unknown", statistics={"p_value": 1e-9, "chi2_per_dof": 1.2, "evidence": 7.0}),
-        case("null", "no_gap", open=STATISTICS | {"candidate": 1e-3, "largest_channel": 1.15, "closure_low": -0.1}),
+        case("null", "no_gap", open=STATISTICS | {"candidate": 1e-6, "largest_channel": 1.15, "closure_low": -0.1}),
     ]
     effects = [
         case("single", "effect", DAMPER, multiple=size, statistics={"evidence": 10.0 * size, "explained": 0.9})
@@ -99,6 +99,19 @@ def test_clean_recordings_set_what_chance_may_reach() -> None:
     assert found["gap"]["sample"][-2:] == [pytest.approx(0.04), pytest.approx(0.2)]
     assert found["channel"]["sample"] == [None, None, None, pytest.approx(0.15)]
     assert found["closure"]["quantile"] == -0.1
+    assert found["candidate"]["quantile"] == 1e-6
+
+
+def test_a_candidate_is_surer_than_any_of_clean_recordings() -> None:
+    clean = [case("null", "no_gap", open=STATISTICS | {"candidate": p}) for p in (0.4, 2.345e-5, 3e-3)]
+    effects = [case("single", "effect", DAMPER, multiple=3.0, statistics={"candidate": p}) for p in (1e-9, 1e-3)]
+    labels, marks, answers = zip(*clean, *effects, strict=True)
+    found = calibrate(labels, marks, answers)
+    assert found["rules"]["candidate"]["quantile"] == 2.345e-5
+    assert found["rules"]["candidate"]["effects_beyond"]["3"]["count"] == 1
+    assert found["settings"]["candidate_level"] == 2.3e-5
+    few = calibrate(labels[:1], marks[:1], answers[:1])
+    assert few["settings"]["candidate_level"] == 1e-4, "no less sure than odds that convince"
 
 
 def test_effects_that_were_named_right_set_what_must_be_explained() -> None:

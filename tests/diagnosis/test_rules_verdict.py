@@ -85,16 +85,16 @@ def test_a_gap_is_sure_and_worth_a_name(before, held_out, gap):
 )
 def test_a_gap_along_a_candidate_needs_a_channel_above_noise(p_values, before, held_out, gap):
     tests = [outcome(channels=channels) for channels in (before, held_out)]
-    assert has_gap(*tests, Thresholds(smallest_channel=0.03), scored(*p_values)) is gap
+    assert has_gap(*tests, Thresholds(smallest_channel=0.03, candidate_level=0.01), scored(*p_values)) is gap
 
 
 @pytest.mark.parametrize(
     ("label", "p", "stated", "gap"),
     [
-        ("effort_offset@elbow", 0.004, True, True),
-        ("effort_offset@elbow", 0.005, True, False),
-        ("effort_offset@elbow", 0.004, False, False),
-        ("joint_viscous@elbow", 0.004, True, False),
+        ("effort_offset@elbow", 4e-5, True, True),
+        ("effort_offset@elbow", 5e-5, True, False),
+        ("effort_offset@elbow", 4e-5, False, False),
+        ("joint_viscous@elbow", 4e-5, True, False),
     ],
     ids=["beyond", "within", "nobody stated any", "another effect"],
 )
@@ -107,8 +107,10 @@ def test_the_level_and_the_smallest_gap_are_thresholds():
     tests = (outcome(p=0.02, chi2=1.2), outcome())
     assert has_gap(*tests, Thresholds(level=0.05))
     assert not has_gap(*tests, Thresholds(level=0.05, smallest_gap=0.3))
-    assert has_gap(outcome(), outcome(chi2=1.2), Thresholds(level=0.05), scored(0.03))
-    assert not has_gap(outcome(), outcome(chi2=1.2), Thresholds(level=0.05, smallest_channel=0.3), scored(0.03))
+    by_one = Thresholds(candidate_level=0.05)
+    assert has_gap(outcome(), outcome(chi2=1.2), by_one, scored(0.03))
+    assert not has_gap(outcome(), outcome(chi2=1.2), replace(by_one, smallest_channel=0.3), scored(0.03))
+    assert not has_gap(outcome(), outcome(chi2=1.2), Thresholds(level=0.05), scored(0.03))
 
 
 # -- is it chance -----------------------------------------------------------------------------------------------------

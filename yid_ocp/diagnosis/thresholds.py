@@ -23,6 +23,8 @@ class Thresholds:
         chi2/n - 1 below which a gap is not worth a name, however sure.
     smallest_channel : float
         chi2/n - 1 of the worst channel below which what a candidate would surely mend is not worth a name.
+    candidate_level : float
+        Significance, as the best of all candidates, from which one shows a gap that the residual as a whole does not.
     shapeless : float
         Part of the significance level that an excess without any shape has to reach.
     samples_per_unknown : float
@@ -107,6 +109,9 @@ class Thresholds:
         USUAL.smallest_gap
     )
     smallest_channel: Annotated[float, Ge(0), About("the same of the worst channel, where a candidate mends it")] = 0.02
+    candidate_level: Annotated[float, Gt(0), Lt(1), About("significance from which a candidate alone shows a gap")] = (
+        1e-4
+    )
     shapeless: Annotated[float, Gt(0), Le(1), About("part of the level that an excess without shape must reach")] = 0.01
     samples_per_unknown: Annotated[float, Gt(0), About("effective samples needed for every unknown")] = 3.0
     window: Annotated[float, Gt(0), About("length of the windows of the residual", "s")] = WINDOW

@@ -22,8 +22,9 @@ def has_gap(
     """Whether the residual is more than noise, by enough to be worth a name.
 
     Either as a whole, or along what a candidate would do to it with some channel above noise: the sum over all channels
-    does not notice what only a few samples show. An offset of a torque beyond what was stated needs no such channel: it
-    is one number among thousands, and all others follow it.
+    does not notice what only a few samples show. A candidate alone has to be surer than that sum: it is the best of
+    many, at the end of a tail that is known by asymptotics only. An offset of a torque beyond what was stated needs no
+    such channel: it is one number among thousands, and all others follow it.
 
     Parameters
     ----------
@@ -37,11 +38,11 @@ def has_gap(
     if more_than_noise((before, held_out), limits.gap):
         return True
     stated = [score.p_value for score in ranked if score.effect.kind == "effort_offset"] if offsets else []
-    if stated and min(stated) * len(ranked) < limits.level:
+    if stated and min(stated) * len(ranked) < limits.candidate_level:
         return True
     best = best_of(ranked)
     largest = max((*before.channels.values(), *held_out.channels.values()), default=1.0)
-    return best < limits.level and largest > 1 + limits.smallest_channel
+    return best < limits.candidate_level and largest > 1 + limits.smallest_channel
 
 
 def shapeless(

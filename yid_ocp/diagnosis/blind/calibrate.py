@@ -27,7 +27,8 @@ def opened_wide(limits: Thresholds) -> Thresholds:
 
     A diagnosis of clean recordings with these shows how far chance alone goes.
     """
-    limits = replace(limits, level=1.0 + 1e-9, smallest_gap=-1.0, smallest_channel=-1.0, shapeless=1.0)
+    sure = 1.0 + 1e-9
+    limits = replace(limits, level=sure, candidate_level=sure, shapeless=1.0, smallest_gap=-1.0, smallest_channel=-1.0)
     return replace(limits, worth=1e-9, places=1, closure=-math.inf, relevance=-math.inf, effects=1)
 
 
@@ -70,7 +71,7 @@ def _excess(said: Statistics, limits: Thresholds, _: str) -> float:
 
 def _along(said: Statistics, limits: Thresholds, _: str) -> float:
     """That of the worst channel, if any candidate is significant."""
-    return (said["largest_channel"] or 1.0) - 1 if said["candidate"] < limits.level else -math.inf
+    return (said["largest_channel"] or 1.0) - 1 if said["candidate"] < limits.candidate_level else -math.inf
 
 
 def _of(name: str) -> Callable[[Statistics, Thresholds, str], float]:
@@ -106,6 +107,7 @@ def _lost(said: Statistics, limits: Thresholds, truth: str) -> float:
 
 RULES: Mapping[str, Rule] = {
     "gap": Rule("smallest_gap", _excess, "chi2/n - 1 of a significant residual", "clean", "most", 0.1),
+    "candidate": Rule("candidate_level", _of("candidate"), "p of the best candidate", "clean", "least", 1e-4),
     "channel": Rule(
         "smallest_channel", _along, "the same of the worst channel, along a candidate", "clean", "most", 0.02
     ),
@@ -196,6 +198,12 @@ def calibrate(
         sample = clean if rule.of == "clean" else [value for _, value in true if value > -math.inf]
         value, attained = conformal(sample, rule.side, coverage)
         sizes = sorted({size for size, _ in true})
+        # what chance brings more of is what small values tell of
+        below = rule.of == "clean" and rule.side == "least"
+
+        def beyond(entry: float, value: float = value, below: bool = below) -> bool:
+            return entry < value if below else entry > value
+
         found[name] = {
             "setting": rule.setting,
             "statistic": rule.words,
@@ -207,8 +215,8 @@ def calibrate(
             "limit": rule.limit,
             "is": getattr(limits, rule.setting),
             "sample": [_number(entry) for entry in sorted(sample)],
-            "effects_beyond": {f"{size:.3g}": proportion([x > value for s, x in true if s == size]) for size in sizes},
-            "strange_beyond": proportion([entry > value for entry in strange]),
+            "effects_beyond": {f"{size:.3g}": proportion([beyond(x) for s, x in true if s == size]) for size in sizes},
+            "strange_beyond": proportion([beyond(entry) for entry in strange]),
         }
     return {"format": FORMAT, "asked": coverage, "rules": found, "settings": advised(found)}
 
