@@ -677,6 +677,14 @@ def test_a_pair_that_is_no_better_is_not_taken(monkeypatch):
     assert alone.compose()[1] == ["a"]
 
 
+def test_of_a_pair_either_stays_though_the_model_does_not_run_with_it_alone(monkeypatch):
+    rounds = Rounds(monkeypatch, HIDDEN, pairs=("bc",), fails=("b",))
+    _, chosen, added = rounds.compose(effects=2)
+    assert chosen == ["b", "c"]
+    assert [len(entry.fit.effects) for entry in added] == [2, 2]
+    assert added[0].closure.value == pytest.approx(added[1].closure.value)
+
+
 @pytest.mark.parametrize("absent", ["b", "c"])
 def test_both_of_a_pair_have_to_be_there(monkeypatch, absent):
     rounds = Rounds(monkeypatch, HIDDEN, pairs=("bc",), absent=(absent,))

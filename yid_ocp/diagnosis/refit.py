@@ -308,7 +308,6 @@ def refit_all(
     where : str
         What is said of `values` in the store, if the same effects are refitted from elsewhere too.
     """
-
     beside = f" beside {', '.join(effect.label for effect in base)}" if base else ""
     entries = [_Tried((*base, effect), effect.label, step, where) for effect, step in tried]
     return _each(search, entries, values, f"{len(tried)} effects{beside}")

@@ -335,7 +335,18 @@ def likely_pairs(
 ) -> list[tuple[tuple[EffectBase, EffectBase], Mapping[str, float]]]:
     """Which pairs of candidates are refitted: those worth most, none of which one before it can stand in for.
 
-    The best effect alone, with which others are tried anyway, is in none of them.
+    Parameters
+    ----------
+    screened : Screened
+        At the nominal fit.
+    limits : Thresholds
+    without : EffectBase
+        The best effect alone, with which others are tried anyway: it is in no pair.
+
+    Returns
+    -------
+    list of (pair of EffectBase, mapping of parameter to float)
+        With the values at which both begin.
     """
     alike = screened.alike
 
@@ -440,13 +451,13 @@ def _needed(without: Fit, full: Fit, effect: EffectBase, limits: Thresholds) -> 
 
 
 def _rebuilt(search: Search, nominal: Fit, entries: Sequence[Added], last: Fit) -> tuple[Added, ...]:
-    """Effects in their order, each with the fit of all up to it, the whole one known."""
+    """Effects in their order, each with the fit of all up to it, the whole one known and in the place of missing ones."""
     found = []
     for i, entry in enumerate(entries):
         effects = [other.effect for other in entries[: i + 1]]
-        fit = last if i == len(entries) - 1 else _again(search, effects, last, f"{describe(effects)} again")
-        if fit is not None:
-            found.append(replace(entry, fit=fit, closure=closure(nominal.loss, fit.loss, limits=search.limits)))
+        part = None if i == len(entries) - 1 else _again(search, effects, last, f"{describe(effects)} again")
+        fit = last if part is None else part
+        found.append(replace(entry, fit=fit, closure=closure(nominal.loss, fit.loss, limits=search.limits)))
     return tuple(found)
 
 
