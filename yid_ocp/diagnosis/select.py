@@ -451,7 +451,7 @@ def _needed(without: Fit, full: Fit, effect: EffectBase, limits: Thresholds) -> 
 
 
 def _rebuilt(search: Search, nominal: Fit, entries: Sequence[Added], last: Fit) -> tuple[Added, ...]:
-    """Effects in their order, each with the fit of all up to it, the whole one known and in the place of missing ones."""
+    """Effects in their order, each with the fit of all up to it, or of all where that cannot be made."""
     found = []
     for i, entry in enumerate(entries):
         effects = [other.effect for other in entries[: i + 1]]
