@@ -378,7 +378,7 @@ def test_two_that_hide_in_each_other_show_as_a_pair():
     at = point(
         [0.0, -1.0, 0.0], *(signature(of, x) for of, x in ((a, [1, 0.5, 0]), (b, [1, -0.5, 0]), (c, [0, 0.5, 2])))
     )
-    pairs = together(at).pairs([a.label, b.label, c.label])
+    pairs = list(together(at).pairs([a.label, b.label, c.label]))
     assert [tuple(of.kind for of in pair.effects) for pair in pairs] == [("a", "b"), ("a", "c"), ("b", "c")]
     best = pairs[0]
     assert best.decrease == pytest.approx(1.0)

@@ -387,7 +387,9 @@ class Rounds:
 
     def promised(self, among):
         kinds = {of.kind: of for of in (A, B, C) if of.label in among}
-        return [Pair((kinds[one], kinds[other]), {}, 9.0) for one, other in self.pairs if {one, other} <= set(kinds)]
+        return [
+            Pair((kinds[one], kinds[other]), {}, 9.0, 7.0) for one, other in self.pairs if {one, other} <= set(kinds)
+        ]
 
     def refit_pairs(self, search, tried, values):
         if tried:
@@ -693,7 +695,7 @@ def test_both_of_a_pair_have_to_be_there(monkeypatch, absent):
 
 def test_pairs_that_others_can_stand_in_for_are_not_refitted():
     kinds = {name: effect(f"{name}@x", amplitude()) for name in "abcdef"}
-    promised = [Pair((kinds[one], kinds[other]), {}, 9.0 - i) for i, (one, other) in enumerate(PROMISED)]
+    promised = [Pair((kinds[one], kinds[other]), {}, 9.0 - i, 7.0 - i) for i, (one, other) in enumerate(PROMISED)]
     table = np.eye(6)
     table[3, 1] = 0.9  # d's signature is b's, not the other way round
     found = Screened(

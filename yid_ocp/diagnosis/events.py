@@ -270,8 +270,7 @@ def _falls(problem: EstimationProblem, run: Run, limits: Thresholds) -> Iterator
 def _before_fall(history: History, falls: Sequence[Fall], limits: Thresholds) -> History | None:
     """A history up to where its recording's motion gets too fast, less what a filter smears; None where too short."""
     until = min((fall.time for fall in falls if fall.recording == history.recording), default=math.inf)
-    smear = effort_filter(history.cutoff).settling
-    keep = np.flatnonzero(history.t <= until - (smear if math.isfinite(until) else 0.0))
+    keep = np.flatnonzero(history.t <= until - effort_filter(history.cutoff).settling)
     if len(keep) < 10:
         return None
     return history.at(keep)

@@ -16,7 +16,7 @@ best one counting as the best of that many tries (Davies 1987, doi:10.1093/biome
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -276,14 +276,18 @@ def _room(effect: EffectBase) -> tuple[Array, Array]:
     return np.array([q.lower - q.neutral for q in own]), np.array([q.upper - q.neutral for q in own])
 
 
+def _promised(information: Array, slope: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
+    """The linear model's step within bounds and the decrease of r'r by it; of one, or of a stack of them."""
+    plain = (np.linalg.pinv(information, rcond=1e-10, hermitian=True) @ slope[..., None])[..., 0]
+    step = np.clip(plain, lower, upper)
+    return step, np.sum((2 * slope - (information @ step[..., None])[..., 0]) * step, axis=-1)
+
+
 def _score(signature: Signature, residual: Array, series: Sequence[Series]) -> Score:
     effect, x = signature.effect, signature.columns
-    neutral = np.array([effect.neutral[name] for name in effect.amplitudes])
-    information, slope = x.T @ x, -(x.T @ residual)
-    plain = np.linalg.pinv(information, rcond=1e-10, hermitian=True) @ slope
+    slope = -(x.T @ residual)
     lower, upper = _room(effect)
-    step = np.clip(plain, lower, upper)
-    decrease = float(2 * slope @ step - step @ information @ step)
+    step, decrease = _promised(x.T @ x, slope, lower, upper)
     # the candidate's own share of the residual would hide it: what would be left is what its score scatters with
     covariance = robust(x, residual + x @ step, series)
     floor = signature.noise
@@ -292,11 +296,16 @@ def _score(signature: Signature, residual: Array, series: Sequence[Series]) -> S
     statistic = float(slope @ np.linalg.pinv(covariance, rcond=1e-10, hermitian=True) @ slope)
     p_value = float(scipy.stats.chi2.sf(statistic, len(step)))
     if len(step) == 1 and lower[0] == 0:
-        if plain[0] <= 0:
+        if step[0] <= 0:
             statistic, p_value = 0.0, 1.0
         p_value = p_value / 2 if statistic > 0 else 1.0
-    values = dict(zip(effect.amplitudes, map(float, neutral + step), strict=True)) | signature.shape
-    return Score(effect, values, max(decrease, 0.0), statistic, p_value)
+    return Score(effect, _values(effect, step) | signature.shape, max(float(decrease), 0.0), statistic, p_value)
+
+
+def _values(effect: EffectBase, step: Array) -> dict[str, float]:
+    """Amplitudes a step from neutral."""
+    neutral = effect.neutral
+    return {name: neutral[name] + float(moved) for name, moved in zip(effect.amplitudes, step, strict=True)}
 
 
 @dataclass(frozen=True)
@@ -330,16 +339,14 @@ class Pair:
         Amplitudes to which the linear model would go, and the shape values.
     decrease : float
         Promised decrease of r'r.
+    worth : float
+        The decrease beyond what chance alone brings by so many amplitudes.
     """
 
     effects: tuple[EffectBase, EffectBase]
     step: dict[str, float]
     decrease: float
-
-    @property
-    def worth(self) -> float:
-        """The decrease beyond what chance alone brings by so many amplitudes."""
-        return self.decrease - sum(len(effect.amplitudes) for effect in self.effects)
+    worth: float
 
 
 @dataclass(frozen=True)
@@ -367,7 +374,7 @@ class Together:
         edges = np.cumsum([0, *(len(effect.amplitudes) for effect in self.effects)])
         return [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
 
-    def pairs(self, among: Sequence[str]) -> list[Pair]:
+    def pairs(self, among: Sequence[str]) -> Iterator[Pair]:
         """All pairs of some candidates, by what they are worth, best first.
 
         What two effects do together neither need do alone: one of them may hide in what the other leaves.
@@ -380,26 +387,21 @@ class Together:
         bounds = [_room(effect) for effect in self.effects]
         lower, upper = (np.concatenate([np.zeros(0), *(entry[k] for entry in bounds)]) for k in (0, 1))
         columns = [np.arange(block.start, block.stop) for block in self.blocks]
+        wanted = set(among)
         by_size: dict[tuple[int, int], list[tuple[int, int]]] = {}
-        for i, j in itertools.combinations([i for i, e in enumerate(self.effects) if e.label in set(among)], 2):
+        for i, j in itertools.combinations([i for i, e in enumerate(self.effects) if e.label in wanted], 2):
             by_size.setdefault((len(columns[i]), len(columns[j])), []).append((i, j))
-        found = []
+        found: list[tuple[float, float, int, int, Array]] = []
         for members in by_size.values():
             at = np.array([[*columns[i], *columns[j]] for i, j in members])
             information, slope = self.information[at[:, :, None], at[:, None, :]], self.slope[at]
-            plain = np.einsum("kab,kb->ka", np.linalg.pinv(information, rcond=1e-10, hermitian=True), slope)
-            steps = np.clip(plain, lower[at], upper[at])
-            decrease = 2 * np.einsum("ka,ka->k", slope, steps) - np.einsum("ka,kab,kb->k", steps, information, steps)
-            for (i, j), step, value in zip(members, steps, decrease, strict=True):
-                found.append(self._pair(i, j, step, float(value)))
-        return sorted(found, key=lambda pair: -pair.worth)
-
-    def _pair(self, i: int, j: int, step: Array, decrease: float) -> Pair:
-        one, other = self.effects[i], self.effects[j]
-        neutral = one.neutral | other.neutral
-        names = (*one.amplitudes, *other.amplitudes)
-        values = {name: neutral[name] + float(moved) for name, moved in zip(names, step, strict=True)}
-        return Pair((one, other), values | self.shapes[i] | self.shapes[j], decrease)
+            steps, decrease = _promised(information, slope, lower[at], upper[at])
+            worth = decrease - at.shape[1]
+            found += [(w, d, *both, s) for w, d, both, s in zip(worth, decrease, members, steps, strict=True)]
+        for worth, promised, i, j, step in sorted(found, key=lambda entry: -entry[0]):
+            (one, other), width = (self.effects[i], self.effects[j]), len(columns[i])
+            values = _values(one, step[:width]) | _values(other, step[width:])
+            yield Pair((one, other), values | self.shapes[i] | self.shapes[j], float(promised), float(worth))
 
 
 def together(point: Linearisation, chosen: Sequence[Score] = ()) -> Together:

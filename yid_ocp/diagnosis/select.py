@@ -112,7 +112,7 @@ def within_reach(fits: Sequence[Fit], limits: Thresholds = DEFAULTS) -> list[Fit
     out of its range (`oversized`) comes last.
     """
     best = min(fits, key=lambda fit: fit.loss.mean)
-    likely = [fit for fit in fits if not fit.effects or _likely(fit, limits)]
+    likely = [fit for fit in fits if not fit.effects or _likely(fit.effects[-1], fit, limits)]
     if likely and min(fit.loss.mean for fit in likely) <= (1 + limits.stand_in) * best.loss.mean:
         fits = likely
         best = min(fits, key=lambda fit: fit.loss.mean)
@@ -147,8 +147,7 @@ def behind(fit: Fit, other: Fit) -> float:
     return held + 2 * (fit.cost - other.cost) + fit.size - other.size
 
 
-def _likely(fit: Fit, limits: Thresholds) -> bool:
-    effect = fit.effects[-1]
+def _likely(effect: EffectBase, fit: Fit, limits: Thresholds) -> bool:
     return stands_out(effect, fit, limits) and not out_of_shape(effect, fit.values, limits)
 
 
@@ -291,7 +290,7 @@ def compose(
     added: tuple[Added, ...] = ()
     paired = False
     while len(added) < limits.effects:
-        base = [entry.effect for entry in added]
+        base = tuple(entry.effect for entry in added)
         if added:
             search.progress.stage(f"scoring what is left beside {', '.join(e.label for e in base)}")
             screened = screen(search.problem, base, current.values, limits)
@@ -313,7 +312,7 @@ def compose(
         chosen = next((fit for fit in near if _worth_adding(current, fit, limits)), None)
         if chosen is None:
             break
-        paired = [e.label for e in chosen.effects[:-1]] != [e.label for e in base]
+        paired = chosen.effects[:-1] != base
         total = closure(nominal.loss, chosen.loss, limits=limits)
         said = "" if np.isnan(total.value) else f": {100 * total.value:.3g} % of the held-out gap closed"
         if paired:
@@ -322,7 +321,7 @@ def compose(
             added = _rebuilt(search, nominal, both, chosen)
         else:
             search.progress.stage(f"added {chosen.effects[-1].label}{said}")
-            beside = [fit.effects[-1] for fit in near if fit is not chosen and fit.effects[:-1] == chosen.effects[:-1]]
+            beside = [fit.effects[-1] for fit in near if fit is not chosen and fit.effects[:-1] == base]
             added = (*added, Added(chosen.effects[-1], chosen, total, (chosen.effects[-1], *beside)))
         current = chosen
         if current.loss.mean < 1 + limits.smallest_gap:
@@ -369,8 +368,7 @@ def likely_pairs(
 
 def _firmly(effect: EffectBase, fit: Fit, limits: Thresholds) -> bool:
     """Whether an effect of a fit is there, with a shape and an amplitude to be expected."""
-    there = stands_out(effect, fit, limits) and not out_of_shape(effect, fit.values, limits)
-    return there and not oversized(effect, fit.values, limits)
+    return _likely(effect, fit, limits) and not oversized(effect, fit.values, limits)
 
 
 def _of_a_size(fits: Sequence[Fit], limits: Thresholds) -> list[Fit]:

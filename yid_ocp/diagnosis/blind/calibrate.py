@@ -199,11 +199,8 @@ def calibrate(
         value, attained = conformal(sample, rule.side, coverage)
         sizes = sorted({size for size, _ in true})
         # what chance brings more of is what small values tell of
-        below = rule.of == "clean" and rule.side == "least"
-
-        def beyond(entry: float, value: float = value, below: bool = below) -> bool:
-            return entry < value if below else entry > value
-
+        sign = -1.0 if rule.of == "clean" and rule.side == "least" else 1.0
+        beyond = {size: [sign * x > sign * value for s, x in true if s == size] for size in sizes}
         found[name] = {
             "setting": rule.setting,
             "statistic": rule.words,
@@ -215,8 +212,8 @@ def calibrate(
             "limit": rule.limit,
             "is": getattr(limits, rule.setting),
             "sample": [_number(entry) for entry in sorted(sample)],
-            "effects_beyond": {f"{size:.3g}": proportion([beyond(x) for s, x in true if s == size]) for size in sizes},
-            "strange_beyond": proportion([beyond(entry) for entry in strange]),
+            "effects_beyond": {f"{size:.3g}": proportion(hits) for size, hits in beyond.items()},
+            "strange_beyond": proportion([sign * entry > sign * value for entry in strange]),
         }
     return {"format": FORMAT, "asked": coverage, "rules": found, "settings": advised(found)}
 
