@@ -364,9 +364,11 @@ FEW = together(point([0.0]))
 class Rounds:
     """Refits whose held-out losses are given by the effects' kinds, screened as wanted; remembers what was asked."""
 
-    def __init__(self, monkeypatch, losses, p_values=(1e-9,) * 3, fails=(), absent=(), before=None, pairs=()):
+    def __init__(
+        self, monkeypatch, losses, p_values=(1e-9,) * 3, fails=(), absent=(), before=None, pairs=(), left=None
+    ):
         self.losses, self.fails, self.refits, self.screens, self.heard = losses, fails, [], [], Heard()
-        self.absent, self.before, self.pairs = absent, before, pairs
+        self.absent, self.before, self.pairs, self.left = absent, before, pairs, left
         kinds = [score(of, p=p, decrease=9.0 - i) for i, (of, p) in enumerate(zip((A, B, C), p_values, strict=True))]
         self.scores = tuple(kinds)
         monkeypatch.setattr(select, "refit_all", self.refit_all)
@@ -382,6 +384,8 @@ class Rounds:
     def screened(self, base=()):
         labels = {of.label for of in base}
         left = tuple(s for s in self.scores if s.effect.label not in labels)
+        if base and self.left is not None:
+            left = tuple(replace(s, p_value=self.left) for s in left)
         table = alike([s.effect.label for s in left], np.eye(len(left)))
         return Screened((), left, table, SimpleNamespace(pairs=self.promised))
 
@@ -425,20 +429,23 @@ class Rounds:
 
 
 def test_one_effect_that_leaves_no_gap_is_enough(monkeypatch):
-    rounds = Rounds(monkeypatch, {"": (3.0, 3.2), "a": (1.0, 1.1), "b": (2.0, 2.2), "c": (1.5, 1.7)})
+    rounds = Rounds(monkeypatch, {"": (3.0, 3.2), "a": (1.0, 1.1), "b": (2.0, 2.2), "c": (1.5, 1.7)}, left=1e-3)
     first, chosen, added = rounds.compose()
     assert (first, chosen) == (["a", "c", "b"], ["a"])
     assert rounds.refits == [([], ["a", "b", "c"], 0.0)]
-    assert rounds.screens == []
+    assert [kinds for kinds, *_ in rounds.screens] == [["a"]]
     assert added[0].closure.value == pytest.approx(1 - 0.05 / 2.1)
     assert [of.kind for of in added[0].rivals] == ["a"]
-    assert rounds.heard.stages == ["added a@x: 97.6 % of the held-out gap closed"]
+    assert rounds.heard.stages == [
+        "added a@x: 97.6 % of the held-out gap closed",
+        "scoring what is left beside a@x",
+    ]
 
 
 def test_where_a_fit_has_left_an_earlier_run_candidates_are_tried_from_there_too(monkeypatch):
     """Each keeps the likelier of its two fits: b's from before, whatever its held-out loss, and a's from the fit."""
     losses = {"": (3.0, 3.2), "a": (2.0, 2.2), "b": (2.5, 2.7), "c": (2.6, 2.8)}
-    rounds = Rounds(monkeypatch, losses, before={"b": (1.0, 1.1)})
+    rounds = Rounds(monkeypatch, losses, before={"b": (1.0, 1.1)}, left=1e-3)
     first, chosen, added = rounds.compose(moved=True)
     assert (first, chosen) == (["b", "a", "c"], ["b"])
     assert rounds.refits == [([], ["a", "b", "c"], 0.0), ([], ["a", "b", "c"], None)]
@@ -498,10 +505,23 @@ def test_what_is_added_to_others_is_of_a_size_to_be_expected(monkeypatch):
 
 def test_a_rest_below_the_smallest_gap_is_left(monkeypatch):
     losses = {"": (3.0, 3.2), "a": (1.04, 1.14), "b": (2.0, 2.2), "c": (2.5, 2.7), "ab": (1.0, 1.0), "ac": (1.0, 1.0)}
-    assert Rounds(monkeypatch, losses).compose()[1] == ["a"]
-    assert Rounds(monkeypatch, losses).compose(smallest_gap=0.05)[1] == ["a", "b"]
+    assert Rounds(monkeypatch, losses, left=1e-3).compose()[1] == ["a"]
+    assert Rounds(monkeypatch, losses, left=1e-3).compose(smallest_gap=0.05)[1] == ["a", "b"]
     # at the smallest gap another one is tried
-    assert Rounds(monkeypatch, losses).compose(smallest_gap=0.09)[1] == ["a", "b"]
+    assert Rounds(monkeypatch, losses, left=1e-3).compose(smallest_gap=0.09)[1] == ["a", "b"]
+
+
+def test_a_rest_that_shows_along_a_candidate_is_not_left(monkeypatch):
+    """It has to be surer than a rest that the residual as a whole shows, and only odds convince of it."""
+    losses = {"": (3.0, 3.2), "a": (1.04, 1.14), "b": (2.0, 2.2), "c": (2.5, 2.7), "ab": (1.0, 1.0), "ac": (1.0, 1.0)}
+    assert Rounds(monkeypatch, losses, left=4e-5).compose()[1] == ["a", "b"]
+    # counted as the best of two
+    assert Rounds(monkeypatch, losses, left=6e-5).compose()[1] == ["a"]
+    assert Rounds(monkeypatch, losses, left=6e-5).compose(candidate_level=2e-4)[1] == ["a", "b"]
+    # all of the rest is closed surely, and r'r falls by 9, not by twice the log odds
+    less = losses | {"ab": (0.995, 1.095), "ac": (1.03, 1.13)}
+    assert Rounds(monkeypatch, less, left=1e-9).compose()[1] == ["a"]
+    assert Rounds(monkeypatch, less, left=1e-9).compose(worth=4.0)[1] == ["a", "b"]
 
 
 @pytest.mark.parametrize(
@@ -675,7 +695,7 @@ def test_a_pair_that_is_no_better_is_not_taken(monkeypatch):
     rounds = Rounds(monkeypatch, HIDDEN | {"bc": (3.0, 3.2)}, pairs=("bc",))
     assert rounds.compose(effects=2)[1] == ["a"]
     # what one effect explains to the noise is not looked at in pairs
-    alone = Rounds(monkeypatch, HIDDEN | {"a": (1.0, 1.1), "bc": (0.9, 0.95)}, pairs=("bc",))
+    alone = Rounds(monkeypatch, HIDDEN | {"a": (1.0, 1.1), "bc": (0.9, 0.95)}, pairs=("bc",), left=1e-3)
     assert alone.compose()[1] == ["a"]
 
 

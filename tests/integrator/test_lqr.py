@@ -1,4 +1,4 @@
-"""The tracking filter: optimal gains, a reference that a true motion follows by itself, the shift that effects make."""
+"""The tracking filter: optimal gains, and a reference that a true motion follows by itself."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from yid_ocp.effects import make_effect
 from yid_ocp.errors import ModelError
-from yid_ocp.integrator.lqr import MomentumShift, lqr_filter, proportional_filter
+from yid_ocp.integrator.lqr import lqr_filter, proportional_filter
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Segment, System, flexible_object, forward_kinematics
@@ -95,28 +94,3 @@ def test_driven_joints_must_come_first(parts):
     step = compile_step(parts.cable(driven=["C_2_x"]), 0.01, use_compiler=False)
     with pytest.raises(ModelError, match="come first"):
         lqr_filter(step, np.zeros((4, 1)), np.zeros((3, 1)), step.system.parameters.vector())
-
-
-def test_an_armature_shifts_the_reference_momentum(robot, motion):
-    """What the same angles mean in momentum: armature times the rate at the middle of the step before."""
-    _, torque, swung = motion
-    plain = System.build(robot, driven=robot.joint_names, damping=0.1)
-    effect = make_effect("rotor_inertia", "shoulder", plain)
-    system = plain.with_effects([effect])
-    step = compile_step(system, TIME_STEP, use_compiler=False)
-    shift = MomentumShift(step)
-    [name] = shift.parameters
-    neutral = system.parameters.vector(effect.neutral)
-    assert not shift.active(neutral, ())
-    theta = neutral.copy()
-    theta[system.parameters.index(name)] = 0.3
-    assert shift.active(theta, ())
-    assert shift.active(neutral, (name,))
-    angles = swung.state[:, :2]
-    value, slope = shift.along(angles, torque, theta, (name, "elbow.mass"))
-    rate = np.diff(angles[:, 0]) / TIME_STEP
-    np.testing.assert_allclose(value[1:, 0], 0.3 * rate[:-1], rtol=1e-9)
-    np.testing.assert_allclose(value[:, 1], 0.0, atol=1e-12)
-    np.testing.assert_allclose(slope[:, :, 0] * 0.3, value, rtol=1e-9, atol=1e-12)
-    np.testing.assert_array_equal(slope[:, :, 1], 0.0)
-    np.testing.assert_array_equal(shift.without(theta), neutral)

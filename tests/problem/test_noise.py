@@ -175,6 +175,26 @@ def test_a_constant_error_is_seen_and_its_spread_said(urdf_folder):
     assert problem.torque_offsets(problem.start) == [None]
 
 
+@pytest.mark.parametrize("feedback", [TRACKED, {"feedback": "lqr"}], ids=["angles", "angles_and_momenta"])
+def test_a_constant_error_counts_in_what_the_filter_follows_too(urdf_folder, feedback):
+    """The momentum of the measured motion is worked out from recorded torques; weights know what their error does."""
+    problem = problem_of(urdf_folder, encoders=False, feedback=feedback)
+    x, error = problem.start, 1e-3
+    weighted = problem.weighted_at(x)
+    [episode], [whitening] = weighted.episodes, weighted.innovations
+    group = episode.recording.joints
+    wrong = replace(episode.recording, joints=replace(group, effort=group.effort + error))
+    again = EstimationProblem(problem.step, [wrong], problem.free, problem.options).episodes[0]
+    other = replace(again, errors=episode.errors)
+    found = []
+    for each in (episode, other):
+        result = weighted.predictor.run(each, *problem.split(x, 0), False)
+        found.append(weighted.predictor.torque_offset(each, result, whitening)[0])
+    seen = 1 - (whitening.bias_std[0] / BIAS) ** 2
+    assert seen > 0.05
+    assert (found[1] - found[0]) / error == pytest.approx(seen, rel=0.01)
+
+
 def test_what_cannot_be_rolled_out_has_no_constant_error(point, monkeypatch):
     problem, x = point
     weighted = problem.weighted_at(x)

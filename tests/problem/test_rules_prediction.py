@@ -20,6 +20,7 @@ GEARS = (("series_elasticity", "shoulder", {"stiffness": 300.0}), ("backlash", "
 HEAVY = (("rotor_inertia", "shoulder", {"armature": 0.03}), ("link_mass", "elbow", {"scale": 1.1}))
 DELAYED = (("effort_delay", "gripper", {"delay": 0.0137}), ("effort_offset", "shoulder", {"offset": 0.2}))
 SOFT = (("joint_coulomb", "elbow", {"tau_c": 0.05}), ("gravity_tilt", "world", {"rx": 0.03, "ry": 0.02}))
+STICKING = (("joint_presliding", "shoulder", {"tau_c": 0.3, "yield_angle": 0.02}),)
 
 TRACKED = {"feedback": "proportional", "gains": (9.0,)}
 FILTERED = {"feedback": "lqr"}
@@ -35,6 +36,7 @@ CASES = {
     "driven, proportional": (MISREAD + GEARS, {"driven": ("shoulder",)}, TRACKED),
     "driven, filtered": (MISREAD + HEAVY + LATE, {"driven": ("shoulder",)}, FILTERED),
     "driven, filtered, both": (MISREAD + HEAVY, {"driven": PENDULUM}, FILTERED),
+    "driven, filtered, remembering": (STICKING + GEARS + DELAYED, {"driven": ("shoulder",)}, FILTERED),
     "driven, filtered, estimated": (MISREAD, {"driven": ("shoulder",)}, {**FILTERED, "initial_state": "estimated"}),
     "driven and prescribed": (MISREAD, {"driven": ("elbow",), "prescribed": ("shoulder",)}, TRACKED),
 }
@@ -231,9 +233,10 @@ def test_heavier_joints_have_more_momentum_for_the_filter_to_follow(urdf_folder)
     problem = problem_of(urdf_folder, "driven, filtered, both", seeds=(1,))
     episode, vector = problem.episodes[0], problem.system.parameters.vector
     neutral = {name: value for effect in problem.system.effects for name, value in effect.neutral.items()}
-    assert problem.predictor.inputs(episode, vector(neutral), ()).momentum is None
+    none = np.zeros(problem.step.sizes["nx"])
+    assert problem.predictor.tracked(episode, vector(neutral), (), none).momentum is None
     armature = neutral | {"rotor_inertia@shoulder.armature": 0.05}
-    found = problem.predictor.inputs(episode, vector(armature), ("rotor_inertia@shoulder.armature",))
+    found = problem.predictor.tracked(episode, vector(armature), ("rotor_inertia@shoulder.armature",), none)
     # of the motion up to each node; it begins from a stand
     rate = np.diff(episode.smooth_arm[:, 0], prepend=episode.smooth_arm[0, 0])[:-1] / H
     np.testing.assert_allclose(found.momentum, np.stack([0.05 * rate, 0 * rate], axis=1), atol=1e-12)
@@ -344,14 +347,14 @@ def test_a_moving_reference_moves_the_torque_by_the_gain():
     by_arm, by_momentum = np.zeros((4, 2, 1)), np.zeros((3, 2, 1))
     by_arm[:, 1], by_momentum[:, 0] = 1.0, 2.0
     plain = Inputs(np.zeros((3, 2)), np.zeros(2), np.zeros((4, 0)), np.zeros((4, 2)))
-    assert plain.torque_directions(feedback, (0, 1)) is None
+    assert plain.torque_directions(feedback, (0, 1), 1) is None
     by_torque = np.full((3, 2, 1), 100.0)
     full = replace(plain, by_torque=by_torque, by_arm=by_arm, by_momentum=by_momentum)
-    np.testing.assert_array_equal(full.torque_directions(None, (0, 1)), by_torque)
-    found = full.torque_directions(feedback, (0, 1))
+    np.testing.assert_array_equal(full.torque_directions(None, (0, 1), 1), by_torque)
+    found = full.torque_directions(feedback, (0, 1), 1)
     np.testing.assert_array_equal(found[:, :, 0], 100.0 + gain[:, :, 1] + 2 * gain[:, :, 2])
     np.testing.assert_array_equal(by_torque, np.full((3, 2, 1), 100.0))
-    alone = replace(plain, by_momentum=by_momentum).torque_directions(feedback, (0, 1))
+    alone = replace(plain, by_momentum=by_momentum).torque_directions(feedback, (0, 1), 1)
     np.testing.assert_array_equal(alone[:, :, 0], 2 * gain[:, :, 2])
 
 

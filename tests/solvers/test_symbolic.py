@@ -264,7 +264,9 @@ def test_blocks_are_named_after_what_they_hold(urdf_folder):
 
 
 @pytest.mark.parametrize("encoders", [False, True])
-@pytest.mark.parametrize("feedback", [TRACKED, {"feedback": "none"}])
+@pytest.mark.parametrize(
+    "feedback", [TRACKED, {"feedback": "lqr"}, {"feedback": "none"}], ids=["angles", "momenta_too", "none"]
+)
 def test_errors_as_unknowns_have_the_likelihood_of_innovations(urdf_folder, encoders, feedback):
     """At fixed parameters, with errors so small that everything is linear, the best errors cost what innovations do."""
     step = pendulum_step(urdf_folder, driven=("shoulder",))
@@ -302,9 +304,11 @@ def test_errors_as_unknowns_have_the_likelihood_of_innovations(urdf_folder, enco
     solver = program.solver("ipopt", "exact", ipopt={"print_level": 0, "sb": "yes", "tol": 1e-9, "max_iter": 50})
     found = solver(**arguments)
     assert solver.stats()["success"], solver.stats()["return_status"]
-    # beside encoders no torque is taken as better than a thousandth: errors are then not small enough to be linear
-    assert float(found["f"]) == pytest.approx(expected, rel=4e-3 if encoders else 1e-4)
-    assert ("angle_error[run_3]" in program.variables) is (not encoders and feedback is TRACKED)
+    # beside encoders no torque is taken as better than a thousandth: errors are then not small enough to be linear;
+    # where momenta are followed, the noise of the step before is taken for this step's
+    exact = not encoders and feedback["feedback"] != "lqr"
+    assert float(found["f"]) == pytest.approx(expected, rel=1e-4 if exact else 4e-3)
+    assert ("angle_error[run_3]" in program.variables) is (not encoders and feedback["feedback"] != "none")
     assert program.block("torque_error").index.shape == (1, len(np.unique(errors.sample)))
 
 

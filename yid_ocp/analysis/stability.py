@@ -175,7 +175,7 @@ def growth_of_fit(problem: EstimationProblem, x: ArrayLike) -> Growth | None:
         begin = predictor.start(episode, theta, offset, ())
         if begin.message:
             continue
-        inputs = predictor.inputs(episode, theta, ())
+        inputs = predictor.tracked(episode, theta, (), begin.state)
         feedback = inputs.guided(episode.feedback, system.driven_indices, episode.measured_arm)
         rollout = simulate(problem.step, theta, begin.state, episode.grid.steps, inputs.torque, inputs.path, feedback)
         found.append(growth_along(problem.step, theta, rollout, feedback, episode.name, looks))

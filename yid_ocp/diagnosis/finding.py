@@ -14,11 +14,11 @@ from yid_ocp.diagnosis.events import NOTHING, Events
 from yid_ocp.diagnosis.hypotheses import Cut
 from yid_ocp.diagnosis.localise import Place
 from yid_ocp.diagnosis.refit import Fit
-from yid_ocp.diagnosis.screening import Confusability, Score, Visibility
+from yid_ocp.diagnosis.screening import Confusability, Score, Visibility, best_of
 from yid_ocp.diagnosis.select import Added, Closure, behind, closure, fall, gain
 from yid_ocp.diagnosis.smoother import Smoothed
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.diagnosis.verdict import Reason, assumptions, best_of
+from yid_ocp.diagnosis.verdict import Reason, assumptions
 from yid_ocp.effects import EffectBase
 from yid_ocp.problem.null_test import Floor, NullTest, smallest_p_value
 from yid_ocp.shown import Shown, Summary

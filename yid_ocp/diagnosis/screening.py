@@ -269,6 +269,11 @@ def scores(point: Linearisation, series: Sequence[Series], visible: Sequence[Vis
     return tuple(sorted(final, key=lambda s: -s.decrease))
 
 
+def best_of(ranked: Sequence[Score]) -> float:
+    """Smallest p-value of candidates as the best of that many tries, one where there is none (Bonferroni)."""
+    return min((score.p_value for score in ranked), default=1.0) * max(len(ranked), 1)
+
+
 def _room(effect: EffectBase) -> tuple[Array, Array]:
     """How far amplitudes may go from neutral, to either side."""
     quantities = {f"{effect.label}.{q.name}": q for q in effect.quantities}

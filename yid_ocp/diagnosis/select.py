@@ -14,7 +14,7 @@ import numpy as np
 
 from yid_ocp.diagnosis.hypotheses import describe
 from yid_ocp.diagnosis.refit import Fit, Loss, Search, refit, refit_all, refit_pairs
-from yid_ocp.diagnosis.screening import Confusability, Pair, Score, Screened, screen
+from yid_ocp.diagnosis.screening import Confusability, Pair, Score, Screened, best_of, screen
 from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import SolverError
@@ -291,9 +291,13 @@ def compose(
     paired = False
     while len(added) < limits.effects:
         base = tuple(entry.effect for entry in added)
+        little = bool(added) and current.loss.mean < 1 + limits.smallest_gap
         if added:
             search.progress.stage(f"scoring what is left beside {', '.join(e.label for e in base)}")
             screened = screen(search.problem, base, current.values, limits)
+            # a rest that the residual as a whole does not show may show along a candidate, as a gap does
+            if little and best_of(screened.scores) >= limits.candidate_level:
+                break
         # where the gap lay before anything was added asks for no more than the significant afterwards
         scores = [score for score in screened.scores if not added or score.p_value < limits.level]
         fits = refit_all(search, base, shortlist(scores, screened.alike, limits, places), current.values)
@@ -309,7 +313,7 @@ def compose(
         near = within_reach(fits, limits)
         if not added:
             first = (near[0], *sorted((fit for fit in fits if fit is not near[0]), key=lambda fit: fit.loss.mean))
-        chosen = next((fit for fit in near if _worth_adding(current, fit, limits)), None)
+        chosen = next((fit for fit in near if _worth_adding(current, fit, limits, little)), None)
         if chosen is None:
             break
         paired = chosen.effects[:-1] != base
@@ -324,8 +328,6 @@ def compose(
             beside = [fit.effects[-1] for fit in near if fit is not chosen and fit.effects[:-1] == base]
             added = (*added, Added(chosen.effects[-1], chosen, total, (chosen.effects[-1], *beside)))
         current = chosen
-        if current.loss.mean < 1 + limits.smallest_gap:
-            break
     return first, _reconsidered(search, nominal, added, paired)
 
 
@@ -376,10 +378,13 @@ def _of_a_size(fits: Sequence[Fit], limits: Thresholds) -> list[Fit]:
     return [fit for fit in fits if not oversized(fit.effects[-1], fit.values, limits)]
 
 
-def _worth_adding(current: Fit, chosen: Fit, limits: Thresholds) -> bool:
-    """Whether the last effect of a fit closes a sure and relevant part of the gap, and is there at all."""
+def _worth_adding(current: Fit, chosen: Fit, limits: Thresholds, little: bool) -> bool:
+    """Whether the last effect of a fit closes a sure and relevant part of the gap, and is there at all.
+
+    Where little but noise is left, only odds convince: a part of next to nothing is soon closed.
+    """
     gained, error = gain(current.loss, chosen.loss)
-    closes = gained > error and gained >= limits.closure * current.loss.gap and current.loss.gap > 0
+    closes = not little and gained > error and gained >= limits.closure * current.loss.gap and current.loss.gap > 0
     if not closes and not far_likelier(current.loss, chosen.loss, limits):
         return False
     return stands_out(chosen.effects[-1], chosen, limits) and relevant(current.loss, chosen.loss, limits)

@@ -352,18 +352,23 @@ def _steps(
     """
     a, e, effort = [], [], []
     feedback = course.episode.feedback
+    followed = np.zeros((0, 0)) if feedback is None else np.vstack([0 * loads.momentum, loads.momentum])[feedback.index]
     found = linear_steps(course.problem.step, course.theta, course.rollout, loads, slice(first, last))
     for k, one in enumerate(found, first):
         by_state, effort_by_state = one.by_state, one.effort_by_state
+        by_load, effort_by_load = one.by_load, one.effort_by_load
         if feedback is not None:
             by_state, effort_by_state = by_state.copy(), effort_by_state.copy()
             by_state[:, feedback.index] -= one.by_torque @ feedback.gain[k]
             effort_by_state[:, feedback.index] -= one.effort_by_torque @ feedback.gain[k]
+            # the momentum of the motion that was measured has half the impulse of an unknown force in it
+            unknown = feedback.gain[k] @ followed
+            by_load, effort_by_load = by_load + one.by_torque @ unknown, effort_by_load + one.effort_by_torque @ unknown
         forces = pushes.shape[1]
         a.append(by_state[np.ix_(moving, moving)])
-        e.append(np.hstack([one.by_load[moving], one.by_load[moving, :forces] @ pushes[k]]))
-        pushed = one.effort_by_load[:, :forces] @ pushes[k]
-        effort.append(np.hstack([effort_by_state[:, moving], one.effort_by_load, pushed]))
+        e.append(np.hstack([by_load[moving], by_load[moving, :forces] @ pushes[k]]))
+        pushed = effort_by_load[:, :forces] @ pushes[k]
+        effort.append(np.hstack([effort_by_state[:, moving], effort_by_load, pushed]))
     return np.stack(a), np.stack(e), np.stack(effort)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 from yid_ocp.diagnosis.refit import Fit
-from yid_ocp.diagnosis.screening import Score, Visibility
+from yid_ocp.diagnosis.screening import Score, Visibility, best_of
 from yid_ocp.diagnosis.select import Added, Closure
 from yid_ocp.diagnosis.smoother import Smoothed
 from yid_ocp.diagnosis.thresholds import Thresholds
@@ -55,11 +55,6 @@ def shapeless(
     best = best_of(ranked)
     barely = min(before.p_value, held_out.p_value) > limits.shapeless * limits.level
     return barely and best >= limits.level and (smoothed is None or smoothed.side == "none")
-
-
-def best_of(ranked: Sequence[Score]) -> float:
-    """Smallest p-value of candidates as the best of that many tries, one where there is none (Bonferroni)."""
-    return min((score.p_value for score in ranked), default=1.0) * max(len(ranked), 1)
 
 
 def decide(

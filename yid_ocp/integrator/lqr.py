@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
-import casadi as ca
 import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import ModelError
-from yid_ocp.integrator.mapped import Mapped
 from yid_ocp.integrator.step import Step, compile_alike
 from yid_ocp.integrator.step_model import ITERATION_LIMIT, Feedback
-from yid_ocp.model.system import Effect, System
+from yid_ocp.model.system import System
 
 Array = NDArray[np.float64]
 
@@ -110,82 +108,6 @@ def lqr_filter(
     n = system.size
     index = np.concatenate([np.array(system.driven_indices), n + np.array(system.driven_indices)])
     return Feedback(index.astype(np.int32), gain, np.hstack([reference[:-1], momenta[:-1]]))
-
-
-class MomentumShift:
-    """What effects add to the momentum of driven joints along a measured motion.
-
-    `lqr_filter` works its reference out once, without effects; an armature or a heavier link changes what the same
-    motion's momentum is, and the filter would otherwise pull at the difference.
-
-    Parameters
-    ----------
-    step : Step
-
-    Attributes
-    ----------
-    parameters : tuple of str
-        Those of effects on which the momentum depends.
-    """
-
-    def __init__(self, step: Step) -> None:
-        e, system = step.equations, step.system
-        driven = list(system.driven_indices)
-        nu = len(driven)
-        before, now = ca.SX.sym("before", nu), ca.SX.sym("now", nu)
-        whole = []
-        for arm in (before, now):
-            q = ca.SX(ca.DM.zeros(system.size))
-            q[driven] = arm
-            whole.append(q)
-        zero, free = ca.SX(ca.DM.zeros(e.z0.numel())), ca.SX(ca.DM.zeros(e.lam.numel()))
-        old, new = [e.q0, e.q1, e.z0, e.z1, e.lam], [*whole, zero, zero, free]
-        [momentum] = ca.substitute([ca.densify(e.p1[driven])], old, new)
-        pattern = np.array(ca.DM(ca.jacobian_sparsity(momentum, e.theta), 1)).any(axis=0)
-        neutral = {name: value for effect in system.effects for name, value in _neutral(effect).items()}
-        columns = [i for i in np.flatnonzero(pattern) if system.parameters.names[i] in neutral]
-        self._columns = np.array(columns, int)
-        self._neutral = np.array([neutral[system.parameters.names[i]] for i in columns])
-        self.parameters = tuple(system.parameters.names[i] for i in columns)
-        slope = ca.jacobian(momentum, e.theta)[:, [int(i) for i in columns]]
-        function = ca.Function("momentum", [before, now, e.u, e.theta, e.time_step], [momentum, ca.densify(slope)])
-        self._map = Mapped(function, shared=(3, 4), use_compiler=step.compiled)
-        self._time_step = np.array([step.time_step])
-
-    def along(self, measured: Array, torque: Array, theta: Array, names: Sequence[str]) -> tuple[Array, Array]:
-        """The shift at every node but the last, shape (N, nu), and its derivative by named parameters, (N, nu, d).
-
-        Parameters
-        ----------
-        measured : ndarray, shape (N + 1, nu)
-        torque : ndarray, shape (N, nu)
-        theta : ndarray, shape (ntheta,)
-        names : sequence of str
-        """
-        before = np.vstack([measured[:1], measured[:-2]])
-        held = np.vstack([torque[:1], torque[:-1]])
-        plain, _ = self._map(before, measured[:-1], held, self.without(theta), self._time_step)
-        value, slopes = self._map(before, measured[:-1], held, theta, self._time_step)
-        wide = np.zeros((*value.shape[:2], len(names)))
-        for column, name in enumerate(names):
-            if name in self.parameters:
-                wide[:, :, column] = slopes[:, :, self.parameters.index(name)]
-        return (value - plain)[:, :, 0], wide
-
-    def without(self, theta: Array) -> Array:
-        """theta with these effects absent, at which a filter's own reference is worked out."""
-        plain = theta.copy()
-        plain[self._columns] = self._neutral
-        return plain
-
-    def active(self, theta: Array, names: Sequence[str]) -> bool:
-        """Whether any effect is at work on it, or is among the parameters to differentiate by."""
-        return not set(names).isdisjoint(self.parameters) or bool(np.any(theta[self._columns] != self._neutral))
-
-
-def _neutral(effect: Effect) -> Mapping[str, float]:
-    """Values with which an effect is absent; one that does not say so is taken as it stands."""
-    return dict(getattr(effect, "neutral", {}))
 
 
 def arms_alone(step: Step) -> Step:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.integrator.mapped import Mapped
+from yid_ocp.integrator.momentum import MomentumShift, Motion
 from yid_ocp.integrator.step import Feedback
 from yid_ocp.model.system import RecordedEffect, System
 from yid_ocp.parallel import Once
@@ -33,7 +35,8 @@ class Inputs:
     by_torque, by_first_torque, by_path, by_arm : ndarray, shape (..., d), or None
     momentum : ndarray, shape (N, nu), or None
         What effects add to that of the driven joints along their measured motion.
-    by_momentum : ndarray, shape (N, nu, d), or None
+    by_momentum : ndarray, shape (N, nu, d'), or None
+        By what is unknown of the start as well, where it is asked for.
     """
 
     torque: Array
@@ -70,16 +73,48 @@ class Inputs:
                 reference[:, column] += self.momentum[:, at]
         return Feedback(feedback.index, feedback.gain, reference)
 
-    def torque_directions(self, feedback: Feedback | None, driven: tuple[int, ...]) -> Array | None:
-        """Derivative of the nominal torque, that of the filter's reference included, shape (N, nu, d)."""
-        total = self.by_torque
+    def with_momenta(
+        self,
+        shift: MomentumShift,
+        recorded: Motion,
+        measured: Array,
+        theta: Array,
+        wanted: Sequence[str],
+        by_internal: Array | None,
+    ) -> Inputs:
+        """The same with what effects add to the momenta of the driven joints.
+
+        Parameters
+        ----------
+        shift : MomentumShift
+        recorded : Motion
+            Its angles are smooth.
+        measured : ndarray, shape (N + 1, nu)
+            Angles as they were read.
+        theta : ndarray, shape (ntheta,)
+        wanted : sequence of str
+        by_internal : ndarray, shape (nz, d), or None
+            Derivative of the internal coordinates at the start.
+        """
+        slopes = [x for x in (self.by_torque, self.by_arm) if x is not None]
+        read = np.array_equal(self.torque, recorded.torque) and np.array_equal(self.arm, measured)
+        if read and not any(np.any(x) for x in slopes) and not shift.active(theta, wanted):
+            return self
+        smooth = recorded.angles + self.arm - measured
+        true = Motion(smooth, self.torque, recorded.internal, self.by_arm, self.by_torque, by_internal)
+        momentum, slope = shift.along(recorded, true, theta, wanted)
+        return replace(self, momentum=momentum, by_momentum=slope if np.any(slope) else None)
+
+    def torque_directions(self, feedback: Feedback | None, driven: tuple[int, ...], width: int) -> Array | None:
+        """Derivative of the nominal torque, that of the filter's reference included, shape (N, nu, width)."""
+        reached = [] if self.by_torque is None else [self.by_torque]
         for slope, momenta in ((self.by_arm, False), (self.by_momentum, True)):
-            if feedback is None or slope is None:
-                continue
-            total = np.zeros((*self.torque.shape, slope.shape[2])) if total is None else total.copy()
-            for column, at in self._followed(feedback, driven, momenta):
-                total += feedback.gain[:, :, column, None] * slope[: len(total), at][:, None, :]
-        return total
+            if feedback is not None and slope is not None:
+                columns, own = (list(x) for x in zip(*self._followed(feedback, driven, momenta), strict=True))
+                reached.append(feedback.gain[:, :, columns] @ slope[: len(self.torque), own])
+        if not reached:
+            return None
+        return np.asarray(sum(np.pad(by, ((0, 0), (0, 0), (0, width - by.shape[2]))) for by in reached))
 
     def _followed(self, feedback: Feedback, driven: tuple[int, ...], momenta: bool) -> list[tuple[int, int]]:
         """Columns of a filter that follow angles, or momenta, and the driven joint of each."""

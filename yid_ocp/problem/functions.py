@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from yid_ocp.integrator.lqr import MomentumShift, arms_alone
+from yid_ocp.integrator.lqr import arms_alone
 from yid_ocp.integrator.mapped import Mapped
+from yid_ocp.integrator.momentum import MomentumShift
 from yid_ocp.integrator.statics import Rest, Statics
 from yid_ocp.integrator.step import Step
 from yid_ocp.parallel import Once

@@ -398,11 +398,15 @@ def innovations(course: Course, errors: InputErrors) -> Innovations:
     unit = np.vstack([start, np.eye(2 * nu, 3 * nu, nu)])
     unit *= np.concatenate([errors.angle_std, errors.torque_std, errors.bias_std])
     covariance = first = unit @ unit.T
-    made, steps = [], linear()
+    made, steps, momentum = [], linear(), course.functions.momentum_shift.by_torque(course.theta)
     for k in range(count + 1):
         fresh = k + 1 < count and errors.sample[k + 1] != errors.sample[k]
         here = next(steps, None)
-        turn = _last_turn(len(kept), nu) if here is None else _turn(here, kept, course.feedback, errors, k, fresh)
+        turn = (
+            _last_turn(len(kept), nu)
+            if here is None
+            else _turn(here, kept, course.feedback, momentum, errors, k, fresh)
+        )
         rows, observe, ahead = readings.at(k, turn)
         cross = observe @ covariance
         try:
@@ -459,19 +463,32 @@ def _last_turn(ns: int, nu: int) -> _Turn:
     return _Turn(np.eye(ns, ns + 2 * nu), False, None, None)
 
 
-def _turn(here: LinearStep, kept: Rows, feedback: Feedback | None, errors: InputErrors, k: int, fresh: bool) -> _Turn:
-    by_state, by_torque, effort_by_state, shaken = here.by_state, here.by_torque[kept], here.effort_by_state, None
+def _turn(
+    here: LinearStep,
+    kept: Rows,
+    feedback: Feedback | None,
+    momentum: Array,
+    errors: InputErrors,
+    k: int,
+    fresh: bool,
+) -> _Turn:
+    """Step k; `momentum` (nu, nu) is what torques of the step before add to the momenta that the filter follows."""
+    by_state, effort_by_state, shaken = here.by_state, here.effort_by_state, None
+    by_error, effort_by_error = here.by_torque[kept], here.effort_by_torque
     if feedback is not None and not errors.encoders:
         by_state, effort_by_state = by_state.copy(), effort_by_state.copy()
         by_state[:, feedback.index] -= here.by_torque @ feedback.gain[k]
         effort_by_state[:, feedback.index] -= here.effort_by_torque @ feedback.gain[k]
-        # an error of the angles that the filter follows; that of the momenta, their slope, averages out
-        nu = by_torque.shape[1]
-        shaken = by_torque @ feedback.gain[k][:, :nu] * errors.angle_std * np.sqrt(errors.spread)
+        nu = by_error.shape[1]
+        # an error of the angles that the filter follows; that of the momenta as their slope averages out
+        shaken = by_error @ feedback.gain[k][:, :nu] * errors.angle_std * np.sqrt(errors.spread)
+        # that as half the impulse of the step before does not: its w is taken for this step's
+        known = np.eye(nu) + feedback.gain[k][:, nu:] @ momentum if feedback.gain.shape[2] > nu else np.eye(nu)
+        by_error, effort_by_error = by_error @ known, effort_by_error @ known
     effort = None
     if len(effort_by_state):
-        effort = np.hstack([effort_by_state[:, kept], here.effort_by_torque, here.effort_by_torque])
-    return _Turn(np.hstack([by_state[np.ix_(kept, kept)], by_torque, by_torque]), fresh, shaken, effort)
+        effort = np.hstack([effort_by_state[:, kept], effort_by_error, effort_by_error])
+    return _Turn(np.hstack([by_state[np.ix_(kept, kept)], by_error, by_error]), fresh, shaken, effort)
 
 
 @dataclass(frozen=True)

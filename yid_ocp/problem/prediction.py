@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from yid_ocp.integrator.momentum import Motion
 from yid_ocp.integrator.rollout import adjoint_gradient, rollout_member, simulate_all
 from yid_ocp.integrator.statics import Rest
 from yid_ocp.integrator.step import Directions, Rollout, Step
@@ -152,37 +153,48 @@ class Predictor:
         wanted = self.unknowns.parameters
         inputs = self.inputs(episode, theta, wanted)
         pairs = ((inputs.torque, episode.torque), (inputs.path, episode.path), (inputs.arm, episode.measured_arm))
-        slopes = [x for x in (inputs.by_torque, inputs.by_path, inputs.by_arm, inputs.by_momentum) if x is not None]
-        if inputs.momentum is not None:
+        slopes = [x for x in (inputs.by_torque, inputs.by_path, inputs.by_arm) if x is not None]
+        if self._follows_momenta and self.functions.momentum_shift.active(theta, wanted):
             return False
         slopes += self.functions.corrections.effort_lag(theta, wanted) or ()
         for samples in episode.samples:
             slopes += self.lateness(samples, theta, wanted) or ()
         return not any(np.any(x) for x in slopes) and all(np.array_equal(a, b) for a, b in pairs)
 
+    @property
+    def _follows_momenta(self) -> bool:
+        """Whether a filter keeps the driven joints on their measured motion by their momenta too."""
+        return bool(self.system.driven) and not self.system.servos and self.options.feedback == "lqr"
+
     # -- what drives the rollout --------------------------------------------------------------------------------------
 
-    def inputs(self, episode: Episode, theta: Array, wanted: tuple[str, ...]) -> Inputs:
-        """What drives an episode's rollout: the recording, as far as no effect says that it reads something else.
+    def tracked(
+        self, episode: Episode, theta: Array, wanted: tuple[str, ...], state: Array, by_unknowns: Array | None = None
+    ) -> Inputs:
+        """What drives an episode's rollout, with the momenta that its tracking filter follows.
 
         Parameters
         ----------
         episode : Episode
         theta : ndarray, shape (ntheta,)
         wanted : tuple of str
-            Parameters by which to differentiate.
+        state : ndarray, shape (nx,)
+            With which it begins.
+        by_unknowns : ndarray, optional, shape (nx, d)
+            Derivative of that by the parameters and what is unknown of the start.
         """
-        inputs = self._corrected(episode, theta, wanted)
-        if not self.system.driven or self.system.servos or self.options.feedback != "lqr":
+        inputs = self.inputs(episode, theta, wanted)
+        if not self._follows_momenta:
             return inputs
-        shift = self.functions.momentum_shift
-        if not shift.active(theta, wanted):
-            return inputs
-        momentum, slope = shift.along(episode.smooth_arm, episode.torque, theta, wanted)
-        return replace(inputs, momentum=momentum, by_momentum=slope if np.any(slope) else None)
+        rows = slice(2 * self.system.size, None)
+        recorded = Motion(episode.smooth_arm, episode.torque, state[rows])
+        by_internal = None if by_unknowns is None else by_unknowns[rows]
+        return inputs.with_momenta(
+            self.functions.momentum_shift, recorded, episode.measured_arm, theta, wanted, by_internal
+        )
 
-    def _corrected(self, episode: Episode, theta: Array, wanted: tuple[str, ...]) -> Inputs:
-        """The recording's torques, angles and paths as the effects say they truly were."""
+    def inputs(self, episode: Episode, theta: Array, wanted: tuple[str, ...]) -> Inputs:
+        """The recording's torques, angles and paths as the effects say they truly were, and derivatives by `wanted`."""
         corrections = self.functions.corrections
         torque, arm, path = episode.torque, episode.measured_arm, episode.path
         nu, nc, errors = torque.shape[1], path.shape[1], episode.errors
@@ -252,13 +264,14 @@ class Predictor:
         start = self.start(episode, theta, offset, wanted, guess)
         if start.message:
             return start.message
-        inputs, by_start = self.inputs(episode, theta, wanted), start.by_unknowns
+        by_start = start.by_unknowns
+        inputs = self.tracked(episode, theta, wanted, start.state, by_start)
         feedback, driven = episode.tracking, self.system.driven_indices
         directions = None
         if derivatives and by_start.shape[1]:
-            extra = ((0, 0), (0, 0), (0, by_start.shape[1] - len(wanted)))
-            moved = (inputs.torque_directions(feedback, driven), inputs.by_path)
-            by_torque, by_path = (None if by is None else np.pad(by, extra) for by in moved)
+            width, by_path = by_start.shape[1], inputs.by_path
+            by_torque = inputs.torque_directions(feedback, driven, width)
+            by_path = None if by_path is None else np.pad(by_path, ((0, 0), (0, 0), (0, width - len(wanted))))
             directions = Directions(wanted, by_start, by_torque, by_path)
         feedback = inputs.guided(feedback, driven, episode.measured_arm)
         member = rollout_member(
@@ -342,7 +355,7 @@ class Predictor:
         own = self.own_theta(episode, theta)
         errors = self._behind_effects(episode, own, replace(errors, offset=found.offset, white=found.white))
         if errors.encoders and feedback is not None:
-            inputs = self.inputs(episode, own, ())
+            inputs = self.tracked(episode, own, (), result.rollout.state[0])
             guided = inputs.guided(feedback, self.system.driven_indices, episode.measured_arm)
             assert guided is not None
             shift = guided.reference - feedback.reference
@@ -362,7 +375,7 @@ class Predictor:
             read = np.where(seen, read, 0.0) / np.where(seen, by_reading, 1.0)
         none = replace(episode, errors=errors.as_recorded)
         without = replace(episode, errors=replace(errors.as_recorded, read=read))
-        through = self._corrected(none, theta, ()).torque - self._corrected(without, theta, ()).torque
+        through = self.inputs(none, theta, ()).torque - self.inputs(without, theta, ()).torque
         return replace(errors, read=read, through=through)
 
     def about_torques(
@@ -528,16 +541,16 @@ class Predictor:
         if feedback is not None:
             by_state[:-1, feedback.index] -= np.einsum("kub,ku->kb", feedback.gain, by_applied)
         by_inputs = adjoint_gradient(self.step, theta, rollout, wanted, by_state, None, by_effort, feedback)
-        inputs = self.inputs(episode, theta, wanted)
-        by_torque = inputs.torque_directions(feedback, self.system.driven_indices)
+        start = self.start(episode, theta, offset, wanted, result.warm)
+        inputs = self.tracked(episode, theta, wanted, start.state, start.by_unknowns)
+        own = np.concatenate([total + by_inputs.by_theta, np.zeros(len(self.unknowns.start))])
+        by_torque = inputs.torque_directions(feedback, self.system.driven_indices, len(own))
         if by_torque is not None:
-            total += np.einsum("ku,kuw->w", by_inputs.by_torque + by_applied, by_torque)
+            own += np.einsum("ku,kuw->w", by_inputs.by_torque + by_applied, by_torque)
         if inputs.by_path is not None:
             # node 0 is part of the start state
-            total += np.einsum("kc,kcw->w", by_inputs.by_path[1:], inputs.by_path[1:])
-        by_start = self.start(episode, theta, offset, wanted, result.warm).by_unknowns
-        own = np.concatenate([total + by_inputs.by_theta, np.zeros(len(self.unknowns.start))])
-        return np.asarray(own + by_inputs.by_start @ by_start)
+            own[: len(total)] += np.einsum("kc,kcw->w", by_inputs.by_path[1:], inputs.by_path[1:])
+        return np.asarray(own + by_inputs.by_start @ start.by_unknowns)
 
     def _pull(self, samples: Measurements, pull: Array, rollout: Rollout, theta: Array, pulls: _Pulls) -> Array:
         """Spread the pull at one group's samples over states and efforts; the direct part by the parameters."""

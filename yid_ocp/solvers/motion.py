@@ -69,7 +69,12 @@ class DrivenStage:
 
 
 def driven_stage(
-    stage: Stage, freed: Freed, followed: NDArray[np.int32] | None, noisy: bool, use_compiler: bool
+    stage: Stage,
+    freed: Freed,
+    followed: NDArray[np.int32] | None,
+    momentum: NDArray[np.float64],
+    noisy: bool,
+    use_compiler: bool,
 ) -> DrivenStage:
     """The stage under a tracking filter and with errors, where there are such.
 
@@ -79,6 +84,8 @@ def driven_stage(
     freed : Freed
     followed : ndarray of int, or None
         Rows of the state that the filter follows, those of the driven joints' angles first; None without a filter.
+    momentum : ndarray, shape (nu, nu)
+        What torques of the step before add to the momenta that the filter follows.
     noisy : bool
         Whether errors are unknowns: w and b, and v where there is a filter.
     use_compiler : bool
@@ -88,9 +95,13 @@ def driven_stage(
     before, after, lam = ca.SX.sym("x0", nx), ca.SX.sym("x1", nx), ca.SX.sym("lam", m)
     nominal, gain = ca.SX.sym("torque", nu), ca.SX.sym("gain", nu * len(index))
     reference = ca.SX.sym("reference", len(index))
-    errors = ca.SX.sym("errors", (2 + (followed is not None)) * nu if noisy else 0)
     matrix = ca.reshape(gain, len(index), nu).T
-    by_errors = ca.horzcat(*([-ca.SX.eye(nu)] * 2), *([-matrix[:, :nu]] if index else [])) if noisy else ca.SX(nu, 0)
+    by_errors = ca.SX(nu, 0)
+    if noisy:
+        # the momentum that was measured has half the impulse of the step before in it: its w is taken for this step's
+        late = ca.mtimes(matrix[:, nu:], momentum) if len(index) > nu else 0.0
+        by_errors = ca.horzcat(*([-ca.SX.eye(nu) - late] * 2), *([-matrix[:, :nu]] if index else []))
+    errors = ca.SX.sym("errors", by_errors.shape[1])
     by_before = ca.SX(nu, nx)
     torque = nominal + ca.mtimes(by_errors, errors)
     if index:
@@ -104,8 +115,8 @@ def driven_stage(
     ):
         parts = [value, own, *(slopes[name] for name in ("x0", "x1", "lam", "u"))]
         value, own, first, second, pull, by_u = ca.substitute(parts, symbols, [before, after, lam, torque, freed.theta])
-        through = ca.mtimes(by_u, by_before), ca.mtimes(by_u, by_errors)
-        made.append((value, ca.horzcat(own, first + through[0], second, pull, through[1])))
+        driven = ca.mtimes(by_u, by_before), ca.mtimes(by_u, by_errors)
+        made.append((value, ca.horzcat(own, first + driven[0], second, pull, driven[1])))
     (rows, by_v), effort = made
     by_torque = ca.horzcat(ca.SX(nu, len(freed.names)), by_before, ca.SX(nu, nx + m), by_errors)
     v, data = ca.vertcat(freed.free, before, after, lam, errors), ca.vertcat(nominal, gain, reference)

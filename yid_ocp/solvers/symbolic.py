@@ -318,7 +318,8 @@ class _Maker:
         key = _kind(episode)
         if key not in self._stages:
             followed = episode.feedback.index if key[0] and episode.feedback is not None else None
-            self._stages[key] = driven_stage(self._stage, self._freed, followed, key[1], self._compiled)
+            momentum = self._problem.functions.momentum_shift.by_torque(self._problem.theta)
+            self._stages[key] = driven_stage(self._stage, self._freed, followed, momentum, key[1], self._compiled)
         return self._stages[key]
 
     def _erring(self, episode: Episode) -> tuple[Places, Places, list[Residual]]:

@@ -1,0 +1,269 @@
+"""The momentum of a known motion of the driven joints, and by how much effects change it.
+
+In the discrete equations it has half the impulse of the step before it in it: another torque than the recorded one, or
+what an effect does with it, changes the momentum of one and the same motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from yid_ocp.integrator.mapped import Mapped
+from yid_ocp.integrator.step import Step
+from yid_ocp.model.system import Effect
+from yid_ocp.parallel import Once
+
+Array = NDArray[np.float64]
+ITERATIONS = 5
+"""Newton's, for a law of an internal coordinate that is not linear in its next value."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How the driven joints move, and what moves them, over the steps of a recording.
+
+    Attributes
+    ----------
+    angles : ndarray, shape (N + 1, nu)
+        At every node [rad].
+    torque : ndarray, shape (N, nu)
+        Held over every step [N m].
+    internal : ndarray, shape (nz,)
+        Internal coordinates at the first node.
+    by_angles : ndarray, shape (N + 1, nu, d), or None
+        Derivatives by d parameters and what follows these; None where nothing depends on them.
+    by_torque : ndarray, shape (N, nu, d), or None
+    by_internal : ndarray, shape (nz, d), or None
+    """
+
+    angles: Array
+    torque: Array
+    internal: Array
+    by_angles: Array | None = None
+    by_torque: Array | None = None
+    by_internal: Array | None = None
+
+    @property
+    def around(self) -> tuple[Array, Array]:
+        """Angles before and after the step that leads to every node but the last; the first node is stood at before."""
+        return _one_before(self.angles[:-1]), self.angles[:-1]
+
+
+class MomentumShift:
+    """By how much a motion's momentum differs from that of what was recorded, on account of effects.
+
+    `lqr_filter` works its reference out once, from recorded angles and torques without effects. Where a torque is not
+    the recorded one, or an effect adds an armature, a weight or a friction, the same motion has another momentum, and
+    the filter would pull at the difference: at a wrist, whose gain by momentum times h/2 is near one, so much that it
+    undoes half of what an effect does.
+
+    Parameters
+    ----------
+    step : Step
+
+    Attributes
+    ----------
+    parameters : tuple of str
+        Those of effects on which the momentum of a motion under known torques depends.
+    """
+
+    def __init__(self, step: Step) -> None:
+        e, system = step.equations, step.system
+        driven = list(system.driven_indices)
+        nu = len(driven)
+        before, now = ca.SX.sym("before", nu), ca.SX.sym("now", nu)
+        whole = []
+        for arm in (before, now):
+            q = ca.SX(ca.DM.zeros(system.size))
+            q[driven] = arm
+            whole.append(q)
+        seen = ca.DM(ca.jacobian_sparsity(e.p1[driven], ca.vertcat(e.z0, e.z1)), 1)
+        kept = np.unique(np.flatnonzero(np.array(seen).any(axis=0)) % max(e.z0.numel(), 1))
+        self._kept = [int(row) for row in kept]
+        z0, z1 = (ca.SX(ca.DM.zeros(e.z0.numel())) for _ in range(2))
+        z0[self._kept], z1[self._kept] = (x[self._kept] for x in (e.z0, e.z1))
+        known = [*whole, z0, z1, ca.SX(ca.DM.zeros(e.lam.numel()))]
+        [momentum, law] = ca.substitute(
+            [ca.densify(e.p1[driven]), e.internal[self._kept]], [e.q0, e.q1, e.z0, e.z1, e.lam], known
+        )
+        last, then = e.z0[self._kept], e.z1[self._kept]
+        self._time_step = np.array([step.time_step])
+        neutral = {name: value for effect in system.effects for name, value in _neutral(effect).items()}
+        at = {i: neutral[name] for i, name in enumerate(system.parameters.names) if name in neutral}
+        columns = [i for i in _columns(ca.vertcat(momentum, law), e.theta) if i in at]
+        self._columns, self._neutral = np.array(columns, int), np.array([at[i] for i in columns])
+        self.parameters = tuple(system.parameters.names[i] for i in columns)
+        inputs = [before, now, last, then, e.u, e.theta, e.time_step]
+        by_theta = ca.jacobian(momentum, e.theta)[:, columns]
+
+        def compiled(by_all: bool) -> Mapped:
+            slopes = [ca.densify(ca.jacobian(momentum, x)) for x in (before, now, last, then)] if by_all else []
+            function = ca.Function("momentum", inputs, [momentum, ca.densify(by_theta), *slopes])
+            return Mapped(function, shared=(5, 6), use_compiler=step.compiled)
+
+        self._maps: Once[bool, Mapped] = Once(compiled)
+        self._impulse = ca.Function("impulse", inputs, [ca.densify(ca.jacobian(momentum, e.u))])
+        rows = {name: row for row, name in enumerate(system.internal)}
+        self._memories = tuple(
+            _Memory(self._time_step, [before, now, last, then, e.theta, e.time_step], law, own, columns, step.compiled)
+            for effect in system.effects
+            if (own := [self._kept.index(row) for name in effect.internal if (row := rows[name]) in self._kept])
+        )
+
+    def by_torque(self, theta: Array) -> Array:
+        """Derivative of the momentum by the torques of the step before it, shape (nu, nu) [s]."""
+        arguments = [np.zeros(self._impulse.numel_in(i)) for i in range(5)]
+        return np.array(self._impulse(*arguments, theta, self._time_step))
+
+    def along(self, recorded: Motion, true: Motion, theta: Array, names: Sequence[str]) -> tuple[Array, Array]:
+        """The shift at every node but the last, shape (N, nu), and its derivatives, (N, nu, d).
+
+        Parameters
+        ----------
+        recorded, true : Motion
+            What was read, and what effects say that it was; only the latter's derivatives count.
+        theta : ndarray, shape (ntheta,)
+        names : sequence of str
+            Parameters that the first of d derivatives are by.
+        """
+        steps, plain_theta = len(true.torque), self.without(theta)
+        still = np.zeros((steps, len(self._kept)))
+        plain, *_ = self._maps(False)(
+            *recorded.around, still, still, _one_before(recorded.torque), plain_theta, self._time_step
+        )
+        slopes = (true.by_angles, true.by_torque, true.by_internal)
+        width = max((len(names), *(x.shape[-1] for x in slopes if x is not None)))
+        wanted = [(k, self.parameters.index(name)) for k, name in enumerate(names) if name in self.parameters]
+        z, by_z = self._remembered(true, theta, wanted, width)
+        moved = by_z is not None or true.by_angles is not None
+        value, by_theta, *by_all = self._maps(moved)(
+            *true.around, _one_before(z), z, _one_before(true.torque), theta, self._time_step
+        )
+        total = np.zeros((*value.shape[:2], width))
+        for column, own in wanted:
+            total[:, :, column] = by_theta[:, :, own]
+        if true.by_angles is not None:
+            turned = true.by_angles[:-1]
+            total[:, :, : turned.shape[2]] += by_all[0] @ _one_before(turned) + by_all[1] @ turned
+        if by_z is not None:
+            total += by_all[2] @ _one_before(by_z) + by_all[3] @ by_z
+        if true.by_torque is not None:
+            pushed = true.by_torque
+            total[:, :, : pushed.shape[2]] += self.by_torque(theta) @ _one_before(pushed)
+        return (value - plain)[:, :, 0], total
+
+    def _remembered(
+        self, motion: Motion, theta: Array, wanted: Sequence[tuple[int, int]], width: int
+    ) -> tuple[Array, Array | None]:
+        """What joints remember at every node but the last, (N, nk), and its derivatives, (N, nk, d), or None."""
+        steps = len(motion.torque)
+        z, total = np.zeros((steps, len(self._kept))), np.zeros((steps, len(self._kept), width))
+        freed, away = {own for _, own in wanted}, theta[self._columns] != self._neutral
+        for memory in self._memories:
+            if freed.isdisjoint(memory.columns) and not np.any(away[list(memory.columns)]):
+                continue
+            rows = [self._kept[i] for i in memory.rows]
+            z[:, memory.rows] = memory.along(motion, motion.internal[rows], theta)
+            total[:, memory.rows] = memory.slopes(motion, z[:, memory.rows], rows, theta, wanted, width)
+        return z, total if np.any(total) else None
+
+    def without(self, theta: Array) -> Array:
+        """theta with these effects absent, at which a filter's own reference is worked out."""
+        plain = theta.copy()
+        plain[self._columns] = self._neutral
+        return plain
+
+    def active(self, theta: Array, names: Sequence[str]) -> bool:
+        """Whether any effect is at work on it, or is among the parameters to differentiate by."""
+        return not set(names).isdisjoint(self.parameters) or bool(np.any(theta[self._columns] != self._neutral))
+
+
+class _Memory:
+    """The internal coordinates of one effect of driven joints, along a motion.
+
+    Attributes
+    ----------
+    rows : list of int
+        Among all that the momentum depends on.
+    columns : tuple of int
+        Parameters on which it depends, among those of `MomentumShift`.
+    """
+
+    def __init__(
+        self,
+        time_step: Array,
+        inputs: Sequence[ca.SX],
+        law: ca.SX,
+        rows: list[int],
+        columns: Sequence[int],
+        use_compiler: bool,
+    ) -> None:
+        before, now, last, then, theta, symbol = inputs
+        self.rows, self._time_step = rows, time_step
+        old, new, own = last[rows], then[rows], law[rows]
+        slope = ca.jacobian(own, new)
+        after = old
+        for _ in range(1 if ca.is_linear(own, new) else ITERATIONS):
+            row, by_new = ca.substitute([own, slope], [new], [after])
+            after = after - ca.solve(by_new, row)
+        by_theta = ca.jacobian(after, theta)[:, columns]
+        self.columns = tuple(_columns(after, theta[columns]))
+        self._advance = ca.Function("remembered", [old, before, now, theta, symbol], [after])
+        outputs = [ca.densify(x) for x in (*(ca.jacobian(after, x) for x in (old, before, now)), by_theta)]
+        function = ca.Function("remembering", [old, before, now, theta, symbol], outputs)
+        self._maps: Once[None, Mapped] = Once(lambda _: Mapped(function, shared=(3, 4), use_compiler=use_compiler))
+
+    def along(self, motion: Motion, start: Array, theta: Array) -> Array:
+        """Values at every node but the last, shape (N, k)."""
+        before, now = motion.around
+        found = [start]
+        if len(now) > 1:
+            many = self._advance.mapaccum(len(now) - 1)
+            repeated = np.tile(theta[:, None], len(now) - 1), np.tile(self._time_step[:, None], len(now) - 1)
+            found += list(np.array(many(start, before[1:].T, now[1:].T, *repeated)).T)
+        return np.stack(found)
+
+    def slopes(
+        self,
+        motion: Motion,
+        values: Array,
+        start: list[int],
+        theta: Array,
+        wanted: Sequence[tuple[int, int]],
+        width: int,
+    ) -> Array:
+        """Derivatives of the values, shape (N, k, d)."""
+        before, now = motion.around
+        by_old, by_before, by_now, by_theta = self._maps(None)(_one_before(values), before, now, theta, self._time_step)
+        total = np.zeros((*values.shape, width))
+        for column, own in wanted:
+            total[1:, :, column] = by_theta[1:, :, own]
+        if motion.by_angles is not None:
+            turned = motion.by_angles[:-1]
+            total[1:, :, : turned.shape[2]] += (by_before @ _one_before(turned) + by_now @ turned)[1:]
+        if motion.by_internal is not None:
+            total[0] = motion.by_internal[start]
+        for k in range(1, len(total)):
+            total[k] += by_old[k] @ total[k - 1]
+        return total
+
+
+def _columns(expression: ca.SX, theta: ca.SX) -> list[int]:
+    """Which entries of theta an expression depends on."""
+    pattern = np.array(ca.DM(ca.jacobian_sparsity(expression, theta), 1))
+    return [int(i) for i in np.flatnonzero(pattern.any(axis=0))]
+
+
+def _one_before(values: Array) -> Array:
+    """Every entry but the last moved by one; the first stands twice."""
+    return np.concatenate([values[:1], values[:-1]])
+
+
+def _neutral(effect: Effect) -> Mapping[str, float]:
+    """Values with which an effect is absent; one that does not say so is taken as it stands."""
+    return dict(getattr(effect, "neutral", {}))
