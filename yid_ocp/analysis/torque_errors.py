@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from yid_ocp.errors import SolverError
 from yid_ocp.integrator.linear import linear_steps
+from yid_ocp.integrator.momentum import with_reference
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.noise import Course, InputErrors
@@ -193,15 +194,17 @@ class _Motion:
     @staticmethod
     def of(course: Course, errors: InputErrors) -> _Motion:
         step, feedback = course.functions.step, course.feedback
+        momentum = course.functions.momentum_shift.by_torque(course.theta)
         by_state, by_torque, by_angles = [], [], []
         for k, here in enumerate(linear_steps(step, course.theta, course.rollout)):
-            state, angles = here.by_state.copy(), np.zeros_like(here.by_torque)
+            state, angles, by_error = here.by_state.copy(), np.zeros_like(here.by_torque), here.by_torque.copy()
             if feedback is not None:
+                by_error = here.by_torque @ with_reference(feedback.gain[k], momentum)
                 pulled = here.by_torque @ feedback.gain[k]
                 state[:, feedback.index] -= pulled
                 angles = pulled[:, : angles.shape[1]] * errors.angle_std * np.sqrt(errors.spread)
             by_state.append(state)
-            by_torque.append(here.by_torque.copy())
+            by_torque.append(by_error)
             by_angles.append(angles)
         return _Motion(
             np.array(by_state),

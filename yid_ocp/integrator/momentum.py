@@ -183,6 +183,22 @@ class MomentumShift:
         return not set(names).isdisjoint(self.parameters) or bool(np.any(theta[self._columns] != self._neutral))
 
 
+def with_reference(gain: Array, by_torque: Array) -> Array:
+    """The torque that an error of the recorded one brings where a filter's momenta are worked out from it, (nu, nu).
+
+    The error of the step before is taken for this step's.
+
+    Parameters
+    ----------
+    gain : ndarray, shape (nu, nb)
+        Of the filter in one step.
+    by_torque : ndarray, shape (nu, nu)
+        See `MomentumShift.by_torque`.
+    """
+    nu = len(by_torque)
+    return np.eye(nu) + gain[:, nu:] @ by_torque if gain.shape[1] > nu else np.eye(nu)
+
+
 class _Memory:
     """The internal coordinates of one effect of driven joints, along a motion.
 

@@ -4,9 +4,10 @@ Recorded torques of driven joints are wrong by w, white from recorded sample to 
 a recording; encoders by v. Along a rollout the error d of its state, model less truth, obeys to first order
 
     d_{k+1} = A_k d_k + B_k (w_k + b) + B_k du_k                 where encoders are measurements,
-    d_{k+1} = (A_k - B_k K_k) d_k + B_k (w_k + b - K_k v_k)      where they are not,
+    d_{k+1} = (A_k - B_k K_k) d_k + B_k (G_k (w_k + b) - K_k v_k)      where they are not,
 
-with the correction du_k that the tracking filter K_k added to the recorded torque. In the first form du is known, and
+with the correction du_k that the tracking filter K_k added to the recorded torque, and G_k what an error of the torque
+comes to with the momentum that the filter follows (`with_reference`). In the first form du is known, and
 the outcome does not depend on the filter; in the second the filter is part of the model, as its reference is no
 measurement. Residuals are r = H d + v, so that with the filter's prediction m of (d, w, b)
 
@@ -40,6 +41,7 @@ from numpy.typing import NDArray
 
 from yid_ocp.data.recording import Recording
 from yid_ocp.integrator.linear import LinearStep, linear_steps, live_states
+from yid_ocp.integrator.momentum import with_reference
 from yid_ocp.integrator.step import Feedback, Rollout
 from yid_ocp.model.system import System
 from yid_ocp.problem.functions import ModelFunctions
@@ -482,8 +484,8 @@ def _turn(
         nu = by_error.shape[1]
         # an error of the angles that the filter follows; that of the momenta as their slope averages out
         shaken = by_error @ feedback.gain[k][:, :nu] * errors.angle_std * np.sqrt(errors.spread)
-        # that as half the impulse of the step before does not: its w is taken for this step's
-        known = np.eye(nu) + feedback.gain[k][:, nu:] @ momentum if feedback.gain.shape[2] > nu else np.eye(nu)
+        # that as half the impulse of the step before does not
+        known = with_reference(feedback.gain[k], momentum)
         by_error, effort_by_error = by_error @ known, effort_by_error @ known
     effort = None
     if len(effort_by_state):
