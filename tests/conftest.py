@@ -11,6 +11,7 @@ import casadi as ca
 import hypothesis
 import numpy as np
 import pytest
+import threadpoolctl
 from pendulum_run import cli as cli
 from pendulum_run import left_nothing as left_nothing
 from pendulum_run import pendulum as pendulum
@@ -28,6 +29,13 @@ STIFFNESSES = ("T1.bend", "T1.twist", "T2.bend", "T2.twist", "T3.bend", "T3.twis
 
 hypothesis.settings.register_profile("tests", deadline=None, max_examples=20, derandomize=True)
 hypothesis.settings.load_profile("tests")
+
+
+# each of several processes that share the processors takes one: their libraries would start a thread for every one
+if "PYTEST_XDIST_WORKER" in os.environ:
+    for library in ("OMP", "OPENBLAS", "MKL"):
+        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+    threadpoolctl.threadpool_limits(1)
 
 
 def pytest_configure(config):

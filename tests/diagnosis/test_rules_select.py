@@ -624,9 +624,10 @@ def test_the_last_of_three_may_make_both_others_superfluous(monkeypatch):
     rounds = Rounds(monkeypatch, GROWING | {"bc": (1.4, 1.6), "c": (1.3, 1.5)}, p_values=(1e-9, 1e-9, 1e-9))
     rounds.scores = rounds.scores[:2]
     monkeypatch.setattr(rounds, "screened", lambda base=(), own=rounds.screened: screened_with(own, base))
-    _, chosen, added = rounds.compose()
+    first, chosen, added = rounds.compose()
     assert chosen == ["c"]
     assert added[0].closure.value == pytest.approx(1 - 0.4 / 4.1)
+    assert first == ["c", "a", "b"], "what stays alone is said first, as it ended"
 
 
 def screened_with(usual, base):

@@ -281,7 +281,8 @@ def compose(
     Returns
     -------
     fits : tuple of Fit
-        Of the first round, the chosen one first, then by held-out loss.
+        Of single effects in the first round, the chosen one first, then by held-out loss; where one effect alone stays,
+        its last fit first.
     added : tuple of Added
     """
     limits, alone = search.limits, screened
@@ -328,7 +329,12 @@ def compose(
             beside = [fit.effects[-1] for fit in near if fit is not chosen and fit.effects[:-1] == base]
             added = (*added, Added(chosen.effects[-1], chosen, total, (chosen.effects[-1], *beside)))
         current = chosen
-    return first, _reconsidered(search, nominal, added, paired)
+    kept = _reconsidered(search, nominal, added, paired)
+    if len(kept) == 1:
+        # it may have ended elsewhere than where it was tried first
+        [own] = kept
+        first = (own.fit, *(fit for fit in first if fit.effects[0].label != own.effect.label))
+    return first, kept
 
 
 def likely_pairs(
