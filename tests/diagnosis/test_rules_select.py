@@ -292,6 +292,26 @@ def test_a_shape_may_leave_its_range_by_a_factor_or_a_width(expected, value, odd
     assert out_of_shape(of, {"wide@x.a": 99.0, "wide@x.s": value}) is odd
 
 
+def test_a_shape_that_may_as_well_lie_within_is_not_out_of_it():
+    """By two standard deviations on either side; what they are not known of is taken as it is."""
+    of = effect("wide@x", amplitude(), shape("s", expected=(0.1, 1.0), lower=-math.inf))
+
+    def odd(value, std, **limits):
+        return out_of_shape(of, {"wide@x.a": 99.0, "wide@x.s": value}, Thresholds(**limits), {"wide@x.s": std})
+
+    assert [odd(3.0, std) for std in (0.49, 0.51, math.inf)] == [True, False, False]
+    assert [odd(0.02, std) for std in (0.014, 0.016)] == [True, False]
+    assert odd(3.0, 0.51, away=1.0)
+    # a fit with such a shape counts as one with a shape to be expected
+    values, near = (
+        {"wide@x.a": 9.0, "wide@x.s": 3.0},
+        fit([effect("other@x", amplitude())], loss(1.04, 1.04), values={"other@x.a": 1.0}),
+    )
+    sure, unsure = (fit([of], loss(1.0, 1.0), values=values, std={"wide@x.s": std}) for std in (0.1, 2.0))
+    assert within_reach([sure, near])[0] is near
+    assert within_reach([unsure, near])[0] is unsure
+
+
 @pytest.mark.parametrize(
     ("value", "odd"), [(-1.0, False), (-1.01, True), (3.0, False), (5.0, False), (5.01, True), (0.0, False)]
 )

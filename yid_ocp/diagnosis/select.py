@@ -148,7 +148,7 @@ def behind(fit: Fit, other: Fit) -> float:
 
 
 def _likely(effect: EffectBase, fit: Fit, limits: Thresholds) -> bool:
-    return stands_out(effect, fit, limits) and not out_of_shape(effect, fit.values, limits)
+    return stands_out(effect, fit, limits) and not out_of_shape(effect, fit.values, limits, fit.std)
 
 
 def outweighs(fit: Fit, best: Fit, limits: Thresholds = DEFAULTS) -> bool:
@@ -164,14 +164,23 @@ def outweighs(fit: Fit, best: Fit, limits: Thresholds = DEFAULTS) -> bool:
     return fewer > 0 and blocks * math.log(fit.loss.mean / best.loss.mean) <= fewer * math.log(blocks)
 
 
-def out_of_shape(effect: EffectBase, values: Mapping[str, float], limits: Thresholds = DEFAULTS) -> bool:
-    """Whether a shape parameter lies outside its range by more than `shape_factor`, or `range_widths` widths of it."""
+def out_of_shape(
+    effect: EffectBase,
+    values: Mapping[str, float],
+    limits: Thresholds = DEFAULTS,
+    std: Mapping[str, float] | None = None,
+) -> bool:
+    """Whether a shape parameter lies outside its range by more than `shape_factor`, or `range_widths` widths of it.
+
+    One that may as well lie within, by `away` standard deviations, does not.
+    """
     for name in effect.shapes:
         low, high = effect.prior_range[name]
         room = limits.range_widths * (high - low)
         factor = limits.shape_factor
         near, far = (low / factor, high * factor) if low > 0 else (low - room, high + room)
-        if not near <= values[name] <= far:
+        unsure = limits.away * (std or {}).get(name, 0.0)
+        if not near - unsure <= values[name] <= far + unsure:
             return True
     return False
 
