@@ -185,13 +185,14 @@ def labels(fits):
 )
 def test_the_simplest_within_reach_of_the_best_comes_first(small, large, expected):
     fits = [fit([LARGE], loss(*large)), fit([SMALL], loss(*small))]
-    assert labels(within_reach(fits)) == expected
-    assert labels(within_reach(fits[::-1])) == expected
+    hundredth = Thresholds(tie=0.01)
+    assert labels(within_reach(fits, hundredth)) == expected
+    assert labels(within_reach(fits[::-1], hundredth)) == expected
 
 
 def test_a_tie_is_a_part_of_the_best_loss():
     fits = [fit([LARGE], loss(50.0, 50.0)), fit([SMALL], loss(50.4, 50.4))]
-    assert labels(within_reach(fits)) == ["small@x", "large@x"]
+    assert labels(within_reach(fits, Thresholds(tie=0.01))) == ["small@x", "large@x"]
     assert labels(within_reach(fits, Thresholds(tie=0.005))) == ["large@x"]
 
 
@@ -219,7 +220,7 @@ def test_where_a_model_errs_everywhere_fewer_parameters_outweigh_a_larger_loss(l
 def test_of_equally_simple_ones_the_better_comes_first():
     other = effect("other@x", amplitude())
     fits = [fit([SMALL], loss(1.004, 1.004)), fit([other], loss(1.0, 1.0)), fit([LARGE], loss(0.999, 0.999))]
-    assert labels(within_reach(fits)) == ["other@x", "small@x", "large@x"]
+    assert labels(within_reach(fits, Thresholds(tie=0.01))) == ["other@x", "small@x", "large@x"]
 
 
 def test_an_amplitude_far_out_of_its_range_comes_last():

@@ -11,7 +11,7 @@ from factories import BIAS, FORCE, READ_FORCE, added, closed, effect, fit, outco
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import decide, explained_part, has_gap, shapeless, why_unknown
 
-LIMITS = Thresholds()
+LIMITS = Thresholds(explained=0.5)
 ONE, OTHER = effect("friction@elbow"), effect("offset@elbow")
 ELSEWHERE, THIRD = effect("friction@wrist"), effect("spring@elbow")
 LOADS = effect("load@elbow", alone=True), effect("load@wrist", alone=True)

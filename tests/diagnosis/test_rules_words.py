@@ -29,6 +29,7 @@ from factories import (
 
 from yid_ocp.diagnosis.finding import which
 from yid_ocp.diagnosis.hypotheses import Cut
+from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import Reason
 from yid_ocp.diagnosis.words import NAMELESS, next_experiment, sentences
 
@@ -331,7 +332,7 @@ def test_an_unknown_gap_lists_refits_before_scores():
 
 
 def nameless(reason, **changed):
-    return sentences(finding("unknown", reason=reason, **changed))
+    return sentences(finding("unknown", reason=reason, limits=Thresholds(explained=0.5), **changed))
 
 
 @pytest.mark.parametrize(

@@ -129,14 +129,14 @@ class Thresholds:
     away: Annotated[float, Ge(0), About("standard deviations from neutral below which no effect is kept")] = 2.0
     relevance: Annotated[float, Ge(0), Lt(1), About("part of a held-out error that an effect must take away")] = 0.01
     closure: Annotated[float, Ge(0), Lt(1), About("part of the held-out gap that must be closed")] = 0.05
-    tie: Annotated[float, Ge(0), About("part of chi2/n within which models are equal")] = 0.01
+    tie: Annotated[float, Ge(0), About("part of chi2/n within which models are equal")] = 0.0014
     everywhere: Annotated[float, Gt(0), About("chi2/n from which a model errs everywhere, and blocks count")] = 1e3
     stand_in: Annotated[float, Ge(0), About("part of chi2/n by which an unlikely shape must be better")] = 0.05
     shape_factor: Annotated[float, Ge(1), About("factor by which a shape parameter may leave its range")] = 2.0
     range_widths: Annotated[float, Ge(0), About("widths of its range by which a value may leave it")] = 1.0
     carried: Annotated[float, Ge(0), About("part of an effect by which it may differ on held-out recordings")] = 0.3
-    carried_stds: Annotated[float, Gt(0), About("standard deviations by which it may differ in any case")] = 3.3
-    explained: Annotated[float, Ge(0), Le(1), About("part of the smoother's explanation that effects must reach")] = 0.5
+    carried_stds: Annotated[float, Gt(0), About("standard deviations by which it may differ in any case")] = 4.5
+    explained: Annotated[float, Ge(0), Le(1), About("part of the smoother's explanation that effects reach")] = 0.75
     # where the gap lies
     worth: Annotated[float, Gt(0), About("rise of the log evidence that a group of unknowns must bring")] = 5.0
     places: Annotated[int, Ge(1), About("groups of unknowns taken in at most")] = 4
