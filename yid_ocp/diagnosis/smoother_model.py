@@ -361,7 +361,8 @@ def _steps(
             by_state, effort_by_state = by_state.copy(), effort_by_state.copy()
             by_state[:, feedback.index] -= one.by_torque @ feedback.gain[k]
             effort_by_state[:, feedback.index] -= one.effort_by_torque @ feedback.gain[k]
-            # the momentum of the motion that was measured has half the impulse of an unknown force in it
+            # the momentum of the motion that was measured has half the impulse of an unknown force in it (of the step
+            # before; this step's stands for it)
             unknown = feedback.gain[k] @ followed
             by_load, effort_by_load = by_load + one.by_torque @ unknown, effort_by_load + one.effort_by_torque @ unknown
         forces = pushes.shape[1]
