@@ -14,7 +14,7 @@ from factories import amplitude, effect, shape, signature
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.diagnosis.blind import Conditions, Ensemble, Label, Planned, finer_values, planned
 from yid_ocp.diagnosis.blind import ensemble as module
-from yid_ocp.diagnosis.blind.ensemble import OUTSIDE_SIZES, Detectable
+from yid_ocp.diagnosis.blind.ensemble import DRAWS, OUTSIDE_SIZES, Detectable
 from yid_ocp.diagnosis.hypotheses import CandidateProblem
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import ConfigError, ModelError
@@ -244,10 +244,10 @@ def test_a_motion_that_cannot_be_simulated_is_drawn_anew(drawn, monkeypatch):
     assert other.truth != told.truth
     assert case.name == again.name
     drawn.made.clear()
-    of_category(drawn(failures=7), "null")
+    of_category(drawn(failures=DRAWS - 1), "null")
     drawn.made.clear()
     with pytest.raises(ModelError, match="no motion of this experiment"):
-        of_category(drawn(failures=8), "null")
+        of_category(drawn(failures=DRAWS), "null")
 
 
 def test_a_case_is_the_same_whatever_was_drawn_before(drawn):

@@ -33,6 +33,8 @@ from yid_ocp.virtual.outside import OUTSIDE
 
 Array = NDArray[np.float64]
 
+DRAWS = 64
+"""Motions, objects and effects drawn for a case until one can be simulated; of 300, one was given up after eight."""
 SPREAD = 1.5
 """Factor by which true stiffnesses lie above or below the problem's start, at most."""
 OUTSIDE_SIZES: Mapping[str, tuple[str, float, float, str]] = {
@@ -313,7 +315,7 @@ class Ensemble:
         """
         name = f"case_{wanted.number:03d}"
         purposes = [f"estimate_{i}" for i in range(self.conditions.recordings)]
-        for attempt in range(8):
+        for attempt in range(DRAWS):
             rng = self._rng(1, wanted.number, attempt)
             truth = self.truth(rng)
             injected, multiple = self._injected(wanted, rng)
