@@ -23,6 +23,7 @@ EFFECTS = {
     "a heavier link": (("link_mass", {"scale": 1.2}),),
     "friction": (("joint_coulomb", {"tau_c": 0.4}), ("joint_viscous", {"b": 0.2})),
     "friction that holds": (("joint_presliding", {"tau_c": 0.4, "yield_angle": 0.05}),),
+    "at its neutral angle": (("joint_presliding", {"tau_c": 0.4, "yield_angle": 5e-3}),),
     "two that hold": tuple(("joint_presliding", {"tau_c": 0.4, "yield_angle": 0.05}) for _ in range(2)),
 }
 

@@ -79,12 +79,12 @@ def far_likelier(before: Loss, after: Loss, limits: Thresholds = DEFAULTS) -> bo
     in a few of them only, as a constant error of a torque does at the start, differs too much from block to block for
     `gain` to be sure, and hardly moves chi2/n.
     """
-    return _noise_is_left(before, after, limits) and _squares(before) - _squares(after) > 2 * limits.worth
+    return _noise_is_left(limits, before, after) and _squares(before) - _squares(after) > 2 * limits.worth
 
 
-def _noise_is_left(one: Loss, other: Loss, limits: Thresholds) -> bool:
-    """Whether both of two models leave little but noise."""
-    return max(one.mean, other.mean) < 1 + limits.smallest_gap
+def _noise_is_left(limits: Thresholds, *losses: Loss) -> bool:
+    """Whether all of some models leave little but noise."""
+    return max(loss.mean for loss in losses) < 1 + limits.smallest_gap
 
 
 def _squares(loss: Loss) -> float:
@@ -135,7 +135,7 @@ def less_likely(fit: Fit, other: Fit, limits: Thresholds = DEFAULTS) -> bool:
 
     Where more than noise is left, squares count errors of the model, and their differences say little.
     """
-    return _noise_is_left(fit.loss, other.loss, limits) and behind(fit, other) > 2 * limits.worth
+    return _noise_is_left(limits, fit.loss, other.loss) and behind(fit, other) > 2 * limits.worth
 
 
 def behind(fit: Fit, other: Fit) -> float:
@@ -301,12 +301,11 @@ def compose(
     paired = False
     while len(added) < limits.effects:
         base = tuple(entry.effect for entry in added)
-        little = bool(added) and current.loss.mean < 1 + limits.smallest_gap
         if added:
             search.progress.stage(f"scoring what is left beside {', '.join(e.label for e in base)}")
             screened = screen(search.problem, base, current.values, limits)
             # a rest that the residual as a whole does not show may show along a candidate, as a gap does
-            if little and best_of(screened.scores) >= limits.candidate_level:
+            if _little_is_left(current, limits) and best_of(screened.scores) >= limits.candidate_level:
                 break
         # where the gap lay before anything was added asks for no more than the significant afterwards
         scores = [score for score in screened.scores if not added or score.p_value < limits.level]
@@ -323,7 +322,7 @@ def compose(
         near = within_reach(fits, limits)
         if not added:
             first = (near[0], *sorted((fit for fit in fits if fit is not near[0]), key=lambda fit: fit.loss.mean))
-        chosen = next((fit for fit in near if _worth_adding(current, fit, limits, little)), None)
+        chosen = next((fit for fit in near if _worth_adding(current, fit, limits)), None)
         if chosen is None:
             break
         paired = chosen.effects[:-1] != base
@@ -393,13 +392,19 @@ def _of_a_size(fits: Sequence[Fit], limits: Thresholds) -> list[Fit]:
     return [fit for fit in fits if not oversized(fit.effects[-1], fit.values, limits)]
 
 
-def _worth_adding(current: Fit, chosen: Fit, limits: Thresholds, little: bool) -> bool:
+def _little_is_left(fit: Fit, limits: Thresholds) -> bool:
+    """Whether the effects of a fit leave little but noise; a gap that is as little is one without any."""
+    return bool(fit.effects) and _noise_is_left(limits, fit.loss)
+
+
+def _worth_adding(current: Fit, chosen: Fit, limits: Thresholds) -> bool:
     """Whether the last effect of a fit closes a sure and relevant part of the gap, and is there at all.
 
     Where little but noise is left, only odds convince: a part of next to nothing is soon closed.
     """
     gained, error = gain(current.loss, chosen.loss)
-    closes = not little and gained > error and gained >= limits.closure * current.loss.gap and current.loss.gap > 0
+    part = gained >= limits.closure * current.loss.gap and current.loss.gap > 0
+    closes = not _little_is_left(current, limits) and gained > error and part
     if not closes and not far_likelier(current.loss, chosen.loss, limits):
         return False
     return stands_out(chosen.effects[-1], chosen, limits) and relevant(current.loss, chosen.loss, limits)

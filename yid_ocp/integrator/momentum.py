@@ -82,9 +82,8 @@ class MomentumShift:
             q = ca.SX(ca.DM.zeros(system.size))
             q[driven] = arm
             whole.append(q)
-        seen = ca.DM(ca.jacobian_sparsity(e.p1[driven], ca.vertcat(e.z0, e.z1)), 1)
-        kept = np.unique(np.flatnonzero(np.array(seen).any(axis=0)) % max(e.z0.numel(), 1))
-        self._kept = [int(row) for row in kept]
+        seen = _columns(e.p1[driven], ca.vertcat(e.z0, e.z1))
+        self._kept = sorted({row % e.z0.numel() for row in seen})
         z0, z1 = (ca.SX(ca.DM.zeros(e.z0.numel())) for _ in range(2))
         z0[self._kept], z1[self._kept] = (x[self._kept] for x in (e.z0, e.z1))
         known = [*whole, z0, z1, ca.SX(ca.DM.zeros(e.lam.numel()))]
@@ -110,7 +109,10 @@ class MomentumShift:
         self._impulse = ca.Function("impulse", inputs, [ca.densify(ca.jacobian(momentum, e.u))])
         rows = {name: row for row, name in enumerate(system.internal)}
         self._memories = tuple(
-            _Memory(self._time_step, [before, now, last, then, e.theta, e.time_step], law, own, columns, step.compiled)
+            (
+                [i for i, name in enumerate(self.parameters) if name in effect.parameters.names],
+                _Memory(step, [before, now, last, then, e.theta, e.time_step], law, own, columns),
+            )
             for effect in system.effects
             if (own := [self._kept.index(row) for name in effect.internal if (row := rows[name]) in self._kept])
         )
@@ -164,8 +166,8 @@ class MomentumShift:
         steps = len(motion.torque)
         z, total = np.zeros((steps, len(self._kept))), np.zeros((steps, len(self._kept), width))
         freed, away = {own for _, own in wanted}, theta[self._columns] != self._neutral
-        for memory in self._memories:
-            if freed.isdisjoint(memory.columns) and not np.any(away[list(memory.columns)]):
+        for own, memory in self._memories:
+            if freed.isdisjoint(own) and not np.any(away[own]):
                 continue
             rows = [self._kept[i] for i in memory.rows]
             z[:, memory.rows] = memory.along(motion, motion.internal[rows], theta)
@@ -206,21 +208,13 @@ class _Memory:
     ----------
     rows : list of int
         Among all that the momentum depends on.
-    columns : tuple of int
-        Parameters on which it depends, among those of `MomentumShift`.
     """
 
     def __init__(
-        self,
-        time_step: Array,
-        inputs: Sequence[ca.SX],
-        law: ca.SX,
-        rows: list[int],
-        columns: Sequence[int],
-        use_compiler: bool,
+        self, step: Step, inputs: Sequence[ca.SX], law: ca.SX, rows: list[int], columns: Sequence[int]
     ) -> None:
         before, now, last, then, theta, symbol = inputs
-        self.rows, self._time_step = rows, time_step
+        self.rows, self._time_step = rows, np.array([step.time_step])
         old, new, own = last[rows], then[rows], law[rows]
         slope = ca.jacobian(own, new)
         after = old
@@ -228,20 +222,19 @@ class _Memory:
             row, by_new = ca.substitute([own, slope], [new], [after])
             after = after - ca.solve(by_new, row)
         by_theta = ca.jacobian(after, theta)[:, columns]
-        self.columns = tuple(_columns(after, theta[columns]))
-        self._advance = ca.Function("remembered", [old, before, now, theta, symbol], [after])
+        advance = ca.Function("remembered", [old, before, now, theta, symbol], [after])
+        self._many: Once[int, ca.Function] = Once(advance.mapaccum)
         outputs = [ca.densify(x) for x in (*(ca.jacobian(after, x) for x in (old, before, now)), by_theta)]
         function = ca.Function("remembering", [old, before, now, theta, symbol], outputs)
-        self._maps: Once[None, Mapped] = Once(lambda _: Mapped(function, shared=(3, 4), use_compiler=use_compiler))
+        self._maps: Once[None, Mapped] = Once(lambda _: Mapped(function, shared=(3, 4), use_compiler=step.compiled))
 
     def along(self, motion: Motion, start: Array, theta: Array) -> Array:
         """Values at every node but the last, shape (N, k)."""
         before, now = motion.around
         found = [start]
         if len(now) > 1:
-            many = self._advance.mapaccum(len(now) - 1)
             repeated = np.tile(theta[:, None], len(now) - 1), np.tile(self._time_step[:, None], len(now) - 1)
-            found += list(np.array(many(start, before[1:].T, now[1:].T, *repeated)).T)
+            found += list(np.array(self._many(len(now) - 1)(start, before[1:].T, now[1:].T, *repeated)).T)
         return np.stack(found)
 
     def slopes(

@@ -16,6 +16,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import Run
 from yid_ocp.data.hdf5 import write_recording
 from yid_ocp.diagnosis.blind import PURPOSES, Conditions, Ensemble, first_posture, recorded
+from yid_ocp.diagnosis.blind.ensemble import DRAWS
 from yid_ocp.errors import ConfigError, ModelError, YidError
 from yid_ocp.virtual.engine import INNER_STEP, Simulation
 from yid_ocp.virtual.experiment import ArmNoise
@@ -136,7 +137,7 @@ class Experiment:
         values = dict(zip(system.parameters.names, map(float, system.parameters.vector()), strict=True))
         conditions = replace(self.conditions, vision=vision)
         posture = first_posture(system, first[0])
-        for attempt in range(8):
+        for attempt in range(DRAWS):
             rng = np.random.default_rng([self.seed, PURPOSES.index(self.purpose), 3, attempt])
             try:
                 made = recorded(system, system, posture, values, values, (), rng, conditions)
