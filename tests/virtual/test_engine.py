@@ -15,7 +15,7 @@ from yid_ocp.model.kinematics import forward_kinematics, rigid_body
 from yid_ocp.model.system import Grasp, System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.model.y_object import y_object
-from yid_ocp.virtual.engine import Scene, SimulatedRun, Simulation, simulate_in_mujoco
+from yid_ocp.virtual.engine import Scene, SimulatedRun, Simulation, settle, simulate_in_mujoco
 from yid_ocp.virtual.mjcf import compiled_model, mujoco_xml
 from yid_ocp.virtual.motion import multisine
 from yid_ocp.virtual.posture import initial_posture
@@ -160,6 +160,22 @@ def test_the_constraint_solver_converges_on_a_fine_chain() -> None:
     mujoco.mj_step(model, scene.data, nstep=3)
     assert scene.data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number == 0
     assert scene.data.solver_niter[0] < 10
+
+
+def test_grippers_beside_what_they_hold_close_at_a_short_step_too() -> None:
+    system = SYSTEMS[2]
+    model = compiled_model(mujoco_xml(system, TRUTH, time_step=5e-5))
+    scene = Scene.of(system, mujoco, model)
+    scene.data.qpos[:] = model.qpos_spring
+    for name, angle in initial_posture(system, TRUTH).items():
+        scene.data.qpos[model.joint(name).id] = angle + 0.1
+    balance = settle(scene, np.array(model.dof_damping))
+    scene.data.qfrc_applied[scene.driven] = balance
+    mujoco.mj_forward(model, scene.data)
+    gaps = [np.diff(scene.data.site_xpos[ends], axis=0) for ends in scene.ends]
+    assert np.abs(gaps).max() < 1e-7
+    # at rest as it is simulated from here on, with grasps as firm as the step allows
+    assert np.abs(scene.data.qacc).max() < 0.01
 
 
 @pytest.mark.parametrize(("later", "said"), [(False, "before the motion began"), (True, "the simulation diverged")])
