@@ -162,7 +162,10 @@ def test_the_constraint_solver_converges_on_a_fine_chain() -> None:
     assert scene.data.solver_niter[0] < 10
 
 
-def test_grippers_beside_what_they_hold_close_at_a_short_step_too() -> None:
+def test_grippers_beside_what_they_hold_close_at_a_short_step_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # MuJoCo leaves a log where it is
     system = SYSTEMS[2]
     model = compiled_model(mujoco_xml(system, TRUTH, time_step=5e-5))
     scene = Scene.of(system, mujoco, model)

@@ -269,8 +269,7 @@ def settle(scene: Scene, damping: Array) -> Array:
     """Bring the scene to static equilibrium with the driven joints where they are; return their torques [N m].
 
     On the way there joints damp as `damping` says: of several shapes that an object can rest in, it must not depend on
-    its own damping which is found. Grasps close at first no faster than with the usual step: their time constant is two
-    steps, and a gripper beside what it holds would throw a fine chain about before any step is short enough.
+    its own damping which is found.
     """
     model, data, driven = scene.model, scene.data, scene.driven
     held = copy.copy(model)
@@ -281,19 +280,12 @@ def settle(scene: Scene, damping: Array) -> Array:
     held.dof_damping[driven] += _HOLD_DAMPING
     held.jnt_stiffness[driven] += _HOLD_STIFFNESS
     held.qpos_spring[driven] = target
-    held.eq_solref[:, 0] = np.maximum(held.eq_solref[:, 0], 2 * INNER_STEP)
-    block = max(1, round(0.1 / model.opt.timestep))
-    for _ in range(math.ceil(_SETTLING_LIMIT / (block * model.opt.timestep))):
-        scene.mujoco.mj_step(held, data, nstep=block)
-        _refuse_lost(scene)
-        held.eq_solref[:] = model.eq_solref
-        calm, error = float(np.abs(data.qvel).max()), target - data.qpos[driven]
+    for calm in _calming(scene, held):
+        error = target - data.qpos[driven]
         if np.abs(error).max() > _POSTURE_TOLERANCE:
             held.qpos_spring[driven] += error
         elif calm < _REST:
             break
-    else:
-        raise _restless(data)
     balance = _HOLD_STIFFNESS * (held.qpos_spring[driven] - data.qpos[driven])
     data.qvel[:], data.qacc_warmstart[:], data.time = 0.0, 0.0, 0.0
     return balance
@@ -399,23 +391,37 @@ def settle_servos(scene: Scene, damping: Array, commands: Array) -> None:
     held.dof_damping[others] *= _SETTLING_FACTOR
     if hasattr(held, "actuator_delay"):
         held.actuator_delay[:] = 0.0
-    block = max(1, round(0.1 / model.opt.timestep))
-    for _ in range(math.ceil(_SETTLING_LIMIT / (block * model.opt.timestep))):
-        scene.mujoco.mj_step(held, data, nstep=block)
-        _refuse_lost(scene)
-        if np.abs(data.qvel).max() < _REST:
+    for calm in _calming(scene, held):
+        if calm < _REST:
             break
-    else:
-        raise _restless(data)
     posture = data.qpos.copy()
     scene.mujoco.mj_resetData(model, data)
     data.qpos[:] = posture
     command_always(scene, commands)
 
 
-def _restless(data: Any) -> ModelError:
-    calm = float(np.abs(data.qvel).max())
-    return ModelError(
+def _calming(scene: Scene, held: Any) -> Iterator[float]:
+    """Let a scene settle as `held` says, and yield its largest velocity [rad/s] every tenth of a second.
+
+    A grasp's time constant is two steps: at a short one a gripper beside what it holds may throw a fine chain about.
+    Where that loses the state it begins again, and grasps close in the first of those tenths as with the usual step.
+    """
+    data, step = scene.data, scene.mujoco.mj_step
+    start, commands = data.qpos.copy(), data.ctrl.copy()
+    block = max(1, round(0.1 / held.opt.timestep))
+    step(held, data, nstep=block)
+    if _lost(scene):
+        scene.mujoco.mj_resetData(held, data)
+        data.qpos[:], data.ctrl[:] = start, commands
+        firm = held.eq_solref.copy()
+        held.eq_solref[:, 0] = np.maximum(firm[:, 0], 2 * INNER_STEP)
+        step(held, data, nstep=block)
+        held.eq_solref[:] = firm
+    for _ in range(math.ceil(_SETTLING_LIMIT / (block * held.opt.timestep))):
+        _refuse_lost(scene)
+        yield (calm := float(np.abs(data.qvel).max()))
+        step(held, data, nstep=block)
+    raise ModelError(
         f"the object does not come to rest in {_SETTLING_LIMIT:g} s (largest velocity {calm:.2g} rad/s)",
         where="settling before the motion",
         hint="give every coordinate some damping and enough stiffness to stand",
