@@ -225,7 +225,7 @@ def values_of(results: Sequence[TaskResult]) -> list[Any]:
     ours = {kind.__name__ for kind in YidError.__subclasses__()}
     if first.partition(":")[0] in ours:
         told = "; ".join(line.strip() for line in rest.splitlines())
-        raise WorkerError(f"{what}; {told}" if told else what, hint="the same command does again what failed")
+        raise WorkerError(f"{what}; {told}" if told else what, hint="mend it: the same command does what failed again")
     raise RuntimeError(f"{what}; the same command tries them again")
 
 

@@ -145,7 +145,11 @@ class Experiment:
                 continue  # the motion throws the object about; draw another
             write_recording(replace(made, name="first", description="", source="", truth={}), file)
             return
-        raise ModelError("no motion of this experiment can be simulated", where=self.variation)
+        raise ModelError(
+            f"none of {DRAWS} motions can be simulated",
+            where=f"{self.config.name}, {varied.words}",
+            hint="an object that is thrown about needs more damping, or a start of its arms in which it hangs calm",
+        )
 
     def ensemble(self, first: Path) -> tuple[Run, Ensemble]:
         """The run that is diagnosed and its ensemble, from the first recording.

@@ -329,7 +329,11 @@ class Ensemble:
             left_out = (injected[0].kind,) if wanted.category == "left_out" else self._other_kind(injected, rng)
             label = Label(name, wanted.category, injected, multiple, truth, wanted.experiment)
             return Case(name, tuple(estimate), held_out, left_out), label
-        raise ModelError("no motion of this experiment can be simulated", where=f"case {wanted.number}")
+        raise ModelError(
+            f"none of {DRAWS} motions can be simulated",
+            where=f"{name} of {wanted.experiment}",
+            hint="take another --seed: a seed draws the same again",
+        )
 
     def _other_kind(self, injected: Sequence[InjectedEffect], rng: np.random.Generator) -> tuple[str, ...]:
         at_work = {effect.kind for effect in injected}
