@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 from types import SimpleNamespace
 
@@ -39,33 +41,41 @@ def cli(capsys):
     return run
 
 
-@pytest.fixture
-def config(repository, tmp_path):
-    file = tmp_path / "small.yaml"
+@pytest.fixture(scope="module")
+def config(repository, tmp_path_factory):
+    file = tmp_path_factory.mktemp("config") / "small.yaml"
     file.write_text(CONFIG.format(data=repository / "tests" / "vision" / "data"))
     return file
 
 
-def test_track_makes_a_recording_that_solve_reads(cli, config, tmp_path, small, system):
-    done = cli("track", config, "--out", tmp_path / "run")
-    assert done.code == 0, done.err
-    assert "3 of 3 frames are good" in done.out
-    assert "w_T1" in done.out
-    assert "tracking" in done.err
-    made = read_recording(tmp_path / "run" / "recording.h5")
+@pytest.fixture(scope="module")
+def whole(config):
+    """What a run in one process made and said."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = main(["track", str(config), "--out", str(config.parent / "whole")])
+    return SimpleNamespace(folder=config.parent / "whole", code=code, out=out.getvalue(), err=err.getvalue())
+
+
+def test_track_makes_a_recording_that_solve_reads(whole, small, system):
+    assert whole.code == 0, whole.err
+    assert "3 of 3 frames are good" in whole.out
+    assert "w_T1" in whole.out
+    assert "tracking" in whole.err
+    made = read_recording(whole.folder / "recording.h5")
     group = next(group for group in made.points if group.name == "points_camera")
     assert group.names == ("w_T1", "w_T3")
     truth = small.truth[:, [system.points.index(name) for name in group.names]]
     assert np.linalg.norm(group.position - truth, axis=2).max() < 0.008
     assert made.joints is not None
-    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    result = json.loads((whole.folder / "result.json").read_text())
     assert result["format"] == "yid-track/1"
     assert [frame["reason"] for frame in result["frames"]] == ["", "", ""]
     assert result["camera"]["estimated"] is False  # the clouds hold no arm
     assert len(result["inputs"]) == 4
-    pictures = sorted(path.stem.rpartition("_")[2] for path in (tmp_path / "run" / "pictures").glob("*.png"))
+    pictures = sorted(path.stem.rpartition("_")[2] for path in (whole.folder / "pictures").glob("*.png"))
     assert pictures == sorted(STAGES)
-    assert (tmp_path / "run" / "track.png").is_file()
+    assert (whole.folder / "track.png").is_file()
 
 
 @pytest.mark.parametrize(
@@ -111,9 +121,8 @@ def result_of(folder):
     return result
 
 
-def test_what_an_interrupted_run_did_is_used(cli, config, tmp_path, monkeypatch):
+def test_what_an_interrupted_run_did_is_used(cli, config, whole, tmp_path, monkeypatch):
     """Killed after the first frame: the next run does the others alone, with the same result to the last bit."""
-    assert cli("track", config, "--out", tmp_path / "whole").code == 0
     worked, work = [], Tracker.frame
 
     def interrupted(self, index, common):
@@ -138,16 +147,16 @@ def test_what_an_interrupted_run_did_is_used(cli, config, tmp_path, monkeypatch)
     assert len(later) == 2
     assert not set(later) & set(worked)
     assert not (tmp_path / "run.partial").exists()
-    assert result_of(tmp_path / "run") == result_of(tmp_path / "whole")
-    one, other = (read_recording(tmp_path / name / "recording.h5").points[-1] for name in ("run", "whole"))
+    assert result_of(tmp_path / "run") == result_of(whole.folder)
+    one, other = (read_recording(folder / "recording.h5").points[-1] for folder in (tmp_path / "run", whole.folder))
     assert np.array_equal(one.position, other.position)
     assert np.array_equal(one.std, other.std)
 
 
-def test_several_workers_find_the_same(cli, config, tmp_path):
-    for name, more in (("one", ()), ("two", ("--workers", "2"))):
-        assert cli("track", config, "--out", tmp_path / name, "--set", "track.pictures=0", *more).code == 0
-    assert result_of(tmp_path / "one") == result_of(tmp_path / "two")
+def test_several_workers_find_the_same(cli, config, whole, tmp_path):
+    done = cli("track", config, "--out", tmp_path / "two", "--set", "track.pictures=0", "--workers", "2")
+    assert done.code == 0, done.err
+    assert result_of(tmp_path / "two") == result_of(whole.folder)
 
 
 @pytest.mark.parametrize("name", ["track_single_arm", "track_dual_arm"])
