@@ -129,14 +129,21 @@ def costing(cost: float, rows: int) -> Evaluation:
 
 
 def fit(
-    effects: Sequence[EffectBase] = (), lost: Loss | None = None, cost=1.0, values=None, std=None, problem=None
+    effects: Sequence[EffectBase] = (),
+    lost: Loss | None = None,
+    cost=1.0,
+    values=None,
+    std=None,
+    problem=None,
+    held=None,
 ) -> Fit:
-    """A refitted model; values are neutral unless given."""
+    """A refitted model; values are neutral unless given. `held`: std of amplitudes with shapes held, if others."""
     neutral = {name: value for entry in effects for name, value in entry.neutral.items()}
     values = neutral | dict(values or {})
     std = dict.fromkeys(values, 0.01) | dict(std or {})
     lost = loss(1.0, 1.0) if lost is None else lost
-    return Fit(tuple(effects), problem, values, std, cost, evaluation([1.0]), lost, "made up")
+    held = {name: std[name] for entry in effects for name in entry.amplitudes} | dict(held or {})
+    return Fit(tuple(effects), problem, values, std, held, cost, evaluation([1.0]), lost, "made up")
 
 
 def closed(value=0.9, low=0.8, high=0.95) -> Closure:

@@ -15,6 +15,7 @@ from yid_ocp.diagnosis.refit import (
     Refitted,
     Search,
     _half_done,
+    amplitude_std,
     block_length,
     held_out_loss,
     recalled,
@@ -89,7 +90,7 @@ def solved(monkeypatch):
 
     monkeypatch.setattr(module, "SOLVER", SimpleNamespace(run=run))
     monkeypatch.setattr(module, "held_out_loss", held_out)
-    monkeypatch.setattr(module, "refit_std", lambda problem, finish, limits: np.full(len(problem.names), 0.1))
+    monkeypatch.setattr(module, "refit_covariance", lambda problem, finish, limits: 0.01 * np.eye(len(problem.names)))
     return made
 
 
@@ -223,6 +224,37 @@ def test_a_refit_that_ends_where_nothing_can_be_rolled_out_is_none(solved, monke
     assert refit(Problem(lambda values: 5.0 if values["k"] < 9 else None), [FRICTION], START) is None
 
 
+def test_an_amplitude_is_judged_with_its_shape_held():
+    # a weak spring: torque and stiffness are known well, the rest angle is their quotient
+    names = ["k", A, S]
+    jacobian = np.array([[1.0, 0.3, 0.2], [0.0, 8.0, 0.1], [0.0, 0.4, 0.01], [0.1, 0.0, 0.0]])
+    covariance = np.linalg.inv(jacobian.T @ jacobian)
+    found = amplitude_std(names, [FRICTION], covariance)
+    held = np.linalg.inv(jacobian[:, :2].T @ jacobian[:, :2])
+    assert found == {A: pytest.approx(np.sqrt(held[1, 1]))}
+    assert found[A] < 0.7 * np.sqrt(covariance[1, 1])
+    # what says nothing of the shape, or of the amplitude
+    covariance[2, 2] = np.nan
+    assert amplitude_std(names, [FRICTION], covariance) == {A: pytest.approx(np.sqrt(covariance[1, 1]))}
+    covariance[1, 1] = np.nan
+    assert amplitude_std(names, [FRICTION], covariance) == {A: np.inf}
+    assert amplitude_std(names, [FRICTION], np.zeros((0, 0))) == {}
+
+
+def test_another_place_is_tried_where_more_than_noise_is_left(solved, monkeypatch):
+    # of ten samples chi2 is above 23.2 in one of a hundred, and costs are half of it
+    monkeypatch.setattr(type(FRICTION), "elsewhere", lambda self, start: {A: -start[A]}, raising=False)
+    cases = {11.5: (11.5, 0.75), 11.7: (5.0, -0.75), None: (5.0, -0.75)}
+    for first, (cost, value) in cases.items():
+        there = {0.75: first, -0.75: 5.0}
+        found = refit(Problem(lambda values, there=there: there.get(values[A])), [FRICTION], {"k": 2.0, A: 0.75})
+        assert (found.cost, found.values[A]) == (pytest.approx(cost), value)
+    # a worse one is not taken
+    there = {0.75: 20.0, -0.75: 21.0}
+    found = refit(Problem(lambda values: there.get(values[A], 30.0)), [FRICTION], {"k": 2.0, A: 0.75})
+    assert found.values[A] == pytest.approx(0.75)
+
+
 # -- what is remembered -----------------------------------------------------------------------------------------------
 
 
@@ -235,15 +267,17 @@ def test_a_refit_is_stored_under_its_effects_or_its_name(solved):
     kept = store["another"]
     assert (kept.values, kept.message) == (START, "done")
     assert set(kept.std.values()) == {0.1}
+    assert kept.amplitude_std == {A: 0.1}
 
 
 def test_a_stored_refit_is_evaluated_and_not_solved(solved):
     values, std = {**START, "k": 2.0}, dict.fromkeys(START, 0.3)
-    store = Memory({"friction@elbow": Refitted(values, std, "long ago")})
+    store = Memory({"friction@elbow": Refitted(values, std, {A: 0.2}, "long ago")})
     problem = Problem(lambda values: 5.0)
     found = refit(problem, [FRICTION], START, store)
     assert solved.runs == []
     assert (found.values, found.std, found.message, found.resumed) == (values, std, "long ago", True)
+    assert found.amplitude_std == {A: 0.2}
     assert found.cost == pytest.approx(5.0)
     assert solved.losses == [values]
     assert problem.freed == (FRICTION,)
@@ -253,17 +287,18 @@ def test_a_stored_refit_is_evaluated_and_not_solved(solved):
 
 
 @pytest.mark.parametrize(
-    ("values", "std", "cost"),
+    ("values", "std", "held", "cost"),
     [
-        ({"k": 1.0}, {"k": 1.0}, 5.0),
-        (START, {"k": 1.0}, 5.0),
-        ({**START, "more": 1.0}, dict.fromkeys(START, 0.3), 5.0),
-        (START, dict.fromkeys(START, 0.3), None),
+        ({"k": 1.0}, {"k": 1.0}, {A: 0.2}, 5.0),
+        (START, {"k": 1.0}, {A: 0.2}, 5.0),
+        ({**START, "more": 1.0}, dict.fromkeys(START, 0.3), {A: 0.2}, 5.0),
+        (START, dict.fromkeys(START, 0.3), {"k": 0.2}, 5.0),
+        (START, dict.fromkeys(START, 0.3), {A: 0.2}, None),
     ],
-    ids=["other unknowns", "deviations of others", "one unknown more", "cannot be rolled out"],
+    ids=["other unknowns", "deviations of others", "one unknown more", "other amplitudes", "cannot be rolled out"],
 )
-def test_a_stored_refit_of_another_problem_is_no_use(solved, values, std, cost):
-    store = Memory({"friction@elbow": Refitted(values, std, "")})
+def test_a_stored_refit_of_another_problem_is_no_use(solved, values, std, held, cost):
+    store = Memory({"friction@elbow": Refitted(values, std, held, "")})
     assert recalled(Problem(lambda _: cost), [FRICTION], store) is None
 
 

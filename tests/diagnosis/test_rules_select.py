@@ -768,6 +768,9 @@ def test_an_effect_within_two_standard_deviations_of_neutral_is_not_there(std, t
     found = fit([of], values={"wide@x.a": 2.0, "wide@x.b": 0.01}, std={"wide@x.a": std, "wide@x.b": 1.0})
     assert stands_out(of, found) is there
     assert stands_out(of, found, Thresholds(away=1.9)) or std > 0.52
+    # a shape that is not known next to nothing makes the amplitude no less sure
+    unsure = fit([of], values=found.values, std={"wide@x.a": 9.0}, held={"wide@x.a": std, "wide@x.b": 1.0})
+    assert stands_out(of, unsure) is there
 
 
 def test_an_effect_that_is_not_there_is_not_added(monkeypatch):

@@ -140,6 +140,24 @@ def test_moments_beyond_reach_do_not_act_and_what_acts_is_reported() -> None:
     assert added == pytest.approx(TURNED[:3, :3] @ acting + 1.0 * TURNED[:3, 3])
 
 
+@pytest.mark.parametrize(
+    ("mass", "moments", "other"),
+    [
+        (0.2, (0.0, 0.03, -0.04), -0.05 / REACH),
+        (-0.2, (0.0, 0.03, -0.04), 0.05 / REACH),
+        (0.2, (3.0, 0.0, 0.0), -0.9 * 1.2),
+        (0.2, (0.0, 0.0, 0.0), None),
+        (0.0, (0.1, 0.0, 0.0), None),
+    ],
+    ids=["less", "more", "all that there is", "no moment", "no mass"],
+)
+def test_a_search_begins_with_the_other_sign_too(mass, moments, other) -> None:
+    effect = make_effect("payload", "hand", arm())
+    start = dict(zip(effect.parameters.names, (mass, *moments), strict=True))
+    found = effect.elsewhere(start)
+    assert found == (None if other is None else {"payload@hand.mass": pytest.approx(other)})
+
+
 def test_two_frames_of_one_link_say_the_same() -> None:
     nominal = arm()
     values = {"mass": 0.5, "mx": 0.01, "my": -0.02, "mz": 0.03}

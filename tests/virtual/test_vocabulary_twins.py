@@ -10,7 +10,7 @@ import pytest
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.diagnose import nominal_fit
 from yid_ocp.diagnosis.hypotheses import CandidateProblem
-from yid_ocp.diagnosis.refit import refit
+from yid_ocp.diagnosis.refit import Fit, refit
 from yid_ocp.diagnosis.screening import screen
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ModelError
@@ -128,16 +128,31 @@ def test_a_flipped_sign_is_found_where_torques_drive() -> None:
     assert agrees(fitted("effort_gain", "elbow", recording, "driven")["scale"], -1.0, 1e-3)
 
 
-def test_a_flipped_sign_is_found_where_efforts_are_compared() -> None:
-    """Downhill from 1 lies a gain without end; the refit of a diagnosis begins at -1 as well."""
+def refitted(effect: InjectedEffect) -> tuple[Fit, Fit]:
+    """The nominal fit of an arm that is moved as measured, and a refit from where its screening leads."""
     system = arm("prescribed")
-    flipped = [InjectedEffect("effort_gain", "elbow", {"scale": -1.0})]
-    runs = [recorded(flipped, seed, 1.0) for seed in (1, 2)]
+    runs = [recorded([effect], seed, 1.0) for seed in (1, 2)]
     step = compile_step(system, 0.01, use_compiler=False)
     nominal = EstimationProblem(step, runs[:1], ("shoulder.damping", "elbow.damping"), ProblemOptions(path_cutoff=20.0))
-    composed = CandidateProblem.of(nominal, [make_effect("effort_gain", "elbow", system)], runs[1:])
+    composed = CandidateProblem.of(nominal, [make_effect(effect.kind, effect.location, system)], runs[1:])
     start = nominal_fit(nominal, composed)
     [score] = screen(composed, (), start.values).scores
     found = refit(composed, composed.effects, {**start.values, **score.step})
-    assert found.reported(composed.effects[0])["scale"].value == pytest.approx(-1.0, abs=0.01)
+    assert found is not None
+    return start, found
+
+
+def test_a_flipped_sign_is_found_where_efforts_are_compared() -> None:
+    """Downhill from 1 lies a gain without end; the refit of a diagnosis begins at -1 as well."""
+    start, found = refitted(InjectedEffect("effort_gain", "elbow", {"scale": -1.0}))
+    assert found.reported(found.effects[0])["scale"].value == pytest.approx(-1.0, abs=0.01)
+    assert found.loss.mean < 0.01 * start.loss.mean
+
+
+def test_a_load_far_out_is_not_found_as_one_that_is_missing() -> None:
+    """Next to no mass it has no second moment: downhill lies a mass of -0.29 kg that leaves 160 times the error."""
+    values = {"mass": 0.1, "mx": -0.03, "my": -0.05, "mz": 0.01}
+    start, found = refitted(InjectedEffect("payload", "hand", values))
+    for name, reported in found.reported(found.effects[0]).items():
+        assert reported.value == pytest.approx(values[name], rel=0.05), name
     assert found.loss.mean < 0.01 * start.loss.mean

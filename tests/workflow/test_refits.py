@@ -13,7 +13,7 @@ from yid_ocp.workflow.refits import Refits
 @pytest.mark.parametrize("spoil", ["nothing", "inputs", "version", "half a file", "other text"])
 def test_kept_refits_count_only_for_what_they_were_made_from(spoil, rubbing, tmp_path, caplog):
     made_from = [{"a.h5": "12"}, "a: 1", {"yid-ocp": "1.0"}]
-    refitted = Refitted({"b": 0.1 + 0.2}, {"b": float("inf")}, "done")
+    refitted = Refitted({"b": 0.1 + 0.2}, {"b": float("inf")}, {"b": 0.1}, "done")
     with new_run_folder(load_config(rubbing), tmp_path / "run") as folder:
         first = Refits(folder, *made_from)
         first.put("joint_coulomb@elbow", refitted)

@@ -13,6 +13,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from yid_ocp.diagnosis.hypotheses import CandidateProblem, describe
 from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
@@ -78,7 +79,9 @@ class Fit:
     values : dict of str to float
         Unknowns.
     std : dict of str to float
-        Their standard deviations; see `refit_std`.
+        Their standard deviations; see `refit_covariance`.
+    amplitude_std : dict of str to float
+        Of the effects' amplitudes, with their shapes held; see `amplitude_std`.
     cost : float
     evaluation : Evaluation
     loss : Loss
@@ -93,6 +96,7 @@ class Fit:
     problem: EstimationProblem
     values: dict[str, float]
     std: dict[str, float]
+    amplitude_std: dict[str, float]
     cost: float
     evaluation: Evaluation
     loss: Loss
@@ -117,11 +121,14 @@ class Refitted:
     ----------
     values, std : dict of str to float
         Of every unknown.
+    amplitude_std : dict of str to float
+        Of amplitudes; see `Fit`.
     message : str
     """
 
     values: dict[str, float]
     std: dict[str, float]
+    amplitude_std: dict[str, float]
     message: str
 
 
@@ -202,7 +209,7 @@ def refit(
     # those before it were found from both already
     for effect in effects[-1:]:
         moved = effect.elsewhere(start)
-        if moved is None:
+        if moved is None or (best is not None and _leaves_noise(best[1], limits)):
             continue
         there = _placed(problem, effects, {**start, **moved})
         again = _attempt(there, effects, {**start, **moved})
@@ -211,12 +218,14 @@ def refit(
     if best is None:
         return None
     outcome, finish = best
-    std = told(effects, own.named(refit_std(own, finish, limits)))
+    covariance = refit_covariance(own, finish, limits)
+    std = told(effects, own.named(plain_std(covariance, outcome.x)))
+    held = told(effects, amplitude_std(own.names, effects, covariance))
     loss = held_out_loss(own, outcome.x)
     values = own.named(outcome.x)
     if store is not None:
-        store.put(name or describe(effects), Refitted(values, std, outcome.message))
-    return Fit(tuple(effects), own, values, std, finish.cost, finish, loss, outcome.message)
+        store.put(name or describe(effects), Refitted(values, std, held, outcome.message))
+    return Fit(tuple(effects), own, values, std, held, finish.cost, finish, loss, outcome.message)
 
 
 def _placed(problem: CandidateProblem, effects: Sequence[EffectBase], start: Mapping[str, float]) -> EstimationProblem:
@@ -245,6 +254,11 @@ def _half_done(
     return before.cost - finish.cost > limits.promising * (before.cost - count / 2)
 
 
+def _leaves_noise(finish: Evaluation, limits: Thresholds) -> bool:
+    """Whether a refit leaves no more than noise may, so that no other place can be better."""
+    return float(chi2.sf(2 * finish.cost, len(finish.residual))) >= limits.level
+
+
 def _attempt(
     own: EstimationProblem, effects: Sequence[EffectBase], start: Mapping[str, float]
 ) -> tuple[Outcome, Evaluation] | None:
@@ -265,7 +279,10 @@ def recalled(
     """A refit that a store knows, evaluated once; None where it knows none."""
     known = None if store is None else store.get(name or describe(effects))
     own = problem.freeing(effects)
+    amplitudes = {name for effect in effects for name in effect.amplitudes}
     if known is None or not set(known.values) == set(known.std) == set(own.names):
+        return None
+    if set(known.amplitude_std) != amplitudes:
         return None
     own = _placed(problem, effects, known.values)
     x = own.vector(known.values)
@@ -273,13 +290,31 @@ def recalled(
     if not finish.ok:
         return None
     loss = held_out_loss(own, x)
-    return Fit(tuple(effects), own, known.values, known.std, finish.cost, finish, loss, known.message, True)
+    spread = known.std, known.amplitude_std
+    return Fit(tuple(effects), own, known.values, *spread, finish.cost, finish, loss, known.message, True)
 
 
-def refit_std(problem: EstimationProblem, finish: Evaluation, limits: Thresholds = DEFAULTS) -> Array:
-    """Standard deviation of every unknown, shape (nx,), counting the misfit where there is one, as `solve` has it."""
-    covariance = covariance_of_fit(problem, finish, judge_fit(problem, finish, limits.gap))
-    return plain_std(covariance, problem.start)
+def refit_covariance(problem: EstimationProblem, finish: Evaluation, limits: Thresholds = DEFAULTS) -> Array:
+    """Covariance of the unknowns, shape (nx, nx), counting the misfit where there is one, as `solve` has it."""
+    return covariance_of_fit(problem, finish, judge_fit(problem, finish, limits.gap))
+
+
+def amplitude_std(names: Sequence[str], effects: Sequence[EffectBase], covariance: Array) -> dict[str, float]:
+    """Standard deviations of the effects' amplitudes with their shapes held where they were found.
+
+    Next to nothing an effect has any shape: that of a weak spring is a rest angle as far away as one likes. Whether it
+    is there at all is asked with its shape held (Davies 1987, doi:10.1093/biomet/74.1.33).
+    """
+    found = {}
+    for effect in effects if len(covariance) else ():
+        shapes = [names.index(name) for name in effect.shapes]
+        for name in effect.amplitudes:
+            i = names.index(name)
+            own, along, other = covariance[i, i], covariance[shapes, i], covariance[np.ix_(shapes, shapes)]
+            if np.isfinite(along).all() and np.isfinite(other).all():
+                own = own - along @ np.linalg.pinv(other, hermitian=True) @ along
+            found[name] = math.inf if np.isnan(own) else math.sqrt(max(float(own), 0.0))
+    return found
 
 
 def told(effects: Sequence[EffectBase], std: Mapping[str, float]) -> dict[str, float]:

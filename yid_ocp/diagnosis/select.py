@@ -196,9 +196,12 @@ def oversized(effect: EffectBase, values: Mapping[str, float], limits: Threshold
 
 
 def stands_out(effect: EffectBase, fit: Fit, limits: Thresholds = DEFAULTS) -> bool:
-    """Whether any amplitude is `away` standard deviations or more from neutral; an effect that is not is not there."""
-    neutral = effect.neutral
-    return any(abs(fit.values[n] - neutral[n]) >= limits.away * fit.std.get(n, 0.0) for n in effect.amplitudes)
+    """Whether any amplitude is `away` standard deviations or more from neutral; an effect that is not is not there.
+
+    These are of the amplitude with the effect's shape held: see `amplitude_std`.
+    """
+    neutral, std = effect.neutral, fit.amplitude_std
+    return any(abs(fit.values[n] - neutral[n]) >= limits.away * std.get(n, 0.0) for n in effect.amplitudes)
 
 
 def relevant(before: Loss, after: Loss, limits: Thresholds = DEFAULTS) -> bool:

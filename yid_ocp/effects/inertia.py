@@ -175,6 +175,13 @@ class Payload(EffectBase):
         )
         return (Quantity("mass", "kg", 0.0, lower, upper, (lower, expected), "mass added to the link"), *moments)
 
+    def elsewhere(self, start: Mapping[str, float]) -> Mapping[str, float] | None:
+        """With the other sign of the mass as well, `REACH` away: next to nothing no second moment tells them apart."""
+        mass, *moments = (start.get(f"{self.label}.{quantity.name}", 0.0) for quantity in self.quantities)
+        own = self.quantities[0]
+        other = float(np.clip(-math.copysign(np.linalg.norm(moments) / REACH, mass), own.lower, own.upper))
+        return {f"{self.label}.mass": other} if other * mass < 0 else None
+
     def reported(
         self, values: Mapping[str, float] | None = None, stds: Mapping[str, float] | None = None
     ) -> dict[str, Reported]:

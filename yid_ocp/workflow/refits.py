@@ -55,7 +55,12 @@ class Refits:
         with self._lock:
             self._known[name] = refitted
             refits = {
-                key: {"values": _texts(fit.values), "std": _texts(fit.std), "message": fit.message}
+                key: {
+                    "values": _texts(fit.values),
+                    "std": _texts(fit.std),
+                    "amplitude_std": _texts(fit.amplitude_std),
+                    "message": fit.message,
+                }
                 for key, fit in self._known.items()
             }
             try:
@@ -78,7 +83,12 @@ class Refits:
             held = json.loads(self.file.read_text(encoding="utf-8"))
             if (held["format"], held["key"]) == (FORMAT, self._key):
                 return {
-                    name: Refitted(_numbers(fit["values"]), _numbers(fit["std"]), str(fit["message"]))
+                    name: Refitted(
+                        _numbers(fit["values"]),
+                        _numbers(fit["std"]),
+                        _numbers(fit["amplitude_std"]),
+                        str(fit["message"]),
+                    )
                     for name, fit in held["refits"].items()
                 }
             reason = "other inputs, another configuration or another version"
