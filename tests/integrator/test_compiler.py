@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import shutil
 import stat
 
 import casadi as ca
@@ -98,6 +99,18 @@ def test_what_a_library_was_made_with_is_part_of_its_key(cache, tmp_path, monkey
     compiler._machine.cache_clear()
     assert compiler.compile_library(SOURCE % 42).yid_answer() == 42
     assert len(list(cache.iterdir())) == 2
+
+
+@pytest.mark.parametrize(("program", "words"), [("gcc", compiler.GCC), ("clang", ())])
+def test_a_compiler_is_told_what_it_knows(cache, runs, monkeypatch, program, words):
+    if shutil.which(program) is None:
+        pytest.skip(f"{program} is not here")
+    monkeypatch.setenv("CC", program)
+    compiler.compiler.cache_clear()
+    compiler._machine.cache_clear()
+    assert compiler.compile_library(SOURCE % 42).yid_answer() == 42
+    [told] = [command for command in runs if "-shared" in command]
+    assert tuple(word for word in told if word in compiler.GCC) == words
 
 
 @needs_compiler
