@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import pytest
@@ -358,13 +358,22 @@ def test_an_answer_is_given_from_the_recordings_without_what_was_left_out(monkey
 def test_the_best_that_could_be_closed_is_that_of_the_true_effects(monkeypatch, injected, refitted, expected):
     asked = []
     stiff = effect("kelvin_voigt@T1", amplitude("tau", unit="s"), amplitude("other"))
-    made = SimpleNamespace(of=lambda problem, effects, held_out: SimpleNamespace(effects=tuple(effects), held=held_out))
+
+    @dataclass(frozen=True)
+    class Composed:
+        effects: tuple
+        held: list
+        problem: str
+
+    made = SimpleNamespace(of=lambda problem, effects, held_out: Composed(tuple(effects), held_out, "from the start"))
     monkeypatch.setattr(answers, "chosen_effects", lambda *_: [stiff, FRICTION])
     monkeypatch.setattr(answers, "CandidateProblem", made)
-    monkeypatch.setattr(answers, "nominal_fit", lambda *_: fit(lost=loss(2.0, 2.0), values={"k": 3.0}))
+    monkeypatch.setattr(
+        answers, "nominal_fit", lambda *_: fit(lost=loss(2.0, 2.0), values={"k": 3.0}, problem="settled")
+    )
 
     def refit(composed, chosen, start):
-        asked.append((composed.held, [e.kind for e in chosen], dict(start)))
+        asked.append((composed.held, composed.problem, [e.kind for e in chosen], dict(start)))
         return fit(chosen, loss(1.25, 1.25)) if refitted else None
 
     monkeypatch.setattr(answers, "refit", refit)
@@ -372,7 +381,7 @@ def test_the_best_that_could_be_closed_is_that_of_the_true_effects(monkeypatch, 
     found = answers.best_closure(ensemble, case(), Label("c", "single", injected, 1.0, {}))
     assert found == pytest.approx(expected, nan_ok=True)
     at_truth = {"kelvin_voigt@T1.tau": 0.05} if injected else {}
-    assert asked == [(["held out"], ["kelvin_voigt"] if injected else [], {"k": 3.0} | at_truth)]
+    assert asked == [(["held out"], "settled", ["kelvin_voigt"] if injected else [], {"k": 3.0} | at_truth)]
 
 
 def test_reported_values_are_turned_back_into_parameters():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from yid_ocp.diagnosis.blind.ensemble import Case, Ensemble, Label
 from yid_ocp.diagnosis.diagnose import diagnose, nominal_fit
@@ -41,7 +42,8 @@ def best_closure(ensemble: Ensemble, case: Case, label: Label, candidates: Choic
     start = {}
     for effect in chosen:
         start.update(_internal(effect.label, true[effect.label].values, effect.quantities))
-    fit = refit(composed, chosen, {**nominal.values, **start})
+    # under the weights of the nominal fit, as all that it is compared with
+    fit = refit(replace(composed, problem=nominal.problem), chosen, {**nominal.values, **start})
     return math.nan if fit is None or len(chosen) < len(true) else closure(nominal.loss, fit.loss).value
 
 
