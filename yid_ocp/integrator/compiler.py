@@ -160,8 +160,9 @@ def _library_file(source: str, level: str) -> Path | None:
     path = compiler()
     if path is None:
         return None
+    flags = _flags(path)
     key = hashlib.sha256(
-        "\0".join([source, level, *_flags(path), *NATIVE, _machine(), ca.CasadiMeta.version()]).encode()
+        "\0".join([source, level, *flags, *NATIVE, _machine(), ca.CasadiMeta.version()]).encode()
     ).hexdigest()[:32]
     folder = cache_folder()
     kept = _kept(folder, key)
@@ -172,8 +173,8 @@ def _library_file(source: str, level: str) -> Path | None:
         with tempfile.TemporaryDirectory(dir=folder) as work:
             text, built = Path(work) / "source.c", Path(work) / "library.so"
             text.write_text(f"{source}\nint {MARK}(void) {{ return 1; }}\n", encoding="utf-8")
-            for flags in ((*_flags(path), *NATIVE), _flags(path)):
-                good, said = _said([path, level, *flags, str(text), "-o", str(built), "-lm"], PATIENCE)
+            for told in ((*flags, *NATIVE), flags):
+                good, said = _said([path, level, *told, str(text), "-o", str(built), "-lm"], PATIENCE)
                 if good and _is_ours(built):
                     target = folder / f"{key}-{file_sha256(built)[:32]}.so"
                     os.replace(built, target)
