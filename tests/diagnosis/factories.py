@@ -315,20 +315,25 @@ class Recorded:
         node = np.rint(np.asarray(times) / 0.1).astype(int)
         self._samples = measurements(["a"], node, np.zeros(len(node)), value, weight)
 
-    def predicted(self, prediction):
-        """A problem that predicts the recording so, or says why not; `asked` holds the values that it was asked at."""
+    def predicted(self, prediction, slopes=None):
+        """A problem that predicts the recording so, or says why not; `asked` holds the values that it was asked at.
+
+        It has one parameter; `slopes` is what moving it adds to the prediction, nothing where absent.
+        """
         asked = []
         grid = SimpleNamespace(steps=len(self._samples.node), time_step=0.1)
         held = SimpleNamespace(name="other", grid=grid, samples=(self._samples,))
         result = prediction
         if not isinstance(prediction, str):
             result = SimpleNamespace(predicted=(np.asarray(prediction, float),))
+            by = np.zeros((len(prediction), 1, 1)) if slopes is None else np.asarray(slopes, float)[:, None, None]
         return SimpleNamespace(
             asked=asked,
             held_out=(held,),
             vector=lambda values: asked.append(dict(values)),
-            validate=lambda x: [(held, result)],
-            held_out_rows=lambda i, episode, found: self._samples.rows(found.predicted[0]),
+            shared=("k",),
+            validate=lambda x, derivatives=False: [(held, result)],
+            held_out_rows=lambda i, episode, found: self._samples.rows(found.predicted[0], by),
             on=lambda episodes, held_out: SimpleNamespace(
                 episodes=episodes,
                 held_out=held_out,

@@ -140,13 +140,25 @@ def test_the_test_on_the_fits_data_leaves_out_what_parameters_took(monkeypatch):
     assert len(found.windows) == 3
 
 
-def test_held_out_data_are_tested_without_any_fit():
+def test_held_out_data_are_tested_without_any_fit(monkeypatch):
+    monkeypatch.setattr(module, "spread_by_noise", lambda problem, found: np.array([[0.0]]))
     measured = Recorded(times=[0.0, 0.1, 0.2], value=[[1.0], [2.0], [math.nan]], weight=[[2.0], [3.0], [0.0]])
     problem = measured.predicted([[2.0], [4.0], [9.0]])
-    found = module.held_out_test(SimpleNamespace(problem=problem, values={"k": 5.0}), Thresholds())
+    found = module.held_out_test(SimpleNamespace(problem=problem, values={"k": 5.0}, evaluation=None), Thresholds())
     assert found.chi2_per_dof == pytest.approx((4.0 + 36.0) / 2)
     assert found.degrees == 2.0
     assert problem.asked == [{"k": 5.0}]
+
+
+def test_held_out_data_are_tested_in_units_of_what_parameters_are_unsure_of_too(monkeypatch):
+    asked = []
+    monkeypatch.setattr(module, "spread_by_noise", lambda *given: asked.append(given) or np.array([[0.5]]))
+    measured = Recorded(times=[0.0, 0.1], value=[[1.0], [2.0]], weight=[[2.0], [3.0]])
+    problem = measured.predicted([[2.0], [4.0]], slopes=[3.0, 0.0])
+    found = module.held_out_test(SimpleNamespace(problem=problem, values={"k": 5.0}, evaluation="fit"), Thresholds())
+    # one standard deviation of k moves the first sample by 1.5 in its unit of half, the second not at all
+    assert found.chi2_per_dof == pytest.approx((4.0 / (1 + 3.0**2) + 36.0) / 2)
+    assert asked == [(problem, "fit")]
 
 
 def test_held_out_data_that_cannot_be_predicted_are_refused():

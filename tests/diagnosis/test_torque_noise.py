@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -21,6 +22,7 @@ from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers import GaussNewton, solve
+from yid_ocp.solvers.judgement import spread_by_noise
 
 TIME_STEP, STEPS = 0.01, 300
 WHITE, OFFSET, ANGLE, POINT = 0.05, 0.1, 2e-4, 1e-3
@@ -123,6 +125,20 @@ def test_noise_that_drives_the_motion_is_no_gap(step):
     plain = bare.evaluate(bare.vector(fit.values), False)
     assert 2 * plain.cost > 2 * len(plain.residual)
     test = held_out_test(fit)
+    assert 0.8 < test.chi2_per_dof < 1.2
+    assert test.p_value > 1e-3
+
+
+def test_what_parameters_are_unsure_of_is_no_gap(step):
+    """A fit to recordings that tell a fiftieth as much may be fifty times as far off."""
+    made = composed(step, True)
+    fit = nominal_fit(problem_of(step, [recorded(step, 1)]), made)
+    spread = spread_by_noise(fit.problem, fit.evaluation)
+    off = fit.problem.vector(fit.values) + 50 * spread @ np.ones(spread.shape[1]) / math.sqrt(spread.shape[1])
+    moved = replace(fit, values=fit.problem.named(off))
+    assert held_out_test(moved).p_value < 1e-12
+    less = replace(fit.evaluation, jacobian=fit.evaluation.jacobian / 50)
+    test = held_out_test(replace(moved, evaluation=less))
     assert 0.8 < test.chi2_per_dof < 1.2
     assert test.p_value > 1e-3
 

@@ -11,7 +11,15 @@ import pytest
 import scipy.stats
 from made_series import samples, series
 
-from yid_ocp.problem.null_test import GapLimits, NullTest, more_than_noise, noise_floor, null_test, spread
+from yid_ocp.problem.null_test import (
+    GapLimits,
+    NullTest,
+    more_than_noise,
+    noise_floor,
+    null_test,
+    spread,
+    whitened_beside,
+)
 
 CHI2 = scipy.stats.chi2
 
@@ -92,6 +100,38 @@ def test_the_limits_of_the_gap_are_those_given():
     found = [NullTest(1.5, 10.0, 0.02, {}, {}, ())]
     assert more_than_noise(found, GapLimits(level=0.05))
     assert not more_than_noise(found, GapLimits(level=0.05, smallest_gap=0.5))
+
+
+# -- beside what else has moved it ------------------------------------------------------------------------------------
+
+
+def test_a_residual_beside_other_errors_has_unit_covariance():
+    rng = np.random.default_rng(0)
+    spread = rng.standard_normal((7, 3)) * [0.1, 3.0, 1e6]
+    root = np.array([whitened_beside(unit, spread) for unit in np.eye(7)])
+    np.testing.assert_allclose(root @ (np.eye(7) + spread @ spread.T) @ root.T, np.eye(7), atol=1e-4)
+
+
+def test_what_no_other_error_could_have_done_is_left_as_it_is():
+    spread = np.array([[2.0], [0.0], [0.0]])
+    found = whitened_beside(np.array([3.0, 5.0, -7.0]), spread)
+    np.testing.assert_allclose(found, [3.0 / math.sqrt(5.0), 5.0, -7.0])
+
+
+def test_predictions_by_what_was_estimated_are_noise_in_units_of_their_own():
+    """Straight lines through a few points, and points far beyond them: the plain residual is twenty times noise."""
+    rng, near, far = np.random.default_rng(1), np.linspace(0.0, 1.0, 12), np.linspace(4.0, 6.0, 40)
+    fitted, held = (np.column_stack([np.ones_like(t), t]) for t in (near, far))
+    factor = np.linalg.cholesky(np.linalg.inv(fitted.T @ fitted))
+    plain, judged = [], []
+    for _ in range(400):
+        line = np.linalg.lstsq(fitted, rng.standard_normal(len(near)), rcond=None)[0]
+        residual = held @ line - rng.standard_normal(len(far))
+        plain.append(null_test([series(range(40))], residual, 0).p_value)
+        judged.append(null_test([series(range(40))], whitened_beside(residual, held @ factor), 0).p_value)
+    assert np.mean(np.array(plain) < 0.01) > 0.5
+    assert 0.001 < np.mean(np.array(judged) < 0.01) < 0.03
+    assert 0.4 < np.median(judged) < 0.6
 
 
 # -- is it white ------------------------------------------------------------------------------------------------------

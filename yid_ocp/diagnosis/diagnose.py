@@ -31,10 +31,11 @@ from yid_ocp.errors import DataError, SolverError
 from yid_ocp.parallel import map_in_step
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.constant_errors import without_constants
-from yid_ocp.problem.null_test import NullTest, noise_floor, null_test, residual_series
+from yid_ocp.problem.null_test import NullTest, noise_floor, null_test, residual_series, whitened_beside
 from yid_ocp.progress import Logged, Progress
 from yid_ocp.solvers import GaussNewton, Solution, solve
 from yid_ocp.solvers.base import RESTARTS
+from yid_ocp.solvers.judgement import spread_by_noise
 
 log = logging.getLogger(__name__)
 
@@ -469,23 +470,31 @@ def fitted_test(fit: Fit, limits: Thresholds = DEFAULTS) -> NullTest:
 def held_out_test(fit: Fit, limits: Thresholds = DEFAULTS) -> NullTest:
     """The null test of a model on the held-out recordings, in which nothing was fitted.
 
+    What is held out is predicted by parameters that noise has moved: without a gap the residual has the covariance
+    I + J F F' J', where F F' is that of the parameters (`spread_by_noise`). It is tested in units of that.
+
     Raises
     ------
     DataError
         A held-out recording cannot be predicted by the nominal model.
     """
     problem = fit.problem
-    residuals = []
-    for i, (episode, result) in enumerate(problem.validate(problem.vector(fit.values))):
+    residuals, slopes = [], []
+    for i, (episode, result) in enumerate(problem.validate(problem.vector(fit.values), True)):
         if isinstance(result, str):
             raise DataError(
                 f"the held-out recording cannot be predicted: {result}",
                 where=episode.name,
                 hint="hold out a recording that the nominal model can follow",
             )
-        residuals.append(problem.held_out_rows(i, episode, result).residual)
+        rows = problem.held_out_rows(i, episode, result)
+        assert rows.jacobian is not None
+        residuals.append(rows.residual)
+        slopes.append(rows.jacobian[:, : len(problem.shared)])
     series = residual_series(problem.on(problem.held_out, ()))
-    return null_test(series, np.concatenate(residuals), 0, limits.level, limits.window)
+    spread = np.vstack(slopes) @ spread_by_noise(problem, fit.evaluation)[: len(problem.shared)]
+    residual = whitened_beside(np.concatenate(residuals), spread)
+    return null_test(series, residual, 0, limits.level, limits.window)
 
 
 def smooth_fit(fit: Fit, limits: Thresholds = DEFAULTS) -> Smoothed:

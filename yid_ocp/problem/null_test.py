@@ -192,6 +192,22 @@ def null_test(
     return NullTest(ratio, effective, p_value, channels, whiteness, _windows(series, residual, level, window))
 
 
+def whitened_beside(residual: Array, spread: Array) -> Array:
+    """A residual in units of its noise and of what else may have moved it, (I + F F')^(-1/2) r.
+
+    Rows stay what they are: what no column of F could have done is left as it is.
+
+    Parameters
+    ----------
+    residual : ndarray, shape (nr,)
+        In units of its noise.
+    spread : ndarray, shape (nr, k)
+        F: what one standard deviation of each of k independent errors does to it.
+    """
+    columns, sizes, _ = np.linalg.svd(spread, full_matrices=False)
+    return np.asarray(residual + columns @ ((1 / np.hypot(1.0, sizes) - 1) * (columns.T @ residual)))
+
+
 def more_than_noise(tests: Sequence[NullTest], limits: GapLimits = USUAL) -> bool:
     """Whether residuals of one model are more than noise, by enough to be worth a word.
 

@@ -405,19 +405,19 @@ class EstimationProblem(Shown):
 
     # -- held-out recordings ------------------------------------------------------------------------------------------
 
-    def validate(self, x: ArrayLike) -> list[tuple[Episode, EpisodeResult | str]]:
+    def validate(self, x: ArrayLike, derivatives: bool = False) -> list[tuple[Episode, EpisodeResult | str]]:
         """Predict the held-out recordings with the shared parameters of `x`; local ones stay at their initial value.
 
         The episodes come back with the starts that were fitted to their points, as far as they are. An `estimated`
         start is found from each recording's first `HELD_OUT_START` seconds and its prior, one that is fitted to points
-        at these parameters.
+        at these parameters. Derivatives are by (free parameters, offset of the start), the start held.
         """
         x = np.asarray(x, float)
         theta = self._held_out_theta(x)
 
         def one(held: Episode) -> tuple[Episode, EpisodeResult | str]:
             episode = self._held_out_episode(held, theta)
-            return episode, self.predictor.run(episode, theta, self._held_out_offset(episode, theta, x), False)
+            return episode, self.predictor.run(episode, theta, self._held_out_offset(episode, theta, x), derivatives)
 
         return [one(episode) for episode in self.held_out]
 

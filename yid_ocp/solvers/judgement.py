@@ -125,20 +125,24 @@ def uncertainty(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Arr
 
     Directions that the data do not inform get a variance of (1e8 x scale)^2 rather than an infinite one.
     """
-    count = len(problem.start)
     if evaluation.jacobian is None or not evaluation.ok:
-        return np.full((count, count), np.nan), math.nan
-    scale = problem.scales
+        return np.full((len(problem.start), len(problem.start)), np.nan), math.nan
+    spread, chi2 = spread_by_noise(problem, evaluation), _chi2_per_dof(problem, evaluation)
+    return spread @ spread.T * max(1.0, chi2), chi2
+
+
+def spread_by_noise(problem: EstimationProblem, evaluation: Evaluation) -> Array:
+    """F of which F F' is the covariance of the unknowns if nothing but noise has moved them, shape (nx, nx).
+
+    Kept apart, as a covariance with directions that nothing informs has no digits left for the others.
+    """
+    count, scale = len(problem.start), problem.scales
     _, jacobian = problem.informing(evaluation)
-    jacobian = jacobian * scale
-    _, singular, vectors = np.linalg.svd(jacobian, full_matrices=False)
+    _, singular, vectors = np.linalg.svd(jacobian * scale, full_matrices=False)
     inverse = np.zeros(count)
     inverse[: len(singular)] = singular
-    inverse = 1.0 / np.maximum(inverse, 1e-8)
     basis = np.eye(count) if len(vectors) == 0 else _completed(vectors, count)
-    covariance = (basis.T * inverse**2) @ basis * np.outer(scale, scale)
-    chi2 = _chi2_per_dof(problem, evaluation)
-    return covariance * max(1.0, chi2), chi2
+    return scale[:, None] * basis.T / np.maximum(inverse, 1e-8)
 
 
 def _chi2_per_dof(problem: EstimationProblem, evaluation: Evaluation) -> float:
