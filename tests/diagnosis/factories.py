@@ -282,6 +282,11 @@ class Candidates:
     def freeing(self, names):
         return self._like(names=tuple(names))
 
+    def placed(self, effects, at):
+        """Nothing drives its motion wrong; `places` are what was asked for."""
+        self.places = [*getattr(self, "places", []), ([effect.label for effect in effects], dict(at))]
+        return self
+
     def at(self, values):
         return self._like(theta=self.theta | dict(values))
 

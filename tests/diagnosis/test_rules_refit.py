@@ -39,16 +39,20 @@ class Problem:
 
     def __init__(self, cost, rows=10, names=("k", "k[run]", "start.q.k[run]", A, S)):
         self.cost, self.rows, self.names, self.nominal = cost, rows, names, ("k",)
-        self.asked, self.warmed = [], []
-        self.freed = self.placed = None
+        self.asked, self.warmed, self.at = [], [], []
+        self.freed, self.innovations = None, ()
+
+    @property
+    def problem(self):
+        return self
 
     def freeing(self, effects):
         self.freed = tuple(effects)
         return self
 
-    def about_torques_of(self, x, frozen):
-        self.placed = self.named(x), self.named(frozen)
-        return self
+    def placed(self, effects, at):
+        self.at.append(self.named(self.vector(at)))
+        return self.freeing(effects)
 
     def vector(self, values):
         return np.array([values.get(name, 1.0) for name in self.names])
@@ -97,10 +101,19 @@ def solved(monkeypatch):
 # -- where weights stand ----------------------------------------------------------------------------------------------
 
 
-def test_weights_stand_about_the_torques_of_the_start_without_the_effects(solved):
+def test_filters_are_about_the_torques_that_are_seen_at_the_start(solved):
     problem = Problem(lambda values: 1.0)
-    refit(problem, [FRICTION], {"k": 2.0, A: 3.0})
-    assert problem.placed == ({**problem.named(np.ones(5)), "k": 2.0, A: 3.0}, {**problem.placed[0], A: 0.25, S: 0.5})
+    refit(problem, [FRICTION], {"k": 2.0, A: 3.0, S: 0.9})
+    # and once more where it ended, which is the same
+    assert problem.at == 2 * [{**problem.named(np.ones(5)), "k": 2.0, A: 3.0, S: 0.9}]
+
+
+@pytest.mark.parametrize(("apart", "runs"), [(0.9, 1), (1.0, 2)])
+def test_an_effect_that_takes_much_of_an_offset_is_fitted_once_more(solved, monkeypatch, apart, runs):
+    monkeypatch.setattr(module, "torques_apart", lambda before, after: apart)
+    monkeypatch.setattr(module, "_Following", lambda problem: problem)
+    refit(Problem(lambda values: 1.0), [FRICTION], {"k": 2.0, A: 3.0})
+    assert len(solved.runs) == runs
 
 
 def test_a_spread_far_beyond_what_one_would_expect_is_no_knowledge():

@@ -13,6 +13,8 @@ from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.diagnosis import diagnose
 from yid_ocp.diagnosis.diagnose import held_out_test, nominal_fit
 from yid_ocp.diagnosis.hypotheses import CandidateProblem, chosen_effects
+from yid_ocp.diagnosis.refit import refit
+from yid_ocp.diagnosis.screening import linearise
 from yid_ocp.diagnosis.smoother_model import INTERVAL, MEMORY, linear_model
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.step import Step, compile_step
@@ -98,7 +100,7 @@ def test_what_an_effect_takes_from_a_torque_its_offset_gives_back(step, held_out
     wide = made.freeing(made.effects)
     at = {"elbow.stiffness": 2.5}
     x, frozen = (wide.vector({**at, "effort_offset@shoulder.offset": value}) for value in (0.3, 0.0))
-    moved = wide.about_torques_of(x, frozen)
+    moved = wide.about_torques_at(x, frozen).held_out_about_torques_at(x, frozen)
     for before, after in (
         (wide.innovations, moved.innovations),
         (wide.held_out_innovations, moved.held_out_innovations),
@@ -141,6 +143,48 @@ def test_what_parameters_are_unsure_of_is_no_gap(step):
     test = held_out_test(replace(moved, evaluation=less))
     assert 0.8 < test.chi2_per_dof < 1.2
     assert test.p_value > 1e-3
+
+
+# -- effects that take most of a torque's error with them ------------------------------------------------------------
+
+STRONG, REST = 0.6, 2.0
+
+
+@pytest.fixture(scope="module")
+def sprung(step, urdf_folder):
+    """The pendulum with candidates, and recordings of it with a spring at the shoulder that its motor works against.
+
+    The spring's torque at rest is twelve times the offset that is stated.
+    """
+    tree = read_urdf(urdf_folder / "double_pendulum.urdf")
+    springs = {"elbow": Spring(3.0), "shoulder": Spring(STRONG)}
+    system = System.build(tree, driven=("shoulder",), springs=springs, damping={"shoulder": 0.3, "elbow": 0.05})
+    moves = compile_step(system, TIME_STEP)
+    # a spring about another angle is one about zero and a constant torque
+    files = [recorded(moves, seed, -STRONG * REST) for seed in (1, 2)]
+    problem = problem_of(step, files[:1])
+    effects = chosen_effects(step.system, files[:1], ["joint_spring@shoulder", "effort_offset@shoulder"])
+    return problem, CandidateProblem.of(problem, effects, files[1:])
+
+
+def test_a_filter_is_about_the_torque_that_is_left_beside_an_effect(sprung):
+    """Its offset as the nominal model has it, some newton metres, is no error beside the spring."""
+    problem, made = sprung
+    nominal = nominal_fit(problem, made)
+    made = replace(made, problem=nominal.problem)
+    spring, offset = (next(e for e in made.effects if e.kind == kind) for kind in ("joint_spring", "effort_offset"))
+    k, rest = "joint_spring@shoulder.stiffness", "joint_spring@shoulder.rest_angle"
+    found = refit(made, [spring], {**nominal.values, k: 0.3, rest: 1.0})
+    other = refit(made, [offset], nominal.values)
+    assert found.values[k] == pytest.approx(STRONG, abs=4 * found.std[k])
+    assert found.values[rest] == pytest.approx(REST, abs=4 * found.std[rest])
+    assert found.std[k] < 0.1 * STRONG
+    assert found.loss.mean < 1.1 < other.loss.mean
+    for whitening in (*found.problem.innovations, *found.problem.held_out_innovations):
+        assert abs(whitening.errors.offset[0]) < OFFSET
+    # and what is looked for beside it stands on the same ground
+    beside = linearise(made, [spring], found.values)
+    assert float(beside.residual @ beside.residual) < 1.2 * len(beside.residual)
 
 
 # -- torques are regressors with errors -------------------------------------------------------------------------------

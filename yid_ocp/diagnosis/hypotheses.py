@@ -216,6 +216,18 @@ class CandidateProblem:
         """The problem with the parameters of some effects free beside the nominal ones."""
         return self.problem.freeing((*self.nominal, *(name for effect in effects for name in effect.parameters.names)))
 
+    def placed(self, effects: Sequence[EffectBase], at: Mapping[str, float]) -> EstimationProblem:
+        """The problem with some effects free, its filters about the torque errors that are left beside them.
+
+        Torque offsets that the nominal model sees are too large by what an effect does.
+        """
+        own = self.freeing(effects)
+        if not own.disturbed:
+            return own
+        neutral = {name: value for effect in effects for name, value in effect.neutral.items()}
+        x, frozen = own.vector(at), own.vector({**at, **neutral})
+        return own.about_torques_at(x, frozen).held_out_about_torques_at(x, frozen)
+
 
 _JOINT: WeakKeyDictionary[Step, tuple[Step, tuple[EffectBase, ...]]] = WeakKeyDictionary()
 """The last step composed with candidates, and these: another diagnosis with the same step finds it again."""

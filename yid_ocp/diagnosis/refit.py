@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.stats import chi2
 
 from yid_ocp.diagnosis.hypotheses import CandidateProblem, describe
@@ -21,8 +21,9 @@ from yid_ocp.effects import EffectBase, Reported
 from yid_ocp.parallel import map_in_step
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
-from yid_ocp.problem.evaluation import Evaluation
+from yid_ocp.problem.evaluation import Evaluation, WarmStart
 from yid_ocp.problem.null_test import sample_times
+from yid_ocp.problem.torque_offsets import torques_apart
 from yid_ocp.problem.validation import channel_errors
 from yid_ocp.progress import Parts, Progress
 from yid_ocp.solvers import GaussNewton, Status
@@ -32,9 +33,11 @@ from yid_ocp.solvers.judgement import covariance_of_fit, judge_fit, plain_std
 Array = NDArray[np.float64]
 
 SOLVER = GaussNewton(iterations=25, step_tolerance=1e-3, cost_tolerance=1e-5)
+"""A refit starts near its end and must be good to a small part of its standard deviation, and of the `tie`, only."""
 UNTOLD = 100.0
 """A standard deviation so many times the range in which an engineer would expect a parameter tells nothing of it."""
-"""A refit starts near its end and must be good to a small part of its standard deviation, and of the `tie`, only."""
+FAR = 1.0
+"""Stated standard deviations of a torque's offset; an effect that takes more of it is fitted once more."""
 
 
 @dataclass(frozen=True)
@@ -194,9 +197,8 @@ def refit(
     known = recalled(problem, effects, store, name)
     if known is not None:
         return known
-    own = _placed(problem, effects, start)
-    best = _attempt(own, effects, start)
-    if best is not None and _half_done(own, effects, start, best[1], limits):
+    best = _attempt(problem, effects, start)
+    if best is not None and _half_done(problem, effects, start, best.finish, limits):
         # the nominal fit may have driven its parameters to where this model cannot come back from
         nominal = {*problem.nominal}
         fresh = {
@@ -204,20 +206,19 @@ def refit(
             for key, value in start.items()
             if key.split("[")[0] not in nominal and not key.startswith("start.")
         }
-        again = _attempt(own, effects, fresh) if len(fresh) < len(start) else None
-        best = again if again is not None and again[1].cost < best[1].cost else best
+        again = _attempt(problem, effects, fresh) if len(fresh) < len(start) else None
+        best = again if again is not None and again.finish.cost < best.finish.cost else best
     # those before it were found from both already
     for effect in effects[-1:]:
         moved = effect.elsewhere(start)
-        if moved is None or (best is not None and _leaves_noise(best[1], limits)):
+        if moved is None or (best is not None and _leaves_noise(best.finish, limits)):
             continue
-        there = _placed(problem, effects, {**start, **moved})
-        again = _attempt(there, effects, {**start, **moved})
-        if again is not None and (best is None or again[1].cost < best[1].cost):
-            own, best = there, again
+        again = _attempt(problem, effects, {**start, **moved})
+        if again is not None and (best is None or again.finish.cost < best.finish.cost):
+            best = again
     if best is None:
         return None
-    outcome, finish = best
+    own, outcome, finish = best.problem, best.outcome, best.finish
     covariance = refit_covariance(own, finish, limits)
     std = told(effects, own.named(plain_std(covariance, outcome.x)))
     held = told(effects, amplitude_std(own.names, effects, covariance))
@@ -228,25 +229,36 @@ def refit(
     return Fit(tuple(effects), own, values, std, held, finish.cost, finish, loss, outcome.message)
 
 
-def _placed(problem: CandidateProblem, effects: Sequence[EffectBase], start: Mapping[str, float]) -> EstimationProblem:
-    """The problem with some effects free, its weights frozen about the torques that the nominal model has.
+@dataclass(frozen=True)
+class _Attempt:
+    """Where a run ended, and the problem that it solved, its filters about the torques that are seen there."""
 
-    Torque offsets that the nominal model sees are too large by what an effect adds.
-    """
-    own = problem.freeing(effects)
-    neutral = {name: value for effect in effects for name, value in effect.neutral.items()}
-    return own.about_torques_of(own.vector(start), own.vector({**start, **neutral}))
+    problem: EstimationProblem
+    outcome: Outcome
+    finish: Evaluation
+
+
+class _Following(EstimationProblem):
+    """A problem whose filters are about the torques that are seen wherever it is evaluated."""
+
+    def __init__(self, problem: EstimationProblem) -> None:
+        vars(self).update(vars(problem))
+
+    def evaluate(self, x: ArrayLike, derivatives: bool = True, warm: WarmStart | None = None) -> Evaluation:
+        """See `EstimationProblem.evaluate`."""
+        x = np.asarray(x, float)
+        return self.about_torques_at(x, x).evaluate(x, derivatives, warm)
 
 
 def _half_done(
-    own: EstimationProblem,
+    problem: CandidateProblem,
     effects: Sequence[EffectBase],
     start: Mapping[str, float],
     finish: Evaluation,
     limits: Thresholds,
 ) -> bool:
     """Whether a refit explains much of what the model without the effects leaves, but by far not all."""
-    count = len(finish.residual)
+    own, count = problem.freeing(effects), len(finish.residual)
     neutral = {name: value for effect in effects for name, value in effect.neutral.items()}
     before = own.evaluate(own.vector({**start, **neutral}), False, finish.warm)
     if 2 * finish.cost < limits.poor * count or not before.ok:
@@ -259,18 +271,29 @@ def _leaves_noise(finish: Evaluation, limits: Thresholds) -> bool:
     return float(chi2.sf(2 * finish.cost, len(finish.residual))) >= limits.level
 
 
-def _attempt(
-    own: EstimationProblem, effects: Sequence[EffectBase], start: Mapping[str, float]
-) -> tuple[Outcome, Evaluation] | None:
-    """One run from one start and the evaluation at its end; None where the model cannot be rolled out."""
+def _attempt(problem: CandidateProblem, effects: Sequence[EffectBase], start: Mapping[str, float]) -> _Attempt | None:
+    """One run from one start; None where the model cannot be rolled out."""
     neutral = {name: value for effect in effects for name, value in effect.neutral.items()}
+    own = problem.placed(effects, start)
     for pull in (1.0, 0.5, 0.2, 0.05, 0.0):
         drawn = {name: value + pull * (start.get(name, value) - value) for name, value in neutral.items()}
         outcome = SOLVER.run(own, own.vector({**start, **drawn}), None)
         if outcome.status != Status.FAILED:
             break
-    finish = own.evaluate(outcome.x, warm=outcome.warm)
-    return (outcome, finish) if finish.ok else None
+    found = _seen(problem, effects, outcome)
+    if found is None or torques_apart(problem.problem.innovations, found.problem.innovations) < FAR:
+        return found
+    # about fixed torques a run stops where the effect and an offset that it makes superfluous hold each other
+    outcome = SOLVER.run(_Following(found.problem), outcome.x, None)
+    again = None if outcome.status == Status.FAILED else _seen(problem, effects, outcome)
+    return again if again is not None and again.finish.cost < found.finish.cost else found
+
+
+def _seen(problem: CandidateProblem, effects: Sequence[EffectBase], outcome: Outcome) -> _Attempt | None:
+    """Where a run ended, about the torques that are seen there."""
+    placed = problem.placed(effects, problem.freeing(effects).named(outcome.x))
+    finish = placed.evaluate(outcome.x, warm=outcome.warm)
+    return _Attempt(placed, outcome, finish) if finish.ok else None
 
 
 def recalled(
@@ -284,7 +307,7 @@ def recalled(
         return None
     if set(known.amplitude_std) != amplitudes:
         return None
-    own = _placed(problem, effects, known.values)
+    own = problem.placed(effects, known.values)
     x = own.vector(known.values)
     finish = own.evaluate(x)
     if not finish.ok:

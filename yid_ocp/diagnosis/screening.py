@@ -156,14 +156,14 @@ def linearise(
     grids = {effect.label: shape_grid(effect, grid) for effect in others}
     own = [name for effect in base for name in effect.parameters.names]
     residual, basis = np.zeros(0), np.zeros((0, 0))
-    series = residual_series(problem.problem)
+    placed, series = problem.placed(base, values), residual_series(problem.problem)
     warm = None
     signatures: list[Signature] = []
     for k in range(max((len(g) for g in grids.values()), default=0)):
         chosen = [effect for effect in others if k < len(grids[effect.label])]
         shape = {name: value for effect in chosen for name, value in grids[effect.label][k].items()}
         amplitudes = [name for effect in chosen for name in effect.amplitudes]
-        trial = problem.problem.freeing((*problem.nominal, *own, *amplitudes)).at(shape)
+        trial = placed.freeing((*problem.nominal, *own, *amplitudes)).at(shape)
         evaluation = trial.evaluate(trial.vector(values), warm=warm)
         if not evaluation.ok or evaluation.jacobian is None:
             raise SolverError(f"the model cannot be linearised: {evaluation.message}", where="diagnosis")

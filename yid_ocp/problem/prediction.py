@@ -378,25 +378,6 @@ class Predictor:
         through = self.inputs(none, theta, ()).torque - self.inputs(without, theta, ()).torque
         return replace(errors, read=read, through=through)
 
-    def about_torques(
-        self, episode: Episode, whitening: Innovations | None, theta: Array, frozen: Array
-    ) -> tuple[Episode, Innovations | None]:
-        """An episode and its filter about another torque offset, so that the torques stay what they are on average.
-
-        Parameters
-        ----------
-        episode : Episode
-        whitening : Innovations or None
-            Frozen at parameters that correct torques like `frozen`; it is kept but for its offset.
-        theta, frozen : ndarray, shape (ntheta,)
-        """
-        if episode.errors is None or whitening is None:
-            return episode, whitening
-        now, before = (self.inputs(episode, self.own_theta(episode, t), ()).torque for t in (theta, frozen))
-        offset = episode.errors.offset + np.mean(now - before, axis=0)
-        errors = replace(episode.errors, offset=offset)
-        return replace(episode, errors=errors), replace(whitening, errors=errors)
-
     def torque_offset(self, episode: Episode, result: EpisodeResult, whitening: Innovations) -> Array:
         """Constant error of every driven joint's torque, as all measurements of an episode have it, (nu,) [N m]."""
         return whitening.whitened(_plain(episode, result)[:, None], result.push)[1][:, 0]

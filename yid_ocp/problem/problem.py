@@ -26,6 +26,7 @@ from yid_ocp.problem.outcome import EpisodeResult, Start
 from yid_ocp.problem.prediction import Predictor
 from yid_ocp.problem.preparation import prepared
 from yid_ocp.problem.simulated import simulated
+from yid_ocp.problem.torque_offsets import filters_about, with_errors
 from yid_ocp.problem.unknowns import (
     Unknowns,
     check_bounds,
@@ -283,9 +284,8 @@ class EstimationProblem(Shown):
             `ok` is False, with the reason, where an equilibrium or a rollout failed.
         """
         x = np.asarray(x, float)
-        guesses = warm or (None,) * len(self.episodes)
-
-        asked = [(e, *self.split(x, i), guess) for i, (e, guess) in enumerate(zip(self.episodes, guesses, strict=True))]
+        pairs = zip(self.episodes, warm or (None,) * len(self.episodes), strict=True)
+        asked = [(e, *self.split(x, i), guess) for i, (e, guess) in enumerate(pairs)]
         results = self.predictor.run_all(asked, derivatives)
         failures = [result for result in results if isinstance(result, str)]
         if failures:
@@ -314,12 +314,12 @@ class EstimationProblem(Shown):
         """
         x = np.asarray(x, float)
         found: list[tuple[Array, Array] | None] = []
-        for i, whitening in enumerate(self.innovations):
-            result = "" if whitening is None else self.predictor.run(self.episodes[i], *self.split(x, i), False)
+        for i, (episode, whitening) in enumerate(zip(self.episodes, self.innovations, strict=True)):
+            result = "" if whitening is None else self.predictor.run(episode, *self.split(x, i), False)
             if whitening is None or isinstance(result, str):
                 found.append(None)
-                continue
-            found.append((self.predictor.torque_offset(self.episodes[i], result, whitening), whitening.bias_std))
+            else:
+                found.append((self.predictor.torque_offset(episode, result, whitening), whitening.bias_std))
         return found
 
     def gradient(
@@ -536,9 +536,8 @@ class EstimationProblem(Shown):
 
         One that cannot be rolled out keeps its sensors' weights.
         """
-        x = np.asarray(x, float)
+        x, episodes, made = np.asarray(x, float), [], []
         theta = self._held_out_theta(x)
-        episodes, made = [], []
         for held in self.held_out:
             episode, whitening = self._held_out_episode(held, theta), None
             offset = self._held_out_offset(episode, theta, x)
@@ -548,18 +547,19 @@ class EstimationProblem(Shown):
             made.append(whitening)
         return self._changed(held_out=tuple(episodes), held_out_innovations=tuple(made))
 
-    def about_torques_of(self, x: Array, frozen: Array) -> EstimationProblem:
-        """The same problem, its filters about torque offsets that leave the torques at `x` what they were at `frozen`.
+    def about_torques_at(self, x: Array, frozen: Array) -> EstimationProblem:
+        """The same problem, its filters about the torques that measurements see at `x`; now they are so at `frozen`."""
+        at = [(e, *self.split(x, i), self.split(frozen, i)[0]) for i, e in enumerate(self.episodes)]
+        made = filters_about(self.predictor, self.innovations, at)
+        return self._changed(episodes=with_errors(self.episodes, made), innovations=made)
 
-        What an effect adds to a torque, its offset no longer has to.
-        """
-        about = self.predictor.about_torques
-        own = zip(self.episodes, self.innovations, strict=True)
-        others = zip(self.held_out, self.held_out_innovations, strict=True)
-        fitted = [about(e, w, self.split(x, i)[0], self.split(frozen, i)[0]) for i, (e, w) in enumerate(own)]
-        held = [about(e, w, self._held_out_theta(x), self._held_out_theta(frozen)) for e, w in others]
-        (episodes, made), (held_out, there) = (tuple(zip(*p, strict=True)) or ((), ()) for p in (fitted, held))
-        return self._changed(episodes=episodes, innovations=made, held_out=held_out, held_out_innovations=there)
+    def held_out_about_torques_at(self, x: Array, frozen: Array) -> EstimationProblem:
+        """The same problem with the filters of held-out recordings about the torques seen at `x` as well."""
+        theta, before = self._held_out_theta(x), self._held_out_theta(frozen)
+        own = (self._held_out_episode(e, theta) for e in self.held_out)
+        at = [(e, theta, self._held_out_offset(e, theta, x), before) for e in own]
+        made = filters_about(self.predictor, self.held_out_innovations, at)
+        return self._changed(held_out=with_errors(self.held_out, made), held_out_innovations=made)
 
     def held_out_rows(self, i: int, episode: Episode, result: EpisodeResult) -> Rows:
         """Residual of a held-out recording, from its place and what `validate` says of it.
