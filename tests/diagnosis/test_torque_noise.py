@@ -184,7 +184,7 @@ def test_a_filter_is_about_the_torque_that_is_left_beside_an_effect(sprung):
         assert abs(whitening.errors.offset[0]) < OFFSET
     # and what is looked for beside it stands on the same ground
     beside = linearise(made, [spring], found.values)
-    assert float(beside.residual @ beside.residual) < 1.2 * len(beside.residual)
+    assert 0.95 < float(beside.residual @ beside.residual) / (2 * found.cost) < 1.001
 
 
 # -- torques are regressors with errors -------------------------------------------------------------------------------
