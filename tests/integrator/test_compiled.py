@@ -91,8 +91,9 @@ def test_a_rollout_beyond_all_memory(urdf_folder, use_compiler):
 
 @needs_compiler
 @pytest.mark.parametrize("rows", [0, 1, 2])
-def test_derivatives_of_other_equations_are_refused(step, monkeypatch, rows):
+def test_derivatives_of_other_equations_are_refused(step, monkeypatch, tmp_path, rows):
     """The kernel adds them row by row without looking; a number of rows that does not fit is found before."""
+    monkeypatch.setenv("YID_OCP_CACHE", str(tmp_path))
     original = codegen.theta_function
 
     def cut(equations, names):
@@ -110,3 +111,44 @@ def test_derivatives_of_other_equations_are_refused(step, monkeypatch, rows):
 def test_fewer_directions_than_parameters_are_refused():
     with pytest.raises(ModelError, match="1 directions for 2 parameters"):
         Directions(("a", "b"), np.zeros((4, 1)))
+
+
+@needs_compiler
+def test_derivatives_that_the_cache_has_are_not_derived_again(parts, urdf_folder, monkeypatch, tmp_path):
+    monkeypatch.setenv("YID_OCP_CACHE", str(tmp_path))
+    names = ("spin.mass", "hinge.damping")
+
+    def swept(wanted):
+        case = parts.make_case(*parts.closed_loop(urdf_folder))
+        directions = Directions(wanted, np.zeros((case.step.sizes["nx"], len(wanted))))
+        return case.rollout(directions=directions).by_state
+
+    first, turned = swept(names), swept(names[::-1])
+    np.testing.assert_array_equal(turned, first[:, :, ::-1])
+
+    def derive(*_):
+        raise AssertionError("derived again")
+
+    monkeypatch.setattr(codegen, "theta_function", derive)
+    np.testing.assert_array_equal(swept(names), first)
+    with pytest.raises(AssertionError, match="derived again"):
+        swept(("spin.mass",))
+
+
+@needs_compiler
+def test_derivatives_are_those_of_their_own_equations(parts, urdf_folder, monkeypatch, tmp_path):
+    """Two systems whose parameters have the same names and places, and other equations."""
+    tree = read_urdf(urdf_folder / "double_pendulum.urdf")
+
+    def swept(split, cache):
+        monkeypatch.setenv("YID_OCP_CACHE", str(tmp_path / cache))
+        system = System.build(tree, driven=("shoulder",), damping={"shoulder": 0.3, "elbow": 0.1})
+        made = compile_step(system, 1e-2, force_split=split)
+        directions = Directions(("elbow.damping",), np.zeros((made.sizes["nx"], 1)))
+        start = np.concatenate([[0.4, -0.3], np.zeros(made.sizes["nx"] - 2)])
+        given = system.parameters.vector(), start, np.full((20, 1), 0.7), np.zeros((21, 0))
+        return made.kernel.rollout(*given, None, directions).by_state
+
+    together = [swept(split, "one") for split in ("left", "symmetric")]
+    for split, found in zip(("left", "symmetric"), together, strict=True):
+        np.testing.assert_array_equal(found, swept(split, f"that of {split}"))

@@ -57,7 +57,8 @@ def assert_same(one, other):
             np.testing.assert_array_equal(a, b)
 
 
-def test_rollouts_adjoints_and_linearizations(parts, urdf_folder, monkeypatch, use_compiler):
+def test_rollouts_adjoints_and_linearizations(parts, urdf_folder, monkeypatch, tmp_path, use_compiler):
+    monkeypatch.setenv("YID_OCP_CACHE", str(tmp_path))
     case = parts.make_case(*parts.closed_loop(urdf_folder), steps=40)
     system = case.step.system
     names = tuple(system.parameters.names[::2])

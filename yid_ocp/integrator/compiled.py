@@ -5,12 +5,15 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TypeVar
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.errors import ModelError
+from yid_ocp.files import file_sha256
 from yid_ocp.integrator import codegen, compiler
 from yid_ocp.integrator.step_model import (
     ITERATION_LIMIT,
@@ -158,7 +161,9 @@ class CompiledKernel:
         self._library = library
         self._wished = 0  # steps for which a batch would have been the better way
         self._batched: Once[None, tuple[ctypes.CDLL, int] | None] = Once(lambda _: _batched_library(model))
-        self._theta_columns: Once[tuple[str, ...], _ThetaColumns] = Once(lambda names: _theta_columns(model, names))
+        self._theta_columns: Once[tuple[str, ...], _ThetaColumns] = Once(
+            lambda names: _theta_columns(model, library, names)
+        )
 
     def of(self, model: StepModel) -> CompiledKernel:
         """See `Kernel.of`."""
@@ -395,17 +400,28 @@ def _batched_library(model: StepModel) -> tuple[ctypes.CDLL, int] | None:
     return None if library is None or not count else (library, count)
 
 
-def _theta_columns(model: StepModel, names: tuple[str, ...]) -> _ThetaColumns:
-    """Compile the derivatives by some parameters and make sure that they fit the kernel, which does not look."""
-    function = codegen.theta_function(model.equations, names)
+def _theta_columns(model: StepModel, kernel: ctypes.CDLL, names: tuple[str, ...]) -> _ThetaColumns:
+    """Compile the derivatives by some parameters and make sure that they fit the kernel, which does not look.
+
+    They follow from the kernel's equations and the places of the parameters: to differentiate again what is in the
+    cache takes longer than all that a diagnosis does with it.
+    """
+
+    def source() -> str:
+        function = codegen.theta_function(model.equations, names)
+        return codegen.functions_source(function.name(), (function,))
+
+    places = [str(model.system.parameters.index(name)) for name in names]
+    told = "\0".join([file_sha256(Path(codegen.__file__)), Path(kernel._name).name, *places])
+    library = compiler.compile_library(told, source)
+    if library is None:
+        raise ModelError("the compiler worked for the step but not for its derivatives", hint="set CC=none")
+    function = ca.external("by_theta", library._name)
     sizes = model.sizes
     rows = (sizes["n"] + sizes["nz"] + sizes["m"], sizes["n"], sizes["nc"])
     shapes = [function.size_out(i) for i in range(function.n_out())]
     if shapes != [(count, len(names)) for count in rows]:
         raise ValueError(f"derivatives by {len(names)} parameters have the shapes {shapes}, not the rows {rows}")
-    library = compiler.compile_library(codegen.functions_source(function.name(), (function,)))
-    if library is None:
-        raise ModelError("the compiler worked for the step but not for its derivatives", hint="set CC=none")
     address = ctypes.cast(library.by_theta, ctypes.c_void_p).value
     assert address is not None
     patterns = (function.sparsity_out(i) for i in range(function.n_out()))

@@ -13,6 +13,7 @@ import shutil
 import stat
 import subprocess
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import casadi as ca
@@ -117,15 +118,18 @@ def _machine() -> str:
     return f"{version}|{platform.system()}|{processor}"
 
 
-def compile_library(source: str) -> ctypes.CDLL | None:
+def compile_library(source: str, make: Callable[[], str] | None = None) -> ctypes.CDLL | None:
     """Shared library of a C source, from the cache where it is there; None where nothing can compile it.
 
     Parameters
     ----------
     source : str
-        C text. The cache key is the hash of this text, the flags, the compiler, the processor and CasADi's version.
+        C text, or what it follows from. The cache key is the hash of this text, the flags, the compiler, the processor
+        and CasADi's version.
+    make : callable, optional
+        Makes the C text where `source` is not it; asked only where the library is not in the cache.
     """
-    target = _library_file(source, LEVEL)
+    target = _library_file(source, LEVEL, make)
     if target is None:
         return None
     try:
@@ -155,7 +159,7 @@ def compiled_function(function: ca.Function) -> ca.Function:
         return function
 
 
-def _library_file(source: str, level: str) -> Path | None:
+def _library_file(source: str, level: str, make: Callable[[], str] | None = None) -> Path | None:
     """The library in the cache, compiled if it is not there yet; None where nothing can compile it."""
     path = compiler()
     if path is None:
@@ -172,7 +176,9 @@ def _library_file(source: str, level: str) -> Path | None:
     try:
         with tempfile.TemporaryDirectory(dir=folder) as work:
             text, built = Path(work) / "source.c", Path(work) / "library.so"
-            text.write_text(f"{source}\nint {MARK}(void) {{ return 1; }}\n", encoding="utf-8")
+            text.write_text(
+                f"{source if make is None else make()}\nint {MARK}(void) {{ return 1; }}\n", encoding="utf-8"
+            )
             for told in ((*flags, *NATIVE), flags):
                 good, said = _said([path, level, *told, str(text), "-o", str(built), "-lm"], PATIENCE)
                 if good and _is_ours(built):
