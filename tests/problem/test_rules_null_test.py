@@ -118,6 +118,13 @@ def test_what_no_other_error_could_have_done_is_left_as_it_is():
     np.testing.assert_allclose(found, [3.0 / math.sqrt(5.0), 5.0, -7.0])
 
 
+def test_a_column_that_overflowed_says_nothing():
+    spread = np.array([[2.0, math.inf], [0.0, 1.0]])
+    found = whitened_beside(np.array([3.0, 5.0]), spread)
+    np.testing.assert_allclose(found, whitened_beside(np.array([3.0, 5.0]), spread[:, :1]))
+    np.testing.assert_array_equal(whitened_beside(np.array([3.0]), np.array([[math.nan]])), [3.0])
+
+
 def test_predictions_by_what_was_estimated_are_noise_in_units_of_their_own():
     """Straight lines through a few points, and points far beyond them: the plain residual is twenty times noise."""
     rng, near, far = np.random.default_rng(1), np.linspace(0.0, 1.0, 12), np.linspace(4.0, 6.0, 40)

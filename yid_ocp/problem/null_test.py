@@ -202,8 +202,10 @@ def whitened_beside(residual: Array, spread: Array) -> Array:
     residual : ndarray, shape (nr,)
         In units of its noise.
     spread : ndarray, shape (nr, k)
-        F: what one standard deviation of each of k independent errors does to it.
+        F: what one standard deviation of each of k independent errors does to it; a column that overflowed says
+        nothing.
     """
+    spread = spread[:, np.isfinite(spread).all(axis=0)]
     columns, sizes, _ = np.linalg.svd(spread, full_matrices=False)
     return np.asarray(residual + columns @ ((1 / np.hypot(1.0, sizes) - 1) * (columns.T @ residual)))
 
