@@ -239,15 +239,17 @@ class _Attempt:
 
 
 class _Following(EstimationProblem):
-    """A problem whose filters are about the torques that are seen wherever it is evaluated."""
+    """A problem whose filters are about the torques that are seen wherever it is evaluated, from the last place on."""
 
     def __init__(self, problem: EstimationProblem) -> None:
         vars(self).update(vars(problem))
+        self._last = problem
 
     def evaluate(self, x: ArrayLike, derivatives: bool = True, warm: WarmStart | None = None) -> Evaluation:
         """See `EstimationProblem.evaluate`."""
         x = np.asarray(x, float)
-        return self.about_torques_at(x, x).evaluate(x, derivatives, warm)
+        self._last = self._last.about_torques_at(x, x)
+        return self._last.evaluate(x, derivatives, warm)
 
 
 def _half_done(
@@ -281,7 +283,8 @@ def _attempt(problem: CandidateProblem, effects: Sequence[EffectBase], start: Ma
         if outcome.status != Status.FAILED:
             break
     found = _seen(problem, effects, outcome)
-    if found is None or torques_apart(problem.problem.innovations, found.problem.innovations) < FAR:
+    # without effects all weights are frozen anew where it ends
+    if found is None or not effects or torques_apart(problem.problem.innovations, found.problem.innovations) < FAR:
         return found
     # about fixed torques a run stops where the effect and an offset that it makes superfluous hold each other
     outcome = SOLVER.run(_Following(found.problem), outcome.x, None)
