@@ -39,7 +39,7 @@ class Problem:
 
     def __init__(self, cost, rows=10, names=("k", "k[run]", "start.q.k[run]", A, S)):
         self.cost, self.rows, self.names, self.nominal = cost, rows, names, ("k",)
-        self.asked, self.warmed, self.at = [], [], []
+        self.asked, self.warmed, self.at, self.foreseen = [], [], [], []
         self.freed, self.innovations = None, ()
 
     @property
@@ -53,6 +53,11 @@ class Problem:
     def placed(self, effects, at):
         self.at.append(self.named(self.vector(at)))
         return self.freeing(effects)
+
+    def held_out_placed(self, own, effects, at):
+        assert own is self
+        self.foreseen.append(dict(at))
+        return self
 
     def vector(self, values):
         return np.array([values.get(name, 1.0) for name in self.names])
@@ -106,6 +111,15 @@ def test_filters_are_about_the_torques_that_are_seen_at_the_start(solved):
     refit(problem, [FRICTION], {"k": 2.0, A: 3.0, S: 0.9})
     # and once more where it ended, which is the same
     assert problem.at == 2 * [{**problem.named(np.ones(5)), "k": 2.0, A: 3.0, S: 0.9}]
+
+
+def test_held_out_recordings_are_seen_about_the_torques_where_the_best_of_all_runs_ended(solved):
+    problem, memory = fitting(good=7.0), Memory()
+    found = refit(problem, [FRICTION], START, memory)
+    assert len(solved.runs) == 2
+    assert problem.foreseen == solved.losses == [found.values]
+    recalled(problem, [FRICTION], memory)
+    assert problem.foreseen == solved.losses == 2 * [found.values]
 
 
 @pytest.mark.parametrize(("apart", "runs"), [(0.9, 1), (1.0, 2)])

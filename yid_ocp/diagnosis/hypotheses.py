@@ -219,14 +219,23 @@ class CandidateProblem:
     def placed(self, effects: Sequence[EffectBase], at: Mapping[str, float]) -> EstimationProblem:
         """The problem with some effects free, its filters about the torque errors that are left beside them.
 
-        Torque offsets that the nominal model sees are too large by what an effect does.
+        Torque offsets that the nominal model sees are too large by what an effect does. Filters of held-out recordings
+        are left as they are: see `held_out_placed`.
         """
         own = self.freeing(effects)
-        if not own.disturbed:
-            return own
-        neutral = {name: value for effect in effects for name, value in effect.neutral.items()}
-        x, frozen = own.vector(at), own.vector({**at, **neutral})
-        return own.about_torques_at(x, frozen).held_out_about_torques_at(x, frozen)
+        return own.about_torques_at(*_beside(own, effects, at)) if own.disturbed else own
+
+    def held_out_placed(
+        self, own: EstimationProblem, effects: Sequence[EffectBase], at: Mapping[str, float]
+    ) -> EstimationProblem:
+        """A problem that is `placed`, its filters of held-out recordings too: once, where a fit has ended."""
+        return own.held_out_about_torques_at(*_beside(own, effects, at)) if own.disturbed else own
+
+
+def _beside(own: EstimationProblem, effects: Sequence[EffectBase], at: Mapping[str, float]) -> tuple[Array, Array]:
+    """Unknowns at some values, and with neutral effects, where filters are about the right torques."""
+    neutral = {name: value for effect in effects for name, value in effect.neutral.items()}
+    return own.vector(at), own.vector({**at, **neutral})
 
 
 _JOINT: WeakKeyDictionary[Step, tuple[Step, tuple[EffectBase, ...]]] = WeakKeyDictionary()

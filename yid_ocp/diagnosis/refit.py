@@ -218,12 +218,13 @@ def refit(
             best = again
     if best is None:
         return None
-    own, outcome, finish = best.problem, best.outcome, best.finish
+    outcome, finish = best.outcome, best.finish
+    values = best.problem.named(outcome.x)
+    own = problem.held_out_placed(best.problem, effects, values)
     covariance = refit_covariance(own, finish, limits)
     std = told(effects, own.named(plain_std(covariance, outcome.x)))
     held = told(effects, amplitude_std(own.names, effects, covariance))
     loss = held_out_loss(own, outcome.x)
-    values = own.named(outcome.x)
     if store is not None:
         store.put(name or describe(effects), Refitted(values, std, held, outcome.message))
     return Fit(tuple(effects), own, values, std, held, finish.cost, finish, loss, outcome.message)
@@ -315,6 +316,7 @@ def recalled(
     finish = own.evaluate(x)
     if not finish.ok:
         return None
+    own = problem.held_out_placed(own, effects, known.values)
     loss = held_out_loss(own, x)
     spread = known.std, known.amplitude_std
     return Fit(tuple(effects), own, known.values, *spread, finish.cost, finish, loss, known.message, True)
