@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import shutil
 import subprocess
 from dataclasses import replace
@@ -12,7 +13,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from yid_ocp.integrator import compiled, compiler
+from yid_ocp.integrator import codegen, compiled, compiler, lane_functions
 from yid_ocp.integrator.lane_functions import lane_functions_source
 from yid_ocp.integrator.step_model import Directions, Feedback, Member
 
@@ -151,14 +152,14 @@ def test_few_members_do_not_ask_for_a_batch(parts, urdf_folder, monkeypatch):
 DRIVER = """
 void yid_try(const double *in, double *out, int count) {
     for (int first = 0; first < count; first += LANES) {
-        real x[2], y[OUTPUTS];
+        real x[2], y[OUTPUTS], w[PLACES];
         const real *arg[1] = {x};
         real *res[1] = {y};
         for (int lane = 0; lane < LANES; lane++)
-            for (int i = 0; i < 2; i++) x[i][lane] = in[2 * (first + lane) + i];
-        everything(arg, res, 0, 0, 0);
+            for (int i = 0; i < 2; i++) LANE(x[i], lane) = in[2 * (first + lane) + i];
+        everything(arg, res, 0, w, 0);
         for (int lane = 0; lane < LANES; lane++)
-            for (int o = 0; o < OUTPUTS; o++) out[OUTPUTS * (first + lane) + o] = y[o][lane];
+            for (int o = 0; o < OUTPUTS; o++) out[OUTPUTS * (first + lane) + o] = LANE(y[o], lane);
     }
 }
 """
@@ -185,12 +186,13 @@ MACHINES = {
 }
 
 
-def arithmetic_source(function):
-    """C source of a function of two numbers for members that march together, with what tries it."""
+def arithmetic_source(function, batched=True):
+    """C source of a function of two numbers, for members that march together or for one, with what tries it."""
     body = lane_functions_source([function])
     assert body is not None
     arithmetic = resources.files("yid_ocp.integrator").joinpath("lanes.c").read_text(encoding="utf-8")
-    return f"#define BATCHED\n#define OUTPUTS {function.numel_out(0)}\n{arithmetic}\n{body}\n{DRIVER}"
+    sizes = f"#define OUTPUTS {function.numel_out(0)}\n#define PLACES {function.sz_w()}"
+    return f"{'#define BATCHED' if batched else ''}\n{sizes}\n{arithmetic}\n{body}\n{DRIVER}"
 
 
 def tried_points():
@@ -223,6 +225,36 @@ def test_arithmetic_of_lanes_is_that_of_one(monkeypatch, machine, program):
     found = np.zeros((len(points), function.numel_out(0)))
     library.yid_try(ctypes.c_void_p(points.ctypes.data), ctypes.c_void_p(found.ctypes.data), len(points))
     assert_those_of_casadi(found, function, points, 1e-13)
+
+
+@pytest.mark.parametrize("size", [1, 7, 40])
+@pytest.mark.parametrize("batched", [True, False], ids=["many", "one"])
+def test_a_long_function_in_parts_is_the_same(monkeypatch, batched, size):
+    function, points = everything(), tried_points()
+    monkeypatch.setattr(lane_functions, "LONG", 20)
+    monkeypatch.setattr(lane_functions, "PART", size)
+    source = arithmetic_source(function, batched)
+    assert source.count("noinline") == math.ceil(function.n_instructions() / size)
+    library = compiler.compile_library(source)
+    if batched and not library.yid_lanes():
+        pytest.skip("this machine has no vectors")
+    found = np.zeros((len(points), function.numel_out(0)))
+    library.yid_try(ctypes.c_void_p(points.ctypes.data), ctypes.c_void_p(found.ctypes.data), len(points))
+    assert_those_of_casadi(found, function, points, 1e-13)
+
+
+@pytest.mark.parametrize("name", ["closed_loop", "relaxing_cable"])
+def test_a_step_of_long_functions_is_the_same(parts, urdf_folder, monkeypatch, name):
+    case = parts.builders[name](urdf_folder)
+    members = members_of(case)
+    monkeypatch.setattr(lane_functions, "LONG", 100)
+    monkeypatch.setattr(lane_functions, "PART", 30)
+    model = case.step.model
+    text = codegen.kernel_source(model.functions, model.structure)
+    assert "linear_3(" in text and "casadi_f0" in text  # the short ones are CasADi's own
+    kernel = compiled.CompiledKernel(model, compiler.compile_library(text))
+    for member, found in zip(members, kernel.rollouts(members), strict=True):
+        assert_same(found, alone(case, member), TOLERANCE)
 
 
 MAIN = """

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.integrator.discrete import DiscreteEquations
-from yid_ocp.integrator.lane_functions import lane_functions_source
+from yid_ocp.integrator.lane_functions import is_long, lane_functions_source
 
 Indices = NDArray[np.int32]
 
@@ -305,7 +305,7 @@ def kernel_source(functions: StepFunctions, tables: Structure, batched: bool = F
         row, column = triplet(patterns[key])
         table(f"{key}_row", row)
         table(f"{key}_col", column)
-    made = lane_functions_source(functions.all) if batched else functions_source("step", functions.all)
+    made = lane_functions_source(functions.all) if batched else _step_source(functions.all)
     if made is None:
         return None
     arithmetic, kernel = (
@@ -313,6 +313,16 @@ def kernel_source(functions: StepFunctions, tables: Structure, batched: bool = F
         for name in ("lanes.c", "kernel.c")
     )
     return "\n".join(["#define BATCHED" if batched else "", arithmetic, made, *lines, kernel])
+
+
+def _step_source(functions: Sequence[ca.Function]) -> str:
+    """C source of a step's functions: CasADi's own, but for long ones, which no compiler takes whole."""
+    long = [function for function in functions if is_long(function)]
+    ours = lane_functions_source(long)
+    if not long or ours is None:
+        return functions_source("step", functions)
+    short = [function for function in functions if not is_long(function)]
+    return "\n".join([functions_source("step", short), ours])
 
 
 def functions_source(name: str, functions: Sequence[ca.Function]) -> str:

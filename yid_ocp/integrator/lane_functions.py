@@ -1,8 +1,9 @@
-"""C source of CasADi functions in the arithmetic of `lanes.c`, several members at once."""
+"""C source of CasADi functions in the arithmetic of `lanes.c`: for several members at once, and for long functions."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import casadi as ca
 
@@ -62,6 +63,18 @@ _FORMS = {
     **{code: f"each_pair({name}, {{0}}, {{1}})" for code, name in _TWO.items()},
 }
 _TURNS = {ca.OP_SIN: "sine", ca.OP_COS: "cosine"}
+_KNOWN = {ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST, *_FORMS, *_TURNS}
+
+
+LONG = 80_000
+"""Instructions of a function beyond which it is written in parts: a compiler's time and memory grow faster than it."""
+PART = 300
+"""Of 300 instructions a step of 151 variables compiles in half the time that one of 4000 takes, and runs as fast."""
+
+
+def is_long(function: ca.Function) -> bool:
+    """Whether a function is written in parts."""
+    return int(function.n_instructions()) > LONG
 
 
 def lane_functions_source(functions: Sequence[ca.Function]) -> str | None:
@@ -70,40 +83,92 @@ def lane_functions_source(functions: Sequence[ca.Function]) -> str | None:
     Parameters
     ----------
     functions : sequence of casadi.Function
-        All their arguments and results are there whenever they are called.
+        All their arguments and results are there whenever they are called. A long one is written as functions of
+        `PART` instructions, which hand on what later ones need in the work vector.
     """
     sources = [_source(function) for function in functions]
     return None if None in sources else "\n".join(source for source in sources if source is not None)
 
 
+@dataclass(frozen=True)
+class _Instruction:
+    code: int
+    inputs: list[int]  # places of CasADi's work vector, but for those of an argument
+    outputs: list[int]
+    constant: float
+
+
 def _source(function: ca.Function) -> str | None:
-    lines = [f"static void {function.name()}(const real **arg, real **res, long long *iw, real *w, int mem) {{"]
-    value: dict[int, str] = {}  # what stands in a place of CasADi's work vector now
-    turned: dict[str, str] = {}  # sine and cosine of a value are worked out together
-    for k in range(function.n_instructions()):
-        code, inputs, outputs = (
+    instructions = [
+        _Instruction(
             function.instruction_id(k),
             function.instruction_input(k),
             function.instruction_output(k),
+            function.instruction_constant(k) if function.instruction_id(k) == ca.OP_CONST else 0.0,
         )
+        for k in range(function.n_instructions())
+    ]
+    if any(instruction.code not in _KNOWN for instruction in instructions):
+        return None
+    size = PART if is_long(function) else max(len(instructions), 1)
+    held: dict[int, int] = {}  # the instruction whose value stands in a place now
+    needed = [0] * len(instructions)  # the last part that needs its value
+    for k, instruction in enumerate(instructions):
+        for place in instruction.inputs if instruction.code != ca.OP_INPUT else ():
+            needed[held[place]] = k // size
+        if instruction.code != ca.OP_OUTPUT:
+            held[instruction.outputs[0]] = k
+    held.clear()
+    signature, name = "const real **arg, real **res, long long *iw, real *restrict w, int mem", function.name()
+    firsts = range(0, max(len(instructions), 1), size)
+    parts = [_part(instructions, first, size, held, needed) for first in firsts]
+    if len(parts) == 1:
+        return "\n".join([f"static void {name}({signature}) {{", *parts[0], "}"])
+    written = [
+        "\n".join([f"static __attribute__((noinline)) void {name}_{i}({signature}) {{", *lines, "}"])
+        for i, lines in enumerate(parts)
+    ]
+    calls = [f"{name}_{i}(arg, res, iw, w, mem);" for i in range(len(parts))]
+    return "\n".join([*written, f"static void {name}({signature}) {{", *calls, "}"])
+
+
+def _part(
+    instructions: Sequence[_Instruction], first: int, size: int, held: dict[int, int], needed: Sequence[int]
+) -> list[str]:
+    """Some instructions, each value a constant of its own; `held` is carried on."""
+    lines: list[str] = []
+    known: dict[int, str] = {}  # values of this part, and those that it has read from the work vector
+    turned: dict[int, str] = {}  # sine and cosine of a value are worked out together
+
+    def value(place: int) -> str:
+        of = held[place]
+        if of not in known:
+            known[of] = f"v{of}"
+            lines.append(f"const real v{of} = w[{place}];")
+        return known[of]
+
+    for k, told in enumerate(instructions[first : first + size], first):
         name = f"v{k}"
-        if code == ca.OP_OUTPUT:
-            lines.append(f"res[{outputs[0]}][{outputs[1]}] = {value[inputs[0]]};")
+        if told.code == ca.OP_OUTPUT:
+            result = value(told.inputs[0])
+            lines.append(f"res[{told.outputs[0]}][{told.outputs[1]}] = {result};")
             continue
-        if code == ca.OP_CONST:
-            constant = repr(function.instruction_constant(k)).replace("inf", "INFINITY").replace("nan", "NAN")
+        if told.code == ca.OP_CONST:
+            constant = repr(told.constant).replace("inf", "INFINITY").replace("nan", "NAN")
             lines.append(f"const real {name} = ALL({constant});")
-        elif code == ca.OP_INPUT:
-            lines.append(f"const real {name} = arg[{inputs[0]}][{inputs[1]}];")
-        elif code in _TURNS:
-            angle = value[inputs[0]]
-            if angle not in turned:
-                turned[angle] = f"t{k}"
+        elif told.code == ca.OP_INPUT:
+            lines.append(f"const real {name} = arg[{told.inputs[0]}][{told.inputs[1]}];")
+        elif told.code in _TURNS:
+            of, angle = held[told.inputs[0]], value(told.inputs[0])
+            if of not in turned:
+                turned[of] = f"t{k}"
                 lines.append(f"const Turn t{k} = turn({angle});")
-            name = f"{turned[angle]}.{_TURNS[code]}"
-        elif code in _FORMS:
-            lines.append(f"const real {name} = {_FORMS[code].format(*(value[i] for i in inputs))};")
+            name = f"{turned[of]}.{_TURNS[told.code]}"
         else:
-            return None
-        value[outputs[0]] = name
-    return "\n".join([*lines, "}"])
+            operands = [value(place) for place in told.inputs]
+            lines.append(f"const real {name} = {_FORMS[told.code].format(*operands)};")
+        known[k] = name
+        held[told.outputs[0]] = k
+    part = first // size
+    kept = sorted((place, k) for place, k in held.items() if k >= first and needed[k] > part)
+    return [*lines, *(f"w[{place}] = {known[k]};" for place, k in kept)]

@@ -16,6 +16,7 @@ typedef long long whole;
 #define NOT(m) (!(m))
 #define ONES(m) (m)
 #define LANE(x, lane) (x)
+#define ALL(x) (x)
 #define SIMD _Pragma("omp simd")
 #define SIMD_SUM _Pragma("omp simd reduction(- : sum)")
 static inline int any(mask m) { return m; }
@@ -47,33 +48,39 @@ static inline int any(mask m) {
 }
 static inline real choose(mask m, real a, real b) { return (real)(((mask)a & m) | ((mask)b & ~m)); }
 static inline real magnitude(real x) { return (real)((mask)x & (mask)ALL(0x7fffffffffffffff)); }
+#endif
 
-/* What the generated functions use, beside operators. */
+/* What our functions use, beside operators (lane_functions.py). */
 static inline real truth(mask m) { return choose(m, (real)ALL(1.0), (real)ALL(0.0)); }
 static inline real lesser(real a, real b) { return choose((a < b) | (b != b), a, b); }
 static inline real larger(real a, real b) { return choose((a > b) | (b != b), a, b); }
 static inline real sign_of(real x) { return choose(x < 0, (real)ALL(-1.0), choose(x > 0, (real)ALL(1.0), x)); }
 static real each(double (*function)(double), real x) {
-    for (int lane = 0; lane < LANES; lane++) x[lane] = function(x[lane]);
+    for (int lane = 0; lane < LANES; lane++) LANE(x, lane) = function(LANE(x, lane));
     return x;
 }
 static real each_pair(double (*function)(double, double), real x, real y) {
-    for (int lane = 0; lane < LANES; lane++) x[lane] = function(x[lane], y[lane]);
+    for (int lane = 0; lane < LANES; lane++) LANE(x, lane) = function(LANE(x, lane), LANE(y, lane));
     return x;
 }
 static inline real root(real x) {
-    for (int lane = 0; lane < LANES; lane++) x[lane] = sqrt(x[lane]);
+    for (int lane = 0; lane < LANES; lane++) LANE(x, lane) = sqrt(LANE(x, lane));
     return x;
 }
-
-/* Sine and cosine of every member, within two units in the last place. Quarter turns are taken off in three parts of
- * pi/2, the first two of which stay exact when multiplied by their number (Cody and Waite 1980); Taylor's series do for
- * the 45 degrees that are left. */
-#define MANY 1e6 /* [rad]; libm takes what is beyond, and what is not finite */
 typedef struct {
     real sine, cosine;
 } Turn;
 
+#ifndef BATCHED
+static inline Turn turn(real x) {
+    const Turn t = {sin(x), cos(x)};
+    return t;
+}
+#else
+/* Sine and cosine of every member, within two units in the last place. Quarter turns are taken off in three parts of
+ * pi/2, the first two of which stay exact when multiplied by their number (Cody and Waite 1980); Taylor's series do for
+ * the 45 degrees that are left. */
+#define MANY 1e6 /* [rad]; libm takes what is beyond, and what is not finite */
 static Turn turn(real x) {
     const real shifted = x * 0x1.45f306dc9c883p-1 + 0x1.8p52, n = shifted - 0x1.8p52;
     const mask quarter = (mask)shifted, odd = -(quarter & 1);
