@@ -617,6 +617,21 @@ def test_all_recordings_tell_which_effects_are_within_reach():
     assert len(within_reach([rough, fit([effect("other@elbow")], loss(1.2, 1.2), cost=130.0)])) == 2
 
 
+def test_what_all_recordings_say_is_within_reach_beyond_a_standard_error_on_those_held_out():
+    """A spring that bends far away is an offset; chance alone may predict one motion better with it, by 2 here."""
+    spring = fit([effect("spring@elbow", amplitude("a"), amplitude("b"))], loss(1.0, 1.0), cost=103.0)
+    offset = fit([effect("offset@elbow")], loss(1.01, 1.01), cost=102.0)
+    assert gain(offset.loss, spring.loss) == pytest.approx((0.01, 0.0))
+    assert behind(offset, spring) == pytest.approx(-1.0)
+    assert [entry.effects[0].kind for entry in within_reach([spring, offset])] == ["offset", "spring"]
+    # 3.84 is what a 95 % interval is worth
+    assert len(within_reach([spring, replace(offset, cost=104.4)])) == 2
+    assert within_reach([spring, replace(offset, cost=104.5)]) == [spring]
+    # where more than noise is left, squares are errors of the model
+    rough = [replace(spring, loss=loss(1.2, 1.2)), replace(offset, loss=loss(1.21, 1.21))]
+    assert within_reach(rough) == [rough[0]]
+
+
 def test_nothing_is_added_where_no_refit_succeeds(monkeypatch):
     assert Rounds(monkeypatch, {"": (3.0, 3.0)}).compose() == ([], [], ())
 

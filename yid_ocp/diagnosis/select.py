@@ -18,6 +18,7 @@ from yid_ocp.diagnosis.screening import Confusability, Pair, Score, Screened, be
 from yid_ocp.diagnosis.thresholds import DEFAULTS, Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import SolverError
+from yid_ocp.solvers.judgement import TWO_SIDED
 
 RESAMPLES = 1000
 """Draws of held-out blocks for the interval of a closure."""
@@ -105,8 +106,10 @@ def gain(before: Loss, after: Loss) -> tuple[float, float]:
 def within_reach(fits: Sequence[Fit], limits: Thresholds = DEFAULTS) -> list[Fit]:
     """Fits whose held-out loss is within one standard error of the best one's (or `tie` of it), the simplest first.
 
-    Of these only what is as likely as the likeliest on all recordings together stays (`less_likely`). Where the model
-    errs everywhere, simpler ones are near by the evidence as well; see `outweighs`. An effect whose shape is far from
+    So is one that is as likely as the best on all recordings together (`as_likely`): of models that predict alike,
+    chance puts the true one beyond a standard error in one case of six. Of these only what is as likely as the
+    likeliest stays (`less_likely`). Where the model errs everywhere, simpler ones are near by the evidence as well; see
+    `outweighs`. An effect whose shape is far from
     what an engineer would expect (`out_of_shape`) counts only where no other comes near it: a solid that relaxes in a
     tenth of the shortest time expected is a damper. So does one that is not sure to be there. One whose amplitude is
     out of its range (`oversized`) comes last.
@@ -119,7 +122,8 @@ def within_reach(fits: Sequence[Fit], limits: Thresholds = DEFAULTS) -> list[Fit
     near = []
     for fit in fits:
         lost, error = gain(fit.loss, best.loss)
-        if fit is best or lost <= max(error, limits.tie * best.loss.mean) or outweighs(fit, best, limits):
+        close = fit is best or lost <= max(error, limits.tie * best.loss.mean)
+        if close or as_likely(fit, best, limits) or outweighs(fit, best, limits):
             near.append(fit)
     likeliest = min(near, key=lambda fit: behind(fit, best))
     near = [fit for fit in near if not less_likely(fit, likeliest, limits)]
@@ -130,11 +134,16 @@ def within_reach(fits: Sequence[Fit], limits: Thresholds = DEFAULTS) -> list[Fit
     return sorted(near, key=order)
 
 
-def less_likely(fit: Fit, other: Fit, limits: Thresholds = DEFAULTS) -> bool:
-    """Whether all recordings are less likely with a fit than with another by the odds of `worth`; see `behind`.
+def as_likely(fit: Fit, other: Fit, limits: Thresholds = DEFAULTS) -> bool:
+    """Whether all recordings are as likely with a fit as with another, but for what a 95 % interval is worth.
 
     Where more than noise is left, squares count errors of the model, and their differences say little.
     """
+    return _noise_is_left(limits, fit.loss, other.loss) and behind(fit, other) <= TWO_SIDED
+
+
+def less_likely(fit: Fit, other: Fit, limits: Thresholds = DEFAULTS) -> bool:
+    """Whether all recordings are less likely with a fit than with another by the odds of `worth`; see `as_likely`."""
     return _noise_is_left(limits, fit.loss, other.loss) and behind(fit, other) > 2 * limits.worth
 
 
