@@ -104,15 +104,15 @@ def gain(before: Loss, after: Loss) -> tuple[float, float]:
 
 
 def within_reach(fits: Sequence[Fit], limits: Thresholds = DEFAULTS) -> list[Fit]:
-    """Fits whose held-out loss is within one standard error of the best one's (or `tie` of it), the simplest first.
+    """Fits that predict held-out recordings as well as the best one, the simplest first.
 
-    So is one that is as likely as the best on all recordings together (`as_likely`): of models that predict alike,
-    chance puts the true one beyond a standard error in one case of six. Of these only what is as likely as the
-    likeliest stays (`less_likely`). Where the model errs everywhere, simpler ones are near by the evidence as well; see
-    `outweighs`. An effect whose shape is far from
-    what an engineer would expect (`out_of_shape`) counts only where no other comes near it: a solid that relaxes in a
-    tenth of the shortest time expected is a damper. So does one that is not sure to be there. One whose amplitude is
-    out of its range (`oversized`) comes last.
+    Their loss is within one standard error of the best one's, or within `tie` of it, or all recordings together are as
+    likely with them (`as_likely`): of models that predict alike, chance puts the true one beyond a standard error in
+    one case of six. Of these only what is as likely as the likeliest stays (`less_likely`). Where the model errs
+    everywhere, simpler ones are near by the evidence as well; see `outweighs`. An effect whose shape is far from what
+    an engineer would expect (`out_of_shape`) counts only where no other comes near it: a solid that relaxes in a tenth
+    of the shortest time expected is a damper. So does one that is not sure to be there. One whose amplitude is out of
+    its range (`oversized`) comes last.
     """
     best = min(fits, key=lambda fit: fit.loss.mean)
     likely = [fit for fit in fits if not fit.effects or _likely(fit.effects[-1], fit, limits)]
