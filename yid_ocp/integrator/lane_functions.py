@@ -93,35 +93,22 @@ def lane_functions_source(functions: Sequence[ca.Function]) -> str | None:
 @dataclass(frozen=True)
 class _Instruction:
     code: int
-    inputs: list[int]  # places of CasADi's work vector, but for those of an argument
-    outputs: list[int]
+    inputs: list[int]  # argument and entry, or the instructions whose values it takes
+    outputs: list[int]  # the place of CasADi's work vector, or result and entry
     constant: float
 
 
 def _source(function: ca.Function) -> str | None:
-    instructions = [
-        _Instruction(
-            function.instruction_id(k),
-            function.instruction_input(k),
-            function.instruction_output(k),
-            function.instruction_constant(k) if function.instruction_id(k) == ca.OP_CONST else 0.0,
-        )
-        for k in range(function.n_instructions())
-    ]
+    instructions = _instructions(function)
     if any(instruction.code not in _KNOWN for instruction in instructions):
         return None
     size = PART if is_long(function) else max(len(instructions), 1)
-    held: dict[int, int] = {}  # the instruction whose value stands in a place now
-    needed = [0] * len(instructions)  # the last part that needs its value
+    needed = [0] * len(instructions)  # the last part that takes its value
     for k, instruction in enumerate(instructions):
-        for place in instruction.inputs if instruction.code != ca.OP_INPUT else ():
-            needed[held[place]] = k // size
-        if instruction.code != ca.OP_OUTPUT:
-            held[instruction.outputs[0]] = k
-    held.clear()
+        for of in instruction.inputs if instruction.code != ca.OP_INPUT else ():
+            needed[of] = k // size
     signature, name = "const real **arg, real **res, long long *iw, real *restrict w, int mem", function.name()
-    firsts = range(0, max(len(instructions), 1), size)
-    parts = [_part(instructions, first, size, held, needed) for first in firsts]
+    parts = [_part(instructions, first, size, needed) for first in range(0, max(len(instructions), 1), size)]
     if len(parts) == 1:
         return "\n".join([f"static void {name}({signature}) {{", *parts[0], "}"])
     written = [
@@ -132,23 +119,40 @@ def _source(function: ca.Function) -> str | None:
     return "\n".join([*written, f"static void {name}({signature}) {{", *calls, "}"])
 
 
-def _part(
-    instructions: Sequence[_Instruction], first: int, size: int, held: dict[int, int], needed: Sequence[int]
-) -> list[str]:
-    """Some instructions, each value a constant of its own; `held` is carried on."""
+def _instructions(function: ca.Function) -> list[_Instruction]:
+    """What a function does, in order; of an operation without a form no input is looked up."""
+    held: dict[int, int] = {}  # the instruction whose value stands in a place now
+    found = []
+    for k in range(function.n_instructions()):
+        code, inputs, outputs = (
+            function.instruction_id(k),
+            function.instruction_input(k),
+            function.instruction_output(k),
+        )
+        if code in _KNOWN and code != ca.OP_INPUT:
+            inputs = [held[place] for place in inputs]
+        constant = function.instruction_constant(k) if code == ca.OP_CONST else 0.0
+        found.append(_Instruction(code, inputs, outputs, constant))
+        if code != ca.OP_OUTPUT:
+            held.update(dict.fromkeys(outputs, k))
+    return found
+
+
+def _part(instructions: Sequence[_Instruction], first: int, size: int, needed: Sequence[int]) -> list[str]:
+    """Some instructions, each value a constant of its own; those that later parts need go to the work vector."""
     lines: list[str] = []
     known: dict[int, str] = {}  # values of this part, and those that it has read from the work vector
     turned: dict[int, str] = {}  # sine and cosine of a value are worked out together
 
-    def value(place: int) -> str:
-        of = held[place]
+    def value(of: int) -> str:
         if of not in known:
             known[of] = f"v{of}"
-            lines.append(f"const real v{of} = w[{place}];")
+            lines.append(f"const real v{of} = w[{instructions[of].outputs[0]}];")
         return known[of]
 
-    for k, told in enumerate(instructions[first : first + size], first):
-        name = f"v{k}"
+    own = range(first, min(first + size, len(instructions)))
+    for k in own:
+        told, name = instructions[k], f"v{k}"
         if told.code == ca.OP_OUTPUT:
             result = value(told.inputs[0])
             lines.append(f"res[{told.outputs[0]}][{told.outputs[1]}] = {result};")
@@ -159,16 +163,14 @@ def _part(
         elif told.code == ca.OP_INPUT:
             lines.append(f"const real {name} = arg[{told.inputs[0]}][{told.inputs[1]}];")
         elif told.code in _TURNS:
-            of, angle = held[told.inputs[0]], value(told.inputs[0])
+            of, angle = told.inputs[0], value(told.inputs[0])
             if of not in turned:
                 turned[of] = f"t{k}"
                 lines.append(f"const Turn t{k} = turn({angle});")
             name = f"{turned[of]}.{_TURNS[told.code]}"
         else:
-            operands = [value(place) for place in told.inputs]
+            operands = [value(of) for of in told.inputs]
             lines.append(f"const real {name} = {_FORMS[told.code].format(*operands)};")
         known[k] = name
-        held[told.outputs[0]] = k
-    part = first // size
-    kept = sorted((place, k) for place, k in held.items() if k >= first and needed[k] > part)
+    kept = sorted((instructions[k].outputs[0], k) for k in own if needed[k] > first // size)
     return [*lines, *(f"w[{place}] = {known[k]};" for place, k in kept)]
