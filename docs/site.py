@@ -19,6 +19,12 @@ SECTIONS = {
 }
 
 
+def chapters() -> list[str]:
+    """Pages of the folder `design`, in the order of its index."""
+    index = (REPOSITORY / "docs" / "design" / "README.md").read_text(encoding="utf-8")
+    return ["design/README.md", *(f"design/{name}" for name in re.findall(r"^\| \[(\w+\.md)\]", index, re.MULTILINE))]
+
+
 def public() -> list[str]:
     """Names of the front door, classes first."""
     names = [name for name in yid_ocp.__all__ if not name.startswith("_")]
@@ -28,6 +34,7 @@ def public() -> list[str]:
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
     """Fill the navigation."""
     config.nav = [{title: list(pages)} for title, pages in SECTIONS.items()]
+    config.nav.append({"Design": chapters()})
     config.nav.append({"Python": [{name: f"api/{name}.md"} for name in public()]})
     return config
 
